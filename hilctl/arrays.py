@@ -1,0 +1,15 @@
+"""Array types named once, so that signatures say what they hold."""
+
+from typing import TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+F64: TypeAlias = npt.NDArray[np.float64]
+"""A float64 array; the docstring beside it gives the shape and the unit."""
+
+U32: TypeAlias = npt.NDArray[np.uint32]
+"""A uint32 array, used for sample flags."""
+
+I64: TypeAlias = npt.NDArray[np.int64]
+"""An int64 array, used for indices and nanoseconds."""
