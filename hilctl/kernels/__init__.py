@@ -1,0 +1,10 @@
+"""Compiled hysteresis operators: pure functions of float64 arrays and plain numbers.
+
+Rules of this folder: explicit signatures, no globals, no objects, state passed in and updated in
+place, and every kernel stands in one file with all that it calls, because numba's on-disk cache
+does not notice a callee that changed in another file. Units live one level above.
+
+    jit.py       the one decorator
+    hysteresis.py  play, stop, deadband, their sums, the integrated model and its inverse
+    limit.py     peak and slew limits of a command
+"""

@@ -1,0 +1,274 @@
+"""Play, stop and deadband operators, their weighted sums, and the integrated model.
+
+Notation: ``v`` is an input, ``x`` what stands between the plays and the deadbands, ``y`` an output.
+A *widening* is what the rate adds to every threshold: ``r_i(v') = r_i + gamma |v'|`` (6.18).
+
+Memory of a sum of m plays, float64[m + 1]: the m operator outputs, then the previous input. A
+previous input of NaN means that there is none yet: the rate is then zero, and an operator that
+holds 0 starts at ``max(v_0 - r, min(v_0 + r, 0))`` as the literature has it. Memory is updated in
+place, so any cut of a signal into blocks gives the same bits as one call. ``out`` may be the input
+array itself.
+
+Source: "Modeling and Compensation of Rate-Dependent Asymmetric Hysteresis Nonlinearities of
+Magnetostrictive Actuators", Concordia; equation numbers are that dissertation's.
+"""
+
+import numpy as np
+
+from hilctl.arrays import F64
+from hilctl.kernels.jit import kernel
+
+
+@kernel("float64(float64, float64, float64)")
+def play_step(v: float, threshold: float, held: float) -> float:
+    """Advance one play operator by one sample (4.5).
+
+    Args:
+        v: Input.
+        threshold: Half the operator's width, >= 0, in the unit of ``v``.
+        held: The operator's previous output.
+
+    Returns:
+        The operator's output, within ``threshold`` of ``v``.
+    """
+    return max(v - threshold, min(v + threshold, held))
+
+
+@kernel("float64(float64, float64, float64, float64)")
+def stop_step(v: float, v_previous: float, threshold: float, held: float) -> float:
+    """Advance one stop operator by one sample (section 3.3).
+
+    Args:
+        v: Input.
+        v_previous: Previous input.
+        threshold: Largest magnitude of the output, > 0, in the unit of ``v``.
+        held: The operator's previous output.
+
+    Returns:
+        The operator's output, within ``threshold`` of 0.
+    """
+    return min(threshold, max(-threshold, v - v_previous + held))
+
+
+@kernel("float64(float64, float64)", inline=True)
+def _widening(change: float, gain: float) -> float:
+    rate = abs(change)
+    return gain * rate if rate >= 0.0 else 0.0  # NaN: there is no previous input
+
+
+@kernel("void(float64, float64, float64[::1], float64[::1])", inline=True)
+def _move_plays(v: float, widening: float, thresholds: F64, memory: F64) -> None:
+    for i in range(thresholds.size):
+        threshold = thresholds[i] + widening
+        memory[i] = max(min(memory[i], v + threshold), v - threshold)
+
+
+@kernel("float64(float64[::1], float64[::1])", inline=True)
+def _weigh(weights: F64, values: F64) -> float:
+    total = 0.0
+    for i in range(weights.size):
+        total += weights[i] * values[i]
+    return total
+
+
+@kernel(
+    "float64(float64, float64, float64[::1], float64[::1], float64[::1], float64[::1])", inline=True
+)
+def deadband_value(x: float, slope: float, d_up: F64, g_up: F64, d_down: F64, g_down: F64) -> float:
+    """Evaluate the memoryless function Lambda, a weighted sum of deadband operators (6.6).
+
+    Args:
+        x: Input.
+        slope: Weight g_0 of the operator with threshold 0.
+        d_up: float64[k], thresholds > 0, rising, in the unit of ``x``.
+        g_up: float64[k], their weights.
+        d_down: float64[l], thresholds < 0, falling.
+        g_down: float64[l], their weights.
+
+    Returns:
+        Lambda(x).
+    """
+    total = slope * x
+    j = 0
+    while j < d_up.size and x > d_up[j]:
+        total += g_up[j] * (x - d_up[j])
+        j += 1
+    j = 0
+    while j < d_down.size and x < d_down[j]:
+        total += g_down[j] * (x - d_down[j])
+        j += 1
+    return total
+
+
+@kernel(
+    "void(float64[::1], float64, float64[::1], float64[::1], float64[::1], float64[::1],"
+    " float64[::1])"
+)
+def deadband_block(
+    x: F64, slope: float, d_up: F64, g_up: F64, d_down: F64, g_down: F64, out: F64
+) -> None:
+    """Evaluate :func:`deadband_value` for each element of ``x`` into ``out``, both float64[n]."""
+    for k in range(x.size):
+        out[k] = deadband_value(x[k], slope, d_up, g_up, d_down, g_down)
+
+
+@kernel(
+    "void(float64[::1], float64[::1], float64, float64[::1], float64[::1], float64[::1],"
+    " float64[::1])"
+)
+def play_sum_shared(
+    v: F64, widening: F64, direct: float, thresholds: F64, weights: F64, memory: F64, out: F64
+) -> None:
+    """Sum weighted plays whose widening is given sample by sample.
+
+    Two sums fed with one and the same widening cancel exactly where one is the other's inverse.
+
+    Args:
+        v: float64[n], input.
+        widening: float64[n], added to every threshold, >= 0.
+        direct: Weight of the input itself, a_0.
+        thresholds: float64[m], rising, in the unit of ``v``.
+        weights: float64[m].
+        memory: float64[m + 1], see the module's docstring.
+        out: float64[n], filled.
+    """
+    for k in range(v.size):
+        now = v[k]
+        _move_plays(now, widening[k], thresholds, memory)
+        out[k] = direct * now + _weigh(weights, memory)
+        memory[thresholds.size] = now
+
+
+@kernel(
+    "void(float64[::1], float64, float64, float64[::1], float64[::1], float64[::1], float64[::1])"
+)
+def play_sum(
+    v: F64, rate_gain: float, direct: float, thresholds: F64, weights: F64, memory: F64, out: F64
+) -> None:
+    """Sum weighted plays whose thresholds widen with the input's own rate (3.6, 5.5).
+
+    Args:
+        v: float64[n], input.
+        rate_gain: Widening for a change of 1 between samples: gamma times the sample rate; 0
+            gives the rate-independent model.
+        direct: Weight of the input itself, a_0.
+        thresholds: float64[m], rising, in the unit of ``v``.
+        weights: float64[m].
+        memory: float64[m + 1], see the module's docstring.
+        out: float64[n], filled.
+    """
+    for k in range(v.size):
+        now = v[k]
+        _move_plays(now, _widening(now - memory[thresholds.size], rate_gain), thresholds, memory)
+        out[k] = direct * now + _weigh(weights, memory)
+        memory[thresholds.size] = now
+
+
+@kernel("void(float64[::1], float64[::1], float64[::1], float64[::1], float64[:, ::1])")
+def play_outputs(v: F64, widening: F64, thresholds: F64, memory: F64, out: F64) -> None:
+    """Record each play operator's output by itself, as regressors for identification.
+
+    Args:
+        v: float64[n], input.
+        widening: float64[n], added to every threshold, >= 0.
+        thresholds: float64[m], in the unit of ``v``.
+        memory: float64[m + 1], see the module's docstring.
+        out: float64[n, m], filled.
+    """
+    for k in range(v.size):
+        _move_plays(v[k], widening[k], thresholds, memory)
+        for i in range(thresholds.size):
+            out[k, i] = memory[i]
+        memory[thresholds.size] = v[k]
+
+
+@kernel("void(float64[::1], float64, float64[::1], float64[::1], float64[::1], float64[::1])")
+def stop_sum(v: F64, direct: float, thresholds: F64, weights: F64, memory: F64, out: F64) -> None:
+    """Sum weighted stop operators: the stop-operator-based compensator (3.11).
+
+    Args:
+        v: float64[n], input.
+        direct: Weight w_0 of the operator whose threshold is never reached: the input itself.
+        thresholds: float64[m], rising, in the unit of ``v``.
+        weights: float64[m].
+        memory: float64[m + 1]: the operators' outputs, then the previous input. A previous input
+            of NaN counts as 0, the input at rest.
+        out: float64[n], filled.
+    """
+    for k in range(v.size):
+        now = v[k]
+        previous = memory[thresholds.size]
+        if not abs(previous) >= 0.0:
+            previous = 0.0
+        for i in range(thresholds.size):
+            memory[i] = stop_step(now, previous, thresholds[i], memory[i])
+        out[k] = direct * now + _weigh(weights, memory)
+        memory[thresholds.size] = now
+
+
+@kernel(
+    "void(float64[::1], float64, float64, float64[::1], float64[::1], float64, float64[::1],"
+    " float64[::1], float64[::1], float64[::1], float64[::1], float64[::1])"
+)
+def integrated_forward(
+    v: F64,
+    rate_gain: float,
+    direct: float,
+    thresholds: F64,
+    weights: F64,
+    slope: float,
+    d_up: F64,
+    g_up: F64,
+    d_down: F64,
+    g_down: F64,
+    memory: F64,
+    out: F64,
+) -> None:
+    """Run the integrated model Omega[v] = Lambda(Pi[v]) (6.5).
+
+    Args as for :func:`play_sum` and :func:`deadband_value`; ``v`` and ``out`` are float64[n].
+    """
+    for k in range(v.size):
+        widening = _widening(v[k] - memory[thresholds.size], rate_gain)
+        _move_plays(v[k], widening, thresholds, memory)
+        x = direct * v[k] + _weigh(weights, memory)
+        memory[thresholds.size] = v[k]
+        out[k] = deadband_value(x, slope, d_up, g_up, d_down, g_down)
+
+
+@kernel(
+    "void(float64[::1], float64, float64[::1], float64[::1], float64[::1], float64[::1], float64,"
+    " float64, float64[::1], float64[::1], float64[::1], float64[::1])"
+)
+def integrated_inverse(
+    y: F64,
+    slope: float,
+    d_up: F64,
+    g_up: F64,
+    d_down: F64,
+    g_down: F64,
+    rate_gain: float,
+    direct: float,
+    thresholds: F64,
+    weights: F64,
+    memory: F64,
+    out: F64,
+) -> None:
+    """Run the integrated inverse Omega^-1[y] = Pi^-1[Lambda^-1(y)] (6.17).
+
+    The parameters are those of the inverse operators; ``y`` and ``out`` are float64[n]. The
+    previous input in ``memory`` is that of the plays, Lambda^-1(y).
+    """
+    for k in range(y.size):
+        x = deadband_value(y[k], slope, d_up, g_up, d_down, g_down)
+        widening = _widening(x - memory[thresholds.size], rate_gain)
+        _move_plays(x, widening, thresholds, memory)
+        out[k] = direct * x + _weigh(weights, memory)
+        memory[thresholds.size] = x
+
+
+def rest_memory(operators: int) -> F64:
+    """Return the memory of that many operators at rest: float64[operators + 1]."""
+    memory = np.zeros(operators + 1)
+    memory[operators] = np.nan
+    return memory
