@@ -1,0 +1,134 @@
+"""The simulated rigs as devices: ``simulated_terfenol`` and ``simulated_piezo``."""
+
+from dataclasses import asdict, replace
+from typing import Any, ClassVar, Self
+
+from pydantic import Field, model_validator
+
+from hilctl.ports import DeviceInfo, DeviceOptions
+from hilctl_drivers.piezo import PiezoActuator, PiezoParameters
+from hilctl_drivers.plant import Plant
+from hilctl_drivers.simulated_device import (
+    FIFO_DEPTH,
+    MAX_RATE_HZ,
+    SimulatedDevice,
+    SimulatedOptions,
+)
+from hilctl_drivers.terfenol import TerfenolActuator, TerfenolParameters
+
+
+class TerfenolOptions(SimulatedOptions):
+    """Options of ``simulated_terfenol``."""
+
+    load_kg: float = Field(default=0.0, ge=0.0, le=100.0, description="mass on the actuator, kg")
+    bias_a: float = Field(
+        default=0.0,
+        ge=-8.0,
+        le=8.0,
+        description="constant current beside the command, A; displacement is zero there",
+    )
+    current_max_a: float = Field(
+        default=10.0, gt=0.0, le=10.0, description="largest current accepted either way, A"
+    )
+
+
+class PiezoStage(DeviceOptions):
+    """A stage of your own: a sum of play operators, for example one identified from your data."""
+
+    drive_max_v: float = Field(gt=0.0, description="top of the drive, V; its bottom is 0 V")
+    slope_um_per_v: float = Field(gt=0.0, description="weight p_0 of the drive itself")
+    thresholds_v: tuple[float, ...] = Field(description="thresholds r_i of the play operators, V")
+    weights_um_per_v: tuple[float, ...] = Field(description="weights p_i of the play operators")
+    offset_um: float = Field(default=0.0, description="position at rest, um")
+    sensor_range_um: float = Field(gt=0.0, description="reading at either end of the range, um")
+
+    @model_validator(mode="after")
+    def _same_length(self) -> Self:
+        weights, thresholds = len(self.weights_um_per_v), len(self.thresholds_v)
+        if weights != thresholds:
+            raise ValueError(
+                f"weights_um_per_v must have one value a threshold: {weights} for {thresholds}"
+            )
+        return self
+
+
+class PiezoOptions(SimulatedOptions):
+    """Options of ``simulated_piezo``."""
+
+    stage: PiezoStage | None = Field(
+        default=None, description="a stage of your own instead of the published P-753.31C"
+    )
+    sensor_noise_um: float = Field(
+        default=1e-3, ge=0.0, le=1.0, description="rms noise of each reading, um"
+    )
+
+
+def _details(parameters: dict[str, Any], options: SimulatedOptions) -> dict[str, str]:
+    """Return physical parameters and options as text, to be kept with a recording."""
+    everything = parameters | options.model_dump()
+    return {name: str(value) for name, value in everything.items()}
+
+
+class SimulatedTerfenol(SimulatedDevice):
+    """The Terfenol-D actuator of :mod:`hilctl_drivers.terfenol`; commands in A."""
+
+    Options: ClassVar[type[DeviceOptions]] = TerfenolOptions
+
+    def __init__(self, options: TerfenolOptions) -> None:
+        """Describe the device; nothing is simulated before :meth:`open`."""
+        self._options = options
+        rated = TerfenolParameters()
+        self._parameters = rated if options.noise else replace(rated, sensor_noise_um=0.0)
+        info = DeviceInfo(
+            name="simulated_terfenol",
+            description="simulated Terfenol-D actuator, linear amplifier and capacitive sensor",
+            command_unit="A",
+            command_min=-options.current_max_a,
+            command_max=options.current_max_a,
+            sensor_min_um=-rated.sensor_range_um,
+            sensor_max_um=rated.sensor_range_um,
+            max_rate_hz=MAX_RATE_HZ,
+            buffered=True,
+            fifo_depth=FIFO_DEPTH,
+            measures_command=True,
+            details=_details(asdict(self._parameters), options),
+        )
+        super().__init__(info, options.fault)
+
+    def _build(self, sample_rate_hz: float) -> Plant:
+        options = self._options
+        return TerfenolActuator(
+            self._parameters, sample_rate_hz, options.load_kg, options.bias_a, options.seed
+        )
+
+
+class SimulatedPiezo(SimulatedDevice):
+    """The piezo stage of :mod:`hilctl_drivers.piezo`; commands in V of drive."""
+
+    Options: ClassVar[type[DeviceOptions]] = PiezoOptions
+
+    def __init__(self, options: PiezoOptions) -> None:
+        """Describe the device; nothing is simulated before :meth:`open`."""
+        self._seed = options.seed
+        noise_um = options.sensor_noise_um if options.noise else 0.0
+        stage = options.stage.model_dump() if options.stage else {}
+        self._parameters = PiezoParameters(sensor_noise_um=noise_um, **stage)
+        info = DeviceInfo(
+            name="simulated_piezo",
+            description=f"simulated piezo stage, 0..{self._parameters.drive_max_v:g} V drive and "
+            "capacitive sensor",
+            command_unit="V",
+            command_min=0.0,
+            command_max=self._parameters.drive_max_v,
+            sensor_min_um=-self._parameters.sensor_range_um,
+            sensor_max_um=self._parameters.sensor_range_um,
+            max_rate_hz=MAX_RATE_HZ,
+            buffered=True,
+            fifo_depth=FIFO_DEPTH,
+            measures_command=True,
+            details=_details(asdict(self._parameters), options),
+        )
+        super().__init__(info, options.fault)
+
+    def _build(self, sample_rate_hz: float) -> Plant:
+        return PiezoActuator(self._parameters, sample_rate_hz, self._seed)
