@@ -1,0 +1,96 @@
+"""The limiter as the loop uses it."""
+
+import numpy as np
+import pytest
+
+from hilctl.errors import InputError
+from hilctl.flags import Flag
+from hilctl.limiter import CommandLimits, Limiter
+
+LIMITS = CommandLimits(low=-2.0, high=3.0, slew_per_s=100.0, safe=0.5, ramp_per_s=50.0)
+DT_S = 1e-3
+SWEEP = [-np.inf, -1e9, -3.0, -2.0, -1.0, 0.0, 0.5, 1.0, 3.0, 3.5, 1e9, np.inf, np.nan]
+
+
+def limited(limiter, wanted):
+    wanted = np.asarray(wanted, dtype=np.float64)
+    command, flags = np.empty_like(wanted), np.zeros(wanted.size, dtype=np.uint32)
+    limiter.limit(wanted, command, flags)
+    return command, flags
+
+
+def test_starts_at_the_safe_value():
+    """The first step is measured from the safe value, where the output rests before a run."""
+    command, flags = limited(Limiter(LIMITS, DT_S), [3.0])
+    assert command.tolist() == [0.6]
+    assert flags.tolist() == [Flag.SLEW_LIMITED]
+
+
+@pytest.mark.parametrize("before", SWEEP)
+@pytest.mark.parametrize("after", SWEEP)
+def test_no_pair_of_wishes_gets_out(before, after):
+    """Whatever is asked for, commands are finite, within range and within slew."""
+    limiter = Limiter(LIMITS, DT_S)
+    last = limiter.last
+    for wish in (before, after) * 40:
+        command, flags = limited(limiter, [wish])
+        assert LIMITS.low <= command[0] <= LIMITS.high
+        assert abs(command[0] - last) <= LIMITS.slew_per_s * DT_S * (1 + 1e-12)
+        assert bool(flags[0] & Flag.INVALID) == (not np.isfinite(wish))
+        assert bool(flags[0] & Flag.RANGE_LIMITED) == (
+            np.isfinite(wish) and not LIMITS.low <= wish <= LIMITS.high
+        )
+        assert limiter.last == command[0]
+        last = command[0]
+
+
+def test_the_sweep_covers_both_limits():
+    """The sweep above means something: both range limits are reached by it."""
+    limiter = Limiter(LIMITS, DT_S)
+    assert limited(limiter, [1e9] * 100)[0][-1] == LIMITS.high
+    assert limited(limiter, [-1e9] * 100)[0][-1] == LIMITS.low
+
+
+def test_wishes_within_limits_pass_untouched():
+    """Nothing is rounded, flagged or delayed where nothing has to be limited."""
+    wanted = 0.5 + 0.3 * np.sin(np.linspace(0.0, 3.0, 200))
+    command, flags = limited(Limiter(LIMITS, DT_S), wanted)
+    assert np.array_equal(command, wanted)
+    assert not flags.any()
+
+
+def test_ramp_ends_exactly_at_the_safe_value():
+    """The ramp goes straight to the safe value, in its own slew, and says when it is there."""
+    limiter = Limiter(LIMITS, DT_S)
+    limited(limiter, np.full(100, 3.0))
+    way, done = [], False
+    while not done:
+        command, flags = np.empty(7), np.zeros(7, dtype=np.uint32)
+        done = limiter.ramp(command, flags)
+        assert (flags == Flag.RAMP).all()
+        way += command.tolist()
+    steps = np.diff([3.0, *way])
+    assert way[-1] == LIMITS.safe
+    assert (steps <= 0.0).all()
+    assert np.abs(steps).max() == pytest.approx(LIMITS.ramp_per_s * DT_S)
+    assert len(way) == 56  # 2.5 / 0.05 = 50 samples, in blocks of 7
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        ({"low": 4.0}, "finite and rising"),
+        ({"high": np.inf}, "finite and rising"),
+        ({"low": np.nan}, "finite and rising"),
+        ({"safe": 3.1}, "safe value must lie within"),
+        ({"safe": np.nan}, "safe value must lie within"),
+        ({"ramp_per_s": 0.0}, "ramp must be > 0"),
+        ({"ramp_per_s": 101.0}, "no faster than the slew limit"),
+        ({"slew_per_s": np.inf}, "no faster than the slew limit"),
+    ],
+)
+def test_limits_that_mean_nothing_are_refused(change, text):
+    """Limits themselves are checked, each rule by name."""
+    fields = {"low": -2.0, "high": 3.0, "slew_per_s": 100.0, "safe": 0.5, "ramp_per_s": 50.0}
+    with pytest.raises(InputError, match=text):
+        CommandLimits(**{**fields, **change})

@@ -1,0 +1,288 @@
+"""The loop, with a device and a clock that the test makes."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+
+from hilctl.compensator import Compensator
+from hilctl.errors import DeviceError
+from hilctl.flags import Flag
+from hilctl.limiter import CommandLimits, Limiter
+from hilctl.loop import Loop, Plan
+from hilctl.models.published import terfenol_rdpi
+from hilctl.pacer import Pacer
+
+RATE_HZ = 1000.0
+LIMITS = CommandLimits(low=-5.0, high=5.0, slew_per_s=2000.0, safe=0.0, ramp_per_s=100.0)
+
+
+@dataclass
+class FakeDevice:
+    """Answers ten times the last command; may break at a sample."""
+
+    break_at: int = 10**9
+    nan_at: int = 10**9
+    safe_works: bool = True
+    commands: list[float] = field(default_factory=list)
+    firsts: list[int] = field(default_factory=list)
+    made_safe: list[float] = field(default_factory=list)
+
+    def exchange(self, first_sample, command, displacement_um, measured):
+        if first_sample + command.size > self.break_at:
+            raise DeviceError("fake: no answer within 0.1 s")
+        self.firsts.append(first_sample)
+        for j, value in enumerate(command):
+            displacement_um[j] = 10.0 * (self.commands[-1] if self.commands else 0.0)
+            if first_sample + j >= self.nan_at:
+                displacement_um[j] = np.nan
+            self.commands.append(float(value))
+
+    def make_safe(self, command):
+        if not self.safe_works:
+            raise DeviceError("fake: still no answer")
+        self.made_safe.append(command)
+
+
+@dataclass
+class FakeClock:
+    """Time moves only in sleeps; some of them last longer."""
+
+    now: int = 0
+    stall_ns: dict[int, int] = field(default_factory=dict)
+    sleeps: int = 0
+
+    def now_ns(self):
+        return self.now
+
+    def sleep_until_ns(self, deadline_ns):
+        self.now = max(self.now, deadline_ns) + self.stall_ns.get(self.sleeps, 0)
+        self.sleeps += 1
+
+
+@dataclass
+class Sink:
+    """Keeps copies of all blocks; may be full for a while."""
+
+    full: range = range(0)
+    heads: list[tuple[int, ...]] = field(default_factory=list)
+    columns: list[np.ndarray] = field(default_factory=list)
+    flags: list[np.ndarray] = field(default_factory=list)
+    states: list[np.ndarray] = field(default_factory=list)
+
+    def push(self, head, state, columns, flags):
+        if head[0] in self.full:
+            return False
+        self.heads.append(head)
+        self.columns.append(columns.copy())
+        self.flags.append(flags.copy())
+        self.states.append(state.copy())
+        return True
+
+    def column(self, row):
+        return np.concatenate([c[row] for c in self.columns])
+
+
+class Bench:
+    """One loop with all its parts, to be run once."""
+
+    def __init__(self, reference, *, block=1, device=None, clock=None, sink=None, **options):
+        model = options.get("model")
+        self.device = device or FakeDevice()
+        self.clock = clock or FakeClock()
+        self.sink = sink or Sink()
+        self.limiter = Limiter(LIMITS, 1.0 / RATE_HZ)
+        self.compensator = Compensator(model, RATE_HZ)
+        period_ns = 1e9 * block / RATE_HZ
+        policy = options.get("policy", "skip")
+        self.pacer = Pacer(self.clock, period_ns, policy, 0.5 * period_ns)
+        stroke_um = options.get("stroke_um", (-60.0, 60.0))
+        plan = Plan(reference, model is not None, block, stroke_um, options.get("max_late", 1e9))
+        self.loop = Loop(
+            plan,
+            self.device,
+            self.compensator,
+            self.limiter,
+            self.pacer,
+            self.clock,
+            self.sink,
+            options.get("stop", lambda: ""),
+        )
+
+    def run(self):
+        return self.loop.run(1_000_000)
+
+
+def sine(n=200, amplitude=3.0):
+    return amplitude * np.sin(2 * np.pi * 5.0 * np.arange(n) / RATE_HZ)
+
+
+@pytest.mark.parametrize("block", [1, 7, 50])
+def test_waveform_then_ramp(block):
+    """Every sample of the waveform is put out, then the ramp ends at the safe value."""
+    bench = Bench(sine(230), block=block)
+    outcome = bench.run()
+    assert (outcome.code, outcome.safe, outcome.dropped) == ("completed", True, 0)
+    commands = bench.device.commands
+    assert commands[:230] == sine(230).tolist()
+    assert commands[-1] == LIMITS.safe
+    assert np.abs(np.diff(commands[230:])).max() <= LIMITS.ramp_per_s / RATE_HZ * (1 + 1e-9)
+    assert outcome.ended_at == len(commands)
+
+
+def test_blocks_make_no_difference():
+    """The same commands come out whatever the block, hysteresis and limits included."""
+    commands = []
+    for block in (1, 8, 40):
+        bench = Bench(10.0 * sine(400), block=block, model=terfenol_rdpi())
+        bench.run()
+        commands.append(bench.device.commands[:400])
+    assert commands[0] == commands[1] == commands[2]
+
+
+def test_each_sample_is_recorded_with_what_belongs_to_it():
+    """Blocks in the sink are contiguous and hold reference, command and displacement."""
+    bench = Bench(10.0 * sine(100), block=10, model=terfenol_rdpi())
+    bench.run()
+    firsts = [head[0] for head in bench.sink.heads]
+    assert firsts == list(range(0, 10 * len(firsts), 10))
+    assert bench.sink.column(0)[:100].tolist() == (10.0 * sine(100)).tolist()
+    assert np.isnan(bench.sink.column(0)[100:]).all()
+    assert bench.sink.column(2).tolist() == bench.device.commands
+    flags = np.concatenate(bench.sink.flags)
+    assert not (flags[:100] & Flag.RAMP).any()
+    assert (flags[100:] & Flag.RAMP).all()
+
+
+def test_state_before_a_block_is_recorded():
+    """From a block's recorded state, its commands can be made again, bit for bit."""
+    model = terfenol_rdpi()
+    bench = Bench(10.0 * sine(100), block=10, model=model)
+    bench.run()
+    again = Compensator(model, RATE_HZ)
+    again.restore(bench.sink.states[6][:-1])
+    wanted = np.empty(10)
+    again.process(np.ascontiguousarray(bench.sink.columns[6][0]), wanted)
+    assert wanted.tolist() == bench.sink.columns[6][1].tolist()
+    assert bench.sink.states[6][-1] == bench.sink.columns[5][2][-1]
+
+
+def test_current_runs_record_no_reference():
+    """Without a compensator there is no displacement wanted, and none is pretended."""
+    bench = Bench(sine(50))
+    bench.run()
+    assert np.isnan(bench.sink.column(0)).all()
+
+
+def test_stop_request_ramps_down():
+    """A stop leaves by the ramp and says why."""
+    asked = iter([""] * 53 + ["stopped by Ctrl-C"] * 1000)
+    bench = Bench(np.full(1000, 2.0), stop=lambda: next(asked))
+    outcome = bench.run()
+    assert (outcome.code, outcome.reason) == ("stopped", "stopped by Ctrl-C")
+    assert bench.device.commands[52] == 2.0
+    assert bench.device.commands[-1] == 0.0
+    assert len(bench.device.commands) == 53 + 20
+
+
+@pytest.mark.parametrize("block", [1, 10])
+def test_lost_sensor_ramps_down(block):
+    """A displacement that is not a number ends the run by its way out."""
+    bench = Bench(np.full(1000, 2.0), block=block, device=FakeDevice(nan_at=45))
+    outcome = bench.run()
+    assert outcome.code == "fault"
+    assert "displacement nan um at sample 45" in outcome.reason
+    assert bench.device.commands[-1] == 0.0
+    assert outcome.ended_at <= 45 + block + 30
+    flags = np.concatenate(bench.sink.flags)
+    assert not (flags[:45] & Flag.SENSOR_INVALID).any()
+    assert flags[45] & Flag.SENSOR_INVALID
+
+
+def test_stroke_limit_ramps_down():
+    """A displacement outside the stroke limits ends the run, naming value and limits."""
+    bench = Bench(sine(200, 3.0), stroke_um=(-60.0, 25.0))
+    outcome = bench.run()
+    assert outcome.code == "fault"
+    assert "not within the stroke limits -60 to 25 um" in outcome.reason
+    assert max(bench.device.commands) < 3.0
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_reference_that_is_not_a_number_ramps_down(bad):
+    """A wish that is not finite never reaches the device, and ends the run."""
+    reference = np.full(100, 1.5)
+    reference[40:] = bad
+    bench = Bench(reference, block=5)
+    outcome = bench.run()
+    assert (outcome.code, outcome.safe) == ("fault", True)
+    assert "not a finite number at sample 40" in outcome.reason
+    assert np.isfinite(bench.device.commands).all()
+    assert bench.device.commands[-1] == 0.0
+
+
+def test_lost_device_is_made_safe():
+    """When exchanges fail there is no ramp: the last resort is used, and the reason kept."""
+    bench = Bench(np.full(1000, 2.0), device=FakeDevice(break_at=60))
+    outcome = bench.run()
+    assert (outcome.code, outcome.safe) == ("fault", True)
+    assert outcome.reason == "fake: no answer within 0.1 s"
+    assert bench.device.made_safe == [0.0]
+    assert outcome.ended_at == 60
+
+
+def test_lost_device_that_stays_lost_is_said():
+    """Where the safe value can't be confirmed, the outcome says so."""
+    bench = Bench(np.full(100, 2.0), device=FakeDevice(break_at=60, safe_works=False))
+    outcome = bench.run()
+    assert not outcome.safe
+    assert "the safe value could not be confirmed: fake: still no answer" in outcome.reason
+
+
+def test_device_lost_on_the_ramp_keeps_the_first_reason():
+    """A second fault on the way out does not hide the first."""
+    device = FakeDevice(nan_at=40, break_at=45)
+    outcome = Bench(np.full(1000, 2.0), device=device).run()
+    assert outcome.reason.startswith("displacement nan um at sample 40")
+    assert outcome.reason.endswith("; then fake: no answer within 0.1 s")
+
+
+def test_very_late_tick_ends_the_run():
+    """A stall beyond the limit ends the run by its way out."""
+    clock = FakeClock(stall_ns={30: 2_000_000_000})
+    bench = Bench(np.full(10_000, 2.0), clock=clock)
+    outcome = bench.run()
+    assert outcome.code == "fault"
+    assert "woke 2.000 s late" in outcome.reason
+    assert bench.device.commands[-1] == 0.0
+
+
+def test_skipped_ticks_are_a_counted_gap():
+    """Samples left out by the late policy are counted before the next block, phase kept."""
+    clock = FakeClock(stall_ns={30: 5_000_000})
+    bench = Bench(sine(200), clock=clock)
+    outcome = bench.run()
+    gaps = {head[0]: head[2] for head in bench.sink.heads if head[2]}
+    assert gaps == {35: 5}
+    assert outcome.code == "completed"
+    at = [head[0] for head in bench.sink.heads].index(35)
+    assert bench.sink.columns[at][1][0] == sine(200)[35]
+
+
+def test_full_ring_is_a_counted_gap():
+    """Blocks that find no room are counted before the next one that does."""
+    bench = Bench(sine(200), block=10, sink=Sink(full=range(50, 80)))
+    outcome = bench.run()
+    gaps = {head[0]: head[2] for head in bench.sink.heads if head[2]}
+    assert gaps == {80: 30}
+    assert outcome.dropped == 30
+    assert len(bench.device.commands) == outcome.ended_at
+
+
+def test_ticks_record_deadline_lateness_and_exchange():
+    """Deadlines count from the start of the run; lateness is what the clock said."""
+    clock = FakeClock(stall_ns={3: 120_000})
+    bench = Bench(sine(20), clock=clock)
+    bench.run()
+    assert [head[3] for head in bench.sink.heads[:5]] == [0, 10**6, 2 * 10**6, 3 * 10**6, 4 * 10**6]
+    assert [head[4] for head in bench.sink.heads[:5]] == [0, 0, 0, 120_000, 0]
