@@ -1,0 +1,136 @@
+"""A recording in memory: arrays and facts, however they were stored."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from hilctl.arrays import F64, I64, U32
+from hilctl.ports import CommandUnit
+from hilctl.segments import Segment
+
+
+@dataclass(frozen=True, slots=True)
+class Samples:
+    """All samples of a run, one row of each array a sample.
+
+    Attributes:
+        index: int64[n], sample index since the start of the run; a jump is a gap.
+        reference_um: float64[n], wanted displacement; NaN where there is none (current runs, ramp).
+        wanted: float64[n], command before the limiter, in the recording's command unit.
+        command: float64[n], command that was put out.
+        measured: float64[n], command as the device measured it; empty where it does not.
+        displacement_um: float64[n], sampled when ``command`` was put out.
+        flags: uint32[n], bits of :class:`hilctl.flags.Flag`.
+    """
+
+    index: I64
+    reference_um: F64
+    wanted: F64
+    command: F64
+    measured: F64
+    displacement_um: F64
+    flags: U32
+
+    def part(self, start: int, stop: int) -> "Samples":
+        """Return the rows whose sample index lies in [start, stop)."""
+        low, high = np.searchsorted(self.index, (start, stop))
+        rows = slice(int(low), int(high))
+        return Samples(
+            self.index[rows],
+            self.reference_um[rows],
+            self.wanted[rows],
+            self.command[rows],
+            self.measured[rows],
+            self.displacement_um[rows],
+            self.flags[rows],
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Ticks:
+    """Timing of every tick.
+
+    Attributes:
+        first_sample: int64[m], index of the tick's first sample.
+        deadline_ns: int64[m], when the tick was due, since the start of the run.
+        late_ns: int64[m], how much later the loop woke.
+        exchange_ns: int64[m], how long the exchange with the device took.
+    """
+
+    first_sample: I64
+    deadline_ns: I64
+    late_ns: I64
+    exchange_ns: I64
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """Something worth telling that happened during a run.
+
+    Attributes:
+        time_ns: Unix time in ns.
+        sample: Sample index it belongs to.
+        level: ``info``, ``warning`` or ``error``.
+        code: Short name for programs, for example ``run_ended``.
+        text: One line for people.
+    """
+
+    time_ns: int
+    sample: int
+    level: str
+    code: str
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Start:
+    """Where a replay can begin: the first block, and every block after a gap.
+
+    Attributes:
+        sample: Index of the block's first sample.
+        state: float64[s], the compensator's memory before it.
+        previous_command: Command before it, in the command unit.
+    """
+
+    sample: int
+    state: F64
+    previous_command: float
+
+
+@dataclass(frozen=True, slots=True)
+class Recording:
+    """One run, read back.
+
+    Attributes:
+        path: File it was read from.
+        run: Facts of the run as recorded at its start (identity, versions, device, units).
+        end: Facts recorded at its end (counters, reason); empty where the file is cut short.
+        sample_rate_hz: Samples a second.
+        command_unit: Unit of commands, ``A`` or ``V``.
+        compensated: Whether a compensator stood between reference and command.
+        segments: The stretches of the run.
+        samples: All samples.
+        dropped: Samples that were exchanged or due but are missing here.
+        ticks: Timing of every tick.
+        events: Events in order.
+        experiment_yaml: The experiment as it was run.
+        model_yaml: The compensator's model, or empty.
+        starts: Where a replay can begin.
+    """
+
+    path: Path
+    run: Mapping[str, str]
+    end: Mapping[str, str]
+    sample_rate_hz: float
+    command_unit: CommandUnit
+    compensated: bool
+    segments: tuple[Segment, ...]
+    samples: Samples
+    dropped: int
+    ticks: Ticks
+    events: tuple[Event, ...]
+    experiment_yaml: str
+    model_yaml: str
+    starts: tuple[Start, ...] = ()

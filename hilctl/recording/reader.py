@@ -1,0 +1,145 @@
+"""From an MCAP file to a recording in memory."""
+
+import json
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from google.protobuf.message import DecodeError
+from mcap.exceptions import McapError
+from mcap.records import Attachment, Channel, Message, Metadata
+from mcap.stream_reader import StreamReader
+
+from hilctl.arrays import F64
+from hilctl.errors import DataError
+from hilctl.recording import schema
+from hilctl.recording.data import Event, Recording, Samples, Start, Ticks
+from hilctl.segments import Segment
+
+
+def read(path: Path) -> Recording:
+    """Read a recording; one that was cut short gives what it holds.
+
+    Raises:
+        DataError: The file can't be read, is not an MCAP file, or was not written by hilctl.
+    """
+    contents = _Contents()
+    try:
+        with path.open("rb") as stream:
+            for record in _records(stream):
+                contents.take(record)
+    except FileNotFoundError:
+        raise DataError(f"{path}: no such file") from None
+    except OSError as error:
+        raise DataError(f"{path}: can't be read: {error.strerror}") from None
+    except (McapError, DecodeError, struct.error, ValueError) as error:
+        if not contents.run:
+            raise DataError(f"{path}: is not an MCAP recording: {error}") from None
+    if not contents.run:
+        raise DataError(f"{path}: holds no run of hilctl (metadata hilctl.run is missing)")
+    return contents.recording(path)
+
+
+def _records(stream: Any) -> Iterator[Any]:
+    try:
+        yield from StreamReader(stream, record_size_limit=None).records
+    except McapError:
+        raise
+    except Exception as error:  # decompressors raise errors of their own
+        raise ValueError(f"damaged record: {error}") from error
+
+
+class _Contents:
+    """What has been read so far."""
+
+    def __init__(self) -> None:
+        self.run: dict[str, str] = {}
+        self.end: dict[str, str] = {}
+        self._texts: dict[str, str] = {}
+        self._topics: dict[int, str] = {}
+        self._blocks: list[Any] = []
+        self._ticks: list[Any] = []
+        self._events: list[Event] = []
+
+    def take(self, record: Any) -> None:
+        match record:
+            case Message():
+                self._message(record)
+            case Channel():
+                self._topics[record.id] = record.topic
+            case Metadata(name="hilctl.run"):
+                self.run = dict(record.metadata)
+            case Metadata(name="hilctl.end"):
+                self.end = dict(record.metadata)
+            case Attachment():
+                self._texts[record.name] = record.data.decode()
+
+    def _message(self, record: Message) -> None:
+        topic = self._topics.get(record.channel_id, "")
+        if topic not in {"/samples", "/ticks", "/events"}:
+            return
+        decoded: Any = schema.message_class(schema.TOPICS[topic]).FromString(record.data)
+        if topic == "/samples":
+            self._blocks.append(decoded)
+        elif topic == "/ticks":
+            self._ticks.append(decoded)
+        else:
+            self._events.append(
+                Event(record.log_time, decoded.sample, decoded.level, decoded.code, decoded.text)
+            )
+
+    def recording(self, path: Path) -> Recording:
+        unit = "V" if self.run.get("command_unit") == "V" else "A"
+        return Recording(
+            path=path,
+            run=self.run,
+            end=self.end,
+            sample_rate_hz=float(self.run["sample_rate_hz"]),
+            command_unit="V" if unit == "V" else "A",
+            compensated=self.run.get("compensator", "none") != "none",
+            segments=tuple(
+                Segment.from_mapping(each) for each in json.loads(self.run.get("segments", "[]"))
+            ),
+            samples=self._samples(unit),
+            dropped=sum(block.dropped for block in self._blocks),
+            ticks=self._all_ticks(),
+            events=tuple(self._events),
+            experiment_yaml=self._texts.get("experiment.yaml", ""),
+            model_yaml=self._texts.get("model.yaml", ""),
+            starts=tuple(
+                Start(block.tick0, np.array(block.state), block.previous_command[0])
+                for block in self._blocks
+                if block.previous_command
+            ),
+        )
+
+    def _samples(self, unit: str) -> Samples:
+        small = unit.lower()
+        command = "current_a" if unit == "A" else "drive_v"
+        ranges = [np.arange(b.tick0, b.tick0 + b.n, dtype=np.int64) for b in self._blocks]
+        return Samples(
+            index=np.concatenate(ranges) if ranges else np.empty(0, dtype=np.int64),
+            reference_um=self._column("reference_um"),
+            wanted=self._column(f"wanted_{small}"),
+            command=self._column(command),
+            measured=self._column(f"measured_{small}"),
+            displacement_um=self._column("displacement_um"),
+            flags=self._column("flags").astype(np.uint32),
+        )
+
+    def _column(self, name: str) -> F64:
+        parts = [np.array(getattr(block, name), dtype=np.float64) for block in self._blocks]
+        return np.concatenate(parts) if parts else np.empty(0)
+
+    def _all_ticks(self) -> Ticks:
+        names = ("first_sample", "deadline_ns", "late_ns", "exchange_ns")
+        columns = [
+            np.concatenate(
+                [np.array(getattr(tick, name), dtype=np.int64) for tick in self._ticks]
+                or [np.empty(0, dtype=np.int64)]
+            )
+            for name in names
+        ]
+        return Ticks(*columns)
