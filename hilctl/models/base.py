@@ -1,0 +1,196 @@
+"""What every model has: parameters that obey its conditions, and operators that stream."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import Annotated, Any, TypeAlias
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, field_validator
+
+from hilctl.arrays import F64
+from hilctl.errors import ModelError
+from hilctl.kernels.hysteresis import rest_memory
+from hilctl.ports import CommandUnit
+
+BlockKernel: TypeAlias = Callable[[F64, F64, F64], None]
+"""A kernel with its parameters bound: (input[n], memory, output[n])."""
+
+Thresholds: TypeAlias = tuple[Annotated[float, Field(allow_inf_nan=False)], ...]
+Weights: TypeAlias = tuple[Annotated[float, Field(allow_inf_nan=False)], ...]
+
+
+class Operator:
+    """A hysteresis operator that works through a signal block by block.
+
+    Any cut of a signal into blocks gives the same bits as one call.
+
+    Args:
+        kernel: Bound kernel, see :data:`BlockKernel`.
+        operators: Number of operators with memory.
+        input_offset: Added to the input first.
+        output_offset: Added to the output last.
+    """
+
+    def __init__(
+        self,
+        kernel: BlockKernel,
+        operators: int,
+        *,
+        input_offset: float = 0.0,
+        output_offset: float = 0.0,
+    ) -> None:
+        self._kernel = kernel
+        self._memory = rest_memory(operators)
+        self._input_offset = input_offset
+        self._output_offset = output_offset
+
+    def process(self, block: F64, out: F64 | None = None) -> F64:
+        """Run one block through and remember where it ended.
+
+        Args:
+            block: float64[n], contiguous.
+            out: float64[n] to fill; made anew where not given.
+
+        Returns:
+            float64[n], the output.
+        """
+        if out is None:
+            out = np.empty_like(block)
+        if self._input_offset != 0.0:
+            block = block + self._input_offset
+        elif not block.flags.writeable:
+            block = block.copy()  # the kernels' signatures refuse read-only arrays
+        self._kernel(block, self._memory, out)
+        if self._output_offset != 0.0:
+            out += self._output_offset
+        return out
+
+    def state(self) -> F64:
+        """Return a copy of the memory: operator outputs, then the previous input."""
+        return self._memory.copy()
+
+    def restore(self, state: F64) -> None:
+        """Go back to a state that :meth:`state` returned.
+
+        Raises:
+            ModelError: The state is of another model.
+        """
+        if state.shape != self._memory.shape:
+            raise ModelError(
+                f"state must have {self._memory.size} values, as this model's memory has: "
+                f"got {state.size}"
+            )
+        self._memory[:] = state
+
+    def reset(self, first_input: float | None = None) -> None:
+        """Start from rest; where ``first_input`` is given, as if the signal had begun there."""
+        self._memory[:] = rest_memory(self._memory.size - 1)
+        if first_input is not None:
+            self.process(np.array([first_input]))
+
+
+class Provenance(BaseModel):
+    """Where a model's parameters come from.
+
+    Attributes:
+        source: Recordings, data files or publication.
+        method: How the parameters were found.
+        grid: The loops they were found on.
+        parameters: Parameters of the parametrisation that was fitted, by name.
+        errors_percent: Model errors, by name, in percent of the peak-to-peak output.
+        versions: Software versions, by name.
+        created: Date and time in ISO 8601, UTC.
+    """
+
+    model_config = ConfigDict(frozen=True, strict=True, extra="forbid")
+
+    source: tuple[str, ...] = ()
+    method: str = ""
+    grid: tuple[str, ...] = ()
+    parameters: Mapping[str, float] = Field(default_factory=dict)
+    errors_percent: Mapping[str, float] = Field(default_factory=dict)
+    versions: Mapping[str, str] = Field(default_factory=dict)
+    created: str = ""
+
+
+class HysteresisModel(BaseModel, ABC):
+    """Parameters of a model from command to displacement, and of its inverse.
+
+    Attributes:
+        input_unit: Unit of the command, ``A`` or ``V``.
+        input_range: Lowest and highest command that the model was found on.
+        output_range_um: Lowest and highest displacement that it was found on; beyond it the model
+            is a guess, and a reference that goes there is refused.
+        output_offset_um: Displacement where the operators' output is 0.
+        provenance: Where the parameters come from.
+    """
+
+    model_config = ConfigDict(frozen=True, strict=True, extra="forbid", allow_inf_nan=False)
+
+    input_unit: CommandUnit = "A"
+    input_range: tuple[float, float] | None = None
+    output_range_um: tuple[float, float] | None = None
+    output_offset_um: float = 0.0
+    provenance: Provenance = Field(default_factory=Provenance)
+
+    @field_validator("input_range", "output_range_um")
+    @classmethod
+    def _check_range(cls, limits: tuple[float, float] | None) -> tuple[float, float] | None:
+        if limits is not None and not limits[0] < limits[1]:
+            raise ValueError(f"the second value must be above the first: {list(limits)}")
+        return limits
+
+    @abstractmethod
+    def forward(self, sample_rate_hz: float) -> Operator:
+        """Return the operator from command to displacement in um, at rest."""
+
+    @abstractmethod
+    def inverse(self, sample_rate_hz: float) -> Operator:
+        """Return the operator from displacement in um to command, at rest.
+
+        Raises:
+            ModelError: A condition for the inverse is broken.
+        """
+
+    @property
+    @abstractmethod
+    def operators(self) -> int:
+        """Number of operators with memory."""
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return the parameters as plain mappings, lists and numbers, defaults left out."""
+        return self.model_dump(mode="json", exclude_defaults=True, exclude_none=True)
+
+
+def refuse(problems: Iterable[str]) -> None:
+    """Raise one ValueError that names every broken condition; none where there is none."""
+    if text := "; ".join(problems):
+        raise ValueError(text)
+
+
+def threshold_problems(name: str, thresholds: Thresholds, *, sign: int = 1) -> Iterator[str]:
+    """Say where thresholds don't move away from 0, each further out; indices count from 1."""
+    last = 0.0
+    order = "rise from 0" if sign > 0 else "fall from 0"
+    for i, threshold in enumerate(thresholds, start=1):
+        if not sign * threshold > sign * last:
+            yield (
+                f"{name} must {order} (the thresholds must dilate): {name}_{i} = {threshold!r} "
+                f"after {last!r}"
+            )
+        last = threshold
+
+
+def length_problems(name: str, values: Weights, thresholds: Thresholds) -> Iterator[str]:
+    """Say whether there is not one weight for each threshold."""
+    if len(values) != len(thresholds):
+        yield f"{name} must have one value a threshold: {len(values)} for {len(thresholds)}"
+
+
+def play_weight_problems(direct: float, weights: Weights) -> Iterator[str]:
+    """Say which conditions for inverting a sum of plays are broken (5.6)."""
+    if not direct > 0.0:
+        yield f"a_0 must be > 0 for the inverse to exist: {direct!r}"
+    for i, weight in enumerate(weights, start=1):
+        if not weight >= 0.0:
+            yield f"a_{i} must be >= 0 for the inverse to exist: {weight!r}"

@@ -1,0 +1,49 @@
+"""Model files: YAML in and out."""
+
+from pathlib import Path
+from typing import Annotated, TypeAlias
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field
+
+from hilctl.models.base import HysteresisModel
+from hilctl.models.integrated import IntegratedModel
+from hilctl.models.ppi import PpiModel
+from hilctl.models.rdpi import RdpiModel
+from hilctl.yamlio import Document, load_document
+
+AnyModel: TypeAlias = Annotated[PpiModel | RdpiModel | IntegratedModel, Field(discriminator="kind")]
+KINDS: tuple[str, ...] = ("ppi", "rdpi", "integrated")
+
+
+class ModelFile(BaseModel):
+    """A model file: one model under the key ``model``."""
+
+    model_config = ConfigDict(frozen=True, strict=True, extra="forbid")
+
+    model: AnyModel
+
+
+def load_model(path: Path) -> HysteresisModel:
+    """Read a model file.
+
+    Raises:
+        InputError: The file can't be read.
+        ConfigError: It breaks a rule, or the model can't be inverted; all problems are listed.
+    """
+    return load_document(path).validate(ModelFile).model
+
+
+def parse_model(name: str, text: str) -> HysteresisModel:
+    """Read a model from a YAML text, for example a recording's attachment.
+
+    Raises:
+        ConfigError: See :func:`load_model`.
+    """
+    return Document(name, text).validate(ModelFile).model
+
+
+def dump_model(model: HysteresisModel) -> str:
+    """Return a model as YAML; reading it back gives the same model, bit for bit."""
+    mapping = {"model": {"kind": getattr(model, "kind"), **model.to_mapping()}}  # noqa: B009
+    return yaml.safe_dump(mapping, sort_keys=False, width=100)

@@ -1,0 +1,113 @@
+"""Sums of play operators: what the PPI, the RDPI and the integrated model have in common."""
+
+from typing import Self
+
+import numpy as np
+from pydantic import model_validator
+
+from hilctl.arrays import F64
+from hilctl.errors import ModelError
+from hilctl.kernels.hysteresis import play_sum
+from hilctl.models.base import (
+    HysteresisModel,
+    Operator,
+    Thresholds,
+    Weights,
+    length_problems,
+    play_weight_problems,
+    refuse,
+    threshold_problems,
+)
+
+
+def inverse_plays(direct: float, weights: F64, thresholds: F64) -> tuple[float, F64, F64]:
+    """Return the inverse of a sum of plays, itself a sum of plays (5.8-5.10).
+
+    Args:
+        direct: a_0 > 0.
+        weights: float64[n], a_1 to a_n, all >= 0.
+        thresholds: float64[n], r_1 to r_n, rising.
+
+    Returns:
+        The inverse's direct weight 1/a_0, its weights float64[n] (<= 0) and its thresholds
+        float64[n] at zero rate. With the rate, every one of them grows by ``a_0`` times what each
+        r_i grows by, because all r_i grow alike.
+
+    Raises:
+        ModelError: The numbers of the inverse are not finite.
+    """
+    with np.errstate(over="ignore", invalid="ignore"):
+        slopes = np.cumsum((direct, *weights))
+        inverse_direct, inverse_weights = float(1.0 / slopes[0]), np.diff(1.0 / slopes)
+        corners = np.cumsum(slopes[:-1] * np.diff(thresholds, prepend=0.0))
+    if not np.all(np.isfinite((inverse_direct, *inverse_weights, *corners, slopes[-1]))):
+        raise ModelError("the weights and thresholds are too large or too small to be inverted")
+    return inverse_direct, inverse_weights, corners
+
+
+class PlayModel(HysteresisModel):
+    """a_0 v + sum a_i F_i[v], with the conditions for its inverse.
+
+    Attributes:
+        direct: a_0, um per input unit, > 0.
+        weights: a_1 to a_n, um per input unit, >= 0.
+        thresholds: r_1 to r_n at zero rate, in the input unit, rising from 0.
+    """
+
+    direct: float
+    weights: Weights
+    thresholds: Thresholds
+
+    @model_validator(mode="after")
+    def _check_plays(self) -> Self:
+        refuse(
+            (
+                *length_problems("weights", self.weights, self.thresholds),
+                *play_weight_problems(self.direct, self.weights),
+                *threshold_problems("r", self.thresholds),
+            )
+        )
+        return self
+
+    @property
+    def operators(self) -> int:
+        """Number of play operators."""
+        return len(self.weights)
+
+    @property
+    def threshold_growth_s(self) -> float:
+        """Growth of every threshold with the input's rate, gamma, in s."""
+        return 0.0
+
+    def inverse_rate_gain(self, sample_rate_hz: float) -> float:
+        """Return what a change of 1 between samples adds to the inverse's thresholds.
+
+        The command's rate is not known before the inverse has run; that of ``x / sum a_i``, the
+        command at which the loop of an input x closes, stands for it.
+        """
+        total = self.direct + float(np.sum(self.weights))
+        return self.direct * self.threshold_growth_s * sample_rate_hz / total
+
+    def inverse_parameters(self) -> tuple[float, F64, F64]:
+        """Return the inverse's direct weight, weights and thresholds, see :func:`inverse_plays`."""
+        return inverse_plays(self.direct, np.array(self.weights), np.array(self.thresholds))
+
+    def forward(self, sample_rate_hz: float) -> Operator:
+        """Return the operator from command to um, at rest."""
+        weights, thresholds = np.array(self.weights), np.array(self.thresholds)
+        rate_gain, direct = self.threshold_growth_s * sample_rate_hz, self.direct
+
+        def run(v: F64, memory: F64, out: F64) -> None:
+            play_sum(v, rate_gain, direct, thresholds, weights, memory, out)
+
+        return Operator(run, self.operators, output_offset=self.output_offset_um)
+
+    def inverse(self, sample_rate_hz: float) -> Operator:
+        """Return the operator from um to command, at rest."""
+        direct, weights, thresholds = self.inverse_parameters()
+        rate_gain = self.inverse_rate_gain(sample_rate_hz)
+
+        def run(x: F64, memory: F64, out: F64) -> None:
+            play_sum(x, rate_gain, direct, thresholds, weights, memory, out)
+
+        return Operator(run, self.operators, input_offset=-self.output_offset_um)
