@@ -47,7 +47,7 @@ class Segment:
         """
         if self.period <= 0.0:
             return self.steady_start, self.steady_stop, 0
-        available = int((self.steady_stop - self.steady_start) / self.period + 1e-9)
+        available = int((self.steady_stop - self.steady_start + 0.5) / self.period)
         cycles = max(available - 1, min(available, 1))
         start = self.steady_stop - round(cycles * self.period)
         return max(start, self.steady_start), self.steady_stop, cycles

@@ -1,0 +1,128 @@
+"""One waveform and a sample rate to samples: pure functions of time."""
+
+import math
+from fractions import Fraction
+
+import numpy as np
+
+from hilctl.arrays import F64
+from hilctl.errors import InputError
+from hilctl.waveforms import spec
+
+MAX_SAMPLES = 200_000_000
+"""Longest reference that is held in memory: 1.6 GB."""
+
+
+def sample_count(duration_s: float, sample_rate_hz: float) -> int:
+    """Return how many samples a duration has, at least one.
+
+    Raises:
+        InputError: They do not fit in memory.
+    """
+    check_length(duration_s * sample_rate_hz)
+    return max(1, round(duration_s * sample_rate_hz))
+
+
+def check_length(samples: float) -> None:
+    """Refuse what does not fit in memory.
+
+    Raises:
+        InputError: There are more than :data:`MAX_SAMPLES`.
+    """
+    if samples > MAX_SAMPLES:
+        raise InputError(
+            f"has {samples:.10g} samples, more than the {MAX_SAMPLES} that fit in memory: "
+            "shorten it or lower sample_rate_hz"
+        )
+
+
+def _angle(frequency_hz: float, phase_deg: float, t: F64) -> F64:
+    return 2.0 * np.pi * frequency_hz * t + math.radians(phase_deg)
+
+
+def sine(w: spec.Sine, t: F64) -> F64:
+    """Return a sine: float64[n] for times float64[n] in s."""
+    return w.amplitude * np.sin(_angle(w.frequency_hz, w.phase_deg, t))
+
+
+def triangle(w: spec.Triangle, t: F64) -> F64:
+    """Return a triangle that starts at 0 and rises: float64[n]."""
+    phase = np.mod(w.frequency_hz * t + 0.25, 1.0)
+    return w.amplitude * (1.0 - 4.0 * np.abs(phase - 0.5))
+
+
+def complex_harmonic(w: spec.ComplexHarmonic, t: F64) -> F64:
+    """Return a sum of sines: float64[n]."""
+    total = np.zeros_like(t)
+    for part in w.components:
+        total += part.amplitude * np.sin(_angle(part.frequency_hz, part.phase_deg, t))
+    return total
+
+
+def growing_or_decaying(w: spec.GrowingOrDecaying, t: F64) -> F64:
+    """Return a sine of linearly changing amplitude: float64[n]."""
+    part = t / w.duration_s
+    envelope = part if w.kind == "growing" else 1.0 - part
+    return w.amplitude * envelope * np.sin(_angle(w.frequency_hz, 0.0, t))
+
+
+def chirp(w: spec.Chirp, t: F64) -> F64:
+    """Return a sine of moving frequency: float64[n]."""
+    growth = (math.log(w.stop_hz) - math.log(w.start_hz)) / w.duration_s
+    if w.spacing == "linear" or growth == 0.0:
+        slope = (w.stop_hz - w.start_hz) / w.duration_s
+        cycles = w.start_hz * t + 0.5 * slope * t**2
+    else:
+        cycles = w.start_hz * np.expm1(growth * t) / growth
+    return w.amplitude * np.sin(2.0 * np.pi * cycles)
+
+
+def step(w: spec.Step, t: F64) -> F64:
+    """Return levels, each reached linearly in ``rise_s``: float64[n]."""
+    levels = np.array((0.0, *w.levels))
+    index = np.minimum((t / w.dwell_s + 1e-12).astype(np.int64), len(w.levels) - 1)
+    since = t - index * w.dwell_s
+    part = np.ones_like(t) if w.rise_s == 0.0 else np.clip(since / w.rise_s, 0.0, 1.0)
+    values: F64 = levels[index] + part * (levels[index + 1] - levels[index])
+    return values
+
+
+def multisine(w: spec.Multisine, t: F64) -> F64:
+    """Return evenly spaced sines with Schroeder phases, peak ``amplitude``: float64[n].
+
+    Source: M. R. Schroeder, IEEE Trans. Information Theory 16 (1970) 85: phases of a low crest
+    factor, ``phi_m = -pi m (m - 1) / M``.
+    """
+    count = multisine_count(w)
+    total = np.zeros_like(t)
+    for m in range(count):
+        frequency_hz = w.first_hz + m * w.step_hz
+        total += np.sin(2.0 * np.pi * frequency_hz * t - np.pi * m * (m + 1) / count)
+    peak = float(np.max(np.abs(total)))
+    return total if peak == 0.0 else w.amplitude / peak * total
+
+
+def multisine_count(w: spec.Multisine) -> int:
+    """Return how many sines a multisine has."""
+    return int((w.last_hz - w.first_hz) / w.step_hz + 1e-9) + 1
+
+
+def common_period_s(frequencies_hz: list[float]) -> float:
+    """Return the shortest period that all frequencies share, in s.
+
+    Frequencies are taken as the decimal numbers they were written as, so 0.1 and 0.3 Hz share
+    10 s. Infinite where it is too long for a float.
+    """
+    fractions = [Fraction(repr(f)) for f in frequencies_hz]
+    common = fractions[0]
+    for fraction in fractions[1:]:
+        common = Fraction(
+            math.gcd(
+                common.numerator * fraction.denominator, fraction.numerator * common.denominator
+            ),
+            common.denominator * fraction.denominator,
+        )
+    try:
+        return float(1 / common)
+    except OverflowError:
+        return math.inf

@@ -1,0 +1,249 @@
+"""What the experiment file may say of a waveform.
+
+Amplitudes, offsets and levels are in the waveform's ``unit``: um where a compensator turns the
+reference into a command, A or V where none stands between.
+"""
+
+from typing import Annotated, Any, Literal, TypeAlias
+
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationInfo,
+    field_validator,
+)
+
+WaveformUnit: TypeAlias = Literal["um", "A", "V"]
+Positive: TypeAlias = Annotated[float, Field(gt=0.0)]
+NotNegative: TypeAlias = Annotated[float, Field(ge=0.0)]
+
+MAX_SINES = 10_000
+"""Most sines in one multisine."""
+
+
+def _not_empty(values: tuple[Any, ...]) -> tuple[Any, ...]:
+    if not values:  # pydantic's min_length also complains of a list whose only item is broken
+        raise ValueError("must have at least one value: []")
+    return values
+
+
+NotEmpty = AfterValidator(_not_empty)
+AtLeastOne = Field(json_schema_extra={"minItems": 1})
+
+
+class _Spec(BaseModel):
+    model_config = ConfigDict(frozen=True, strict=True, extra="forbid", allow_inf_nan=False)
+
+
+class _Shape(_Spec):
+    """What all kinds have.
+
+    Attributes:
+        unit: Unit of every amplitude, offset and level.
+        offset: Constant that the waveform is centred on.
+        soft_start_s: Time in which the whole waveform, offset included, grows from 0.
+        soft_end_s: Time in which it shrinks back to 0. Both lie within the duration.
+    """
+
+    unit: WaveformUnit | None = Field(default=None, description="um, A or V")
+    offset: float = 0.0
+    soft_start_s: NotNegative = 0.0
+    soft_end_s: NotNegative = 0.0
+
+
+class Sine(_Shape):
+    """``offset + amplitude sin(2 pi frequency t + phase)``."""
+
+    kind: Literal["sine"]
+    amplitude: Positive
+    frequency_hz: Positive
+    phase_deg: float = 0.0
+    duration_s: Positive
+
+
+class Triangle(_Shape):
+    """A triangle that starts at its offset and rises."""
+
+    kind: Literal["triangle"]
+    amplitude: Positive
+    frequency_hz: Positive
+    duration_s: Positive
+
+
+class Harmonic(_Spec):
+    """One component of a complex harmonic."""
+
+    amplitude: Positive
+    frequency_hz: Positive
+    phase_deg: float = 0.0
+
+
+class ComplexHarmonic(_Shape):
+    """A sum of sines of any amplitudes, frequencies and phases."""
+
+    kind: Literal["complex_harmonic"]
+    components: Annotated[tuple[Harmonic, ...], NotEmpty, AtLeastOne]
+    duration_s: Positive
+
+
+class GrowingOrDecaying(_Shape):
+    """A sine whose amplitude grows from 0, or decays to 0, in proportion to time."""
+
+    kind: Literal["growing", "decaying"]
+    amplitude: Positive
+    frequency_hz: Positive
+    duration_s: Positive
+
+
+class Chirp(_Shape):
+    """A sine whose frequency moves from ``start_hz`` to ``stop_hz``."""
+
+    kind: Literal["chirp"]
+    amplitude: Positive
+    start_hz: Positive
+    stop_hz: Positive
+    spacing: Literal["linear", "logarithmic"] = "linear"
+    duration_s: Positive
+
+
+class Step(_Shape):
+    """Levels held one after the other, reached in ``rise_s`` each."""
+
+    kind: Literal["step"]
+    levels: Annotated[tuple[float, ...], NotEmpty, AtLeastOne]
+    dwell_s: Positive
+    rise_s: NotNegative = 0.0
+
+    @field_validator("rise_s")
+    @classmethod
+    def _rise_fits(cls, rise_s: float, info: ValidationInfo) -> float:
+        dwell_s = info.data.get("dwell_s", rise_s)
+        if rise_s > dwell_s:
+            raise ValueError(f"must be <= dwell_s, {dwell_s}: {rise_s}")
+        return rise_s
+
+
+class Hold(_Shape):
+    """One level."""
+
+    kind: Literal["hold"]
+    level: float
+    duration_s: Positive
+
+
+class Multisine(_Shape):
+    """Equal sines at evenly spaced frequencies, Schroeder phases, scaled to a peak amplitude."""
+
+    kind: Literal["multisine"]
+    amplitude: Positive
+    first_hz: Positive
+    last_hz: Positive
+    step_hz: Positive
+    duration_s: Positive
+
+    @field_validator("last_hz")
+    @classmethod
+    def _ordered(cls, last_hz: float, info: ValidationInfo) -> float:
+        first_hz = info.data.get("first_hz", last_hz)
+        if last_hz < first_hz:
+            raise ValueError(f"must be >= first_hz, {first_hz}: {last_hz}")
+        return last_hz
+
+    @field_validator("step_hz")
+    @classmethod
+    def _not_too_many(cls, step_hz: float, info: ValidationInfo) -> float:
+        span_hz = info.data.get("last_hz", 0.0) - info.data.get("first_hz", 0.0)
+        if span_hz / step_hz >= MAX_SINES:
+            raise ValueError(f"must leave at most {MAX_SINES} sines in {span_hz} Hz: {step_hz}")
+        return step_hz
+
+
+class FileWaveform(_Shape):
+    """Samples from a CSV, NPY or MCAP file: ``offset + scale * value``.
+
+    Attributes:
+        path: File, relative to the experiment file's folder.
+        column: Column by name, or by number counted from 1; for MCAP one of ``reference_um``,
+            ``displacement_um``, ``command``, ``wanted``. Not used for a one-column file.
+        file_rate_hz: Sample rate of the file, where it holds no time of its own (column ``t_s``).
+        first_row: First data row used, counted from 1.
+        last_row: Last data row used; all where not given.
+        resample: What to do where the file's rate is not the run's: ``refuse``, or interpolate
+            ``linear`` or with a ``cubic`` spline.
+        period_s: Period of the waveform, where it repeats, so that steady cycles can be judged.
+    """
+
+    kind: Literal["file"]
+    path: str
+    column: str | int | None = None
+    file_rate_hz: Positive | None = None
+    first_row: Annotated[int, Field(ge=1)] = 1
+    last_row: Annotated[int, Field(ge=1)] | None = None
+    scale: float = 1.0
+    resample: Literal["refuse", "linear", "cubic"] = "refuse"
+    period_s: Positive | None = None
+
+    @field_validator("column", mode="before")
+    @classmethod
+    def _name_or_number(cls, column: Any) -> Any:
+        if isinstance(column, bool) or not isinstance(column, str | int | None):
+            rule = "must be a column's name, or its number from 1"
+            raise ValueError(f"{rule}: {column!r}")  # noqa: TRY004  pydantic wants this one
+        return column
+
+    @field_validator("last_row")
+    @classmethod
+    def _rows_ordered(cls, last_row: int | None, info: ValidationInfo) -> int | None:
+        first_row = info.data.get("first_row", 1)
+        if last_row is not None and last_row < first_row:
+            raise ValueError(f"must be >= first_row, {first_row}: {last_row}")
+        return last_row
+
+
+SinglePart: TypeAlias = Annotated[
+    Sine
+    | Triangle
+    | ComplexHarmonic
+    | GrowingOrDecaying
+    | Chirp
+    | Step
+    | Hold
+    | Multisine
+    | FileWaveform,
+    Field(discriminator="kind"),
+]
+
+
+class Sequence(_Spec):
+    """Waveforms one after the other; the unit stands here, not in the parts."""
+
+    kind: Literal["sequence"]
+    unit: WaveformUnit | None = Field(default=None, description="um, A or V")
+    parts: Annotated[tuple[SinglePart, ...], NotEmpty, AtLeastOne]
+    repeat: Annotated[int, Field(ge=1, le=10_000)] = 1
+
+    @field_validator("parts")
+    @classmethod
+    def _one_unit(cls, parts: tuple[SinglePart, ...], info: ValidationInfo) -> Any:
+        unit = info.data.get("unit")
+        for i, part in enumerate(parts):
+            if unit is not None and part.unit not in {None, unit}:
+                raise ValueError(f"{i}.unit must be that of the sequence, {unit}: {part.unit}")
+        return parts
+
+
+AnyWaveform: TypeAlias = Annotated[
+    Sine
+    | Triangle
+    | ComplexHarmonic
+    | GrowingOrDecaying
+    | Chirp
+    | Step
+    | Hold
+    | Multisine
+    | FileWaveform
+    | Sequence,
+    Field(discriminator="kind"),
+]
