@@ -1,0 +1,221 @@
+"""Whole runs as a user starts them, with things going wrong: one way out, nothing lost."""
+
+import json
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from hilctl.flags import Flag
+from hilctl.recording.reader import read
+from hilctl.replay import replay
+from hilctl.ring import memory_folder
+
+EXPERIMENT = {
+    "name": "fault_test",
+    "device": {"kind": "simulated_terfenol", "seed": 3},
+    "sample_rate_hz": 20000,
+    "block": 20,
+    "waveform": {
+        "kind": "sine",
+        "unit": "A",
+        "amplitude": 4.0,
+        "frequency_hz": 20.0,
+        "duration_s": 30.0,
+        "soft_start_s": 0.1,
+    },
+    "compensator": "none",
+    "limits": {"peak_current_a": 5.0, "slew_a_per_s": 5000.0, "stroke_um": [-60.0, 60.0]},
+    "safe": {"value": 0.0, "ramp_s": 0.2},
+}
+
+
+def experiment(folder, **changes):
+    path = folder / "experiment.yaml"
+    path.write_text(yaml.safe_dump({**EXPERIMENT, **changes}), encoding="utf-8")
+    return path
+
+
+def short(seconds, **more):
+    return {**EXPERIMENT["waveform"], "duration_s": seconds, **more}
+
+
+class Run:
+    """A ``hilctl run`` in a process of its own."""
+
+    def __init__(self, folder: Path, *, preexec=None, **changes) -> None:
+        self.output = folder / "run.mcap"
+        command = [sys.executable, "-m", "hilctl.cli", "run", str(experiment(folder, **changes))]
+        command += ["--output", str(self.output), "--json"]
+        self.process = subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=preexec
+        )
+
+    def await_samples(self, size=100_000) -> None:
+        """Wait until the recording has grown to ``size`` bytes."""
+        deadline = time.monotonic() + 60.0
+        while not (self.output.exists() and self.output.stat().st_size > size):
+            assert self.process.poll() is None, self.process.communicate()
+            assert time.monotonic() < deadline
+            time.sleep(0.02)
+
+    def loop_pid(self) -> int:
+        """Find the loop process, the run's only child."""
+        children = Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children")
+        return int(children.read_text().split()[0])
+
+    def end(self) -> tuple[int, dict]:
+        """Wait for the end; return the exit code and the JSON it printed."""
+        out, err = self.process.communicate(timeout=60)
+        assert "Traceback" not in err
+        return self.process.returncode, json.loads(out)
+
+
+def assert_good_way_out(run: Run, *, safe=0.0):
+    """The recording is complete and contiguous, ends on the ramp at the safe value, replays."""
+    recording = read(run.output)
+    samples = recording.samples
+    assert np.array_equal(samples.index, np.arange(samples.index.size))
+    assert recording.dropped == 0
+    assert recording.end["recorded_samples"] == str(samples.index.size)
+    assert recording.end["output_safe"] == "true"
+    assert samples.command[-1] == safe
+    assert samples.flags[-1] & Flag.RAMP
+    steps = np.abs(np.diff(samples.command))
+    assert steps.max() <= 5000.0 / 20000 * (1 + 1e-9)
+    ramp = (samples.flags & Flag.RAMP.value) != 0
+    assert steps[ramp[1:]].max() <= 5.0 / 0.2 / 20000 * (1 + 1e-9)
+    assert replay(recording).identical
+    return recording
+
+
+@pytest.mark.parametrize(
+    ("number", "code", "words"),
+    [
+        (signal.SIGINT, 130, "stopped by Ctrl-C"),
+        (signal.SIGTERM, 143, "stopped by SIGTERM"),
+        (signal.SIGHUP, 129, "stopped by SIGHUP"),
+    ],
+)
+def test_signals_ramp_down(tmp_path, number, code, words):
+    """Ctrl-C, SIGTERM and SIGHUP end the run by its ramp and leave a complete recording."""
+    run = Run(tmp_path)
+    run.await_samples()
+    run.process.send_signal(number)
+    returned, printed = run.end()
+    assert returned == code
+    assert printed["code"] == "stopped"
+    assert words in printed["reason"]
+    recording = assert_good_way_out(run)
+    assert recording.events[-1].code == "run_ended"
+    assert words in recording.events[-1].text
+
+
+def test_impatience_does_not_skip_the_ramp(tmp_path):
+    """Further signals during the ramp change nothing."""
+    run = Run(tmp_path)
+    run.await_samples()
+    for _ in range(5):
+        run.process.send_signal(signal.SIGINT)
+        time.sleep(0.02)
+    assert run.end()[0] == 130
+    assert_good_way_out(run)
+
+
+@pytest.mark.parametrize(
+    ("kind", "words"),
+    [
+        ("sensor_nan", "displacement nan um at sample 9000 is not within the stroke limits"),
+        ("sensor_jump", "is not within the stroke limits -60 to 60 um"),
+    ],
+)
+def test_bad_sensor_ramps_down(tmp_path, kind, words):
+    """A reading that can't be trusted ends the run by its ramp."""
+    device = {**EXPERIMENT["device"], "fault": {"kind": kind, "at_sample": 9000}}
+    run = Run(tmp_path, device=device)
+    returned, printed = run.end()
+    assert returned == 3
+    assert printed["code"] == "fault"
+    assert words in printed["reason"]
+    recording = assert_good_way_out(run)
+    first = int(np.argmax((recording.samples.flags & Flag.SENSOR_INVALID.value) != 0))
+    assert first >= 9000
+
+
+@pytest.mark.parametrize("kind", ["no_answer", "refused"])
+def test_device_that_fails_is_made_safe(tmp_path, kind):
+    """When exchanges fail the last resort is used, and every sample before is in the file."""
+    device = {**EXPERIMENT["device"], "fault": {"kind": kind, "at_sample": 9000}}
+    run = Run(tmp_path, device=device)
+    returned, printed = run.end()
+    assert returned == 3
+    assert "simulated_terfenol" in printed["reason"]
+    assert printed["output_safe"] is True
+    recording = read(run.output)
+    assert recording.samples.index.size == 9000
+    assert recording.end["code"] == "fault"
+
+
+def test_killed_loop_is_noticed(tmp_path):
+    """The supervisor drains the ring, makes the device safe, and closes the recording."""
+    run = Run(tmp_path)
+    run.await_samples()
+    os.kill(run.loop_pid(), signal.SIGKILL)
+    returned, printed = run.end()
+    assert returned == 3
+    assert "the loop process died: killed by SIGKILL" in printed["reason"]
+    recording = read(run.output)
+    assert recording.end["code"] == "fault"
+    assert np.array_equal(recording.samples.index, np.arange(recording.samples.index.size))
+    assert replay(recording).identical
+
+
+def test_killed_supervisor_takes_the_loop_along(tmp_path):
+    """The loop ramps down and leaves when its supervisor dies; the file can be read."""
+    run = Run(tmp_path)
+    run.await_samples()
+    loop = run.loop_pid()
+    run.process.kill()
+    run.process.communicate()
+    deadline = time.monotonic() + 20.0
+    while Path(f"/proc/{loop}").exists():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    recording = read(run.output)
+    assert recording.samples.index.size > 1000
+    assert replay(recording).identical
+    for left in memory_folder().glob("hilctl-*"):  # nobody is left to clear it away
+        for file in left.iterdir():
+            file.unlink()
+        left.rmdir()
+
+
+def test_full_disk_stops_the_run(tmp_path):
+    """When the recording can't grow, the run ramps down, and says so in one line."""
+
+    def small_files() -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (2_600_000, 2_600_000))
+
+    recording = {"ring_s": 1.0}
+    run = Run(tmp_path, preexec=small_files, recording=recording, waveform=short(10.0), block=1)
+    out, err = run.process.communicate(timeout=60)
+    assert "Traceback" not in err
+    assert run.process.returncode == 3
+    assert "can't be written" in json.loads(out)["reason"]
+    assert read(run.output).samples.index.size > 1000
+
+
+def test_nothing_stays_in_memory(tmp_path):
+    """The ring and the reference are gone after a run."""
+    before = set(memory_folder().glob("hilctl-*"))
+    run = Run(tmp_path, waveform=short(0.5))
+    assert run.end()[0] == 0
+    assert set(memory_folder().glob("hilctl-*")) == before
+    assert_good_way_out(run)
