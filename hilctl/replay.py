@@ -1,0 +1,154 @@
+"""Recompute a recording's commands from its recorded reference, by the code that made them."""
+
+from dataclasses import asdict, dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from hilctl.arrays import F64, U32
+from hilctl.compensator import Compensator
+from hilctl.config import Experiment
+from hilctl.errors import DataError
+from hilctl.flags import Flag
+from hilctl.limiter import Limiter
+from hilctl.models.base import HysteresisModel
+from hilctl.models.files import parse_model
+from hilctl.recording.data import Recording, Samples, Start
+from hilctl.yamlio import Document
+
+_LIMIT_BITS = int(Flag.RANGE_LIMITED | Flag.SLEW_LIMITED | Flag.INVALID | Flag.RAMP)
+
+
+@dataclass(frozen=True, slots=True)
+class ReplayResult:
+    """How recomputed commands compare with the recorded ones.
+
+    Attributes:
+        samples: Samples recomputed.
+        identical: Whether every wanted command, command and flag has the same bits.
+        first_difference: Index of the first sample that differs, or None.
+        differing_samples: How many differ.
+        largest_difference: Largest magnitude of a difference between commands.
+        rms_difference: Root mean square of the differences.
+        command_unit: ``A`` or ``V``.
+        command_min: Lowest recomputed command.
+        command_max: Highest recomputed command.
+        limited_samples: Recomputed samples that the limiter held back.
+    """
+
+    samples: int
+    identical: bool
+    first_difference: int | None
+    differing_samples: int
+    largest_difference: float
+    rms_difference: float
+    command_unit: str
+    command_min: float
+    command_max: float
+    limited_samples: int
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return the fields as plain values."""
+        return asdict(self)
+
+
+def replay(recording: Recording, model: HysteresisModel | None = None) -> ReplayResult:
+    """Recompute every command.
+
+    Args:
+        recording: What was recorded.
+        model: Another model to invert instead of the recorded one; it starts from rest, and the
+            limits stay as recorded.
+
+    Raises:
+        DataError: The recording holds no samples or not what a replay needs, or ``model`` does not
+            fit a run without a compensator.
+    """
+    if recording.samples.index.size == 0 or not recording.starts:
+        raise DataError(f"{recording.path}: holds no samples to replay")
+    if model is not None and not recording.compensated:
+        raise DataError(f"{recording.path}: had no compensator: there is no reference to replay")
+    document = Document(f"{recording.path}: experiment.yaml", recording.experiment_yaml)
+    config = document.validate(Experiment)
+    chosen = model or _recorded_model(recording)
+    compensator = Compensator(chosen, recording.sample_rate_hz)
+    limiter = Limiter(config.command_limits(), 1.0 / recording.sample_rate_hz)
+    samples = recording.samples
+    wanted = np.empty_like(samples.wanted)
+    command = np.empty_like(samples.command)
+    flags = np.zeros_like(samples.flags)
+    for start, rows in _stretches(recording):
+        limiter.last = start.previous_command
+        if model is None:
+            compensator.restore(start.state)
+        for part in _alike(samples.flags, rows):
+            _recompute(samples, part, compensator, limiter, (wanted, command, flags))
+    return _compare(recording, wanted, command, flags)
+
+
+def _recorded_model(recording: Recording) -> HysteresisModel | None:
+    if not recording.compensated:
+        return None
+    return parse_model(f"{recording.path}: model.yaml", recording.model_yaml)
+
+
+def _stretches(recording: Recording) -> list[tuple[Start, slice]]:
+    """Return where each gapless stretch starts, and its rows."""
+    index = recording.samples.index
+    firsts = [int(np.searchsorted(index, start.sample)) for start in recording.starts]
+    ends = [*firsts[1:], index.size]
+    return [
+        (start, slice(first, end))
+        for start, first, end in zip(recording.starts, firsts, ends, strict=True)
+    ]
+
+
+def _alike(flags: U32, rows: slice) -> list[slice]:
+    """Cut rows where the waveform gives way to the ramp."""
+    ramp = (flags[rows] & Flag.RAMP.value) != 0
+    cuts = np.flatnonzero(np.diff(ramp)) + rows.start + 1
+    bounds = [rows.start, *cuts.tolist(), rows.stop]
+    return [slice(a, b) for a, b in pairwise(bounds) if b > a]
+
+
+def _recompute(
+    samples: Samples,
+    rows: slice,
+    compensator: Compensator,
+    limiter: Limiter,
+    out: tuple[F64, F64, U32],
+) -> None:
+    wanted, command, flags = out[0][rows], out[1][rows], out[2][rows]
+    if samples.flags[rows.start] & Flag.RAMP.value:
+        wanted[:] = limiter.limits.safe
+        limiter.ramp(command, flags)
+        return
+    reference = samples.reference_um[rows]
+    without = bool(np.isnan(reference).all())
+    compensator.process(samples.wanted[rows] if without else reference, wanted)
+    limiter.limit(wanted, command, flags)
+
+
+def _compare(recording: Recording, wanted: F64, command: F64, flags: U32) -> ReplayResult:
+    samples = recording.samples
+    same = (
+        (wanted.view(np.uint64) == samples.wanted.view(np.uint64))
+        & (command.view(np.uint64) == samples.command.view(np.uint64))
+        & (flags == samples.flags & np.uint32(_LIMIT_BITS))
+    )
+    different = np.flatnonzero(~same)
+    change = command - samples.command
+    limited = flags & (Flag.RANGE_LIMITED | Flag.SLEW_LIMITED).value
+    return ReplayResult(
+        samples=command.size,
+        identical=different.size == 0,
+        first_difference=int(samples.index[different[0]]) if different.size else None,
+        differing_samples=different.size,
+        largest_difference=float(np.max(np.abs(change))),
+        rms_difference=float(np.sqrt(np.mean(change**2))),
+        command_unit=recording.command_unit,
+        command_min=float(command.min()),
+        command_max=float(command.max()),
+        limited_samples=int(np.count_nonzero(limited)),
+    )
