@@ -1,0 +1,15 @@
+"""What a recording says: figures of merit, tables, plots and a page.
+
+metrics.py  pure: folding onto one cycle, peak hysteresis, loop area, errors
+noise.py    pure: sensor noise and the floor it puts under the peak hysteresis
+timing.py   pure: lateness percentiles, late ticks
+steady.py   which part of a recording is judged, and its average cycle
+figures.py  what a report holds
+report.py   from a recording to a report
+table.py    a report for people, in a terminal
+traces.py   pure: long signals reduced to what a plot can show
+canvas.py   what all plots share: style, colours, signals over time, PNG
+plots.py    plots over time: history, error, lateness
+loops.py    the hysteresis loop
+html.py     one self-contained page
+"""

@@ -1,0 +1,122 @@
+"""What all plots share: style, colours, signals over time, PNG.
+
+Colours are those of Okabe and Ito, which colour-blind people can tell apart.
+"""
+
+import io
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from hilctl.analysis import traces
+from hilctl.arrays import F64
+from hilctl.recording.data import Recording
+
+REFERENCE = "#000000"
+DISPLACEMENT = "#0072B2"
+COMMAND = "#D55E00"
+ERROR = "#009E73"
+MARK = "#CC79A7"
+QUIET = "#666666"
+
+STYLE: dict[Any, Any] = {
+    "font.family": "DejaVu Sans",
+    "font.size": 9.0,
+    "axes.titlesize": 10.0,
+    "axes.titlelocation": "left",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": "#e4e4e4",
+    "grid.linewidth": 0.6,
+    "lines.linewidth": 1.2,
+    "legend.frameon": False,
+    "legend.fontsize": 8.0,
+    "figure.constrained_layout.use": True,
+    "agg.path.chunksize": 20000,
+    "text.parse_math": False,  # names and labels are not formulas
+}
+
+
+@mpl.rc_context(STYLE)
+def png(figure: Figure, dpi: int = 110) -> bytes:
+    """Return a figure as a PNG file."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=dpi, metadata={"Software": None})
+    return buffer.getvalue()
+
+
+def pieces(recording: Recording) -> list[tuple[int, int, float]]:
+    """Cut a run where its waveform changes: start, stop and period of each piece, in samples.
+
+    What lies outside all segments, such as the ramp out, has period 0.
+    """
+    index = recording.samples.index
+    if index.size == 0:
+        return []
+    first, end = int(index[0]), int(index[-1]) + 1
+    cut: list[tuple[int, int, float]] = []
+    at = first
+    for segment in sorted(recording.segments, key=lambda each: each.start):
+        start, stop = max(segment.start, at), min(segment.stop, end)
+        if start < stop:
+            cut += [(at, start, 0.0), (start, stop, segment.period)]
+            at = stop
+    return [piece for piece in [*cut, (at, end, 0.0)] if piece[0] < piece[1]]
+
+
+def draw_over_time(
+    axes: Axes, recording: Recording, values: F64, colour: str, label: str, *, outline: bool = False
+) -> None:
+    """Draw a signal over a whole run: as a line, or where cycles crowd as the band they fill.
+
+    Args:
+        axes: Where to draw, time in s.
+        recording: The run.
+        values: float64[n], one a sample.
+        colour: Colour of line and band.
+        label: For the legend.
+        outline: Draw only a band's edges, so that another one can be seen in it.
+    """
+    index = recording.samples.index
+    rate_hz = recording.sample_rate_hz
+    for start, stop, period in pieces(recording):
+        low, high = np.searchsorted(index, (start, stop))
+        part = slice(int(low), int(high))
+        if part.start == part.stop or not np.isfinite(values[part]).any():
+            continue
+        if traces.shown_as_band(stop - start, period, int(index[-1] - index[0]) + 1):
+            middle, lowest, highest = traces.band(index[part], values[part], period)
+            _band(axes, middle / rate_hz, lowest, highest, colour, label, outline)
+        else:
+            share = traces.MAX_POINTS * (part.stop - part.start) // index.size
+            line = traces.min_max(index[part] / rate_hz, values[part], max(share, 2))
+            width, style = (0.9, "--") if outline else (1.5, "-")
+            axes.plot(*line, color=colour, linestyle=style, label=label, linewidth=width)
+        label = "_again"  # matplotlib leaves labels with an underscore out of legends
+
+
+def _band(axes: Axes, t: F64, low: F64, high: F64, colour: str, label: str, outline: bool) -> None:
+    if outline:
+        axes.plot(t, low, color=colour, linewidth=0.8, linestyle="--", label=label)
+        axes.plot(t, high, color=colour, linewidth=0.8, linestyle="--", label="_again")
+    else:
+        axes.fill_between(t, low, high, color=colour, alpha=0.45, linewidth=0.8, label=label)
+
+
+def draw_line(axes: Axes, t: F64, values: F64, colour: str, *, dashed: bool = False) -> None:
+    """Draw a signal as a line of at most :data:`~hilctl.analysis.traces.MAX_POINTS` points."""
+    width, style = (0.9, "--") if dashed else (1.5, "-")
+    axes.plot(*traces.min_max(t, values), color=colour, linestyle=style, linewidth=width)
+
+
+def legend(axes: Axes) -> None:
+    """Put a legend above the axes, at the right, out of the way of what is drawn."""
+    handles, labels = axes.get_legend_handles_labels()
+    if labels:
+        corner = (1.0, 1.0)
+        axes.legend(loc="lower right", bbox_to_anchor=corner, borderaxespad=0.2, ncols=len(handles))

@@ -1,0 +1,81 @@
+"""Which part of a recording is judged, and the average cycle of that part."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hilctl.analysis.metrics import Fold, fold
+from hilctl.arrays import F64
+from hilctl.flags import Flag
+from hilctl.recording.data import Recording, Samples
+from hilctl.segments import Segment
+
+
+@dataclass(frozen=True, slots=True)
+class SteadyPart:
+    """The steady samples of one segment that a recording holds.
+
+    Attributes:
+        samples: Whole cycles where the waveform has a period, otherwise all at full amplitude.
+        cycles: Number of whole cycles; 0 without a period.
+        loop_input: float64[n], what the displacement is held against: reference_um where a
+            compensator stood before the actuator, otherwise the command.
+        cycle: The average cycle of ``loop_input`` and displacement_um, phase 0 at the segment's
+            first sample; None without a whole cycle, or where samples are missing all through it.
+    """
+
+    samples: Samples
+    cycles: int
+    loop_input: F64
+    cycle: Fold | None
+
+
+def waveform_end(samples: Samples) -> int:
+    """Return the index after the last sample that is not of the ramp out; 0 without any."""
+    waveform = samples.index[(samples.flags & Flag.RAMP) == 0]
+    return int(waveform[-1]) + 1 if waveform.size else 0
+
+
+def steady_samples(recording: Recording, segment: Segment) -> tuple[Samples, int]:
+    """Return the samples to judge of a segment, and how many whole cycles they are.
+
+    Of a segment cut short, these are the last whole cycles it got to. Samples whose displacement
+    the run did not trust are left out.
+    """
+    end = min(segment.steady_stop, waveform_end(recording.samples))
+    known = replace(segment, steady_stop=max(end, segment.steady_start))
+    start, stop, cycles = known.steady_cycles()
+    return _trusted(recording.samples.part(start, stop)), cycles
+
+
+def _trusted(samples: Samples) -> Samples:
+    keep = (samples.flags & Flag.SENSOR_INVALID) == 0
+    if keep.all():
+        return samples
+    return Samples(
+        index=samples.index[keep],
+        reference_um=samples.reference_um[keep],
+        wanted=samples.wanted[keep],
+        command=samples.command[keep],
+        measured=samples.measured[keep] if samples.measured.size else samples.measured,
+        displacement_um=samples.displacement_um[keep],
+        flags=samples.flags[keep],
+    )
+
+
+def steady_part(recording: Recording, segment: Segment) -> SteadyPart:
+    """Return what there is to judge of a segment, with its average cycle."""
+    samples, cycles = steady_samples(recording, segment)
+    loop_input = samples.reference_um if recording.compensated else samples.command
+    cycle = None
+    if cycles > 0:
+        signals = (loop_input, samples.displacement_um)
+        folded = fold(samples.index - segment.start, segment.period, signals)
+        cycle = folded if folded.whole else None
+    return SteadyPart(samples, cycles, loop_input, cycle)
+
+
+def error_um(part: SteadyPart) -> F64:
+    """Return displacement less reference of every sample where both are finite, in um."""
+    error = part.samples.displacement_um - part.samples.reference_um
+    return error[np.isfinite(error)]

@@ -1,0 +1,33 @@
+"""How well the loop kept its time: pure functions of tick arrays."""
+
+import numpy as np
+
+from hilctl.arrays import I64
+from hilctl.recording.data import Ticks
+
+_PERCENTILES = {"p50": 50.0, "p90": 90.0, "p99": 99.0, "p99.9": 99.9}
+
+
+def percentiles_us(times_ns: I64) -> dict[str, float]:
+    """Return ``p50``, ``p90``, ``p99``, ``p99.9`` and ``max`` in us of int64[m] in ns.
+
+    Empty where there is none.
+    """
+    if times_ns.size == 0:
+        return {}
+    values = np.percentile(times_ns, list(_PERCENTILES.values())) * 1e-3
+    figures = dict(zip(_PERCENTILES, values.tolist(), strict=True))
+    return {**figures, "max": float(times_ns.max()) * 1e-3}
+
+
+def tick_period_ns(ticks: Ticks) -> float | None:
+    """Return the usual time from one tick's deadline to the next; None with fewer than two."""
+    if ticks.deadline_ns.size < 2:
+        return None
+    return float(np.median(np.diff(ticks.deadline_ns)))
+
+
+def late_ticks(ticks: Ticks) -> int | None:
+    """Count ticks that woke more than half a tick period late; None with fewer than two ticks."""
+    period_ns = tick_period_ns(ticks)
+    return None if period_ns is None else int(np.count_nonzero(ticks.late_ns > 0.5 * period_ns))

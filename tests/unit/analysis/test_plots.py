@@ -1,0 +1,205 @@
+"""Figures: what is drawn in them, and when there is none."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from matplotlib.collections import FillBetweenPolyCollection
+
+from hilctl.analysis import canvas, loops, plots, traces
+from hilctl.recording.data import Recording, Ticks
+from hilctl.segments import Segment
+
+PERIOD = 1000.0
+
+
+@pytest.fixture
+def run(make_recording):
+    """Return a builder of runs with that many steady cycles and a ramp out."""
+
+    def make(cycles: int = 4, *, compensated: bool = True, lag: float = 0.1) -> Recording:
+        n = int(PERIOD * cycles)
+        phase = 2.0 * np.pi * np.arange(n + 300) / PERIOD
+        wave = 40.0 * np.sin(phase)
+        reference_um = np.where(np.arange(n + 300) < n, wave, np.nan)
+        return make_recording(
+            40.0 * np.sin(phase - lag),
+            reference_um=reference_um if compensated else None,
+            command=wave / 7.0,
+            ramp=300,
+            segments=[Segment("sine $_x$ <40> um", 0, n, 0, n, PERIOD)],
+        )
+
+    return make
+
+
+def lines(axes) -> dict[str, object]:
+    """Return the lines of axes by label."""
+    return {line.get_label(): line for line in axes.get_lines()}
+
+
+class TestTimeHistory:
+    def test_few_cycles_are_lines_with_units(self, run) -> None:
+        """Displacement, reference and command are drawn over the whole run, units on the axes."""
+        recording = run()
+        upper, _, lower, _ = plots.time_history(recording).axes
+        assert {"displacement", "reference"} <= set(lines(upper))
+        assert upper.get_ylabel() == "displacement, um"
+        assert lower.get_ylabel() == "command, A"
+        assert lower.get_xlabel() == "time, s"
+        assert lower.get_xlim()[1] >= 4300 / 50_000
+
+    def test_many_cycles_are_a_band(self, run) -> None:
+        """Cycles too narrow for a line fill a band of constant height, and beat with nothing."""
+        upper = plots.time_history(run(cycles=400)).axes[0]
+        bands = [c for c in upper.collections if isinstance(c, FillBetweenPolyCollection)]
+        assert len(bands) == 1
+        heights = bands[0].get_paths()[0].vertices[:, 1]
+        assert np.abs(np.abs(heights) - 40.0).max() < 0.01
+
+    def test_no_line_is_longer_than_a_plot_can_show(self, run) -> None:
+        """Long runs are reduced before they are drawn."""
+        recording = replace(run(cycles=100), segments=())
+        for figure in (plots.time_history(recording), plots.error(recording)):
+            for axes in figure.axes:
+                for line in axes.get_lines():
+                    assert line.get_xdata().size <= traces.MAX_POINTS
+
+    def test_spike_stays_visible(self, run) -> None:
+        """One odd reading in half a million is drawn."""
+        recording = replace(run(cycles=500), segments=())
+        recording.samples.displacement_um[123_456] = 90.0
+        line = lines(plots.time_history(recording).axes[0])["displacement"]
+        assert np.nanmax(line.get_ydata()) == 90.0
+
+    def test_last_steady_cycles_stand_beside(self, run) -> None:
+        """The two cycles before the ramp are drawn again by themselves."""
+        close = plots.time_history(run()).axes[1]
+        start, stop = close.get_lines()[0].get_xdata()[[0, -1]]
+        assert start == pytest.approx(2000 / 50_000)
+        assert stop == pytest.approx(3999 / 50_000)
+
+    def test_nothing_recorded_draws_nothing(self, run) -> None:
+        """Without samples there is no history."""
+        recording = run()
+        assert plots.time_history(replace(recording, samples=recording.samples.part(0, 0))) is None
+
+
+class TestHysteresisLoop:
+    @pytest.mark.parametrize("compensated", [True, False])
+    def test_peak_hysteresis_is_marked_at_its_height(self, run, compensated: bool) -> None:
+        """The mark is 2 B sin(lag) high in both panels, and says its percentage."""
+        figure = loops.hysteresis_loop(run(compensated=compensated))
+        for axes in figure.axes:
+            label = next(name for name in lines(axes) if name.startswith("peak hysteresis"))
+            assert label.startswith(f"peak hysteresis {100.0 * np.sin(0.1):.3g} %")
+            height = np.ptp(lines(axes)[label].get_ydata())
+            assert height == pytest.approx(80.0 * np.sin(0.1), rel=1e-3)
+
+    def test_compensated_run_is_held_against_its_reference(self, run) -> None:
+        """What is left beside is the error over the reference, the loop closed."""
+        right = loops.hysteresis_loop(run()).axes[1]
+        x, y = right.get_lines()[0].get_data()
+        assert right.get_xlabel() == "reference, um"
+        assert (x[0], y[0]) == (x[-1], y[-1])
+        assert np.abs(y).max() == pytest.approx(80.0 * np.sin(0.05), rel=1e-3)
+
+    def test_uncompensated_run_is_held_against_its_command(self, run) -> None:
+        """The axis says command and its unit."""
+        assert loops.hysteresis_loop(run(compensated=False)).axes[0].get_xlabel() == "command, A"
+
+    def test_each_segment_has_its_loop(self, run) -> None:
+        """Segments are told apart by colour and label; the legend leaves out one not reached."""
+        recording = run(cycles=9)
+        ends = [(3000 * k, 3000 * k + 3000) for k in range(4)]
+        parts = [Segment(f"part {k}", *ends[k], *ends[k], PERIOD) for k in range(4)]
+        figure = loops.hysteresis_loop(replace(recording, segments=tuple(parts)))
+        axes = figure.axes[0]
+        shown = {text.get_text() for text in figure.legends[0].get_texts()}
+        assert {"part 0", "part 1", "part 2"} <= shown
+        assert "part 3" not in shown
+        assert len({str(line.get_color()) for line in axes.get_lines()[:3]}) == 3
+
+    def test_what_does_not_repeat_is_drawn_as_measured(self, run) -> None:
+        """Without a period there is a path and no mark."""
+        recording = run()
+        once = replace(recording.segments[0], period=0.0)
+        axes = loops.hysteresis_loop(replace(recording, segments=(once,))).axes[0]
+        assert axes.get_lines()[0].get_xdata().size == 4000
+        assert not any(name.startswith("peak") for name in lines(axes))
+        assert "not averaged" in axes.get_title("left")
+
+    def test_nothing_steady_draws_nothing(self, run) -> None:
+        """A run cut short before its first whole cycle has no loop."""
+        recording = run()
+        assert loops.hysteresis_loop(replace(recording, segments=())) is None
+        short = replace(recording, samples=recording.samples.part(0, 700))
+        assert loops.hysteresis_loop(short) is None
+
+
+class TestError:
+    def test_peak_error_is_marked_on_the_average_cycle(self, run) -> None:
+        """Its mark is where displacement less reference is largest."""
+        _, phase = plots.error(run()).axes
+        mark = lines(phase)["peak error"]
+        assert abs(mark.get_ydata()[0]) == pytest.approx(80.0 * np.sin(0.05), rel=1e-3)
+
+    def test_dots_are_samples_at_their_phase(self, run) -> None:
+        """They lie on the curve of the closed form."""
+        phase, error_um = lines(plots.error(run()).axes[1])["samples"].get_data()
+        expected = 40.0 * (np.sin(2 * np.pi * phase - 0.1) - np.sin(2 * np.pi * phase))
+        np.testing.assert_allclose(error_um, expected, atol=1e-9)
+
+    def test_run_without_reference_has_none(self, run) -> None:
+        """There is no error to draw in a current run."""
+        assert plots.error(run(compensated=False)) is None
+
+
+class TestLateness:
+    def test_every_tick_is_counted(self, run) -> None:
+        """Bars add up to the number of ticks, late, early and extreme ones included."""
+        late_ns = np.array([-5_000, 0, 40_000, 41_000, 3_000_000], dtype=np.int64)
+        first = 50 * np.arange(5, dtype=np.int64)
+        ticks = Ticks(first, 20_000 * first, late_ns, np.full(5, 30_000, dtype=np.int64))
+        axes = plots.lateness(replace(run(), ticks=ticks)).axes[0]
+        bars = axes.containers[0]
+        assert sum(bar.get_height() for bar in bars) == 5
+        assert (bars[0].get_x(), bars[0].get_height()) == (pytest.approx(1.0), 2)
+        assert (axes.get_xscale(), axes.get_yscale()) == ("log", "log")
+        assert {text.get_text() for text in axes.texts} >= {"p50 40 us", "max 3000 us"}
+
+    def test_ticks_that_are_all_alike_can_be_drawn(self, run) -> None:
+        """A histogram of one value has a width all the same."""
+        same = np.full(5, 30_000, dtype=np.int64)
+        ticks = Ticks(same, same, same, same)
+        assert plots.lateness(replace(run(), ticks=ticks)) is not None
+
+    def test_no_ticks_draw_nothing(self, run) -> None:
+        """Without ticks there is nothing to count."""
+        assert plots.lateness(replace(run(), ticks=Ticks(*(np.empty(0, np.int64),) * 4))) is None
+
+
+def test_png_of_every_figure_can_be_drawn(run) -> None:
+    """Labels with dollar signs and angle brackets are text, not formulas; nothing warns."""
+    recording = run()
+    figures = [
+        plots.time_history(recording),
+        loops.hysteresis_loop(recording),
+        plots.error(recording),
+        plots.lateness(recording),
+    ]
+    for figure in figures:
+        assert canvas.png(figure).startswith(b"\x89PNG\r\n\x1a\n")
+
+
+def test_pieces_cover_a_run_without_overlap(run) -> None:
+    """Segments, what lies between them and the ramp out: every sample in one piece."""
+    parts = (Segment("b", 2000, 3000, 2000, 3000, 10.0), Segment("a", 500, 1500, 500, 1500, 20.0))
+    found = canvas.pieces(replace(run(), segments=parts))
+    assert found == [
+        (0, 500, 0.0),
+        (500, 1500, 20.0),
+        (1500, 2000, 0.0),
+        (2000, 3000, 10.0),
+        (3000, 4300, 0.0),
+    ]

@@ -1,0 +1,388 @@
+"""From recordings to figures: what is judged, what is None, what counts as what."""
+
+import io
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from hilctl.analysis.report import RunReport, render, summarize, worst_segment
+from hilctl.arrays import F64
+from hilctl.errors import DataError
+from hilctl.flags import Flag
+from hilctl.recording.data import Recording, Ticks
+from hilctl.segments import Segment
+
+RATE_HZ = 50_000.0
+LAG = 0.05
+STROKE_UM = 80.0
+OFFSET_UM = 0.5
+PEAK_ERROR_UM = STROKE_UM * np.sin(LAG / 2.0) + OFFSET_UM  # 2 sin(lag/2) times half the stroke
+
+
+def wave(period: float, cycles: float, lag: float = 0.0) -> F64:
+    """Return whole cycles of a full-stroke sine in um."""
+    phase = 2.0 * np.pi * np.arange(np.ceil(period * cycles)) / period
+    return 0.5 * STROKE_UM * np.sin(phase - lag)
+
+
+def segment(start: int, samples: int, period: float, label: str = "sine") -> Segment:
+    """Return a segment without soft start or end."""
+    return Segment(label, start, start + samples, start, start + samples, period)
+
+
+@pytest.fixture
+def lagging(make_recording):
+    """Return a builder of compensated recordings whose displacement lags and is offset."""
+
+    def make(period: float = 1000.0, cycles: int = 5, lag: float = LAG, **more) -> Recording:
+        reference_um = wave(period, cycles)
+        displacement_um = wave(period, cycles, lag) + OFFSET_UM
+        parts = [segment(0, reference_um.size, period)]
+        more = {"segments": parts, **more}
+        return make_recording(displacement_um, reference_um=reference_um, **more)
+
+    return make
+
+
+def check_loop(report: RunReport) -> None:
+    """Hold a lagging sine's figures against their closed forms."""
+    assert report.peak_hysteresis_percent == pytest.approx(100.0 * np.sin(LAG), rel=1e-3)
+    area = np.pi * (0.5 * STROKE_UM) ** 2 * np.sin(LAG)
+    assert report.loop_area == pytest.approx(area, rel=1e-3)
+    assert report.peak_to_peak_um == pytest.approx(STROKE_UM, rel=1e-3)
+    expected = 100.0 * PEAK_ERROR_UM / STROKE_UM
+    assert report.peak_error_percent == pytest.approx(expected, rel=1e-3)
+    rms_um = np.hypot(STROKE_UM * np.sin(LAG / 2.0) / np.sqrt(2.0), OFFSET_UM)
+    assert report.rms_error_percent == pytest.approx(100.0 * rms_um / STROKE_UM, rel=1e-3)
+
+
+class TestSteadyPeriodicRun:
+    @pytest.mark.parametrize("period", [50_000.0, 200.0, 1000.0 / 3.0])
+    @pytest.mark.parametrize("cycles", [1, 3])
+    def test_figures_are_those_of_the_closed_form(self, lagging, period, cycles) -> None:
+        """1, 250 and 150 Hz at 50 kHz, one cycle or several, give the same figures."""
+        report = summarize(lagging(period, cycles))
+        check_loop(report)
+        assert report.loop_area_unit == "um*um"
+        assert report.steady_cycles == max(1, cycles - 1)
+        assert report.segments[0].frequency_hz == pytest.approx(RATE_HZ / period)
+
+    def test_one_cycle_after_the_start_is_left_out(self, lagging) -> None:
+        """A first cycle that is nowhere near the others changes no figure."""
+        recording = lagging()
+        recording.samples.displacement_um[:1000] = 500.0
+        check_loop(summarize(recording))
+
+    def test_average_is_less_noisy_than_the_raw_figures(self, lagging) -> None:
+        """Raw errors hold the noise; averaged ones and the loop hold little of it."""
+        recording = lagging(cycles=41)
+        noise_um = np.random.default_rng(1).normal(0.0, 0.5, recording.samples.index.size)
+        recording.samples.displacement_um[:] += noise_um
+        report = summarize(recording)
+        assert report.sensor_noise_um == pytest.approx(0.5, rel=0.05)
+        assert report.peak_error_percent == pytest.approx(
+            100.0 * PEAK_ERROR_UM / STROKE_UM, abs=0.4
+        )
+        assert report.peak_error_raw_percent > report.peak_error_percent + 1.0
+        raw_um = (recording.samples.displacement_um - recording.samples.reference_um)[1000:]
+        expected = 100.0 * np.sqrt(np.mean(raw_um**2)) / report.peak_to_peak_um
+        assert report.rms_error_raw_percent == pytest.approx(expected)
+        assert report.peak_hysteresis_percent == pytest.approx(
+            100.0 * np.sin(LAG), abs=2.0 * report.noise_floor_percent
+        )
+
+    def test_gaps_in_the_samples_do_no_harm(self, lagging) -> None:
+        """Skipped samples, other ones in each cycle, leave the figures as they were."""
+        whole = lagging(cycles=8)
+        keep = np.ones(8000, dtype=bool)
+        for cycle in range(1, 8):
+            keep[1000 * cycle + 90 * cycle : 1000 * cycle + 90 * cycle + 150] = False
+        index = np.flatnonzero(keep).astype(np.int64)
+        recording = lagging(cycles=8)
+        samples = whole.samples
+        kept = replace(
+            samples,
+            index=index,
+            reference_um=samples.reference_um[keep],
+            wanted=samples.wanted[keep],
+            command=samples.command[keep],
+            displacement_um=samples.displacement_um[keep],
+            flags=samples.flags[keep],
+        )
+        report = summarize(replace(recording, samples=kept, dropped=1050))
+        check_loop(report)
+        assert report.dropped == 1050
+        assert report.steady_samples == 7000 - 1050
+
+    def test_samples_missing_all_through_make_no_cycle(self, lagging) -> None:
+        """Where a tenth of every cycle is missing, no average is pretended."""
+        recording = lagging()
+        recording.samples.displacement_um[np.arange(5000) % 1000 < 100] = np.nan
+        report = summarize(recording)
+        assert report.peak_hysteresis_percent is None
+        assert report.peak_to_peak_um is None
+        assert report.peak_error_percent is None
+
+    def test_readings_that_were_not_trusted_are_not_judged(self, lagging) -> None:
+        """A NaN here and a flagged spike there cost their samples and nothing else."""
+        recording = lagging()
+        recording.samples.displacement_um[2500] = np.nan
+        recording.samples.displacement_um[2600] = 1e6
+        recording.samples.flags[2500] |= Flag.SENSOR_INVALID.value
+        recording.samples.flags[2600] |= Flag.SENSOR_INVALID.value
+        report = summarize(recording)
+        check_loop(report)
+        assert report.sensor_invalid_samples == 2
+        assert report.steady_samples == 3998
+
+    def test_period_too_short_tells_no_noise(self, lagging) -> None:
+        """With 12 samples a period, signal can't be told from noise."""
+        report = summarize(lagging(period=12.0, cycles=100))
+        assert report.sensor_noise_um is None
+        assert report.noise_floor_percent is None
+        assert report.peak_hysteresis_percent is not None
+
+
+class TestUncompensatedRun:
+    def test_loop_is_against_the_command_and_there_are_no_errors(self, make_recording) -> None:
+        """Without a reference in um, hysteresis and area remain, and errors are None."""
+        command = wave(1000.0, 4) * 6.0 / 40.0
+        displacement_um = wave(1000.0, 4, LAG)
+        recording = make_recording(
+            displacement_um, command=command, segments=[segment(0, 4000, 1000.0)]
+        )
+        report = summarize(recording)
+        assert report.peak_hysteresis_percent == pytest.approx(100.0 * np.sin(LAG), rel=1e-3)
+        assert report.loop_area == pytest.approx(np.pi * 6.0 * 40.0 * np.sin(LAG), rel=1e-3)
+        assert report.loop_area_unit == "um*A"
+        assert report.peak_error_percent is None
+        assert report.rms_error_raw_percent is None
+        assert (report.command_min, report.command_max) == pytest.approx((-6.0, 6.0))
+
+    def test_reference_beside_an_uncompensated_run_makes_no_errors(self, lagging) -> None:
+        """Nothing stood between reference and command, so displacement owes it nothing."""
+        report = summarize(replace(lagging(), compensated=False))
+        assert report.peak_error_percent is None
+        assert report.peak_error_raw_percent is None
+
+
+class TestWithoutAPeriod:
+    def test_only_raw_figures_exist(self, make_recording) -> None:
+        """What does not repeat has errors and a stroke, and no loop."""
+        reference_um = np.linspace(0.0, 50.0, 2000)
+        error_um = 0.1 * np.sin(np.arange(2000) / 100.0)
+        recording = make_recording(
+            reference_um + error_um,
+            reference_um=reference_um,
+            segments=[segment(0, 2000, 0.0)],
+        )
+        report = summarize(recording)
+        stroke_um = np.ptp(reference_um + error_um)
+        assert report.peak_to_peak_um == pytest.approx(stroke_um)
+        assert report.peak_error_percent == pytest.approx(100.0 * 0.1 / stroke_um, rel=1e-3)
+        assert report.peak_error_percent == report.peak_error_raw_percent
+        assert report.rms_error_percent == report.rms_error_raw_percent
+        assert report.peak_hysteresis_percent is None
+        assert report.loop_area is None
+        assert report.noise_floor_percent is None
+        assert report.steady_cycles == 0
+        assert report.segments[0].frequency_hz is None
+
+
+class TestCutShort:
+    def test_judges_the_whole_cycles_it_got_to(self, lagging) -> None:
+        """A file that ends in the middle of the fourth cycle is judged on two before its end."""
+        recording = lagging(cycles=6)
+        recording = replace(recording, samples=recording.samples.part(0, 3700), end={})
+        report = summarize(recording)
+        check_loop(report)
+        assert report.steady_cycles == 2
+        assert not report.complete
+        assert "cut short" in report.reason
+
+    def test_ramp_ends_what_is_judged(self, lagging) -> None:
+        """A run stopped in its fourth cycle is not judged on its way out."""
+        recording = lagging(cycles=6, end={"reason": "stopped"})
+        samples = recording.samples
+        samples.flags[3700:] |= Flag.RAMP.value
+        samples.reference_um[3700:] = np.nan
+        samples.displacement_um[3700:] = 0.0
+        report = summarize(recording)
+        check_loop(report)
+        assert not report.complete
+        assert (report.samples, report.ramp_samples, report.recorded_samples) == (3700, 2300, 6000)
+        assert report.duration_s == pytest.approx(3700 / RATE_HZ)
+
+    def test_segment_not_reached_has_no_figures(self, lagging) -> None:
+        """Figures of the segments before it stand, and are the run's."""
+        recording = lagging()
+        later = segment(5000, 4000, 400.0, "not reached")
+        report = summarize(replace(recording, segments=(*recording.segments, later), end={}))
+        check_loop(report)
+        assert report.segments[1].peak_hysteresis_percent is None
+        assert report.segments[1].steady_samples == 0
+        assert report.segments[1].samples == 0
+
+    def test_no_whole_cycle_has_no_figures(self, lagging) -> None:
+        """Less than one cycle of a waveform that repeats is not judged, not even raw."""
+        recording = lagging()
+        report = summarize(replace(recording, samples=recording.samples.part(0, 900)))
+        assert report.steady_cycles == 0
+        assert report.peak_hysteresis_percent is None
+        assert report.peak_error_raw_percent is None
+        assert report.samples == 900
+
+    def test_nothing_recorded_is_reported_as_that(self, lagging) -> None:
+        """A run killed before its first sample gives a report of zeros and None."""
+        recording = lagging(ticks=Ticks(*(np.empty(0, dtype=np.int64),) * 4))
+        report = summarize(replace(recording, samples=recording.samples.part(0, 0), end={}))
+        assert report.recorded_samples == 0
+        assert report.duration_s == 0.0
+        assert report.command_min is None
+        assert report.lateness_us == {}
+        assert report.late_ticks is None
+        json.dumps(report.to_mapping(), allow_nan=False)
+
+
+class TestWholeRun:
+    def test_worst_segment_counts(self, make_recording) -> None:
+        """Percentages of the run are the largest of its segments; cycles are summed."""
+        reference_um = np.tile(wave(1000.0, 4), 2)
+        displacement_um = np.concatenate((wave(1000.0, 4, 0.02), wave(1000.0, 4, 0.1)))
+        parts = [segment(0, 4000, 1000.0, "a"), segment(4000, 4000, 1000.0, "b")]
+        recording = make_recording(displacement_um, reference_um=reference_um, segments=parts)
+        report = summarize(recording)
+        first, second = report.segments
+        assert first.peak_hysteresis_percent == pytest.approx(100.0 * np.sin(0.02), rel=1e-3)
+        assert report.peak_hysteresis_percent == second.peak_hysteresis_percent
+        assert report.peak_error_raw_percent == second.peak_error_raw_percent
+        assert report.steady_cycles == 6
+        assert report.steady_samples == 6000
+        assert second.start_s == pytest.approx(4000 / RATE_HZ)
+
+    def test_floor_belongs_to_the_hysteresis_beside_it(self, make_recording) -> None:
+        """A noisier segment with less hysteresis does not lend its floor; noise is pooled."""
+        rng = np.random.default_rng(8)
+        reference_um = np.concatenate((wave(1000.0, 9), 0.1 * wave(1000.0, 3)))
+        displacement_um = np.concatenate((wave(1000.0, 9, 0.2), 0.1 * wave(1000.0, 3, 0.01)))
+        displacement_um += rng.normal(0.0, 0.05, 12_000)
+        parts = [segment(0, 9000, 1000.0), segment(9000, 3000, 1000.0)]
+        recording = make_recording(displacement_um, reference_um=reference_um, segments=parts)
+        report = summarize(recording)
+        first, second = report.segments
+        assert worst_segment(report.segments) == 0
+        assert first.noise_floor_percent < second.noise_floor_percent
+        assert report.noise_floor_percent == first.noise_floor_percent
+        pooled = np.sqrt(0.8 * first.sensor_noise_um**2 + 0.2 * second.sensor_noise_um**2)
+        assert report.sensor_noise_um == pytest.approx(pooled)
+
+    def test_run_without_segments_has_no_figures(self, lagging) -> None:
+        """Counts and extremes stand all the same."""
+        report = summarize(replace(lagging(), segments=()))
+        assert report.peak_hysteresis_percent is None
+        assert report.sensor_noise_um is None
+        assert report.samples == 5000
+        assert worst_segment(report.segments) == 0
+
+    def test_complete_needs_an_end_and_the_last_sample(self, lagging) -> None:
+        """A run is complete with a record of its end and all of its waveform."""
+        recording = lagging()
+        assert summarize(recording).complete
+        assert not summarize(replace(recording, end={})).complete
+        short = replace(recording, samples=recording.samples.part(0, 4999))
+        assert not summarize(short).complete
+
+    def test_counters_of_the_run_go_before_those_counted_here(self, lagging) -> None:
+        """The record of the end knows best; without it, late ticks are counted."""
+        ticks = Ticks(
+            np.arange(0, 5000, 50),
+            1_000_000 * np.arange(100),
+            np.repeat(np.array([100_000, 700_000]), 50),
+            np.full(100, 30_000),
+        )
+        told = lagging(ticks=ticks, end={"late_ticks": "7", "skipped_ticks": "3"})
+        assert summarize(told).late_ticks == 7
+        assert summarize(told).skipped_ticks == 3
+        counted = summarize(replace(told, end={}))
+        assert counted.late_ticks == 50
+        assert counted.skipped_ticks is None
+        assert counted.lateness_us["max"] == pytest.approx(700.0)
+        assert counted.exchange_us["p50"] == pytest.approx(30.0)
+
+    def test_counter_that_is_no_number_is_refused(self, lagging) -> None:
+        """A damaged record of the end is named with its key and value."""
+        with pytest.raises(DataError, match=r"run\.mcap: hilctl\.end: late_ticks .* 'many'"):
+            summarize(lagging(end={"late_ticks": "many"}))
+
+    def test_limited_samples_are_those_of_the_waveform(self, lagging) -> None:
+        """Range, slew and invalid count once a sample; the ramp out does not count."""
+        recording = lagging(ramp=100)
+        recording.samples.flags[10] |= (Flag.RANGE_LIMITED | Flag.SLEW_LIMITED).value
+        recording.samples.flags[11] |= Flag.INVALID.value
+        recording.samples.flags[-1] |= Flag.SLEW_LIMITED.value
+        assert summarize(recording).limited_samples == 2
+
+    def test_mapping_is_plain_json(self, lagging) -> None:
+        """Every figure is a plain value; what is not finite becomes None."""
+        recording = lagging()
+        recording.samples.command[5] = np.nan
+        report = replace(summarize(recording), duration_s=float("inf"))
+        mapping = json.loads(json.dumps(report.to_mapping(), allow_nan=False))
+        assert mapping["duration_s"] is None
+        assert mapping["command_max"] == 0.0
+        assert mapping["segments"][0]["label"] == "sine"
+        assert mapping["peak_hysteresis_percent"] == report.peak_hysteresis_percent
+
+
+class TestTable:
+    def text(self, report: RunReport) -> str:
+        """Return what a terminal of 120 columns shows."""
+        console = Console(width=120, file=io.StringIO(), record=True)
+        console.print(render(report))
+        return console.export_text()
+
+    def test_floor_stands_beside_the_hysteresis(self, lagging) -> None:
+        """The figure that noise can fake is never shown without its floor."""
+        recording = lagging()
+        recording.samples.displacement_um[:] += np.random.default_rng(2).normal(0.0, 0.03, 5000)
+        report = summarize(recording)
+        line = next(t for t in self.text(report).splitlines() if "peak hysteresis" in t)
+        assert f"{report.peak_hysteresis_percent:.4g} %" in line
+        assert f"noise floor {report.noise_floor_percent:.4g} %" in line
+
+    def test_simulation_is_told(self, lagging) -> None:
+        """A simulated device is called so, a real one is not."""
+        simulated = lagging(run={"name": "x", "device": "simulated_terfenol"})
+        assert "no hardware was driven" in self.text(summarize(simulated))
+        assert "no hardware was driven" not in self.text(summarize(lagging()))
+
+    def test_names_are_not_markup(self, lagging) -> None:
+        """Square brackets in names and labels are shown as they are."""
+        parts = [segment(0, 2000, 1000.0, "[red]a[/red]"), segment(2000, 3000, 1000.0, "[b]")]
+        run = {"name": "[bold]name", "device": "[dac]"}
+        text = self.text(summarize(lagging(run=run, segments=parts)))
+        for shown in ("[bold]name", "[dac]", "[red]a[/red]", "[b]"):
+            assert shown in text
+
+    def test_uncompensated_run_shows_no_errors(self, make_recording) -> None:
+        """Rows that can't have a value in such a run are left out."""
+        recording = make_recording(wave(1000.0, 3), segments=[segment(0, 3000, 1000.0)])
+        text = self.text(summarize(recording))
+        assert "error" not in text
+        assert "nothing compensated" in text
+
+    def test_segments_have_a_table_without_empty_columns(self, make_recording) -> None:
+        """Several segments are listed; columns that no segment fills are left out."""
+        parts = [segment(0, 3000, 1000.0, "first"), segment(3000, 3000, 1000.0, "second")]
+        recording = make_recording(wave(1000.0, 6, LAG), command=wave(1000.0, 6), segments=parts)
+        text = self.text(summarize(recording))
+        for shown in ("first", "second", "peak hyst. %"):
+            assert shown in text
+        assert "err. %" not in text
+
+    def test_incomplete_run_is_told(self, lagging) -> None:
+        """A run cut short can't be taken for a whole one."""
+        assert "NOT complete" in self.text(summarize(replace(lagging(), end={})))

@@ -1,0 +1,45 @@
+"""Lateness of ticks."""
+
+import numpy as np
+import pytest
+
+from hilctl.analysis import timing
+from hilctl.recording.data import Ticks
+
+
+def ticks(late_ns: list[int], period_ns: int = 1_000_000) -> Ticks:
+    """Return ticks of one period with these latenesses."""
+    first = np.arange(len(late_ns), dtype=np.int64)
+    late = np.array(late_ns, dtype=np.int64)
+    return Ticks(first, first * period_ns, late, late)
+
+
+def test_percentiles_are_in_microseconds() -> None:
+    """Of 1 to 1001 us, the percentiles are where they belong, and the maximum is the last."""
+    found = timing.percentiles_us(1_000 * np.arange(1, 1002, dtype=np.int64))
+    expected = {"p50": 501.0, "p90": 901.0, "p99": 991.0, "p99.9": 1000.0, "max": 1001.0}
+    assert found == pytest.approx(expected)
+
+
+def test_percentiles_of_nothing_are_empty() -> None:
+    """Without ticks there are no percentiles."""
+    assert timing.percentiles_us(np.empty(0, dtype=np.int64)) == {}
+
+
+def test_late_is_more_than_half_a_period() -> None:
+    """Exactly half a period is not late yet."""
+    assert timing.late_ticks(ticks([0, 500_000, 500_001, 3_000_000])) == 2
+
+
+def test_period_survives_skipped_ticks() -> None:
+    """The usual distance of deadlines counts, not that across a skipped tick."""
+    many = ticks([600_000] * 10)
+    late = Ticks(many.first_sample, many.deadline_ns * 1, many.late_ns, many.exchange_ns)
+    late.deadline_ns[7:] += 50_000_000
+    assert timing.late_ticks(late) == 10
+
+
+def test_fewer_than_two_ticks_have_no_period() -> None:
+    """With one tick nobody knows what late means."""
+    assert timing.late_ticks(ticks([5_000_000])) is None
+    assert timing.late_ticks(ticks([])) is None
