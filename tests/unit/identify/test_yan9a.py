@@ -1,0 +1,97 @@
+"""A PPI identified on measured data of a piezo micromanipulator, and tried on other data of it.
+
+Data: github.com/yan9a/DiscreteBacklashOperator, MIT licence. Drive in V, capacitive sensor, 200 Hz.
+Figures are percent of the output range of the judged rows.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hilctl.identify.cycles import find_cycles
+from hilctl.identify.data import History
+from hilctl.identify.fit import Fit, judge
+from hilctl.identify.fitting import identify
+from hilctl.identify.settings import Settings
+from hilctl.identify.tables import read_table
+
+FOLDER = Path(__file__).resolve().parents[4] / "shared" / "data" / "yan9a_DBO"
+START_TRANSIENT = 500  # rows of the model file; the test file settles after 600
+RATE_HZ = 200.0
+
+pytestmark = [
+    pytest.mark.data,
+    pytest.mark.skipif(not FOLDER.is_dir(), reason=f"measured piezo data not at {FOLDER}"),
+]
+
+
+@pytest.fixture(scope="module")
+def model_file() -> History:
+    path = FOLDER / "Model_Vi_Do.dat"
+    return read_table(path, 1, 5, rate_hz=RATE_HZ, ignore=START_TRANSIENT)
+
+
+@pytest.fixture(scope="module")
+def test_file() -> History:
+    return read_table(FOLDER / "Test_Vi_Do_Di.dat", 1, 5, rate_hz=RATE_HZ, ignore=600)
+
+
+def piezo_fit(history: History, **choices: Any) -> Fit:
+    settings = Settings(
+        plays=25,
+        weights="free",
+        layout="midpoint",
+        output_offset=True,
+        starts=2,
+        input_unit="V",
+        **choices,
+    )
+    return identify("ppi", [history], settings, np.random.default_rng(1), lambda: 0.0)
+
+
+def test_model_and_test_file_within_the_published_baseline(
+    model_file: History, test_file: History
+) -> None:
+    """With the sensor's lag of 2 samples taken out, both files are met within the baselines.
+
+    The drift of the first seconds sets the peak on the model file; the goal of 2 % takes it down.
+    """
+    found = piezo_fit(model_file.without_lag(2), peak_goal_percent=2.0)
+    assert found.peak_percent <= 2.0
+    assert found.rms_percent <= 0.75
+    tried = judge(found.model, [test_file.without_lag(2)])
+    assert tried.peak_percent <= 6.2
+    assert tried.rms_percent <= 1.33
+    assert min(found.model.weights) >= 0.0
+    assert found.model.direct > 0.0
+
+
+@pytest.mark.parametrize(
+    ("lag_samples", "own", "other"), [(0, (2.3, 0.76), (4.6, 1.75)), (1, (2.25, 0.75), (5.1, 1.15))]
+)
+def test_plain_least_squares_at_smaller_lags(
+    model_file: History,
+    test_file: History,
+    lag_samples: int,
+    own: tuple[float, float],
+    other: tuple[float, float],
+) -> None:
+    """Without a goal for the peak, and with less of the lag taken out, errors stay near these."""
+    found = piezo_fit(model_file.without_lag(lag_samples))
+    assert (found.peak_percent, found.rms_percent) <= own
+    assert found.rms_percent <= own[1]
+    tried = judge(found.model, [test_file.without_lag(lag_samples)])
+    assert tried.peak_percent <= other[0]
+    assert tried.rms_percent <= other[1]
+
+
+def test_published_weights_describe_it_too(model_file: History) -> None:
+    """Ten plays with exponential weights (3.25, 3.26) reach 2.8 % peak on the averaged cycle."""
+    loop = find_cycles(model_file.without_lag(1))
+    assert loop.frequency_hz == pytest.approx(1.0, rel=1e-5)
+    settings = Settings(plays=10, output_offset=True, starts=3, input_unit="V")
+    found = identify("ppi", [loop], settings, np.random.default_rng(1), lambda: 0.0)
+    assert found.peak_percent <= 2.8
+    assert set(found.parameters) == {"sigma", "alpha", "beta", "p_0", "output_offset_um"}
