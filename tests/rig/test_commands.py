@@ -1,0 +1,131 @@
+"""The commands of the README, one after the other, as a user types them."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap_protobuf.decoder import DecoderFactory
+
+CONFIGS = Path(__file__).parents[2] / "configs"
+pytestmark = pytest.mark.rig
+
+
+def hilctl(*arguments, code=0):
+    ended = subprocess.run(
+        [sys.executable, "-m", "hilctl.cli", *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        timeout=280,
+    )
+    assert ended.returncode == code, ended.stderr
+    assert "Traceback" not in ended.stderr
+    return ended.stdout
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Where this module's recordings go."""
+    return tmp_path_factory.mktemp("rig")
+
+
+@pytest.fixture(scope="module")
+def run(folder):
+    """A compensated run at full stroke, 100 Hz, and what it printed."""
+    path = folder / "run.mcap"
+    settings = ("--set", "waveform.frequency_hz=100", "--set", "waveform.duration_s=1.0")
+    printed = hilctl(
+        "run", CONFIGS / "terfenol_sine_6a.yaml", *settings, "--output", path, "--json"
+    )
+    return path, json.loads(printed)
+
+
+def test_run_prints_its_result(run):
+    """A run ends with its report; nothing is missing and the output is safe."""
+    _, result = run
+    assert result["code"] == "completed"
+    assert result["output_safe"] is True
+    assert result["samples"] == 50_000
+    assert result["dropped"] == 0
+    assert result["peak_hysteresis_percent"] < 3.7
+
+
+def test_report_is_what_run_printed(run):
+    """The report of the file alone has the same figures."""
+    path, result = run
+    report = json.loads(hilctl("report", path, "--json"))
+    for key in ("samples", "dropped", "peak_hysteresis_percent", "peak_to_peak_um", "loop_area",
+                "peak_error_percent", "rms_error_percent", "late_ticks"):  # fmt: skip
+        assert report[key] == result[key], key
+
+
+def test_page_is_written_once(run, folder):
+    """The page is self-contained, and an existing one is not replaced unasked."""
+    path, _ = run
+    page = folder / "run.html"
+    hilctl("report", path, "--html", page)
+    text = page.read_text()
+    assert text.count("data:image/png") >= 4
+    assert "http://" not in text
+    assert "https://" not in text
+    hilctl("report", path, "--html", page, code=2)
+
+
+def test_replay_is_identical(run):
+    """The recorded reference gives the recorded commands again, bit for bit."""
+    path, _ = run
+    result = json.loads(hilctl("replay", path, "--json"))
+    assert result["identical"] is True
+    assert result["samples"] >= 50_000
+
+
+def test_replay_with_another_model(run):
+    """With another model it says what that would have done, and is not a failure."""
+    path, _ = run
+    other = CONFIGS / "models" / "terfenol_omega_chapter4.yaml"
+    result = json.loads(hilctl("replay", path, "--model", other, "--json"))
+    assert 0.0 < result["rms_difference"] < 0.5
+    assert 5.0 < result["command_max"] < 7.0
+
+
+def test_export_agrees_with_an_independent_reader(run, folder):
+    """What is exported is what the stock MCAP reader decodes."""
+    path, _ = run
+    hilctl("export", path, folder / "run.npz")
+    exported = np.load(folder / "run.npz")
+    with path.open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        blocks = [d for *_, d in reader.iter_decoded_messages(topics=["/samples"])]
+    assert sum(block.n for block in blocks) == exported["current_a"].size
+    assert [block.tick0 for block in blocks][1:] == np.cumsum([b.n for b in blocks])[:-1].tolist()
+    current_a = np.concatenate([np.array(block.current_a) for block in blocks])
+    assert np.array_equal(current_a, exported["current_a"])
+
+
+def test_check_moves_nothing(folder):
+    """Check says what a run would do."""
+    forecast = json.loads(hilctl("check", CONFIGS / "demo.yaml", "--json"))
+    assert forecast["samples"] == 500_000
+    assert forecast["command_unit"] == "A"
+    assert -7.07 < forecast["command_min"] < -5.0
+
+
+def test_schema_is_current():
+    """The schema beside the experiments is the one that the code prints."""
+    assert hilctl("schema") == (CONFIGS / "schema.json").read_text()
+
+
+def test_identify_from_a_recording(folder):
+    """Recorded loops give a model file that a run can use."""
+    loops, model = folder / "piezo.mcap", folder / "piezo.yaml"
+    hilctl("run", CONFIGS / "identify_piezo.yaml", "--output", loops)
+    fit = json.loads(
+        hilctl("identify", loops, "--model", "ppi", "--whole", "--output", model, "--json")
+    )
+    assert fit["peak_percent"] < 0.5
+    settings = ("--set", f"compensator.model={model}")
+    hilctl("check", CONFIGS / "piezo_sine.yaml", *settings)
+    hilctl("identify", loops, "--model", "ppi", "--output", model, code=2)
