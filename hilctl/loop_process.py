@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 
 from hilctl.compensator import Compensator
-from hilctl.config import LoadedExperiment, resolve
 from hilctl.errors import DeviceError, HilctlError
+from hilctl.experiment import LoadedExperiment, resolve
 from hilctl.limiter import Limiter
 from hilctl.loop import Loop, Outcome, Plan
 from hilctl.pacer import Pacer, SystemClock

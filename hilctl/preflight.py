@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from hilctl.compensator import Compensator
-from hilctl.config import LoadedExperiment
 from hilctl.errors import ConfigError, InputError, ModelError, Problem
+from hilctl.experiment import LoadedExperiment
 from hilctl.waveforms.build import Reference, build
 
 _CHUNK = 1_000_000
@@ -65,41 +65,46 @@ class Checked:
     forecast: Forecast
 
 
-def check(loaded: LoadedExperiment, source: str) -> Checked:
+def check(loaded: LoadedExperiment) -> Checked:
     """Work out the whole run and hold it against device, model and limits.
 
     Args:
         loaded: The experiment.
-        source: Name of its file, for messages.
 
     Raises:
         ConfigError: The run must not start; all reasons are listed, each saying by how much.
     """
-    problems = _device_problems(loaded, source)
+    problems = _device_problems(loaded)
     config = loaded.config
     try:
         reference = build(config.waveform, config.sample_rate_hz, loaded.folder)
     except InputError as error:
-        problems.append(Problem(source, "waveform", str(error)))
+        problems.append(_problem(loaded, "waveform", str(error)))
         raise ConfigError(problems) from None
-    problems += _reference_problems(loaded, reference, source)
+    problems += _reference_problems(loaded, reference)
     try:
         forecast = _forecast(loaded, reference)
     except ModelError as error:
-        problems.append(Problem(source, "compensator.model", str(error)))
+        problems.append(_problem(loaded, "compensator.model", str(error)))
         raise ConfigError(problems) from None
-    problems += _command_problems(loaded, forecast, source)
+    problems += _command_problems(loaded, forecast)
     if problems:
         raise ConfigError(problems)
     return Checked(loaded, reference, forecast)
 
 
-def _device_problems(loaded: LoadedExperiment, source: str) -> list[Problem]:
+def _problem(
+    loaded: LoadedExperiment, key: str, rule: str, value: str = "", hint: str = ""
+) -> Problem:
+    return Problem(loaded.document.where(tuple(key.split("."))), key, rule, value, hint)
+
+
+def _device_problems(loaded: LoadedExperiment) -> list[Problem]:
     config, info = loaded.config, loaded.device.info
     found: list[Problem] = []
 
     def add(key: str, rule: str, value: object) -> None:
-        found.append(Problem(source, key, rule, str(value)))
+        found.append(_problem(loaded, key, rule, str(value)))
 
     unit = info.command_unit
     if config.limits.unit != unit:
@@ -131,9 +136,7 @@ def _device_problems(loaded: LoadedExperiment, source: str) -> list[Problem]:
     return found
 
 
-def _reference_problems(
-    loaded: LoadedExperiment, reference: Reference, source: str
-) -> list[Problem]:
+def _reference_problems(loaded: LoadedExperiment, reference: Reference) -> list[Problem]:
     if reference.unit != "um":
         return []
     low, high = float(reference.values.min()), float(reference.values.max())
@@ -147,7 +150,7 @@ def _reference_problems(
             rule = f"reference must stay within {name}, {lowest:g} to {highest:g} um"
             value = f"{low:.6g} to {high:.6g} um"
             hint = f"{excess:.3g} um too far: change the waveform's amplitude or offset"
-            found.append(Problem(source, "waveform", rule, value, hint))
+            found.append(_problem(loaded, "waveform", rule, value, hint))
     return found
 
 
@@ -181,7 +184,7 @@ def _forecast(loaded: LoadedExperiment, reference: Reference) -> Forecast:
     )
 
 
-def _command_problems(loaded: LoadedExperiment, forecast: Forecast, source: str) -> list[Problem]:
+def _command_problems(loaded: LoadedExperiment, forecast: Forecast) -> list[Problem]:
     limits = loaded.config.limits
     low, high = limits.command_range
     unit = limits.unit
@@ -189,19 +192,19 @@ def _command_problems(loaded: LoadedExperiment, forecast: Forecast, source: str)
     if not (math.isfinite(forecast.command_min) and math.isfinite(forecast.command_max)):
         rule = "every command must be a finite number"
         value = f"{forecast.command_min:.6g} to {forecast.command_max:.6g} {unit}"
-        return [Problem(source, "compensator.model", rule, value)]
+        return [_problem(loaded, "compensator.model", rule, value)]
     excess = max(low - forecast.command_min, forecast.command_max - high)
     if excess > 0.0:
         key = "limits.drive_v" if unit == "V" else "limits.peak_current_a"
         value = f"{forecast.command_min:.6g} to {forecast.command_max:.6g} {unit}"
         hint = f"{excess:.3g} {unit} too much: lower the waveform's amplitude, or raise the limit"
         rule = f"the run must stay within {low:g} to {high:g} {unit}"
-        found.append(Problem(source, key, rule, value, hint))
+        found.append(_problem(loaded, key, rule, value, hint))
     if forecast.slew_per_s > limits.slew_per_s:
         key = "limits.slew_v_per_s" if unit == "V" else "limits.slew_a_per_s"
         value = f"{forecast.slew_per_s:.6g}"
         times = forecast.slew_per_s / limits.slew_per_s
         hint = f"{times:.3g} times the limit: lower the frequency, soften the start, or raise it"
         rule = f"the run must change no faster than {limits.slew_per_s:g} {unit}/s"
-        found.append(Problem(source, key, rule, value, hint))
+        found.append(_problem(loaded, key, rule, value, hint))
     return found

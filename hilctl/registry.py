@@ -11,7 +11,7 @@ from importlib.metadata import entry_points
 
 from hilctl.errors import InputError
 from hilctl.ports import Device
-from hilctl.yamlio import did_you_mean
+from hilctl.wording import did_you_mean
 
 BUILTIN: dict[str, str] = {
     "simulated_terfenol": "hilctl_drivers.simulated:SimulatedTerfenol",

@@ -4,8 +4,8 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from hilctl.config import load_experiment
 from hilctl.errors import InputError
+from hilctl.experiment import load_experiment
 from hilctl.preflight import Checked, check
 from hilctl.supervisor import Progress, RunResult, Supervisor, default_output
 
@@ -16,7 +16,7 @@ def checked_experiment(path: Path, settings: Sequence[str]) -> Checked:
     Raises:
         InputError: It can't be used; all problems are listed.
     """
-    return check(load_experiment(path, settings), str(path))
+    return check(load_experiment(path, settings))
 
 
 def start_run(

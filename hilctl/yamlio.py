@@ -4,8 +4,6 @@ A document remembers where each value stands, so that a broken rule is reported 
 ``file:line: key: rule, got value (what to do)``.
 """
 
-import difflib
-import math
 import types
 import typing
 from collections.abc import Iterator
@@ -18,26 +16,10 @@ from pydantic_core import ErrorDetails
 
 from hilctl.errors import ConfigError, InputError, Problem
 from hilctl.plainyaml import MAX_DEPTH, compose, scalar
+from hilctl.wording import hint_of, rule_of, value_of
 
 Loc: TypeAlias = tuple[str | int, ...]
 Model = TypeVar("Model", bound=BaseModel)
-
-_RULES = {
-    "missing": "is required",
-    "extra_forbidden": "unknown key",
-    "float_type": "must be a number",
-    "int_type": "must be a whole number",
-    "int_from_float": "must be a whole number",
-    "string_type": "must be text",
-    "bool_type": "must be true or false",
-    "tuple_type": "must be a list",
-    "dict_type": "must be a mapping of keys to values",
-    "model_type": "must be a mapping of keys to values",
-    "model_attributes_type": "must be a mapping of keys to values",
-    "finite_number": "must be a finite number",
-    "union_tag_not_found": "needs a 'kind'",
-}
-_WITHOUT_VALUE = {"missing", "value_error", "extra_forbidden", "union_tag_not_found"}
 
 
 class Document:
@@ -152,13 +134,10 @@ class Document:
     def _problem(self, model: type[BaseModel], detail: ErrorDetails, at: Loc) -> Problem:
         loc, parent = _plain_loc(model, detail["loc"])
         loc = (*at, *loc)
-        kind = detail["type"]
-        rule = _RULES.get(kind) or _worded_rule(detail)
-        if kind == "union_tag_invalid":
-            loc, value = (*loc, "kind"), repr(detail["ctx"]["tag"])
-        else:
-            value = "" if kind in _WITHOUT_VALUE else shown(detail)
-        return Problem(self.where(loc), dotted(loc), rule, value, _hint(detail, loc, parent))
+        if detail["type"] == "union_tag_invalid":
+            loc = (*loc, "kind")
+        hint = hint_of(detail, list(parent.model_fields) if parent else [])
+        return Problem(self.where(loc), dotted(loc), rule_of(detail), value_of(detail), hint)
 
 
 def load_document(path: Path) -> Document:
@@ -169,6 +148,8 @@ def load_document(path: Path) -> Document:
         ConfigError: See :class:`Document`.
     """
     try:
+        if path.exists() and not path.is_file():
+            raise InputError(f"{path}: is not a file")
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
@@ -183,20 +164,6 @@ def load_document(path: Path) -> Document:
 def dotted(loc: Loc) -> str:
     """Return a location as a dotted key, list indices included."""
     return ".".join(str(part) for part in loc)
-
-
-def shown(detail: ErrorDetails) -> str:
-    """Return the offending value, short enough for one line."""
-    text = repr(detail["input"])
-    return text if len(text) <= 60 else text[:57] + "..."
-
-
-def did_you_mean(word: str, known: list[str]) -> str:
-    """Return a hint with the closest known name, or with all of them."""
-    close = difflib.get_close_matches(word, known, n=1)
-    if close:
-        return f"did you mean '{close[0]}'?"
-    return f"known: {', '.join(sorted(known))}" if known else ""
 
 
 def _syntax_problem(name: str, error: yaml.YAMLError) -> Problem:
@@ -253,50 +220,3 @@ def _plain_loc(model: type[BaseModel], loc: Loc) -> tuple[Loc, type[BaseModel] |
             field = parent.model_fields.get(part) if parent else None
             candidates = list(_models_in(field.annotation)) if field else []
     return tuple(plain), parent
-
-
-def _worded_rule(detail: ErrorDetails) -> str:
-    context = detail.get("ctx", {})
-    kind = detail["type"]
-    if kind == "value_error":
-        return str(context["error"])
-    bounds = {"greater_than": ("> ", "gt"), "greater_than_equal": (">= ", "ge"),
-              "less_than": ("< ", "lt"), "less_than_equal": ("<= ", "le")}  # fmt: skip
-    if kind in bounds:
-        sign, name = bounds[kind]
-        return f"must be {sign}{context[name]}"
-    if kind in {"literal_error", "union_tag_invalid"}:
-        expected = context.get("expected") or context.get("expected_tags")
-        return f"must be one of {expected}"
-    if kind in {"too_short", "too_long"}:
-        name = "at least" if kind == "too_short" else "at most"
-        length = context.get("min_length", context.get("max_length"))
-        return f"must have {name} {length} values"
-    message = detail["msg"]
-    return message[0].lower() + message[1:]
-
-
-def _hint(detail: ErrorDetails, loc: Loc, parent: type[BaseModel] | None) -> str:
-    value = detail["input"]
-    if detail["type"] == "extra_forbidden" and parent is not None:
-        return did_you_mean(str(loc[-1]), list(parent.model_fields))
-    if detail["type"] in {"float_type", "int_type"} and isinstance(value, str):
-        return _number_hint(value)
-    if isinstance(value, bool) and detail["type"] == "string_type":
-        return "YAML reads yes, no, on and off as true and false: put the text in quotes"
-    return ""
-
-
-def _number_hint(text: str) -> str:
-    try:
-        number = float(text)
-    except ValueError:
-        return ""
-    if not math.isfinite(number):
-        return ""
-    mantissa, e, exponent = text.lower().partition("e")
-    if e:
-        dot = mantissa if "." in mantissa else mantissa + ".0"
-        sign = "" if exponent[0] in "+-" else "+"
-        return f"YAML reads this as text: write {number!r} or {dot}e{sign}{exponent}"
-    return "remove the quotes"

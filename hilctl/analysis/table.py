@@ -23,6 +23,7 @@ _SEGMENT_HEADINGS = (
     "rms err. %",
     "loop area",
 )
+_PAGE_ONLY = {"cycles", "start s", "freq. Hz", "floor %", "loop area"}  # a terminal has 80 columns
 
 
 def number(value: float | None, unit: str = "") -> str:
@@ -122,11 +123,11 @@ def _two_columns(title: str, rows: Sequence[tuple[str, str]]) -> Table:
 def _segments(report: RunReport) -> Table:
     table = Table(title="by segment, worst above", title_justify="left")
     headings, rows = segment_table(report)
-    table.add_column(headings[0], no_wrap=True)
-    for heading in headings[1:]:
-        table.add_column(heading, justify="right")
+    shown = [i for i, heading in enumerate(headings) if heading not in _PAGE_ONLY]
+    for i in shown:
+        table.add_column(headings[i], justify="right" if i else "left", no_wrap=True)
     for cells in rows:
-        table.add_row(*(Text(cell) for cell in cells))
+        table.add_row(*(Text(cells[i]) for i in shown))
     return table
 
 

@@ -17,8 +17,8 @@ def kernel(*signatures: str, inline: bool = False) -> Callable[[Function], Funct
 
     Args:
         signatures: numba signatures, for example ``"void(float64[::1], float64[::1])"``.
-        inline: Always merge it into the kernels that call it: for helpers called once a sample.
-            Such a helper must not use an array inside ``if`` or leave a loop by ``break``; numba
+        inline: Always merge it into the kernels that call it: for those called once a sample.
+            Such a kernel must not use an array inside ``if`` or leave a loop by ``break``; numba
             then counts references to its arrays at every call, which takes longer than the work.
 
     Returns:

@@ -9,8 +9,8 @@ from hilctl.arrays import F64
 from hilctl.errors import InputError
 from hilctl.waveforms import spec
 
-MAX_SAMPLES = 200_000_000
-"""Longest reference that is held in memory: 1.6 GB."""
+MAX_SAMPLES = 100_000_000
+"""Longest reference that is held in memory: 0.8 GB, and a few times that while it is built."""
 
 
 def sample_count(duration_s: float, sample_rate_hz: float) -> int:

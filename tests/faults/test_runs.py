@@ -55,7 +55,11 @@ class Run:
         command = [sys.executable, "-m", "hilctl.cli", "run", str(experiment(folder, **changes))]
         command += ["--output", str(self.output), "--json"]
         self.process = subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=preexec
+            command,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            preexec_fn=preexec,  # noqa: PLW1509
         )
 
     def await_samples(self, size=100_000) -> None:

@@ -1,4 +1,4 @@
-"""What the compensator is for: published figures reached on the simulated rig, through a real run."""
+"""Published figures, reached on the simulated rig through real runs."""
 
 from pathlib import Path
 
@@ -16,9 +16,7 @@ pytestmark = pytest.mark.rig
 def sweep(tmp_path_factory):
     """The published compensation runs, 1 to 250 Hz at full stroke, in one recording."""
     path = tmp_path_factory.mktemp("sweep") / "run.mcap"
-    result = start_run(
-        CONFIGS / "terfenol_sweep_6a.yaml", [], path, False, lambda progress: None
-    )
+    result = start_run(CONFIGS / "terfenol_sweep_6a.yaml", [], path, False, lambda progress: None)
     assert result.code == "completed"
     return summarize(read(path))
 

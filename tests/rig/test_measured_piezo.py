@@ -1,6 +1,7 @@
-"""Measured data of a piezo micromanipulator, from the tables to a run through the model's inverse."""
+"""Measured data of a piezo micromanipulator, from tables to a run through the inverse."""
 
 import json
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -12,11 +13,11 @@ from hilctl.models.files import load_model
 from hilctl.models.ppi import PpiModel
 
 DATA = Path(__file__).parents[3] / "shared" / "data" / "yan9a_DBO"
-FIT = (
+FIT = shlex.split(
     "--model ppi --unit V --command-column 1 --displacement-column 5 --rate-hz 200 --whole "
     "--weights free --layout midpoint --plays 25 --offset --lag-samples 2 --peak-goal-percent 2.0 "
     "--json"
-).split()
+)
 
 pytestmark = [
     pytest.mark.rig,

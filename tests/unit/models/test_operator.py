@@ -1,0 +1,136 @@
+"""The streaming operator: memory, restart, offsets."""
+
+import numpy as np
+import pytest
+
+from hilctl.errors import ModelError
+from hilctl.models.deadband import DeadbandFunction
+from hilctl.models.integrated import IntegratedModel
+from hilctl.models.ppi import PpiModel
+from hilctl.models.rdpi import RdpiModel
+
+SAMPLE_RATE_HZ = 10_000.0
+PLAYS = {"direct": 2.0, "weights": (0.5, 0.3, 0.8), "thresholds": (0.2, 0.5, 1.1)}
+MODELS = {
+    "ppi": PpiModel(**PLAYS),
+    "rdpi": RdpiModel(**PLAYS, gamma_s=3e-4),
+    "integrated": IntegratedModel(
+        **PLAYS,
+        gamma_s=3e-4,
+        deadband=DeadbandFunction(
+            slope=1.2,
+            up_thresholds=(1.0, 3.0),
+            up_weights=(-0.3, -0.2),
+            down_thresholds=(-2.0,),
+            down_weights=(0.6,),
+        ),
+    ),
+}
+SIGNAL = 3.0 * np.sin(np.arange(500) / 30.0) + 0.4 * np.sin(np.arange(500) / 3.0)
+
+
+@pytest.fixture(params=MODELS)
+def model(request):
+    """One model of each kind."""
+    return MODELS[request.param]
+
+
+@pytest.fixture(params=["forward", "inverse"])
+def make(request, model):
+    """A maker of that model's operator, forward or inverse."""
+    return lambda: getattr(model, request.param)(SAMPLE_RATE_HZ)
+
+
+def test_state_is_a_copy(make):
+    """What state() hands out does not follow the operator, nor the operator it."""
+    operator = make()
+    operator.process(SIGNAL[:100])
+    state = operator.state()
+    kept = state.copy()
+    following = operator.process(SIGNAL[100:])
+    np.testing.assert_array_equal(state, kept)
+    operator.restore(state)
+    state[:] = 1e9
+    np.testing.assert_array_equal(operator.process(SIGNAL[100:]), following)
+
+
+def test_reset_goes_back_to_rest(make):
+    """After reset() the operator does what a new one does."""
+    operator = make()
+    operator.process(SIGNAL)
+    operator.reset()
+    np.testing.assert_array_equal(operator.process(SIGNAL), make().process(SIGNAL))
+
+
+def test_reset_at_a_first_input_continues_from_there(make):
+    """reset(v0) leaves the operator as a first sample of v0 does."""
+    begun, reset = make(), make()
+    begun.process(np.array([1.7]))
+    reset.process(SIGNAL)
+    reset.reset(1.7)
+    np.testing.assert_array_equal(reset.state(), begun.state())
+
+
+def test_operators_of_one_model_are_independent(model):
+    """Two operators of one model keep their memories apart."""
+    first, second = model.forward(SAMPLE_RATE_HZ), model.forward(SAMPLE_RATE_HZ)
+    first.process(SIGNAL)
+    np.testing.assert_array_equal(second.state()[:3], np.zeros(3))
+
+
+def test_a_state_of_another_model_is_refused(make):
+    """A state with another number of operators does not fit."""
+    with pytest.raises(ModelError, match=r"4 values.*got 7"):
+        make().restore(np.zeros(7))
+
+
+def test_out_is_filled_and_returned(make):
+    """Given an output array, process() fills that one; the input stays as it is."""
+    out, block = np.empty_like(SIGNAL), SIGNAL.copy()
+    assert make().process(block, out) is out
+    np.testing.assert_array_equal(out, make().process(SIGNAL))
+    np.testing.assert_array_equal(block, SIGNAL)
+
+
+def test_out_may_be_the_block_itself(make):
+    """Working in place gives the same output."""
+    block = SIGNAL.copy()
+    make().process(block, block)
+    np.testing.assert_array_equal(block, make().process(SIGNAL))
+
+
+def test_offset_moves_the_output_and_comes_off_first(model):
+    """An offset is added to the displacement and taken off before the inverse, block untouched."""
+    moved = model.model_copy(update={"output_offset_um": 7.0})
+    plain = model.forward(SAMPLE_RATE_HZ).process(SIGNAL)
+    np.testing.assert_array_equal(moved.forward(SAMPLE_RATE_HZ).process(SIGNAL), plain + 7.0)
+    block = SIGNAL + 7.0
+    shifted = moved.inverse(SAMPLE_RATE_HZ).process(block)
+    np.testing.assert_array_equal(block, SIGNAL + 7.0)
+    expected = model.inverse(SAMPLE_RATE_HZ).process(block - 7.0)
+    np.testing.assert_array_equal(shifted, expected)
+
+
+def test_only_the_rate_dependent_models_know_the_sample_rate():
+    """A PPI does the same at every sample rate; the others don't, the inverse included."""
+    for name, model in MODELS.items():
+        for make in (model.forward, model.inverse):
+            same = np.array_equal(make(1_000.0).process(SIGNAL), make(9_000.0).process(SIGNAL))
+            assert same == (name == "ppi")
+
+
+def test_inverse_rate_is_scaled_to_the_command():
+    """The inverse takes the rate of x / sum a, widened by a_0 gamma: a_0 gamma f / sum a."""
+    assert MODELS["ppi"].inverse_rate_gain(SAMPLE_RATE_HZ) == 0.0
+    gain = 2.0 * 3e-4 * SAMPLE_RATE_HZ / (2.0 + 0.5 + 0.3 + 0.8)
+    for name in ("rdpi", "integrated"):
+        assert MODELS[name].inverse_rate_gain(SAMPLE_RATE_HZ) == pytest.approx(gain, rel=1e-14)
+
+
+def test_deadband_function_and_its_inverse_cancel():
+    """Lambda after its inverse, and the other way round, return what went in."""
+    function = MODELS["integrated"].deadband
+    x = np.linspace(-9.0, 9.0, 2_001)
+    np.testing.assert_allclose(function.inverse()(function(x)), x, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(function(function.inverse()(x)), x, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(function.inverse().inverse()(x), function(x), rtol=0, atol=1e-12)

@@ -1,0 +1,219 @@
+"""Published figures, reproduced from the published parameters."""
+
+import numpy as np
+import pytest
+
+from hilctl.kernels.hysteresis import play_sum_shared, rest_memory
+from hilctl.models.deadband import DeadbandFunction
+from hilctl.models.plays import inverse_plays
+from hilctl.models.published import exponential_integrated, piezo_ppi, terfenol_rdpi
+from hilctl.models.spi import SpiCompensator
+
+SAMPLE_RATE_HZ = 50_000.0
+SPI_DIRECT = 2.146
+SPI_THRESHOLDS = (
+    0.9108, 1.9418, 3.0797, 4.3122, 5.6285, 7.0194, 8.4762, 9.9915, 11.5587, 13.1716,
+)  # fmt: skip
+SPI_WEIGHTS = (
+    0.4544, 0.3230, 0.2397, 0.1831, 0.1444, 0.1156, 0.0941, 0.0774, 0.0642, 0.0543,
+)  # fmt: skip
+FREQUENCIES_HZ = [1.0, 10.0, 50.0, 100.0, 200.0, 250.0]
+
+
+@pytest.fixture
+def omega():
+    """An integrated model of the published form, 12 plays and 17 deadbands, gamma > 0."""
+    return exponential_integrated(
+        alpha=0.3, gamma_s=2e-4, a_0=1.0, alpha_0=0.2, beta_0=0.3, g_0=6.0,
+        alpha_1=0.3, beta_1=0.1, d_p=0.8, alpha_2=0.4, beta_2=0.1, d_n=0.8,
+    )  # fmt: skip
+
+
+def sine(amplitude, frequency_hz, cycles=3):
+    n = round(cycles * SAMPLE_RATE_HZ / frequency_hz)
+    return amplitude * np.sin(2 * np.pi * frequency_hz * np.arange(n) / SAMPLE_RATE_HZ)
+
+
+def peak_hysteresis_percent(v, y, frequency_hz):
+    """H_P / M_P over the last cycle: widest gap between the branches over the stroke."""
+    n = round(SAMPLE_RATE_HZ / frequency_hz)
+    start = np.argmax(v[-n:])
+    v, y = np.roll(v[-n:], -start), np.roll(y[-n:], -start)
+    falling, rising = slice(0, n // 2), slice(n // 2, n)
+    grid = np.linspace(v.min(), v.max(), 2_001)[1:-1]
+    descending = np.interp(grid, v[falling][::-1], y[falling][::-1])
+    ascending = np.interp(grid, v[rising], y[rising])
+    return 100.0 * np.max(descending - ascending) / np.ptp(y)
+
+
+def shared(v, widening, direct, weights, thresholds):
+    out = np.empty_like(v)
+    play_sum_shared(v, widening, direct, thresholds, weights, rest_memory(weights.size), out)
+    return out
+
+
+def widening_of(model, v):
+    return model.threshold_growth_s * np.abs(np.diff(v, prepend=v[0])) * SAMPLE_RATE_HZ
+
+
+def test_spi_direct_weight_from_the_published_ppi():
+    """w_0 from the published PPI is the published one."""
+    assert SpiCompensator.of(piezo_ppi()).direct == pytest.approx(SPI_DIRECT, abs=0.002)
+
+
+@pytest.mark.parametrize("i", range(10))
+def test_spi_from_the_published_ppi(i):
+    """Each threshold and weight is the published one, within its inputs' rounding."""
+    spi = SpiCompensator.of(piezo_ppi())
+    assert spi.thresholds[i] == pytest.approx(SPI_THRESHOLDS[i], abs=0.002)
+    assert spi.weights[i] == pytest.approx(SPI_WEIGHTS[i], abs=0.002)
+
+
+def test_spi_weights_are_those_of_the_inverse_ppi():
+    """w_0 + sum w_i = 1/p_0, w_i is minus the inverse's i-th weight, the thresholds agree."""
+    ppi = piezo_ppi()
+    spi = SpiCompensator.of(ppi)
+    direct, weights, thresholds = ppi.inverse_parameters()
+    assert spi.direct + spi.weights.sum() == pytest.approx(direct, rel=1e-12)
+    np.testing.assert_allclose(spi.weights, -weights, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(spi.thresholds, thresholds, rtol=1e-13)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_spi_is_the_inverse_ppi(seed):
+    """On any signal, offset or not, both operators put out the same to 1e-12."""
+    rng = np.random.default_rng(seed)
+    y = 12.0 * rng.uniform(-1.0, 1.0, 400).repeat(3) + 0.3 * rng.standard_normal(1_200)
+    ppi = piezo_ppi().model_copy(update={"output_offset_um": 1.5 * (seed % 2)})
+    by_stops = SpiCompensator.of(ppi).operator().process(y)
+    by_plays = ppi.inverse(SAMPLE_RATE_HZ).process(y)
+    assert np.max(np.abs(by_stops - by_plays)) <= 1e-12 * np.max(np.abs(by_plays))
+
+
+def test_spi_of_a_model_without_hysteresis_is_a_gain():
+    """No plays, no stops: the compensator divides by p_0."""
+    ppi = piezo_ppi().model_copy(update={"weights": (), "thresholds": ()})
+    y = sine(3.0, 50.0)
+    np.testing.assert_allclose(SpiCompensator.of(ppi).operator().process(y), y / 0.2567, rtol=1e-15)
+
+
+@pytest.mark.parametrize(("frequency_hz", "percent"), [(1.0, 18.0), (100.0, 26.6), (200.0, 34.3)])
+def test_rdpi_peak_hysteresis(frequency_hz, percent):
+    """The n = 4 model at 2.3 A has 18 % at 1 Hz and grows with the frequency as published."""
+    v = sine(2.3, frequency_hz)
+    y = terfenol_rdpi().forward(SAMPLE_RATE_HZ).process(v)
+    assert peak_hysteresis_percent(v, y, frequency_hz) == pytest.approx(percent, abs=0.3)
+
+
+@pytest.mark.parametrize("frequency_hz", FREQUENCIES_HZ)
+def test_rdpi_and_its_inverse_cancel_with_shared_thresholds(frequency_hz):
+    """Model after inverse and inverse after model return the input to 1e-12."""
+    model = terfenol_rdpi()
+    weights, thresholds = np.array(model.weights), np.array(model.thresholds)
+    inverse = model.inverse_parameters()
+    for v in (sine(2.3, frequency_hz), 1.0 + sine(0.7, frequency_hz) + sine(1.1, frequency_hz)):
+        growth = widening_of(model, v)
+        y = shared(v, growth, model.direct, weights, thresholds)
+        back = shared(y, model.direct * growth, *inverse)
+        assert np.max(np.abs(back - v)) <= 1e-12 * np.max(np.abs(v))
+        command = shared(v, model.direct * growth, *inverse)
+        again = shared(command, growth, model.direct, weights, thresholds)
+        assert np.max(np.abs(again - v)) <= 1e-12 * np.max(np.abs(v))
+
+
+@pytest.mark.parametrize("frequency_hz", FREQUENCIES_HZ)
+def test_integrated_and_its_inverse_cancel_with_shared_thresholds(omega, frequency_hz):
+    """Lambda, Pi, Pi^-1 and Lambda^-1 in a row return the input to 1e-12, both ways."""
+    weights, thresholds = np.array(omega.weights), np.array(omega.thresholds)
+    inverse, unbend = omega.inverse_parameters(), omega.deadband.inverse()
+    v = sine(5.0, frequency_hz) + sine(1.0, 2 * frequency_hz, cycles=6)
+    growth = widening_of(omega, v)
+    y = omega.deadband(shared(v, growth, omega.direct, weights, thresholds))
+    back = shared(unbend(y), omega.direct * growth, *inverse)
+    assert np.max(np.abs(back - v)) <= 1e-12 * np.max(np.abs(v))
+    command = shared(unbend(y), omega.direct * growth, *inverse)
+    again = omega.deadband(shared(command, growth, omega.direct, weights, thresholds))
+    assert np.max(np.abs(again - y)) <= 1e-12 * np.max(np.abs(y))
+
+
+def test_thresholds_that_are_not_shared_do_not_cancel():
+    """The test above means something: leaving out the scale a_0 costs far more than rounding."""
+    model = terfenol_rdpi()
+    v = sine(2.3, 100.0)
+    growth = widening_of(model, v)
+    y = shared(v, growth, model.direct, np.array(model.weights), np.array(model.thresholds))
+    back = shared(y, growth, *model.inverse_parameters())
+    assert np.max(np.abs(back - v)) > 1e-3
+
+
+@pytest.mark.parametrize("frequency_hz", FREQUENCIES_HZ)
+def test_without_rate_the_integrated_operators_cancel(omega, frequency_hz):
+    """With gamma 0 the streaming inverse, then the model, return the reference to 1e-12."""
+    still = omega.model_copy(update={"gamma_s": 0.0, "output_offset_um": 4.0})
+    y = sine(40.0, frequency_hz) - 7.0
+    command = still.inverse(SAMPLE_RATE_HZ).process(y)
+    back = still.forward(SAMPLE_RATE_HZ).process(command)
+    assert np.max(np.abs(back - y)) <= 1e-12 * np.max(np.abs(y))
+
+
+def test_with_rate_the_inverse_leaves_little():
+    """With the published n = 4 set what remains grows with the rate: the actuator has its own."""
+    model = terfenol_rdpi()
+    remaining = []
+    for frequency_hz in (1.0, 100.0, 200.0):
+        y = sine(13.0, frequency_hz)
+        command = model.inverse(SAMPLE_RATE_HZ).process(y)
+        back = model.forward(SAMPLE_RATE_HZ).process(command)
+        n = round(SAMPLE_RATE_HZ / frequency_hz)
+        remaining.append(np.max(np.abs(back - y)[-n:]) / np.ptp(y) * 100.0)
+    assert remaining[0] < 0.1 < remaining[1] < remaining[2] < 10.0
+
+
+def test_inverse_plays_follow_the_published_relations():
+    """Rising by (a_0 + ... + a_i)(r_{i+1} - r_i) from a_0 r_1; reciprocal slopes (5.8-5.10)."""
+    a, r = [1.2, 0.3, 0.0, 0.7, 0.2], [0.4, 0.9, 1.0, 2.5]
+    direct, weights, thresholds = inverse_plays(a[0], np.array(a[1:]), np.array(r))
+    expected = [a[0] * r[0]]
+    for i in range(1, 4):
+        expected.append(expected[-1] + sum(a[: i + 1]) * (r[i] - r[i - 1]))
+    assert direct == 1.0 / a[0]
+    np.testing.assert_allclose(thresholds, expected, rtol=1e-14)
+    relations = [1.0 / sum(a[: i + 1]) - 1.0 / sum(a[:i]) for i in range(1, 5)]
+    np.testing.assert_allclose(weights, relations, rtol=1e-14, atol=1e-16)
+
+
+def test_inverse_deadbands_follow_the_published_relations(omega):
+    """Thresholds Lambda(d_j), weights -g_j / (S_j S_{j-1}), both sides (6.13-6.16)."""
+    function, inverse = omega.deadband, omega.deadband.inverse()
+    assert inverse.slope == 1.0 / function.slope
+    for d, g, dh, gh in (
+        (function.up_thresholds, function.up_weights, inverse.up_thresholds, inverse.up_weights),
+        (function.down_thresholds, function.down_weights,
+         inverse.down_thresholds, inverse.down_weights),
+    ):  # fmt: skip
+        slope = function.slope
+        for j in range(8):
+            corner = function.slope * d[j] + sum(g[i] * (d[j] - d[i]) for i in range(j))
+            assert dh[j] == pytest.approx(corner, rel=1e-14)
+            assert gh[j] == pytest.approx(-g[j] / ((slope + g[j]) * slope), rel=1e-11)
+            slope += g[j]
+
+
+def test_exponential_parameters_are_the_published_ones(omega):
+    """Omega has evenly spaced thresholds and exponential weights of the published signs."""
+    assert omega.operators == 12
+    np.testing.assert_allclose(omega.thresholds, 0.3 * np.arange(1, 13))
+    np.testing.assert_allclose(omega.weights, 0.2 * np.exp(-0.3 * np.arange(1, 13)))
+    deadband = omega.deadband
+    assert isinstance(deadband, DeadbandFunction)
+    np.testing.assert_allclose(deadband.up_thresholds, 0.8 * np.arange(1, 9))
+    np.testing.assert_allclose(deadband.up_weights, -0.3 * np.exp(-0.1 * np.arange(1, 9)))
+    np.testing.assert_allclose(deadband.down_thresholds, -0.8 * np.arange(1, 9))
+    np.testing.assert_allclose(deadband.down_weights, 0.4 * np.exp(-0.1 * np.arange(1, 9)))
+
+
+def test_published_models_say_where_they_come_from():
+    """Units and provenance travel with the parameters."""
+    assert piezo_ppi().input_unit == "V"
+    assert terfenol_rdpi().input_unit == "A"
+    assert "Concordia" in piezo_ppi().provenance.source[0]

@@ -1,0 +1,269 @@
+"""Soft starts and ends, sequences, and what of a waveform is judged."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hilctl.errors import InputError
+from hilctl.segments import Segment
+from hilctl.waveforms import shapes
+from hilctl.waveforms.build import Reference, build
+from hilctl.waveforms.spec import Hold
+
+Made = Callable[..., Reference]
+SINE: dict[str, Any] = {"kind": "sine", "amplitude": 6.0, "frequency_hz": 10.0}
+
+
+def raised_cosine(x: float) -> float:
+    return float(np.sin(0.5 * np.pi * x) ** 2)
+
+
+class TestSoft:
+    """Soft starts and ends."""
+
+    def test_envelope(self, made: Made) -> None:
+        """A soft waveform is 0 at both ends, and between them as if there were no softness."""
+        hard = made(1000.0, **SINE, offset=3.0, duration_s=1.0).values
+        soft = made(1000.0, **SINE, offset=3.0, duration_s=1.0, soft_start_s=0.2, soft_end_s=0.3)
+        values = soft.values
+        assert values[0] == 0.0
+        assert values[-1] == 0.0
+        np.testing.assert_array_equal(values[200:700], hard[200:700])
+        grow = np.array([raised_cosine(k / 200) for k in range(200)])
+        shrink = np.array([raised_cosine(k / 300) for k in range(300)])[::-1]
+        np.testing.assert_allclose(values[:200], grow * hard[:200], rtol=0.0, atol=1e-12)
+        np.testing.assert_allclose(values[700:], shrink * hard[700:], rtol=0.0, atol=1e-12)
+
+    def test_offset_is_softened_too(self, made: Made) -> None:
+        """A held level grows from 0 and shrinks to 0 without a step, and never overshoots."""
+        keys = {"kind": "hold", "level": 2.0, "offset": -7.0, "duration_s": 1.0}
+        values = made(1000.0, **keys, soft_start_s=0.5, soft_end_s=0.5).values
+        assert values[0] == 0.0
+        assert values[-1] == 0.0
+        assert values[500] == pytest.approx(-5.0, abs=1e-4)
+        assert values.min() >= -5.0
+        assert np.max(np.abs(np.diff(values))) < 5.0 * np.pi / 2.0 / 500.0 * 1.001
+        assert np.all(np.diff(values[:500]) < 0.0)
+        assert np.all(np.diff(values[500:]) > 0.0)
+
+    def test_segment_leaves_soft_parts_out(self, made: Made) -> None:
+        """The steady part lies between soft start and soft end."""
+        reference = made(1000.0, **SINE, duration_s=1.0, soft_start_s=0.2, soft_end_s=0.3)
+        assert reference.segments == (Segment("sine 6 A 10 Hz", 0, 1000, 200, 700, 100.0),)
+
+    def test_halves_of_an_odd_number_of_samples(self, made: Made) -> None:
+        """Soft start and end that fill the duration fit, however the samples round."""
+        keys = {"soft_start_s": 0.5, "soft_end_s": 0.5}
+        reference = made(1003.0, **SINE, duration_s=1.0, **keys)
+        segment = reference.segments[0]
+        assert segment.stop == 1003
+        assert 501 <= segment.steady_start <= segment.steady_stop <= 502
+        assert reference.values[0] == 0.0
+        assert reference.values[-1] == 0.0
+
+    def test_decimal_times(self, made: Made) -> None:
+        """A soft start of 0.29 s at 100 Hz is 29 samples, whatever binary fractions make of it."""
+        reference = made(100.0, **SINE, duration_s=1.0, soft_start_s=0.29)
+        assert reference.segments[0].steady_start == 29
+
+
+class TestSequence:
+    """Waveforms one after the other."""
+
+    PARTS: tuple[dict[str, Any], ...] = (
+        {**SINE, "duration_s": 0.5, "soft_start_s": 0.1},
+        {"kind": "hold", "level": 2.0, "duration_s": 0.2},
+        {"kind": "triangle", "amplitude": 1.0, "frequency_hz": 20.0, "duration_s": 0.3},
+    )
+
+    def test_is_its_parts_one_after_the_other(self, made: Made) -> None:
+        """The samples of a sequence are those of its parts, repeated as often as asked."""
+        alone = np.concatenate([made(1000.0, **part).values for part in self.PARTS])
+        once = made(1000.0, kind="sequence", parts=self.PARTS)
+        thrice = made(1000.0, kind="sequence", parts=self.PARTS, repeat=3)
+        np.testing.assert_array_equal(once.values, alone)
+        np.testing.assert_array_equal(thrice.values, np.tile(alone, 3))
+
+    def test_segments_stand_where_their_parts_do(self, made: Made) -> None:
+        """Each part is a segment of its own, steady part and period included."""
+        reference = made(1000.0, kind="sequence", unit="A", parts=self.PARTS, repeat=2)
+        one = (
+            Segment("sine 6 A 10 Hz", 0, 500, 100, 500, 100.0),
+            Segment("hold 2 A", 500, 700, 500, 700, 0.0),
+            Segment("triangle 1 A 20 Hz", 700, 1000, 700, 1000, 50.0),
+        )
+        assert reference.segments == one + tuple(each.shifted(1000) for each in one)
+
+    def test_time_starts_anew_in_each_part(self, made: Made) -> None:
+        """The second of two equal sines starts at its own phase 0, mid-cycle cuts or not."""
+        part = {**SINE, "duration_s": 0.13}
+        values = made(1000.0, kind="sequence", parts=(part, part)).values
+        np.testing.assert_array_equal(values[130:], values[:130])
+        assert values[130] == 0.0
+
+
+LABELS: list[tuple[dict[str, Any], str, float]] = [
+    ({**SINE, "duration_s": 1.0}, "sine 6 A 10 Hz", 100.0),
+    ({**SINE, "kind": "triangle", "duration_s": 1.0}, "triangle 6 A 10 Hz", 100.0),
+    ({**SINE, "frequency_hz": 3.0, "duration_s": 1.0}, "sine 6 A 3 Hz", 1000.0 / 3.0),
+    ({**SINE, "kind": "growing", "duration_s": 1.0}, "growing 6 A 10 Hz", 0.0),
+    ({**SINE, "kind": "decaying", "duration_s": 1.0}, "decaying 6 A 10 Hz", 0.0),
+    (
+        {
+            "kind": "complex_harmonic",
+            "components": (
+                {"amplitude": 4.0, "frequency_hz": 2.5},
+                {"amplitude": 3.0, "frequency_hz": 7.5},
+            ),
+            "duration_s": 1.0,
+        },
+        "complex harmonic 4 A 2.5 Hz + 3 A 7.5 Hz",
+        400.0,
+    ),
+    (
+        {"kind": "chirp", "amplitude": 2.0, "start_hz": 1.0, "stop_hz": 50.0, "duration_s": 1.0},
+        "chirp 2 A 1-50 Hz",
+        0.0,
+    ),
+    ({"kind": "step", "levels": (1.0, 2.0), "dwell_s": 0.5}, "step", 0.0),
+    ({"kind": "hold", "level": -2.5, "duration_s": 1.0}, "hold -2.5 A", 0.0),
+    (
+        {
+            "kind": "multisine",
+            "amplitude": 3.0,
+            "first_hz": 15.0,
+            "last_hz": 45.0,
+            "step_hz": 10.0,
+            "duration_s": 1.0,
+        },
+        "multisine 3 A 15-45 Hz",
+        200.0,
+    ),
+]
+
+
+@pytest.mark.parametrize(("keys", "label", "period"), LABELS, ids=[case[1] for case in LABELS])
+def test_label_and_period(made: Made, keys: dict[str, Any], label: str, period: float) -> None:
+    """A segment says what runs there; its period is that of the samples."""
+    reference = made(1000.0, **keys)
+    segment = reference.segments[0]
+    assert segment.label == label
+    assert (segment.start, segment.stop) == (0, 1000)
+    assert (segment.steady_start, segment.steady_stop) == (0, 1000)
+    assert segment.period == pytest.approx(period, rel=1e-15)
+    if period and period == round(period):
+        values = reference.values
+        whole = round(period)
+        np.testing.assert_allclose(values[whole:], values[:-whole], rtol=0.0, atol=1e-9)
+
+
+def test_period_too_long_to_count_is_none(made: Made) -> None:
+    """A waveform that would repeat only after longer than a float can hold has no period."""
+    reference = made(1000.0, kind="sine", amplitude=1.0, frequency_hz=1e-320, duration_s=0.1)
+    assert reference.segments[0].period == 0.0
+    assert reference.segments[0].steady_cycles() == (0, 100, 0)
+
+
+SAME: dict[str, Any] = {"amplitude": 1.0, "duration_s": 1.0}
+REFUSED: list[tuple[dict[str, Any], str]] = [
+    (
+        {"kind": "sine", "frequency_hz": 500.5, **SAME},
+        "sine: every frequency must be below half the sample rate, 500 Hz: 500.5 Hz",
+    ),
+    (
+        {"kind": "triangle", "frequency_hz": 500.0, **SAME},
+        "triangle: every frequency must be below half the sample rate, 500 Hz: 500 Hz",
+    ),
+    (
+        {"kind": "chirp", "start_hz": 1.0, "stop_hz": 600.0, **SAME},
+        "chirp: every frequency must be below half the sample rate, 500 Hz: 600 Hz",
+    ),
+    (
+        {"kind": "chirp", "start_hz": 600.0, "stop_hz": 1.0, **SAME},
+        "chirp: every frequency must be below half the sample rate, 500 Hz: 600 Hz",
+    ),
+    (
+        {"kind": "multisine", "first_hz": 1.0, "last_hz": 501.0, "step_hz": 1.0, **SAME},
+        "multisine: every frequency must be below half the sample rate, 500 Hz: 501 Hz",
+    ),
+    (
+        {
+            "kind": "complex_harmonic",
+            "duration_s": 1.0,
+            "components": (
+                {"amplitude": 1.0, "frequency_hz": 10.0},
+                {"amplitude": 1.0, "frequency_hz": 700.0},
+            ),
+        },
+        "complex_harmonic: every frequency must be below half the sample rate, 500 Hz: 700 Hz",
+    ),
+    (
+        {**SINE, "duration_s": 1.0, "soft_start_s": 0.7, "soft_end_s": 0.4},
+        "sine: soft_start_s + soft_end_s = 1.1 s must fit in its 1 s",
+    ),
+    (
+        {**SINE, "duration_s": 1.0, "soft_start_s": 0.501, "soft_end_s": 0.5},
+        "sine: soft_start_s + soft_end_s = 1.001 s must fit in its 1 s",
+    ),
+    (
+        {**SINE, "duration_s": 1.0, "soft_start_s": 1e308, "soft_end_s": 1e308},
+        "sine: soft_start_s + soft_end_s = inf s must fit in its 1 s",
+    ),
+    (
+        {"kind": "step", "levels": (1.0,) * 5, "dwell_s": 0.1, "soft_end_s": 0.6},
+        "step: soft_start_s + soft_end_s = 0.6 s must fit in its 0.5 s",
+    ),
+    (
+        {**SINE, "duration_s": 100_001.0},
+        "has 100001000 samples, more than the 100000000 that fit in memory: shorten it or lower "
+        "sample_rate_hz",
+    ),
+    (
+        {**SINE, "duration_s": 1e308},
+        "has inf samples, more than the 100000000 that fit in memory: shorten it or lower "
+        "sample_rate_hz",
+    ),
+    (
+        {**SINE, "amplitude": 1.7e308, "offset": 1.7e308, "duration_s": 1.0, "soft_start_s": 0.1},
+        "amplitude, offset or scale is too large: a value is not finite",
+    ),
+]
+
+
+@pytest.mark.parametrize(("keys", "text"), REFUSED)
+def test_refused(made: Made, keys: dict[str, Any], text: str) -> None:
+    """What can't be sampled is refused with the numbers that say why."""
+    with pytest.raises(InputError) as caught:
+        made(1000.0, **keys)
+    assert str(caught.value) == text
+
+
+class TestSequenceRefused:
+    """Parts of a sequence that can't be sampled."""
+
+    def test_the_part_is_named(self, made: Made) -> None:
+        """The message says which part, counted as in the file's key."""
+        parts = ({**SINE, "duration_s": 1.0}, {**SINE, "frequency_hz": 900.0, "duration_s": 1.0})
+        with pytest.raises(InputError, match=r"^parts\.1 \(sine\): every frequency .*: 900 Hz$"):
+            made(1000.0, kind="sequence", parts=parts)
+
+    def test_length_counts_repeats_before_anything_is_repeated(
+        self, made: Made, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """A sequence too long by its repeats is refused; one that just fits is built."""
+        monkeypatch.setattr(shapes, "MAX_SAMPLES", 6000)
+        parts = ({**SINE, "duration_s": 1.0},) * 2
+        assert made(1000.0, kind="sequence", parts=parts, repeat=3).values.size == 6000
+        with pytest.raises(InputError, match="has 8000 samples, more than the 6000"):
+            made(1000.0, kind="sequence", parts=parts, repeat=4)
+        with pytest.raises(InputError, match="has 10000000 samples"):
+            made(1000.0, kind="sequence", parts=parts, repeat=10_000)
+
+
+def test_unit_is_needed() -> None:
+    """Without a unit nobody knows what the numbers are."""
+    with pytest.raises(InputError, match="unit is required: um, A or V"):
+        build(Hold(kind="hold", level=1.0, duration_s=1.0), 1000.0, Path())

@@ -1,0 +1,333 @@
+"""Every kind of waveform against its closed form, written out here a second time."""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hilctl.arrays import F64
+from hilctl.waveforms.build import Reference
+from hilctl.waveforms.shapes import common_period_s, sample_count
+
+RATE_HZ = 2000.0
+Made = Callable[..., Reference]
+
+
+def sampled(value: Callable[[float], float], n: int, rate_hz: float = RATE_HZ) -> F64:
+    return np.array([value(k / rate_hz) for k in range(n)])
+
+
+def triangle_wave(cycles: float) -> float:
+    part = cycles % 1.0
+    if part < 0.25:
+        return 4.0 * part
+    return 2.0 - 4.0 * part if part < 0.75 else 4.0 * part - 4.0
+
+
+CASES: list[tuple[dict[str, Any], Callable[[float], float]]] = [
+    (
+        {"kind": "sine", "amplitude": 6.0, "frequency_hz": 12.5, "duration_s": 0.5},
+        lambda t: 6.0 * math.sin(2 * math.pi * 12.5 * t),
+    ),
+    (
+        {
+            "kind": "sine",
+            "amplitude": 2.0,
+            "frequency_hz": 100,
+            "phase_deg": -30.0,
+            "offset": -7.25,
+            "duration_s": 0.3,
+        },
+        lambda t: -7.25 + 2.0 * math.sin(2 * math.pi * 100 * t - math.pi / 6),
+    ),
+    (
+        {
+            "kind": "triangle",
+            "amplitude": 3.0,
+            "frequency_hz": 7.0,
+            "offset": 1.0,
+            "duration_s": 0.4,
+        },
+        lambda t: 1.0 + 3.0 * triangle_wave(7.0 * t),
+    ),
+    (
+        {
+            "kind": "complex_harmonic",
+            "components": (
+                {"amplitude": 4.0, "frequency_hz": 20.0},
+                {"amplitude": 3.0, "frequency_hz": 60.0, "phase_deg": 90.0},
+            ),
+            "duration_s": 0.2,
+        },
+        lambda t: 4.0 * math.sin(2 * math.pi * 20 * t) + 3.0 * math.cos(2 * math.pi * 60 * t),
+    ),
+    (
+        {"kind": "growing", "amplitude": 7.0, "frequency_hz": 10.0, "duration_s": 1.0},
+        lambda t: 7.0 * t * math.sin(2 * math.pi * 10 * t),
+    ),
+    (
+        {"kind": "decaying", "amplitude": 7.0, "frequency_hz": 10.0, "duration_s": 2.0},
+        lambda t: 7.0 * (1 - t / 2.0) * math.sin(2 * math.pi * 10 * t),
+    ),
+    (
+        {
+            "kind": "chirp",
+            "amplitude": 2.0,
+            "start_hz": 5.0,
+            "stop_hz": 45.0,
+            "duration_s": 0.8,
+        },
+        lambda t: 2.0 * math.sin(2 * math.pi * (5.0 * t + 25.0 * t * t)),
+    ),
+    (
+        {
+            "kind": "chirp",
+            "amplitude": 2.0,
+            "start_hz": 5.0,
+            "stop_hz": 80.0,
+            "spacing": "logarithmic",
+            "duration_s": 0.5,
+        },
+        lambda t: 2.0 * math.sin(2 * math.pi * 5.0 * 0.5 / math.log(16) * (16 ** (2 * t) - 1)),
+    ),
+    (
+        {"kind": "hold", "level": -3.5, "offset": 1.0, "duration_s": 0.1},
+        lambda _: -2.5,
+    ),
+]
+
+
+@pytest.mark.parametrize(
+    ("keys", "closed_form"), CASES, ids=[f"{i}-{keys['kind']}" for i, (keys, _) in enumerate(CASES)]
+)
+def test_closed_form(
+    made: Made, keys: dict[str, Any], closed_form: Callable[[float], float]
+) -> None:
+    """Every sample is the closed form at k / sample rate."""
+    reference = made(RATE_HZ, **keys)
+    n = round(keys["duration_s"] * RATE_HZ)
+    assert reference.values.dtype == np.float64
+    assert reference.values.shape == (n,)
+    np.testing.assert_allclose(reference.values, sampled(closed_form, n), rtol=0.0, atol=1e-11)
+    assert reference.unit == "A"
+    assert reference.sample_rate_hz == RATE_HZ
+
+
+class TestStep:
+    """Levels one after the other."""
+
+    def test_levels_without_a_rise(self, made: Made) -> None:
+        """Each level stands from the first sample of its dwell to the last."""
+        values = made(100.0, kind="step", levels=(1.0, -2.0, 0.5), dwell_s=0.3, offset=10.0).values
+        np.testing.assert_array_equal(values, np.repeat([11.0, 8.0, 10.5], 30))
+
+    def test_rise_is_linear_from_the_level_before(self, made: Made) -> None:
+        """A level is reached from the one before, the first from 0, in rise_s."""
+        values = made(10.0, kind="step", levels=(4.0, 2.0), dwell_s=1.0, rise_s=0.4).values
+        first = [0.0, 1.0, 2.0, 3.0] + [4.0] * 6
+        second = [4.0, 3.5, 3.0, 2.5] + [2.0] * 6
+        np.testing.assert_allclose(values, first + second, rtol=0.0, atol=1e-12)
+
+    def test_rise_as_long_as_the_dwell(self, made: Made) -> None:
+        """A staircase whose rises fill the dwells is a ramp."""
+        values = made(100.0, kind="step", levels=(1.0, 2.0, 3.0), dwell_s=0.5, rise_s=0.5).values
+        np.testing.assert_allclose(values, np.arange(150) / 50.0, rtol=0.0, atol=1e-12)
+
+    def test_dwells_that_are_no_binary_fraction(self, made: Made) -> None:
+        """Two thousand dwells of 0.1 s at 10 Hz are one sample each, none early or late."""
+        levels = tuple(float(k) for k in range(2000))
+        values = made(10.0, kind="step", levels=levels, dwell_s=0.1).values
+        np.testing.assert_array_equal(values, levels)
+
+
+def rising_crossings_s(values: F64, rate_hz: float) -> F64:
+    """Return the interpolated times at which a signal goes up through 0."""
+    k = np.flatnonzero((values[:-1] < 0.0) & (values[1:] >= 0.0))
+    return (k - values[k] / (values[k + 1] - values[k])) / rate_hz
+
+
+class TestChirp:
+    """The frequency that a chirp has at each time."""
+
+    @pytest.mark.parametrize(("start_hz", "stop_hz"), [(10.0, 200.0), (200.0, 10.0)])
+    def test_linear_frequency(self, made: Made, start_hz: float, stop_hz: float) -> None:
+        """A cycle of a linear chirp lasts one over the frequency at its middle."""
+        keys = {"start_hz": start_hz, "stop_hz": stop_hz, "duration_s": 2.0}
+        values = made(50e3, kind="chirp", amplitude=1.0, **keys).values
+        times = rising_crossings_s(values, 50e3)
+        middle = 0.5 * (times[1:] + times[:-1])
+        expected = start_hz + (stop_hz - start_hz) * middle / 2.0
+        np.testing.assert_allclose(1.0 / np.diff(times), expected, rtol=2e-4)
+        assert times.size == pytest.approx(2.0 * (start_hz + stop_hz) / 2.0, abs=1.0)
+
+    @pytest.mark.parametrize(("start_hz", "stop_hz"), [(10.0, 1000.0), (1000.0, 10.0)])
+    def test_logarithmic_frequency(self, made: Made, start_hz: float, stop_hz: float) -> None:
+        """A logarithmic chirp takes the same time for every decade."""
+        keys = {"start_hz": start_hz, "stop_hz": stop_hz, "duration_s": 2.0}
+        values = made(50e3, kind="chirp", amplitude=1.0, spacing="logarithmic", **keys).values
+        times = rising_crossings_s(values, 50e3)
+        middle = 0.5 * (times[1:] + times[:-1])
+        expected = start_hz * (stop_hz / start_hz) ** (middle / 2.0)
+        np.testing.assert_allclose(1.0 / np.diff(times), expected, rtol=3e-3)
+        at_half = np.interp(1.0, middle, 1.0 / np.diff(times))
+        assert at_half == pytest.approx(100.0, rel=0.01)
+
+    @pytest.mark.parametrize("stop_hz", [5.0, np.nextafter(5.0, 6.0)])
+    def test_a_frequency_that_stands_still(self, made: Made, stop_hz: float) -> None:
+        """A logarithmic chirp from a frequency to the same, or to its neighbour, is a sine."""
+        keys = {"start_hz": 5.0, "stop_hz": float(stop_hz), "duration_s": 1.0}
+        values = made(1000.0, kind="chirp", amplitude=2.0, spacing="logarithmic", **keys).values
+        expected = sampled(lambda t: 2.0 * math.sin(10 * math.pi * t), 1000, 1000.0)
+        np.testing.assert_allclose(values, expected, rtol=0.0, atol=1e-11)
+
+    def test_from_a_frequency_near_nothing(self, made: Made) -> None:
+        """Frequencies hundreds of decades apart give finite samples."""
+        keys = {"start_hz": 400.0, "stop_hz": 1e-320, "duration_s": 1.0}
+        values = made(1000.0, kind="chirp", amplitude=2.0, spacing="logarithmic", **keys).values
+        assert np.isfinite(values).all()
+
+
+BAND: dict[str, Any] = {"kind": "multisine", "first_hz": 10.0, "last_hz": 100.0, "step_hz": 5.0}
+
+
+class TestMultisine:
+    """Equal sines at evenly spaced frequencies."""
+
+    def test_lines(self, made: Made) -> None:
+        """The spectrum has equal lines at first, first + step, ... last, and nothing else."""
+        values = made(1000.0, amplitude=3.0, duration_s=2.0, **BAND).values
+        lines = np.abs(np.fft.rfft(values)) / (values.size / 2)
+        wanted = np.zeros(lines.size, dtype=bool)
+        wanted[20:201:10] = True  # bins of 0.5 Hz
+        assert np.count_nonzero(wanted) == 19
+        np.testing.assert_allclose(lines[wanted], lines[20], rtol=1e-9)
+        assert lines[20] > 0.1
+        assert lines[~wanted].max() < 1e-11
+
+    def test_phases(self, made: Made) -> None:
+        """Of M sines the m-th, counted from 1, has Schroeder's phase -pi m (m - 1) / M."""
+        values = made(1000.0, amplitude=3.0, duration_s=2.0, **BAND).values
+        lines = np.fft.rfft(values)[20:201:10]
+        m = np.arange(1, 20)
+        expected = np.exp(-1j * np.pi * m * (m - 1) / 19) / 1j  # of a sine, seen as a cosine
+        np.testing.assert_allclose(lines / np.abs(lines), expected, rtol=0.0, atol=1e-9)
+
+    @pytest.mark.parametrize("amplitude", [0.5, 6.0])
+    def test_peak_is_the_amplitude(self, made: Made, amplitude: float) -> None:
+        """The largest magnitude is the amplitude, and the offset comes on top."""
+        values = made(5000.0, amplitude=amplitude, duration_s=1.0, offset=2.0, **BAND).values
+        assert np.max(np.abs(values - 2.0)) == pytest.approx(amplitude, rel=1e-12)
+
+    def test_crest_factor(self, made: Made) -> None:
+        """Schroeder's phases keep the peak far below that of sines in phase."""
+        values = made(5000.0, amplitude=1.0, duration_s=1.0, **BAND).values
+        crest = 1.0 / math.sqrt(float(np.mean(values**2)))
+        t = np.arange(5000) / 5000.0
+        in_phase = sum(np.cos(2 * np.pi * f * t) for f in range(10, 101, 5))
+        assert crest < 2.0
+        assert np.max(in_phase) / np.sqrt(np.mean(in_phase**2)) > 6.0
+
+    def test_one_sine(self, made: Made) -> None:
+        """A band that holds one frequency gives that sine at full amplitude."""
+        keys = {"first_hz": 10.0, "last_hz": 14.9, "step_hz": 5.0}
+        reference = made(1000.0, kind="multisine", amplitude=2.0, duration_s=1.0, **keys)
+        expected = sampled(lambda t: 2.0 * math.sin(20 * math.pi * t), 1000, 1000.0)
+        np.testing.assert_allclose(reference.values, expected, rtol=0.0, atol=1e-11)
+        assert reference.segments[0].period == pytest.approx(100.0)
+
+    def test_a_step_that_is_no_binary_fraction(self, made: Made) -> None:
+        """0.1 to 0.7 Hz in steps of 0.1 Hz are seven sines, the last included."""
+        keys = {"first_hz": 0.1, "last_hz": 0.7, "step_hz": 0.1}
+        values = made(10.0, kind="multisine", amplitude=1.0, duration_s=100.0, **keys).values
+        lines = np.abs(np.fft.rfft(values))
+        np.testing.assert_array_equal(
+            np.flatnonzero(lines > 1e-6 * lines.max()), np.arange(10, 71, 10)
+        )
+
+    def test_one_sample(self, made: Made) -> None:
+        """A multisine too short to leave 0 is 0, not a division by it."""
+        keys = {"first_hz": 10.0, "last_hz": 10.0, "step_hz": 1.0}
+        values = made(1000.0, kind="multisine", amplitude=2.0, duration_s=0.001, **keys).values
+        np.testing.assert_array_equal(values, [0.0])
+
+
+class TestEnvelope:
+    """Growing and decaying sines."""
+
+    @pytest.mark.parametrize("kind", ["growing", "decaying"])
+    def test_peaks_follow_time(self, made: Made, kind: str) -> None:
+        """The crest of each cycle is as large as its time says."""
+        keys = {"amplitude": 7.0, "frequency_hz": 10.0, "duration_s": 1.0}
+        values = made(1000.0, kind=kind, **keys).values.reshape(10, 100)
+        crest_s = 0.025 + 0.1 * np.arange(10)
+        envelope = crest_s if kind == "growing" else 1.0 - crest_s
+        np.testing.assert_allclose(values[:, 25], 7.0 * envelope, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("duration_s", "rate_hz", "samples"),
+    [
+        (30.0, 50e3, 1_500_000),
+        (0.29, 100.0, 29),
+        (2.3, 50e3, 115_000),
+        (1.1, 10.0, 11),
+        (1.0 / 3.0, 3.0, 1),
+        (0.00149, 1000.0, 1),
+        (1e-9, 50e3, 1),
+    ],
+)
+def test_sample_count(duration_s: float, rate_hz: float, samples: int) -> None:
+    """A duration has duration times rate samples, whatever binary fractions make of it."""
+    assert sample_count(duration_s, rate_hz) == samples
+
+
+def test_thirty_seconds_at_full_rate(made: Made) -> None:
+    """30 s at 50 kHz are 1 500 000 samples, the last one period_s before the end."""
+    reference = made(50e3, kind="sine", amplitude=1.0, frequency_hz=1.0, duration_s=30.0)
+    assert reference.values.size == 1_500_000
+    assert reference.segments[0].stop == 1_500_000
+    assert reference.values[-1] == pytest.approx(-math.sin(2 * math.pi / 50e3), rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("frequencies_hz", "period_s"),
+    [
+        ([10.0], 0.1),
+        ([20.0, 60.0], 0.05),
+        ([0.1, 0.3], 10.0),
+        ([2.5, 1.25], 0.8),
+        ([0.7, 1.1], 10.0),
+        ([1.0, 1.5, 0.25], 4.0),
+        ([33.3, 66.6], 1.0 / 33.3),
+        ([50.0, 50.0], 0.02),
+        ([1e-7, 1.0], 1e7),
+    ],
+)
+def test_common_period(frequencies_hz: list[float], period_s: float) -> None:
+    """Decimal frequencies share the period that their decimals say, in either order."""
+    assert common_period_s(frequencies_hz) == pytest.approx(period_s, rel=1e-15)
+    assert common_period_s(frequencies_hz[::-1]) == pytest.approx(period_s, rel=1e-15)
+    for f in frequencies_hz:
+        assert period_s * f == pytest.approx(round(period_s * f), rel=1e-12)
+
+
+def test_common_period_too_long_for_a_float() -> None:
+    """Where the period is too long for a float, it is infinite."""
+    assert common_period_s([1e-320, 1.0]) == math.inf
+
+
+def test_same_keys_same_bits(made: Made) -> None:
+    """Nothing is random: a waveform built twice is the same, bit for bit."""
+    for keys, _ in CASES:
+        first, second = made(RATE_HZ, **keys), made(RATE_HZ, **keys)
+        assert first.values.tobytes() == second.values.tobytes()
+        assert first.segments == second.segments
+
+
+def test_values_are_read_only(made: Made) -> None:
+    """Nobody can change a reference once it is built."""
+    values = made(RATE_HZ, **CASES[0][0]).values
+    with pytest.raises(ValueError, match="read-only"):
+        values[0] = 1.0

@@ -1,0 +1,164 @@
+"""Rules of the waveform section, as an experiment file that breaks them is told."""
+
+from pathlib import Path
+
+import pytest
+
+from hilctl.errors import ConfigError
+from hilctl.experiment import resolve
+from hilctl.yamlio import Document
+
+EXPERIMENT = """\
+name: minimal
+device: {{kind: simulated_terfenol}}
+sample_rate_hz: 1000
+waveform:
+{}compensator: none
+limits: {{peak_current_a: 2.0, slew_a_per_s: 5000.0, stroke_um: [-75.0, 60.0]}}
+"""
+
+
+def problems(waveform: str) -> list[str]:
+    """Return what is said of a waveform section that starts in line 5."""
+    with pytest.raises(ConfigError) as caught:
+        resolve(Document("x.yaml", EXPERIMENT.format(waveform)), Path())
+    return [str(problem) for problem in caught.value.problems]
+
+
+def test_unknown_kind() -> None:
+    """A kind that there is not is refused with those that there are."""
+    found = problems("  unit: A\n  kind: sinus\n  duration_s: 1.0\n")
+    assert len(found) == 1
+    assert found[0].startswith("x.yaml:6: waveform.kind: must be one of 'sine', 'triangle', ")
+    assert ", got 'sinus'" in found[0]
+
+
+def test_no_kind() -> None:
+    """Without a kind nothing can be said of the rest."""
+    found = problems("  unit: A\n  duration_s: 1.0\n")
+    assert found == ["x.yaml:4: waveform: needs a 'kind'"]
+
+
+def test_no_unit() -> None:
+    """The unit has no default."""
+    found = problems("  kind: hold\n  level: 1.0\n  duration_s: 1.0\n")
+    assert found == ["x.yaml:4: waveform.unit: is required (um, A or V)"]
+
+
+def test_unit_of_the_limits() -> None:
+    """Without a compensator the waveform has the unit of the limits."""
+    found = problems("  kind: hold\n  level: 1.0\n  duration_s: 1.0\n  unit: V\n")
+    assert found == [
+        "x.yaml:8: waveform.unit: must be A, the unit of the limits, where compensator is "
+        "none, got V"
+    ]
+
+
+def test_rise_longer_than_dwell() -> None:
+    """A step's rise must fit its dwell."""
+    found = problems("  kind: step\n  unit: A\n  levels: [1]\n  dwell_s: 1\n  rise_s: 2\n")
+    assert found == ["x.yaml:9: waveform.rise_s: must be <= dwell_s, 1.0: 2.0"]
+
+
+@pytest.mark.parametrize(
+    ("section", "key"),
+    [
+        ("  kind: step\n  unit: A\n  levels: []\n  dwell_s: 1\n", "levels"),
+        ("  kind: sequence\n  unit: A\n  parts: []\n", "parts"),
+        ("  kind: complex_harmonic\n  unit: A\n  components: []\n  duration_s: 1\n", "components"),
+    ],
+)
+def test_empty_list(section: str, key: str) -> None:
+    """Levels, parts and components need at least one."""
+    found = problems(section)
+    assert found == [f"x.yaml:7: waveform.{key}: must have at least one value: []"]
+
+
+@pytest.mark.parametrize("value", ["[a, 2.0]", "[a]"])
+def test_levels_that_are_no_numbers(value: str) -> None:
+    """A level that is no number is all that is said, also where it is the only one."""
+    found = problems(f"  kind: step\n  unit: A\n  levels: {value}\n  dwell_s: 1\n")
+    assert found == ["x.yaml:7: waveform.levels.0: must be a number, got 'a'"]
+
+
+@pytest.mark.parametrize(
+    ("numbers", "message"),
+    [
+        ("first_hz: 5, last_hz: 4, step_hz: 1", "last_hz: must be >= first_hz, 5.0: 4.0"),
+        (
+            "first_hz: 0.5, last_hz: 400, step_hz: 0.01",
+            "step_hz: must leave at most 10000 sines in 399.5 Hz: 0.01",
+        ),
+        (
+            "first_hz: 0.5, last_hz: 400, step_hz: 1.0e-320",
+            "step_hz: must leave at most 10000 sines in 399.5 Hz: 1e-320",
+        ),
+    ],
+)
+def test_multisine(numbers: str, message: str) -> None:
+    """A multisine's band must rise, and hold no more sines than anyone can wait for."""
+    keys = f"  {{kind: multisine, unit: A, amplitude: 1, duration_s: 1, {numbers}}}\n"
+    assert problems(keys) == [f"x.yaml:5: waveform.{message}"]
+
+
+def test_file() -> None:
+    """Keys of a file waveform are checked like all others."""
+    found = problems(
+        "  kind: file\n  unit: A\n  path: w.csv\n  column: true\n  resample: nearest\n"
+        "  first_row: 0\n  last_row: 3.5\n"
+    )
+    assert sorted(found) == [
+        "x.yaml:10: waveform.first_row: must be >= 1, got 0",
+        "x.yaml:11: waveform.last_row: must be a whole number, got 3.5",
+        "x.yaml:8: waveform.column: must be a column's name, or its number from 1: True",
+        "x.yaml:9: waveform.resample: must be one of 'refuse', 'linear' or 'cubic', got 'nearest'",
+    ]
+    rows = "  kind: file\n  unit: A\n  path: w.csv\n  first_row: 5\n  last_row: 4\n"
+    assert problems(rows) == ["x.yaml:9: waveform.last_row: must be >= first_row, 5: 4"]
+
+
+def test_parts_of_a_sequence() -> None:
+    """Every broken part is listed with its index and line."""
+    found = problems(
+        "  kind: sequence\n"
+        "  unit: A\n"
+        "  repeat: 10001\n"
+        "  parts:\n"
+        "    - {kind: hold, level: 1.0, duration_s: 1.0}\n"
+        "    - {kind: sine, amplitude: -1, frequency_hz: 10, duration_s: 1}\n"
+        "    - {kind: hold, level: 1.0, duration_s: 1.0, levels: 3}\n"
+        "    - {kind: growing, amplitude: 1.0, duration_s: 1.0}\n"
+        "    - kind: complex_harmonic\n"
+        "      duration_s: 1.0\n"
+        "      components:\n"
+        "        - {amplitude: 1, frequency_hz: 5}\n"
+        "        - {amplitude: 1, frequency: 5}\n"
+    )
+    assert sorted(found) == [
+        "x.yaml:10: waveform.parts.1.amplitude: must be > 0.0, got -1",
+        "x.yaml:11: waveform.parts.2.levels: unknown key (did you mean 'level'?)",
+        "x.yaml:12: waveform.parts.3.frequency_hz: is required",
+        "x.yaml:17: waveform.parts.4.components.1.frequency: unknown key (did you mean "
+        "'frequency_hz'?)",
+        "x.yaml:17: waveform.parts.4.components.1.frequency_hz: is required",
+        "x.yaml:7: waveform.repeat: must be <= 10000, got 10001",
+    ]
+
+
+def test_unit_in_a_part() -> None:
+    """A part can't have a unit of its own."""
+    found = problems(
+        "  kind: sequence\n"
+        "  unit: A\n"
+        "  parts:\n"
+        "    - {kind: hold, unit: A, level: 1.0, duration_s: 1.0}\n"
+        "    - {kind: hold, unit: um, level: 1.0, duration_s: 1.0}\n"
+    )
+    assert found == ["x.yaml:7: waveform.parts: 1.unit must be that of the sequence, A: um"]
+
+
+def test_sequence_in_a_sequence() -> None:
+    """Sequences do not nest."""
+    found = problems("  kind: sequence\n  unit: A\n  parts:\n    - {kind: sequence, parts: []}\n")
+    assert len(found) == 1
+    assert found[0].startswith("x.yaml:8: waveform.parts.0.kind: must be one of 'sine', ")
