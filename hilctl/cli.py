@@ -7,6 +7,7 @@ that ended by a fault; 128 + n a run stopped by signal n.
 """
 
 import json
+import signal
 import sys
 from pathlib import Path
 from typing import Annotated, Any, Literal, NoReturn, TypeAlias
@@ -48,6 +49,8 @@ def main() -> None:
         app()
     except HilctlError as error:
         _refuse(error)
+    except KeyboardInterrupt:
+        raise SystemExit(128 + signal.SIGINT) from None
 
 
 def _refuse(error: HilctlError) -> NoReturn:
@@ -92,6 +95,8 @@ def run(
 
     with LiveView(quiet=as_json) as view:
         result = start_run(experiment, settings or [], output, overwrite, view.update)
+        if result.stop_signal:  # impatience must not cost the result of a run that has ended
+            signal.signal(result.stop_signal, signal.SIG_IGN)
     if as_json:
         _print_json(run_mapping(result))
     else:
