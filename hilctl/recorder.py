@@ -74,18 +74,18 @@ class Recorder:
         """Hand all that was written to the kernel."""
         self._write(self._begun.flush)
 
-    def finish(self, end: Mapping[str, str], sample: int) -> None:
+    def finish(self, end: Mapping[str, str], ended_at: int) -> None:
         """Write how the run ended, and close the file.
 
         Args:
             end: Facts of the end, with ``code`` and ``reason``.
-            sample: Index of the last sample.
+            ended_at: Index after the last sample.
         """
         now_ns = int(datetime.now(UTC).timestamp() * 1e9)
         level = "info" if end["code"] == "completed" else "error"
-        event = Event(now_ns, sample, level, "run_ended", end["reason"])
+        event = Event(now_ns, max(0, ended_at - 1), level, "run_ended", end["reason"])
         self._write(partial(self._begun.event, event))
-        self._write(partial(self._begun.finish, {**end, "ended": iso_time(now_ns)}))
+        self._write(partial(self._begun.finish, {**end, "ended": iso_time(now_ns)}, ended_at))
         if self.error:
             with suppress(OSError):  # the disk's refusal is known already
                 self._file.stream.close()

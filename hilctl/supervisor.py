@@ -127,7 +127,7 @@ class Supervisor:
             ring.put(Field.GO, 1)
             self._drain_while_alive(ring, process, recorder)
             outcome = self._outcome(ring, process, recorder)
-            recorder.finish(_end_facts(outcome, ring), max(0, outcome.ended_at - 1))
+            recorder.finish(_end_facts(outcome, ring), outcome.ended_at)
             return self._result(outcome, ring, recorder)
 
     @contextmanager

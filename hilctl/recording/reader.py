@@ -103,7 +103,7 @@ class _Contents:
                 Segment.from_mapping(each) for each in json.loads(self.run.get("segments", "[]"))
             ),
             samples=self._samples(unit),
-            dropped=sum(block.dropped for block in self._blocks),
+            dropped=self._dropped(),
             ticks=self._all_ticks(),
             events=tuple(self._events),
             experiment_yaml=self._texts.get("experiment.yaml", ""),
@@ -114,6 +114,10 @@ class _Contents:
                 if block.previous_command
             ),
         )
+
+    def _dropped(self) -> int:
+        counted: int = sum(block.dropped for block in self._blocks)
+        return max(counted, int(self.end.get("missing_samples", "0")))
 
     def _samples(self, unit: str) -> Samples:
         small = unit.lower()

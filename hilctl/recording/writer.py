@@ -101,8 +101,15 @@ class RecordingWriter:
         """Close the chunk in work and hand it to the kernel."""
         self._writer.flush()
 
-    def finish(self, end: Mapping[str, str]) -> None:
-        """Write the facts of the end, the index and the footer."""
+    def finish(self, end: Mapping[str, str], ended_at: int) -> None:
+        """Write the facts of the end, the index and the footer.
+
+        Args:
+            end: Facts of the end.
+            ended_at: Index after the last sample that was exchanged; what is not recorded before
+                it is missing, also where no later block could say so.
+        """
+        self.missing = max(self.missing, ended_at - self.samples)
         counted = {"recorded_samples": str(self.samples), "missing_samples": str(self.missing)}
         self._writer.add_metadata("hilctl.end", {**end, **counted})
         self._writer.finish()

@@ -38,7 +38,7 @@ def batch(first, blocks, *, dropped=0, seed=0):
     )
 
 
-def write(stream, batches, *, unit="A", measures=True, finish=True):
+def write(stream, batches, *, unit="A", measures=True, finish=True, ended_at=0):
     facts = RunFacts(
         facts={"command_unit": unit, "sample_rate_hz": repr(RATE_HZ), "compensator": "rdpi"},
         segments=(SEGMENT,),
@@ -55,7 +55,7 @@ def write(stream, batches, *, unit="A", measures=True, finish=True):
         writer.flush()
     writer.event(Event(START_NS + 5, 17, "info", "run_ended", "waveform completed"))
     if finish:
-        writer.finish({"code": "completed", "late_ticks": "3"})
+        writer.finish({"code": "completed", "late_ticks": "3"}, ended_at)
     return writer
 
 
@@ -89,6 +89,14 @@ def test_everything_comes_back(recorded):
     assert back.end["recorded_samples"] == "1850"
     assert back.end["missing_samples"] == "200"
     assert back.compensated
+
+
+def test_samples_lost_at_the_very_end_are_counted(tmp_path):
+    """Where no later block can tell of a loss, the end does."""
+    path = tmp_path / "run.mcap"
+    with path.open("wb") as stream:
+        write(stream, [batch(0, 4)], ended_at=350)
+    assert read(path).dropped == 150
 
 
 def test_replay_can_start_first_and_after_each_gap(recorded):
