@@ -3,6 +3,10 @@
 Reference block, compensator, limiter, device, ring: once a tick, until the waveform ends, someone
 asks for a stop, or something goes wrong. All of these leave by the same way: ramp to the safe
 value within the ramp's slew, recording as before.
+
+A device that plays blocks from a FIFO gives a block's displacements some blocks later. Blocks wait
+for theirs before they are recorded, and after the ramp the loop goes on at the safe value until
+the last of them has come.
 """
 
 from dataclasses import dataclass
@@ -12,6 +16,7 @@ import numpy as np
 
 from hilctl.arrays import F64, U32
 from hilctl.compensator import Compensator
+from hilctl.delay_line import DelayLine, SentBlock
 from hilctl.errors import DeviceError
 from hilctl.flags import Flag
 from hilctl.kernels.limit import first_outside
@@ -69,6 +74,8 @@ class Plan:
         block: Samples in each exchange.
         stroke_um: Lowest and highest displacement that may be measured.
         max_late_ns: Lateness that ends the run.
+        latency_blocks: Exchanges after which a block's displacements come, as
+            :attr:`hilctl.ports.DeviceInfo.latency_blocks`.
     """
 
     reference: F64
@@ -76,6 +83,7 @@ class Plan:
     block: int
     stroke_um: tuple[float, float]
     max_late_ns: float
+    latency_blocks: int = 0
 
 
 class Loop:
@@ -111,17 +119,15 @@ class Loop:
         self._clock = clock
         self._sink = sink
         self._stop_request = stop_request
-        block = plan.block
-        self._columns = np.full((5, block), np.nan)
-        self._reference, self._wanted, self._command = self._columns[:3]
-        self._displacement_um, self._measured = self._columns[3:]
-        self._flags = np.zeros(block, dtype=np.uint32)
-        self._state = np.zeros(compensator.state_size + 1)
+        self._line = DelayLine(plan.latency_blocks, plan.block, compensator.state_size + 1)
         self._start_ns = 0
         self._next_sample = 0
-        self._bad = -1
+        self._ended_at = 0
         self._missing = 0
         self._dropped = 0
+        self._code: Code = "completed"
+        self._reason = "waveform completed"
+        self._ramping = False
 
     def run(self, start_ns: int) -> Outcome:
         """Run until the end, ramp to the safe value, and say how it went.
@@ -131,101 +137,131 @@ class Loop:
         """
         self._start_ns = start_ns
         self._pacer.begin(start_ns)
-        ramping = False
-        code: Code = "completed"
-        reason = "waveform completed"
         try:
-            while True:
-                skipped = self._pacer.wait()
-                self._missing += skipped * self._plan.block
-                self._next_sample += skipped * self._plan.block
-                if not ramping:
-                    code, reason, ramping = self._before()
-                done = self._fill(ramping)
-                self._exchange()
-                if done:
-                    break
-                if not ramping:
-                    code, reason, ramping = self._after()
+            while not self._tick():
+                pass
+            while self._line.waiting:
+                self._hold()
         except DeviceError as error:
-            return self._lost_device(code, reason, ramping, error)
-        return Outcome(code, reason, self._next_sample, True, self._dropped)
+            return self._lost_device(error)
+        return Outcome(self._code, self._reason, self._ended_at, True, self._dropped)
 
-    def _before(self) -> tuple[Code, str, bool]:
+    def _tick(self) -> bool:
+        """Run one tick; return whether the safe value is reached in it."""
+        block = self._next_block()
+        if not self._ramping:
+            self._before()
+        done = self._fill(block)
+        self._exchange(block, recorded=True)
+        self._ended_at = self._next_sample
+        if not self._ramping:
+            self._judge(block)
+        return done
+
+    def _hold(self) -> None:
+        """Hold the safe value for one more block, for the sake of the answer that comes with it."""
+        block = self._next_block()
+        block.command[:] = self._limiter.limits.safe
+        self._exchange(block, recorded=False)
+
+    def _next_block(self) -> SentBlock:
+        """Wait for the tick; return where its block goes."""
+        skipped = self._pacer.wait() * self._plan.block
+        self._next_sample += skipped
+        block = self._line.newest
+        block.skipped = skipped
+        block.first_sample = self._next_sample
+        return block
+
+    def _before(self) -> None:
         if self._pacer.late_ns > self._plan.max_late_ns:
             late_s = self._pacer.late_ns * 1e-9
             text = f"tick {self._pacer.tick} woke {late_s:.3f} s late, more than the limit"
-            return "fault", text, True
-        stop = self._stop_request()
-        if stop:
-            return "stopped", stop, True
-        return "completed", "waveform completed", False
+            self._leave("fault", text)
+        elif stop := self._stop_request():
+            self._leave("stopped", stop)
 
-    def _fill(self, ramping: bool) -> bool:
+    def _leave(self, code: Code, reason: str) -> None:
+        """Take the way out from the next block on."""
+        self._code, self._reason, self._ramping = code, reason, True
+
+    def _fill(self, block: SentBlock) -> bool:
         """Work out one block of commands; return whether the safe value is reached in it."""
-        self._state[:-1] = self._compensator.state()
-        self._state[-1] = self._limiter.last
-        self._flags[:] = 0
-        self._measured[:] = np.nan
+        block.state[:-1] = self._compensator.state()
+        block.state[-1] = self._limiter.last
+        block.flags[:] = 0
+        block.measured[:] = np.nan
+        block.ramping = self._ramping
         start = self._next_sample
         reference = self._plan.reference[start : start + self._plan.block]
-        n = 0 if ramping else reference.size
+        n = 0 if self._ramping else reference.size
         if n:
-            self._reference[:n] = reference if self._plan.in_um else np.nan
-            self._compensator.process(reference, self._wanted[:n])
-            self._limiter.limit(self._wanted[:n], self._command[:n], self._flags[:n])
+            block.reference[:n] = reference if self._plan.in_um else np.nan
+            self._compensator.process(reference, block.wanted[:n])
+            self._limiter.limit(block.wanted[:n], block.command[:n], block.flags[:n])
         if n == self._plan.block:
             return False
-        self._reference[n:] = np.nan
-        self._wanted[n:] = self._limiter.limits.safe
-        return self._limiter.ramp(self._command[n:], self._flags[n:])
+        block.reference[n:] = np.nan
+        block.wanted[n:] = self._limiter.limits.safe
+        return self._limiter.ramp(block.command[n:], block.flags[n:])
 
-    def _exchange(self) -> None:
+    def _exchange(self, sent: SentBlock, *, recorded: bool) -> None:
+        """Send a block; check and record the one whose displacements come back."""
+        answered = self._line.oldest
         before_ns = self._clock.now_ns()
         self._device.exchange(
-            self._next_sample, self._command, self._displacement_um, self._measured
+            sent.first_sample, sent.command, answered.displacement_um, answered.measured
         )
         exchange_ns = self._clock.now_ns() - before_ns
-        self._bad = first_outside(self._displacement_um, *self._plan.stroke_um)
-        if self._bad >= 0:
-            self._flags[self._bad :] |= Flag.SENSOR_INVALID.value
-        head = (
-            self._next_sample,
-            self._plan.block,
-            self._missing,
-            self._pacer.deadline_ns - self._start_ns,
-            self._pacer.late_ns,
-            exchange_ns,
+        deadline_ns = self._pacer.deadline_ns - self._start_ns
+        sent.times_ns = (deadline_ns, self._pacer.late_ns, exchange_ns)
+        self._next_sample += self._plan.block
+        early = self._line.filling
+        self._line.exchanged(recorded=recorded)
+        if not early:
+            self._check_sensor(answered)
+            self._push(answered)
+
+    def _check_sensor(self, block: SentBlock) -> None:
+        low, high = self._plan.stroke_um
+        bad = first_outside(block.displacement_um, low, high)
+        if bad < 0:
+            return
+        block.flags[bad:] |= Flag.SENSOR_INVALID.value
+        if block.ramping or self._code != "completed":
+            return
+        self._leave(
+            "fault",
+            f"displacement {block.displacement_um[bad]:.4g} um at sample "
+            f"{block.first_sample + bad} is not within the stroke limits {low:g} to {high:g} um",
         )
-        if self._sink.push(head, self._state, self._columns, self._flags):
+
+    def _judge(self, block: SentBlock) -> None:
+        """Leave where a wish of the block just sent was not a number."""
+        invalid = np.flatnonzero(block.flags & Flag.INVALID.value)
+        if invalid.size:
+            sample = block.first_sample + int(invalid[0])
+            self._leave("fault", f"wanted command is not a finite number at sample {sample}")
+
+    def _push(self, block: SentBlock) -> None:
+        missing = self._missing + block.skipped
+        head = (block.first_sample, self._plan.block, missing, *block.times_ns)
+        if self._sink.push(head, block.state, block.columns, block.flags):
             self._missing = 0
         else:
-            self._missing += self._plan.block
+            self._missing = missing + self._plan.block
             self._dropped += self._plan.block
-        self._next_sample += self._plan.block
 
-    def _after(self) -> tuple[Code, str, bool]:
-        if self._bad >= 0:
-            low, high = self._plan.stroke_um
-            sample = self._next_sample - self._plan.block + self._bad
-            value = self._displacement_um[self._bad]
-            text = (
-                f"displacement {value:.4g} um at sample {sample} is not within the stroke limits "
-                f"{low:g} to {high:g} um"
-            )
-            return "fault", text, True
-        invalid = np.flatnonzero(self._flags & Flag.INVALID.value)
-        if invalid.size:
-            sample = self._next_sample - self._plan.block + int(invalid[0])
-            return "fault", f"wanted command is not a finite number at sample {sample}", True
-        return "completed", "waveform completed", False
-
-    def _lost_device(self, code: Code, reason: str, ramping: bool, error: DeviceError) -> Outcome:
-        first = f"{reason}; then " if ramping and code != "completed" else ""
-        text = f"{first}{error}"
+    def _lost_device(self, error: DeviceError) -> Outcome:
+        for block in self._line.unanswered():
+            block.displacement_um[:] = block.measured[:] = np.nan
+            block.flags |= Flag.SENSOR_INVALID.value
+            self._push(block)
+        text = str(error) if self._code == "completed" else f"{self._reason}; then {error}"
+        safe = True
         try:
             self._device.make_safe(self._limiter.limits.safe)
         except DeviceError as second:
             text += f"; the safe value could not be confirmed: {second}"
-            return Outcome("fault", text, self._next_sample, False, self._dropped)
-        return Outcome("fault", text, self._next_sample, True, self._dropped)
+            safe = False
+        return Outcome("fault", text, self._ended_at, safe, self._dropped)

@@ -17,11 +17,13 @@ from typing import Any
 import numpy as np
 
 from hilctl.compensator import Compensator
+from hilctl.config import Experiment
 from hilctl.errors import DeviceError, HilctlError
 from hilctl.experiment import LoadedExperiment, resolve
 from hilctl.limiter import Limiter
 from hilctl.loop import Loop, Outcome, Plan
-from hilctl.pacer import Pacer, SystemClock
+from hilctl.pacer import LatePolicy, Pacer, SystemClock
+from hilctl.ports import DeviceInfo
 from hilctl.ring import Field, Phase, SampleRing
 from hilctl.yamlio import Document
 
@@ -86,7 +88,7 @@ def _run(job: dict[str, Any], ring: SampleRing, loaded: LoadedExperiment) -> Out
     compensator.warm_up()
     clock = SystemClock()
     period_ns = config.tick_s * 1e9
-    policy = "catch_up" if device.info.buffered else config.timing.late_policy
+    policy = _late_policy(config, device.info)
     pacer = Pacer(clock, period_ns, policy, config.timing.late_after * period_ns)
     supervision = Supervision(ring, pacer, clock, job["supervisor"])
     plan = Plan(
@@ -95,6 +97,7 @@ def _run(job: dict[str, Any], ring: SampleRing, loaded: LoadedExperiment) -> Out
         block=config.block,
         stroke_um=config.limits.stroke_um,
         max_late_ns=config.timing.max_late_s * 1e9,
+        latency_blocks=device.info.latency_blocks,
     )
     limiter = Limiter(config.command_limits(), 1.0 / config.sample_rate_hz)
     loop = Loop(plan, device, compensator, limiter, pacer, clock, ring, supervision)
@@ -114,6 +117,12 @@ def _run(job: dict[str, Any], ring: SampleRing, loaded: LoadedExperiment) -> Out
         device.close()
     _leave_counters(ring, pacer)
     return outcome
+
+
+def _late_policy(config: Experiment, info: DeviceInfo) -> LatePolicy:
+    if info.latency_blocks:
+        return "follow"
+    return "catch_up" if info.buffered else config.timing.late_policy
 
 
 def _await_go(ring: SampleRing, supervision: Supervision) -> None:

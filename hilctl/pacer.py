@@ -9,8 +9,9 @@ from typing import Literal, TypeAlias
 
 from hilctl.ports import Clock
 
-LatePolicy: TypeAlias = Literal["skip", "catch_up", "slip"]
+LatePolicy: TypeAlias = Literal["skip", "catch_up", "slip", "follow"]
 
+_FOLLOW = 1.0 / 64.0
 _TIMER_ABSTIME = 1
 
 
@@ -66,7 +67,9 @@ class Pacer:
     Args:
         clock: Time.
         period_ns: Time from one tick to the next; it need not be a whole number of ns.
-        policy: What happens when a tick wakes a whole period late or more.
+        policy: What happens when a tick wakes a whole period late or more. ``follow`` is for
+            devices whose exchange waits for their own clock: there is no other wait, and the
+            deadlines follow that clock, so that a late tick is one that came later than usual.
         late_after_ns: Lateness from which a tick counts as late.
     """
 
@@ -96,11 +99,14 @@ class Pacer:
         """
         self.tick += 1
         self.deadline_ns = self._origin_ns + round(self.tick * self._period_ns)
+        if self._policy == "follow" and self.tick:
+            self._follow()
+            return 0
         self._clock.sleep_until_ns(self.deadline_ns)
         now_ns = self._clock.now_ns()
         self.late_ns = now_ns - self.deadline_ns
         self._count()
-        if self.late_ns < self._period_ns or self._policy == "catch_up":
+        if self.late_ns < self._period_ns or self._policy in {"catch_up", "follow"}:
             return 0
         if self._policy == "slip":
             self._origin_ns += self.late_ns
@@ -109,6 +115,16 @@ class Pacer:
         self.tick += skipped
         self.counters.skipped_ticks += skipped
         return skipped
+
+    def _follow(self) -> None:
+        """Take this moment as the tick: at once where it is early, slowly where it is late."""
+        self.late_ns = self._clock.now_ns() - self.deadline_ns
+        if self.late_ns < 0:
+            self._origin_ns += self.late_ns
+            self.deadline_ns += self.late_ns
+            self.late_ns = 0
+        self._origin_ns += round(self.late_ns * _FOLLOW)
+        self._count()
 
     def _count(self) -> None:
         counters = self.counters

@@ -35,9 +35,13 @@ class DeviceInfo:
         sensor_min_um: Lowest displacement its sensor can report.
         sensor_max_um: Highest displacement its sensor can report.
         max_rate_hz: Highest sample rate it can keep.
+        rate_note: Why ``max_rate_hz`` is what it is, in words; empty where there is no more to say.
         buffered: Whether it has a sample clock and a FIFO of its own. Then the sample index is
             the truth and a late tick costs FIFO depth; otherwise the host's clock paces it.
         fifo_depth: Samples its FIFO holds; 0 where it has none.
+        latency_blocks: Exchanges from the one that sends a block to the one that brings its
+            displacements. 0 where they are the same; more where blocks are played from a FIFO of
+            the device, which then keeps the pace: :meth:`Device.exchange` waits for its clock.
         measures_command: Whether :meth:`Device.exchange` fills ``measured``.
         details: Anything worth keeping with a recording (serial numbers, physical parameters).
     """
@@ -50,8 +54,10 @@ class DeviceInfo:
     sensor_min_um: float
     sensor_max_um: float
     max_rate_hz: float
+    rate_note: str = ""
     buffered: bool = False
     fifo_depth: int = 0
+    latency_blocks: int = 0
     measures_command: bool = False
     details: Mapping[str, str] = field(default_factory=dict)
 
@@ -94,7 +100,9 @@ class Device(Protocol):
         """Send one block of commands and read one block of displacements.
 
         ``displacement_um[j]`` is sampled when ``command[j]`` is put out, so it can't yet show
-        that command's effect.
+        that command's effect. Where ``info.latency_blocks`` is more than 0, displacements and
+        measured commands are those of the block sent that many exchanges before; the first ones,
+        which answer no block, are left alone.
 
         Args:
             first_sample: Index of the block's first sample since the start of the run. A jump

@@ -116,7 +116,8 @@ def _device_problems(loaded: LoadedExperiment) -> list[Problem]:
             add("limits", f"must lie within what {info.name} takes, {span}", f"{low:g} to {high:g}")
     if config.sample_rate_hz > info.max_rate_hz:
         rule = f"must be <= {info.max_rate_hz:g}, the fastest that {info.name} can keep"
-        add("sample_rate_hz", rule, config.sample_rate_hz)
+        note = f" ({info.rate_note})" if info.rate_note else ""
+        add("sample_rate_hz", rule + note, config.sample_rate_hz)
     if config.block > 1 and not info.buffered:
         add(
             "block", f"must be 1: {info.name} has no sample clock and FIFO of its own", config.block

@@ -45,6 +45,39 @@ class FakeDevice:
 
 
 @dataclass
+class FifoDevice:
+    """Plays blocks later: the displacement of each sample is ten times the command before it.
+
+    It hands out each block's displacements ``latency`` exchanges after it was sent.
+    """
+
+    latency: int
+    break_at: int = 10**9
+    nan_at: int = 10**9
+    commands: list[float] = field(default_factory=list)
+    made_safe: list[float] = field(default_factory=list)
+    exchanges: int = 0
+
+    def exchange(self, first_sample, command, displacement_um, measured):
+        assert first_sample == len(self.commands)
+        if first_sample + command.size > self.break_at:
+            raise DeviceError("fake: no answer within 0.1 s")
+        self.commands.extend(command.tolist())
+        self.exchanges += 1
+        first = first_sample - self.latency * command.size
+        if first < 0:
+            return
+        before = [0.0, *self.commands]
+        for j in range(command.size):
+            played = first + j >= self.nan_at
+            displacement_um[j] = np.nan if played else 10.0 * before[first + j]
+            measured[j] = before[first + j + 1]
+
+    def make_safe(self, command):
+        self.made_safe.append(command)
+
+
+@dataclass
 class FakeClock:
     """Time moves only in sleeps; some of them last longer."""
 
@@ -97,7 +130,8 @@ class Bench:
         policy = options.get("policy", "skip")
         self.pacer = Pacer(self.clock, period_ns, policy, 0.5 * period_ns)
         stroke_um = options.get("stroke_um", (-60.0, 60.0))
-        plan = Plan(reference, model is not None, block, stroke_um, options.get("max_late", 1e9))
+        max_late, latency = options.get("max_late", 1e9), getattr(self.device, "latency", 0)
+        plan = Plan(reference, model is not None, block, stroke_um, max_late, latency)
         self.loop = Loop(
             plan,
             self.device,
@@ -286,3 +320,89 @@ def test_ticks_record_deadline_lateness_and_exchange():
     bench.run()
     assert [head[3] for head in bench.sink.heads[:5]] == [0, 10**6, 2 * 10**6, 3 * 10**6, 4 * 10**6]
     assert [head[4] for head in bench.sink.heads[:5]] == [0, 0, 0, 120_000, 0]
+
+
+LATENCIES = [1, 3, 8]
+
+
+@pytest.mark.parametrize("latency", LATENCIES)
+def test_displacements_that_come_later_stand_beside_their_commands(latency):
+    """With a FIFO between, every sample is recorded once, with its own command's displacement."""
+    bench = Bench(sine(230), block=10, device=FifoDevice(latency))
+    outcome = bench.run()
+    plain = Bench(sine(230), block=10)
+    assert (outcome.code, outcome.safe) == ("completed", True)
+    assert outcome.ended_at == plain.run().ended_at
+    assert [head[:3] for head in bench.sink.heads] == [head[:3] for head in plain.sink.heads]
+    for row in (1, 2, 3):
+        assert bench.sink.column(row).tolist() == plain.sink.column(row).tolist()
+    assert bench.sink.column(4).tolist() == bench.sink.column(2).tolist()
+    assert np.concatenate(bench.sink.flags).tolist() == np.concatenate(plain.sink.flags).tolist()
+
+
+@pytest.mark.parametrize("latency", LATENCIES)
+def test_last_blocks_are_waited_for_at_the_safe_value(latency):
+    """After the ramp the safe value is held for as many blocks as are under way, and no more."""
+    device = FifoDevice(latency)
+    outcome = Bench(sine(230), block=10, device=device).run()
+    assert len(device.commands) == outcome.ended_at + 10 * latency
+    assert set(device.commands[outcome.ended_at :]) == {LIMITS.safe}
+
+
+def test_state_belongs_to_the_block_it_is_recorded_with():
+    """With a FIFO between, a recorded state still makes its block's commands again."""
+    model = terfenol_rdpi()
+    bench = Bench(10.0 * sine(200), block=10, model=model, device=FifoDevice(4))
+    bench.run()
+    again = Compensator(model, RATE_HZ)
+    again.restore(bench.sink.states[6][:-1])
+    wanted = np.empty(10)
+    again.process(np.ascontiguousarray(bench.sink.columns[6][0]), wanted)
+    assert wanted.tolist() == bench.sink.columns[6][1].tolist()
+    assert bench.sink.states[6][-1] == bench.sink.columns[5][2][-1]
+
+
+@pytest.mark.parametrize("latency", LATENCIES)
+@pytest.mark.parametrize("nan_at", [45, 995])
+def test_sensor_lost_behind_a_fifo_ramps_down(latency, nan_at):
+    """A bad reading ends the run as soon as it comes, even after the waveform's last command."""
+    device = FifoDevice(latency, nan_at=nan_at)
+    bench = Bench(np.full(1000, 2.0), block=10, device=device)
+    outcome = bench.run()
+    assert (outcome.code, outcome.safe) == ("fault", True)
+    assert f"displacement nan um at sample {nan_at} " in outcome.reason
+    assert outcome.ended_at <= nan_at + 10 * latency + 40
+    assert device.commands[-1] == LIMITS.safe
+    assert bench.sink.column(2).size == outcome.ended_at
+    flags = np.concatenate(bench.sink.flags)
+    assert not (flags[:nan_at] & Flag.SENSOR_INVALID).any()
+    assert (flags[nan_at:] & Flag.SENSOR_INVALID).all()
+
+
+@pytest.mark.parametrize("break_at", [5, 25, 60, 205, 235])
+def test_blocks_under_way_to_a_lost_device_are_recorded(break_at):
+    """What was sent and never answered is recorded without displacement, and flagged."""
+    device = FifoDevice(3, break_at=break_at)
+    bench = Bench(sine(200), block=10, device=device)
+    outcome = bench.run()
+    assert (outcome.code, outcome.reason) == ("fault", "fake: no answer within 0.1 s")
+    assert device.made_safe == [LIMITS.safe]
+    recorded = bench.sink.column(2) if bench.sink.columns else np.empty(0)
+    assert recorded.tolist() == device.commands[: outcome.ended_at]
+    if recorded.size:
+        answered = max(0, 10 * (device.exchanges - 3))
+        assert np.isnan(bench.sink.column(3)[answered:]).all()
+        assert np.isfinite(bench.sink.column(3)[:answered]).all()
+        flags = np.concatenate(bench.sink.flags)
+        assert ((flags & Flag.SENSOR_INVALID) != 0).tolist() == [
+            k >= answered for k in range(recorded.size)
+        ]
+
+
+def test_full_ring_behind_a_fifo_is_a_counted_gap():
+    """Blocks that find no room when their displacements come are counted before the next."""
+    device = FifoDevice(3)
+    bench = Bench(sine(200), block=10, device=device, sink=Sink(full=range(50, 80)))
+    outcome = bench.run()
+    assert {head[0]: head[2] for head in bench.sink.heads if head[2]} == {80: 30}
+    assert outcome.dropped == 30

@@ -102,3 +102,51 @@ def test_system_clock_sleeps_to_a_deadline():
     clock.sleep_until_ns(deadline_ns)
     assert clock.now_ns() >= deadline_ns
     clock.sleep_until_ns(deadline_ns)
+
+
+class TestFollow:
+    """Deadlines follow a device whose exchange waits for its own clock."""
+
+    def run(self, clock, exchange_ns, ticks):
+        """Let exchanges take a time each; return the pacer and each tick's lateness."""
+        paced = pacer(clock, "follow")
+        late_ns = []
+        for tick in range(ticks):
+            assert paced.wait() == 0
+            late_ns.append(paced.late_ns)
+            clock.now += exchange_ns(tick)
+        return paced, late_ns
+
+    def test_waits_only_for_the_start(self):
+        """The first tick waits for its time; after it, the exchange is the only wait."""
+        clock = TurnedClock()
+        self.run(clock, lambda _: PERIOD_NS, 100)
+        assert clock.sleeps == 1
+        assert clock.now == 10_000 + 100 * PERIOD_NS
+
+    @pytest.mark.parametrize("ppm", [-500, 500])
+    def test_a_clock_that_drifts_is_never_late(self, ppm):
+        """After an hour of a clock that is off by far more than a quartz is, no tick is late."""
+        period = PERIOD_NS + PERIOD_NS * ppm // 1_000_000
+        paced, late_ns = self.run(TurnedClock(), lambda _: period, 100_000)
+        assert paced.counters.late_ticks == 0
+        assert max(late_ns) < 0.1 * PERIOD_NS
+
+    def test_a_burst_that_fills_the_fifo_is_not_lateness(self):
+        """Exchanges that return at once move the deadlines; the ticks after them are on time."""
+        burst = 8
+        paced, late_ns = self.run(TurnedClock(), lambda k: PERIOD_NS if k >= burst else 0, 100)
+        assert max(late_ns) == 0
+        assert paced.counters.late_ticks == 0
+
+    def test_a_stall_is_late_and_soon_forgotten(self):
+        """A stall counts in full; the burst after it is late ever less, what follows is not."""
+
+        def exchange_ns(tick):
+            return {50: 6 * PERIOD_NS}.get(tick, 0 if 51 <= tick < 56 else PERIOD_NS)
+
+        paced, late_ns = self.run(TurnedClock(), exchange_ns, 200)
+        assert late_ns[51] == 5 * PERIOD_NS
+        assert late_ns[51:57] == sorted(late_ns[51:57], reverse=True)
+        assert max(late_ns[57:]) < 0.5 * PERIOD_NS
+        assert 5 <= paced.counters.late_ticks <= 6
