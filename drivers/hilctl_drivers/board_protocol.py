@@ -1,0 +1,90 @@
+"""Messages of a microcontroller board with a DAC and an ADC, version 1.
+
+Each message is the payload of one binary frame, least significant byte first throughout::
+
+    byte 0  type   byte 1  seq, counted up by the host and repeated in the reply   then the body
+
+    EXCHANGE  10  n u16, n values          puts out one sample, n = 1, and samples the input
+           -> 90  status u8, n u16, n values, fifo_level u16, underruns u16
+    STREAM    11  first u32, n u16, n values     queues samples first .. first + n - 1
+           -> 91  status u8, first u32, n u16, n values, fifo_level u16, underruns u16
+    WATCHDOG  12  timeout_ms u32 (0: off), safe value   clears a trip, too
+           -> 92  status u8, timeout_ms u32
+    SAFE      13  value                    puts it out at once and drops what is queued
+           -> 93  status u8
+    INFO      14  (nothing)
+           -> 94  status u8, version u8, fifo_depth u16, block_max u16, rate_max_hz f32,
+                  min f32, max f32, name in ASCII
+    CLOCK     15  rate_hz f32 (0: stop), prefill u16    empties the queue, counts samples from 0
+           -> 95  status u8, rate_hz f32 as really set
+
+A value is a float32 in volts unless the profile's channel has another type. The board samples its
+input when it puts out a command, so ``first`` of a STREAM reply numbers the command that each
+reading belongs to; a reply carries all readings since the last one. The sample clock starts when
+``prefill`` samples are queued. With nothing left to put out the board holds the last value, and
+counts that in ``underruns``. A refused message changes nothing.
+"""
+
+from enum import IntFlag
+from struct import Struct
+from typing import Final
+
+VERSION: Final = 1
+REPLY_BIT: Final = 0x80
+"""Set in a reply's type."""
+
+EXCHANGE: Final = 0x10
+STREAM: Final = 0x11
+WATCHDOG: Final = 0x12
+SAFE: Final = 0x13
+INFO: Final = 0x14
+CLOCK: Final = 0x15
+
+HEAD = Struct("<BB")
+"""type, seq."""
+EXCHANGE_REQUEST = Struct("<BBH")
+"""type, seq, n; values follow."""
+EXCHANGE_REPLY = Struct("<BBBH")
+"""type, seq, status, n; values and :data:`FIFO_TAIL` follow."""
+STREAM_REQUEST = Struct("<BBIH")
+"""type, seq, first, n; values follow."""
+STREAM_REPLY = Struct("<BBBIH")
+"""type, seq, status, first, n; values and :data:`FIFO_TAIL` follow."""
+FIFO_TAIL = Struct("<HH")
+"""fifo_level, underruns."""
+WATCHDOG_REQUEST = Struct("<BBI")
+"""type, seq, timeout_ms; the safe value follows."""
+WATCHDOG_REPLY = Struct("<BBBI")
+"""type, seq, status, timeout_ms."""
+STATUS_REPLY = Struct("<BBB")
+"""type, seq, status: reply to SAFE, and to anything that is refused."""
+INFO_REPLY = Struct("<BBBBHHfff")
+"""type, seq, status, version, fifo_depth, block_max, rate_max_hz, min, max; the name follows."""
+CLOCK_REQUEST = Struct("<BBfH")
+"""type, seq, rate_hz, prefill."""
+CLOCK_REPLY = Struct("<BBBf")
+"""type, seq, status, rate_hz."""
+
+
+class Status(IntFlag):
+    """The status byte of a reply."""
+
+    TRIPPED = 0x01
+    """The watchdog has tripped: the output is at its safe value, values are refused."""
+    OUT_OF_RANGE = 0x02
+    """Refused: a value is out of range or not a number."""
+    BAD_MESSAGE = 0x04
+    """Refused: unknown type, wrong length, or not in this state."""
+    FIFO_FULL = 0x08
+    """Refused: more samples than the FIFO has room for."""
+    WRONG_FIRST = 0x10
+    """Refused: ``first`` is not the next sample; a block was lost or came twice."""
+
+
+def exchange_sizes(samples: int, value_bytes: int, *, stream: bool) -> tuple[int, int]:
+    """Return payload bytes of an EXCHANGE or STREAM request and of its reply."""
+    request, reply = (
+        (STREAM_REQUEST, STREAM_REPLY) if stream else (EXCHANGE_REQUEST, EXCHANGE_REPLY)
+    )
+    values = samples * value_bytes
+    return request.size + values, reply.size + values + FIFO_TAIL.size

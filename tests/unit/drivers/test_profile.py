@@ -1,0 +1,386 @@
+"""Device profiles: loading, rules, messages."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from hilctl.errors import ConfigError, InputError
+from hilctl_drivers.profile import (
+    FOLDER,
+    load_profile,
+    parse_profile,
+    profile_schema_text,
+    shipped_profiles,
+    with_link,
+)
+from hilctl_drivers.profile_ascii import AsciiProfile
+from hilctl_drivers.profile_frames import FrameProfile
+from hilctl_drivers.profile_modbus import EnsureStep, ModbusProfile, RegisterStep
+
+MODBUS = """\
+vendor: Acme
+model: DAQ-1
+source: [manual]
+verified: partly
+unverified: [turnaround_s]
+link: {kind: rtu, baud: 9600}
+address_base: 0
+exchange: none
+turnaround_s: 0.001
+max_rate_hz: 100.0
+outputs:
+  AO: {address: 0, type: int16, scale: 0.001, unit: V, min: -10.0, max: 10.0}
+inputs:
+  AI: {area: input, address: 4, type: float32, unit: V, min: -10.0, max: 10.0}
+watchdog: none
+"""
+ASCII = """\
+vendor: Acme
+model: PSU-1
+source: [manual]
+verified: partly
+unverified: [turnaround_s]
+link: {kind: ascii, baud: 9600, terminator: "\\r", reply_terminator: "\\r"}
+address: 1
+exchange: none
+turnaround_s: 0.001
+max_rate_hz: 10.0
+outputs:
+  OUT: {write: "SET {value:.3f}", reply: {pattern: OK, example: OK}, unit: A, min: 0.0, max: 5.0}
+inputs:
+  IN: {ask: "GET?", pattern: "([0-9.]+)", example: "1.5", unit: A, min: 0.0, max: 5.0}
+watchdog: none
+"""
+BOARD = (FOLDER / "cobs_board_fifo.yaml").read_text(encoding="utf-8")
+TEXTS = {"modbus": MODBUS, "ascii": ASCII, "board": BOARD}
+
+
+def changed(base: str, changes: dict[str, Any]) -> str:
+    """Return a profile's text with other values at dotted keys; None takes a key out."""
+    data = yaml.safe_load(TEXTS[base])
+    for key, value in changes.items():
+        *parents, last = key.split(".")
+        part = data
+        for parent in parents:
+            part = part[parent]
+        if value is None:
+            del part[last]
+        else:
+            part[last] = value
+    return yaml.safe_dump(data)
+
+
+def lines(text: str) -> list[str]:
+    """Return the messages about a text."""
+    with pytest.raises(ConfigError) as caught:
+        parse_profile(text, "acme.yaml")
+    return str(caught.value).splitlines()
+
+
+AO = "outputs.AO."
+CHANNEL = {"address": 0, "type": "float32", "unit": "V", "min": 0.0, "max": 1.0}
+WATCHDOG = {
+    "unit_s": 0.1, "min_s": 0.1, "max_s": 25.5, "kick": "write", "on_trip": "zero",
+    "refuses_while_tripped": True,
+    "arm": [{"kind": "write", "address": 9, "type": "uint16", "value": "timeout"}],
+}  # fmt: skip
+
+BROKEN: list[tuple[str, dict[str, Any], str]] = [
+    ("modbus", {"vendor": None}, "vendor: is required"),
+    ("modbus", {"vendor": ""}, "vendor: string should have at least 1 character, got ''"),
+    ("modbus", {"source": []}, "source: tuple should have at least 1 item"),
+    ("modbus", {"verified": True}, "verified must be 'partly' when keys are unverified"),
+    ("modbus", {"unverified": []}, "verified must be 'partly' when keys are unverified"),
+    ("modbus", {"unverified": ["outputs.A1"]}, "unverified: must name keys that are in this file"),
+    ("modbus", {"outptus": {}}, "outptus: unknown key (did you mean 'outputs'?)"),
+    ("modbus", {"outputs": {}}, "outputs: dictionary should have at least 1 item"),
+    ("modbus", {"link.kind": "udp"}, "link.kind: must be one of tcp, rtu, ascii, frames, got"),
+    ("modbus", {"link": None}, "link.kind: must be one of tcp, rtu, ascii, frames, got nothing"),
+    ("modbus", {"link.parity": "X"}, "link.parity: must be one of 'N', 'E' or 'O', got 'X'"),
+    ("modbus", {"link.baud": 9600.5}, "link.baud: must be a whole number, got 9600.5"),
+    ("modbus", {"link.gap_s": -1.0}, "link.gap_s: must be >= 0.0, got -1.0"),
+    ("modbus", {"address_base": 2}, "address_base: must be one of 0, 1 or 'modicon', got 2"),
+    ("modbus", {"exchange": 22}, "exchange: must be one of 23, 76 or 'none', got 22"),
+    ("modbus", {"watchdog": False}, "quote a text"),
+    ("modbus", {"watchdog": "off"}, "watchdog: must be one of 'none', or a mapping of keys"),
+    ("modbus", {AO + "address": -1}, "outputs.AO.address: must be >= 0, got -1"),
+    ("modbus", {AO + "address": 65536}, "outputs.AO.address must be in area holding"),
+    ("modbus", {"address_base": "modicon"}, "outputs.AO.address must be in area holding"),
+    ("modbus", {"address_base": 1}, "outputs.AO.address must be in area holding"),
+    ("modbus", {AO + "type": "int8"}, "outputs.AO.type: must be one of"),
+    ("modbus", {AO + "order": "AC"}, "order of int16 must name each of AB once"),
+    ("modbus", {AO + "scale": 0.0}, "scale must be finite and not 0"),
+    ("modbus", {AO + "scale": "1e-3"}, "outputs.AO.scale: must be a number, got '1e-3' (YAML reads"
+     " this as text: write 0.001)"),
+    ("modbus", {AO + "scale": "0.1"}, "(remove the quotes)"),
+    ("modbus", {AO + "max": float("inf")}, "outputs.AO.max: must be a finite number"),
+    ("modbus", {AO + "max": 40.0}, "outputs.AO: min and max must be inside what the register holds,"
+     " -32.768 to 32.767 V, got -10 to 40"),
+    ("modbus", {AO + "raw_min": -5000}, "inside what the register holds, -5 to 32.767 V"),
+    ("modbus", {AO + "raw_max": 40000}, "raw_min and raw_max must be ordered and fit into int16"),
+    ("modbus", {AO + "raw_max": 10000, AO + "raw_min": 10001}, "must be ordered"),
+    ("modbus", {AO + "min": 10.0}, "min must be < max, got 10 and 10"),
+    ("modbus", {"inputs.AI.raw_max": 5}, "raw_min and raw_max are for whole-number types"),
+    ("modbus", {AO + "area": "input"}, "area of an output must be holding, got input"),
+    ("modbus", {AO + "area": "coil"}, "type must be bit in area coil"),
+    ("modbus", {AO + "type": "bit"}, "type must not be bit in area holding"),
+    ("modbus", {AO + "type": "float32", AO + "function": 6}, "function 6 writes one register"),
+    ("modbus", {"inputs.AI.area": "discrete", "inputs.AI.type": "bit"},
+     "inputs.AI: an analogue channel can't be in area discrete"),
+    ("modbus", {"exchange": 23}, "inputs.AI.area must be holding: exchange 23 reads holding"),
+    ("modbus", {"outputs": {"A O": CHANNEL}}, "outputs.A O: string should match pattern"),
+    ("modbus", {"init": [{"kind": "poke"}]}, "init.0: must be one of"),
+    ("modbus", {"init": [{"kind": "write", "address": 1, "type": "uint16"}]},
+     "init.0.value: is required"),
+    ("modbus", {"init": [{"kind": "write", "address": 1, "type": "uint16", "value": 70000}]},
+     "init.0: value must fit into uint16, got 70000"),
+    ("modbus", {"init": [{"kind": "write", "address": 1, "type": "uint16", "value": "safe"}]},
+     "init: timeout and safe are for watchdog steps"),
+    ("modbus", {"init": [{"kind": "write", "address": 65536, "type": "uint16", "value": 1}]},
+     "init.0.address must be in area holding"),
+    ("modbus", {"init": [{"kind": "expect", "area": "coil", "address": 1, "type": "bit",
+                          "value": 1, "scale": 2.0}]}, "a bit has no order, scale or offset"),
+    ("modbus", {"selftest": {"address": 1, "type": "uint16", "expect": 65536}},
+     "selftest: expect must fit into uint16, got 65536"),
+    ("modbus", {"watchdog": WATCHDOG | {"min_s": 30.0}}, "watchdog: min_s must be <= max_s"),
+    ("modbus", {"watchdog": WATCHDOG | {"kick": "strict"}}, "feed steps and kick: strict go"),
+    ("modbus", {"watchdog": WATCHDOG | {"arm": []}}, "watchdog.arm: tuple should have at least 1"),
+    ("modbus", {"watchdog": WATCHDOG | {"safe": {"XO": []}}},
+     "watchdog.safe.XO must be one of the outputs"),
+    ("modbus", {"watchdog": WATCHDOG | {"tripped": {"address": 1, "type": "uint16",
+                                                    "mask": 65536}}}, "mask must fit into uint16"),
+    ("modbus", {"watchdog": WATCHDOG | {"tripped": {"address": 1, "type": "uint16"}}},
+     "watchdog.tripped.mask: is required"),
+    ("ascii", {"outputs.OUT.write": "SET 1"}, "outputs.OUT: write must have the field {value}"),
+    ("ascii", {"outputs.OUT.write": "SET {volts}"}, "fields must be of {value}, {safe}, {address}"),
+    ("ascii", {"outputs.OUT.write": "SET {value.real}"}, "fields must be of {value}, {safe}"),
+    ("ascii", {"outputs.OUT.write": "SET {value"}, "outputs.OUT.write: "),
+    ("ascii", {"outputs.OUT.write": "SET {value:d}"}, "outputs.OUT.write: "),
+    ("ascii", {"outputs.OUT.write": "SET\n{value}"}, "must be printable ASCII"),
+    ("ascii", {"outputs.OUT.reply.pattern": "("}, "must be a regular expression"),
+    ("ascii", {"outputs.OUT.reply.example": "NO"}, "pattern 'OK' must match the example 'NO'"),
+    ("ascii", {"inputs.IN.pattern": "[0-9.]+"}, "must have one group, around the number"),
+    ("ascii", {"inputs.IN.example": "1.5.2"}, "the group must hold a number, got '1.5.2'"),
+    ("ascii", {"errors": [{"pattern": "O.", "example": "OX", "meaning": "no"}]},
+     "errors: 'O.' matches the good reply of outputs.OUT"),
+    ("ascii", {"exchange": {"output": "OUT", "input": "XX", "write": "S {value}",
+                            "pattern": "(1)", "example": "1"}}, "must be an output and an input"),
+    ("ascii", {"exchange": {"output": "OUT", "input": "IN", "write": "S?", "pattern": "(1)",
+                            "example": "1"}}, "exchange.write must have the field {value}"),
+    ("ascii", {"link.terminator": ";"}, "link.terminator: must be one of"),
+    ("ascii", {"watchdog": {**{k: v for k, v in WATCHDOG.items() if k != "arm"},
+                            "kick": "strict", "arm": [{"kind": "send", "text": "W{timeout}"}]}},
+     "feed steps and kick: strict go together"),
+    ("board", {"exchange": "single"}, "streaming and exchange: stream go together"),
+    ("board", {"streaming": None}, "streaming and exchange: stream go together"),
+    ("board", {"streaming.fifo_depth": 100}, "streaming.block_max must be <= streaming.fifo_depth"),
+    ("board", {"link.payload_max": 1000}, "streaming.block_max samples need"),
+    ("board", {"link.crc": "crc8"}, "link.crc: must be one of 'crc16_modbus'"),
+    ("board", {"outputs.DAC.type": "int16", "outputs.DAC.order": "BA", "outputs.DAC.scale": 1e-5},
+     "min and max must be inside what int16 holds"),
+]  # fmt: skip
+
+
+class TestRules:
+    """What a profile must keep to."""
+
+    @pytest.mark.parametrize("base", TEXTS)
+    def test_unbroken(self, base: str) -> None:
+        """The profiles that the broken ones are made from are good."""
+        parse_profile(changed(base, {}), "acme.yaml")
+
+    @pytest.mark.parametrize(("base", "changes", "message"), BROKEN)
+    def test_broken(self, base: str, changes: dict[str, Any], message: str) -> None:
+        """Each broken rule gives one line with file, key and rule."""
+        found = lines(changed(base, changes))
+        assert len(found) == 1, found
+        assert found[0].startswith("acme.yaml: ")
+        assert message in found[0]
+
+    def test_board_with_integers(self) -> None:
+        """A board may send whole numbers, where its range fits into them."""
+        changes = {"outputs.DAC.type": "int16", "outputs.DAC.order": "BA"}
+        profile = parse_profile(changed("board", changes), "acme.yaml")
+        assert isinstance(profile, FrameProfile)
+        assert profile.outputs["DAC"].format.size == 2
+
+    def test_all_at_once(self) -> None:
+        """Several broken rules are reported together."""
+        text = changed("modbus", {"vendor": None, "link.baud": 1, AO + "type": "int8"})
+        keys = [line.split(": ")[1] for line in lines(text)]
+        assert sorted(keys) == ["link.baud", "outputs.AO.type", "vendor"]
+
+    def test_truth_value_for_base(self) -> None:
+        """A truth value is no address base, though Python takes True for 1."""
+        assert "address_base" in lines(changed("modbus", {"address_base": True}))[0]
+
+    @pytest.mark.parametrize(
+        ("word", "wanted"), [("yes", "yes"), ("no", "no"), ("partly", "partly")]
+    )
+    def test_bare_yes_and_no(self, word: str, wanted: str) -> None:
+        """Verified can be written as a bare yes or no, which YAML 1.1 reads as truth values."""
+        text = MODBUS.replace("verified: partly", f"verified: {word}")
+        if word == "yes":
+            text = text.replace("unverified: [turnaround_s]\n", "")
+        assert parse_profile(text, "acme.yaml").verified == wanted
+
+
+class TestYaml:
+    """What YAML does behind one's back."""
+
+    @pytest.mark.parametrize(
+        ("text", "message"),
+        [
+            ("a: [", "is not readable YAML"),
+            ("[1, 2]", "must hold a mapping"),
+            ("", "must hold a mapping"),
+            (MODBUS + "vendor: Other\n", "key 'vendor' stands twice"),
+            (MODBUS.replace("address: 4", "address: 00257"), "YAML reads 00257 in base 8"),
+            (MODBUS.replace("address: 4", "address: 00289"), "is not readable YAML"),
+            (MODBUS.replace("address: 4", "address: 1:30"), "YAML reads 1:30 in base 60"),
+            ("a: 2024-02-31", "is not readable YAML"),
+            ("a: !!python/object:os.system {}", "is not readable YAML"),
+            ("{" * 5000, "is not readable YAML"),
+        ],
+    )
+    def test_refused(self, text: str, message: str) -> None:
+        """What looks like one thing and is another is refused, in one line."""
+        found = lines(text)
+        if "00289" in text:
+            assert "inputs.AI.address: must be a whole number" in found[0]
+        else:
+            assert message in found[0]
+        assert len(found) == 1
+
+    def test_hexadecimal(self) -> None:
+        """Addresses can be written as manuals have them."""
+        profile = parse_profile(MODBUS.replace("address: 4", "address: 0x0200"), "acme.yaml")
+        assert isinstance(profile, ModbusProfile)
+        assert profile.inputs["AI"].address == 512
+
+
+class TestLoading:
+    """Names and paths."""
+
+    def test_by_path(self, tmp_path: Path) -> None:
+        """A user's own profile is given by path."""
+        path = tmp_path / "mine.yaml"
+        path.write_text(MODBUS, encoding="utf-8")
+        assert load_profile(str(path)).title == "Acme DAQ-1"
+
+    def test_unknown_name(self) -> None:
+        """An unknown name lists the shipped ones."""
+        with pytest.raises(
+            InputError, match=r"no profile 'labjack' is shipped.*labjack_t7"
+        ) as error:
+            load_profile("labjack")
+        assert all(name in str(error.value) for name in shipped_profiles())
+
+    def test_no_file(self, tmp_path: Path) -> None:
+        """A path without a file, a folder and a file that is not text are named."""
+        (tmp_path / "x.yaml").write_bytes(b"\xff\xfe\x00")
+        for path, message in (
+            (tmp_path / "none.yaml", "No such file"),
+            (tmp_path, "Is a directory"),
+            (tmp_path / "x.yaml", "not UTF-8"),
+        ):
+            with pytest.raises(InputError, match=message) as error:
+                load_profile(str(path))
+            assert str(error.value).startswith(str(path))
+
+    def test_with_link(self) -> None:
+        """A device that was set to another baud is the same device on a faster line."""
+        profile = parse_profile(MODBUS, "acme.yaml")
+        faster = with_link(profile, baud=115200, parity="E")
+        assert isinstance(faster, ModbusProfile)
+        assert faster.link.model_dump()["baud"] == 115200
+        assert faster.model_copy(update={"link": profile.link}) == profile
+        with pytest.raises(InputError, match=r"link.baud: must be >= 300, got 1"):
+            with_link(profile, baud=1)
+        with pytest.raises(InputError, match=r"link.buad: unknown key \(did you mean 'baud'\?\)"):
+            with_link(profile, buad=9600)
+
+
+class TestSchema:
+    """The schema that editors read."""
+
+    def test_file_is_up_to_date(self) -> None:
+        """profiles/schema.json is what the code says."""
+        path = FOLDER / "schema.json"
+        assert path.read_text(encoding="utf-8") == profile_schema_text(), (
+            "write hilctl_drivers.profile.profile_schema_text() to profiles/schema.json"
+        )
+
+    def test_covers_all_kinds(self) -> None:
+        """Each kind of profile is a choice, and unknown keys are refused everywhere."""
+        schema = json.loads(profile_schema_text())
+        names = [choice["$ref"].rsplit("/", 1)[1] for choice in schema["oneOf"]]
+        kinds = (ModbusProfile, AsciiProfile, FrameProfile)
+        assert names == [kind.__name__ for kind in kinds]
+        objects = [part for part in schema["$defs"].values() if "properties" in part]
+        assert len(objects) > 30
+        assert all(part["additionalProperties"] is False for part in objects)
+
+
+class TestWatchdog:
+    """Units of timeouts and what the steps become."""
+
+    @pytest.mark.parametrize(
+        ("name", "timeout_s", "counts"),
+        [
+            ("labjack_t7", 2.0, 2), ("icp_m7024", 10.0, 100), ("icp_m7024_dcon", 0.1, 1),
+            ("icp_m7024_dcon", 25.5, 255), ("wago_750", 0.3, 3), ("beckhoff_bk9000", 0.2, 200),
+            ("beckhoff_bk9000", 65.535, 65535), ("cobs_board", 0.005, 5),
+        ],
+    )  # fmt: skip
+    def test_counts(self, name: str, timeout_s: float, counts: int) -> None:
+        """A timeout becomes the device's own counts."""
+        watchdog = load_profile(name).watchdog
+        assert watchdog != "none"
+        assert watchdog.counts(timeout_s) == counts
+
+    @pytest.mark.parametrize(
+        ("name", "timeout_s", "message"),
+        [
+            ("labjack_t7", 0.5, "must be 1 to 86400, got 0.5"),
+            ("labjack_t7", 1.5, "must be a multiple of 1, got 1.5"),
+            ("icp_m7024", 25.6, "must be 0.1 to 25.5"),
+            ("wago_750", 0.25, "must be a multiple of 0.1"),
+            ("beckhoff_bk9000", float("nan"), "must be 0.001 to 65.535"),
+        ],
+    )
+    def test_refused(self, name: str, timeout_s: float, message: str) -> None:
+        """A timeout that the device can't have is refused, never rounded."""
+        watchdog = load_profile(name).watchdog
+        assert watchdog != "none"
+        with pytest.raises(InputError, match=message):
+            watchdog.counts(timeout_s)
+
+    def test_bound(self) -> None:
+        """Steps get the timeout in the device's unit and the safe value as the output has it."""
+        profile = load_profile("icp_m7024")
+        assert isinstance(profile, ModbusProfile)
+        assert profile.watchdog != "none"
+        output = profile.outputs["AO0"]
+        safe = (EnsureStep(kind="ensure", address=40500, type="int16", value="safe"),)
+        steps = profile.watchdog.bound((*profile.watchdog.arm, *safe), output, 10.0, -10.0)
+        timeout, enable, value = (step for step in steps if isinstance(step, RegisterStep))
+        assert isinstance(timeout.value, float)
+        assert isinstance(value.value, float)
+        assert timeout.format.encode(timeout.value) == (100).to_bytes(2, "big")
+        assert enable == profile.watchdog.arm[1]
+        assert value.format.encode(value.value) == (-32767).to_bytes(2, "big", signed=True)
+        with pytest.raises(InputError, match="multiple"):
+            profile.watchdog.bound(profile.watchdog.arm, output, 0.15, 0.0)
+
+    def test_protects(self) -> None:
+        """The LabJack's watchdog knows its own outputs, not those of a LJTick-DAC."""
+        profile = load_profile("labjack_t7")
+        assert isinstance(profile, ModbusProfile)
+        assert profile.watchdog != "none"
+        assert [profile.watchdog.protects(name) for name in profile.outputs] == [
+            True, True, False, False,
+        ]  # fmt: skip
