@@ -16,6 +16,8 @@ from hilctl.wording import did_you_mean
 BUILTIN: dict[str, str] = {
     "simulated_terfenol": "hilctl_drivers.simulated:SimulatedTerfenol",
     "simulated_piezo": "hilctl_drivers.simulated:SimulatedPiezo",
+    "modbus_dac": "hilctl_drivers.modbus_dac:ModbusDac",
+    "serial_dac": "hilctl_drivers.serial_dac:SerialDac",
 }
 
 GROUP = "hilctl.devices"

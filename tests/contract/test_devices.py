@@ -1,58 +1,223 @@
-"""The contract of every device that hilctl ships: the same tests for each."""
+"""The contract of every device that hilctl ships: the same tests for each.
+
+Simulated devices stand for themselves. Devices on a wire meet an emulator on loopback, one for each
+shipped profile that can drive and measure; its time passes by one sample an exchange, so that
+nothing depends on how fast this machine is.
+"""
+
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
 
 from hilctl.errors import DeviceError
+from hilctl.ports import Device
 from hilctl.registry import BUILTIN, device_class
+from hilctl_drivers.emulator.main import EmulatorOptions, build
+from hilctl_drivers.profile import load_profile, shipped_profiles
+from hilctl_drivers.profile_modbus import ModbusProfile
 
 RATE_HZ = 10_000.0
-BLOCK = 20
+SAMPLES = 20
+ON_A_WIRE = {"modbus_dac", "serial_dac"}
+SIMULATED = sorted(set(BUILTIN) - ON_A_WIRE)
 
 
-@pytest.fixture(params=sorted(BUILTIN))
-def device(request):
-    """A device with its default options, closed afterwards."""
-    chosen = device_class(request.param)
-    made = chosen(chosen.Options())
-    yield made
-    made.close()
+def modbus_profiles() -> list[str]:
+    """Return the shipped Modbus profiles that have an input, by name."""
+    found = []
+    for name in shipped_profiles():
+        profile = load_profile(name)
+        if isinstance(profile, ModbusProfile) and profile.inputs:
+            found.append(name)
+    return found
 
 
-def exchange(device, first, command):
-    command = np.asarray(command, dtype=np.float64)
-    displacement_um, measured = np.full(command.size, np.nan), np.full(command.size, np.nan)
-    device.exchange(first, command, displacement_um, measured)
-    return displacement_um, measured
+class Clock:
+    """Time that passes when told to."""
+
+    def __init__(self) -> None:
+        self.now_ns = 1_000_000_000
+
+    def __call__(self) -> int:
+        return self.now_ns
 
 
-def middle(device):
-    """A command well inside the range that is not the resting one."""
-    info = device.info
-    return 0.5 * (info.command_max + max(0.0, info.command_min))
+@dataclass
+class Bench:
+    """A device and how to use it.
+
+    Attributes:
+        device: Not yet open.
+        block: Samples it takes in one exchange.
+        rate_hz: A sample rate that it can keep.
+        pass_time: Called before each exchange.
+    """
+
+    device: Device
+    block: int
+    rate_hz: float
+    pass_time: Callable[[], None] = lambda: None
+
+    def open(self) -> None:
+        self.device.open(self.rate_hz, self.block)
+
+    def exchange(self, first, command):
+        """Exchange any number of samples, a block at a time."""
+        command = np.asarray(command, dtype=np.float64)
+        displacement_um, measured = np.full(command.size, np.nan), np.full(command.size, np.nan)
+        for start in range(0, command.size, self.block):
+            part = slice(start, start + self.block)
+            self.pass_time()
+            self.device.exchange(
+                first + start, command[part], displacement_um[part], measured[part]
+            )
+        return displacement_um, measured
+
+    @property
+    def middle(self) -> float:
+        """A command well inside the range that is not the resting one."""
+        info = self.device.info
+        return 0.5 * (info.command_max + max(0.0, info.command_min))
 
 
-def test_says_what_it_is_before_it_is_opened(device):
+def simulated(kind: str) -> Bench:
+    chosen = device_class(kind)
+    return Bench(chosen(chosen.Options()), SAMPLES, RATE_HZ)
+
+
+RTU_PROFILE = """\
+vendor: nobody
+model: an analogue module on a serial line, which no shipped profile with an input is
+source: [this test]
+verified: "yes"
+link: {kind: rtu, baud: 115200}
+unit_id: 3
+address_base: 0
+exchange: 23
+turnaround_s: 0.0
+max_rate_hz: 1000.0
+outputs:
+  OUT: {address: 100, type: int16, scale: 0.001, unit: mA, min: -20.0, max: 20.0}
+inputs:
+  IN: {address: 200, type: float32, order: CDAB, unit: V, min: -10.0, max: 10.0}
+watchdog: none
+"""
+
+
+def modbus(name: str, stack: list[Callable[[], None]]) -> Bench:
+    """Return a modbus_dac that is wired to an emulator of the profile."""
+    clock = Clock()
+    emulator = build(EmulatorOptions(name, link="tcp" if is_tcp(name) else "rtu"), clock)
+    thread = threading.Thread(target=emulator.server.run)
+    thread.start()
+
+    def stop() -> None:
+        emulator.server.stop()
+        thread.join()
+
+    stack.append(stop)
+    profile, wiring = emulator.device.profile, emulator.device.wiring
+    output, sensor = next(iter(profile.outputs)), next(iter(profile.inputs))
+    host, _, port = emulator.address.partition(":")
+    unit = {"V": "v", "mA": "ma"}
+    where = {"host": host, "port": int(port)} if port else {"serial_port": emulator.address}
+    options = {
+        "profile": name,
+        "output": output,
+        "input": sensor,
+        "timeout_s": 5.0,
+        "amplifier": {
+            f"gain_a_per_{unit[profile.outputs[output].unit]}": wiring.gain_a,
+            "offset_a": wiring.offset_a,
+        },
+        "sensor": {
+            f"um_per_{unit[profile.inputs[sensor].unit]}": wiring.sensor_um,
+            "offset_um": wiring.offset_um,
+        },
+        "watchdog": "none",
+        **where,
+    }
+    chosen = device_class("modbus_dac")
+    device = chosen(chosen.Options.model_validate(options))
+    rate_hz = min(RATE_HZ, device.info.max_rate_hz)
+
+    def pass_time() -> None:
+        clock.now_ns += round(1e9 / rate_hz)
+
+    return Bench(device, 1, rate_hz, pass_time)
+
+
+def is_tcp(name: str) -> bool:
+    return load_profile(name).link.kind == "tcp"
+
+
+CASES = [*SIMULATED, *(f"modbus_dac {name}" for name in modbus_profiles()), "modbus_dac rtu"]
+
+
+@pytest.fixture
+def make(tmp_path) -> Iterator[Callable[[str], Bench]]:
+    """Return a function that makes a device of a kind; all are closed afterwards."""
+    benches: list[Bench] = []
+    stack: list[Callable[[], None]] = []
+
+    def of(case: str) -> Bench:
+        kind, _, profile = case.partition(" ")
+        if profile == "rtu":
+            path = tmp_path / "rtu.yaml"
+            path.write_text(RTU_PROFILE, encoding="utf-8")
+            profile = str(path)
+        benches.append(modbus(profile, stack) if profile else simulated(kind))
+        return benches[-1]
+
+    yield of
+    for bench in benches:
+        bench.device.close()
+    for stop in stack:
+        stop()
+
+
+@pytest.fixture(params=CASES)
+def case(request) -> str:
+    """A device by its registry name, and the profile where it needs one."""
+    return request.param
+
+
+@pytest.fixture
+def bench(make, case) -> Bench:
+    """A device that was not opened yet."""
+    return make(case)
+
+
+def test_every_device_is_tried():
+    """No device of the table is left out, and each on a wire meets several profiles."""
+    assert {case.partition(" ")[0] for case in CASES} >= set(BUILTIN) - {"serial_dac"}
+    assert len(modbus_profiles()) >= 3
+
+
+def test_says_what_it_is_before_it_is_opened(bench):
     """Info is complete and sensible without a connection."""
-    info = device.info
+    info = bench.device.info
     assert info.name in BUILTIN
     assert info.description
     assert info.command_unit in {"A", "V"}
     assert info.command_min < info.command_max
     assert info.sensor_min_um < info.sensor_max_um
-    assert info.max_rate_hz >= RATE_HZ
+    assert info.max_rate_hz > 0.0
     assert info.buffered == (info.fifo_depth > 0)
     assert all(isinstance(text, str) for text in info.details.values())
 
 
-def test_exchanges_blocks(device):
+def test_exchanges_blocks(bench):
     """Every displacement is filled with a number in the sensor's range, and commands move it."""
-    device.open(RATE_HZ, BLOCK)
-    info = device.info
-    rest, _ = exchange(device, 0, np.zeros(BLOCK))
-    ramp = np.linspace(0.0, middle(device), BLOCK)
-    exchange(device, BLOCK, ramp)
-    moved, measured = exchange(device, 2 * BLOCK, np.full(BLOCK, ramp[-1]))
+    bench.open()
+    info = bench.device.info
+    rest, _ = bench.exchange(0, np.zeros(SAMPLES))
+    ramp = np.linspace(0.0, bench.middle, SAMPLES)
+    bench.exchange(SAMPLES, ramp)
+    moved, measured = bench.exchange(2 * SAMPLES, np.full(SAMPLES, ramp[-1]))
     for values in (rest, moved):
         assert np.isfinite(values).all()
         assert (values >= info.sensor_min_um).all()
@@ -61,80 +226,93 @@ def test_exchanges_blocks(device):
     assert np.isfinite(measured).all() == info.measures_command
 
 
-def test_displacement_is_sampled_before_the_command_acts(device):
+def test_displacement_is_sampled_before_the_command_acts(bench):
     """The first sample after a jump still shows the rest; a later one does not."""
-    device.open(RATE_HZ, BLOCK)
-    rest, _ = exchange(device, 0, np.zeros(BLOCK))
-    moved, _ = exchange(device, BLOCK, np.full(BLOCK, middle(device)))
+    bench.open()
+    rest, _ = bench.exchange(0, np.zeros(SAMPLES))
+    moved, _ = bench.exchange(SAMPLES, np.full(SAMPLES, bench.middle))
     assert abs(moved[0] - rest.mean()) < 0.5
     assert moved[-1] > rest.mean() + 1.0
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, "above", "below"])
-def test_refuses_what_it_can_not_do(device, bad):
+def test_refuses_what_it_can_not_do(bench, bad):
     """A value that is not finite or out of range is refused whole: nothing of the block is sent."""
-    device.open(RATE_HZ, BLOCK)
-    info = device.info
+    bench.open()
+    info = bench.device.info
     value = {"above": info.command_max * 1.001 + 1e-6, "below": info.command_min * 1.001 - 1e-6}
-    command = np.full(BLOCK, middle(device))
-    command[BLOCK // 2] = value.get(bad, bad) if isinstance(bad, str) else bad
+    command = np.full(bench.block, bench.middle)
+    command[bench.block // 2] = value.get(bad, bad) if isinstance(bad, str) else bad
     with pytest.raises(DeviceError, match=info.name):
-        exchange(device, 0, command)
-    after, _ = exchange(device, 0, np.zeros(BLOCK))
+        bench.exchange(0, command)
+    after, _ = bench.exchange(0, np.zeros(SAMPLES))
     assert np.abs(after).max() < 0.5
 
 
-def test_takes_its_whole_range(device):
+def test_takes_its_whole_range(bench):
     """Both ends of the stated range are accepted."""
-    device.open(RATE_HZ, BLOCK)
-    for k, value in enumerate((device.info.command_min, device.info.command_max)):
-        exchange(device, k * BLOCK, np.full(BLOCK, value))
+    bench.open()
+    for k, value in enumerate((bench.device.info.command_min, bench.device.info.command_max)):
+        bench.exchange(k * SAMPLES, np.full(SAMPLES, value))
 
 
-def test_does_not_change_the_command(device):
+def test_does_not_change_the_command(bench):
     """The command array is read, never written."""
-    device.open(RATE_HZ, BLOCK)
-    command = np.linspace(0.0, middle(device), BLOCK)
+    bench.open()
+    command = np.linspace(0.0, bench.middle, SAMPLES)
     before = command.copy()
-    exchange(device, 0, command)
+    bench.exchange(0, command)
     assert np.array_equal(command, before)
 
 
-def test_use_before_open_and_after_close_is_refused(device):
-    """Exchange needs an open device; closing twice is fine."""
+def test_use_before_open_and_after_close_is_refused(bench):
+    """Exchange needs an open device; closing twice is fine, and opening again too."""
     with pytest.raises(DeviceError):
-        exchange(device, 0, np.zeros(BLOCK))
-    device.open(RATE_HZ, BLOCK)
-    device.close()
-    device.close()
+        bench.exchange(0, np.zeros(SAMPLES))
+    bench.open()
+    bench.device.close()
+    bench.device.close()
     with pytest.raises(DeviceError):
-        exchange(device, 0, np.zeros(BLOCK))
+        bench.exchange(0, np.zeros(SAMPLES))
+    bench.open()
+    bench.exchange(0, np.zeros(SAMPLES))
 
 
-def test_rate_beyond_its_limit_is_refused(device):
+def test_opening_does_not_move_the_output(bench):
+    """What was put out before stays through closing and opening, for devices that have a memory."""
+    if bench.device.info.name in SIMULATED:
+        pytest.skip("opening a simulated device puts it at rest")
+    bench.open()
+    bench.exchange(0, np.full(SAMPLES, bench.middle))
+    held, _ = bench.exchange(SAMPLES, np.full(SAMPLES, bench.middle))
+    bench.device.close()
+    bench.open()
+    first, _ = bench.exchange(0, np.zeros(1))
+    assert first[0] == pytest.approx(held[-1], abs=0.5)
+
+
+def test_rate_beyond_its_limit_is_refused(bench):
     """A sample rate that it can't keep is refused at open."""
     with pytest.raises(DeviceError):
-        device.open(device.info.max_rate_hz * 1.01, BLOCK)
+        bench.device.open(bench.device.info.max_rate_hz * 1.01, bench.block)
 
 
-def test_make_safe_works_open_or_closed(device):
+def test_make_safe_works_open_or_closed(bench):
     """The last resort needs no open connection."""
-    device.make_safe(0.0)
-    device.open(RATE_HZ, BLOCK)
-    exchange(device, 0, np.full(BLOCK, middle(device)))
-    device.make_safe(0.0)
-    device.close()
-    device.make_safe(0.0)
+    bench.device.make_safe(0.0)
+    bench.open()
+    bench.exchange(0, np.full(SAMPLES, bench.middle))
+    bench.device.make_safe(0.0)
+    bench.device.close()
+    bench.device.make_safe(0.0)
 
 
-def test_two_of_a_kind_agree(device):
+def test_two_of_a_kind_agree(bench, make, case):
     """A second one with the same options gives the same bits: runs can be repeated."""
-    chosen = device_class(device.info.name)
-    other = chosen(chosen.Options())
-    command = np.linspace(0.0, middle(device), BLOCK)
+    other = make(case)
+    command = np.linspace(0.0, bench.middle, SAMPLES)
     results = []
-    for each in (device, other):
-        each.open(RATE_HZ, BLOCK)
-        results.append(exchange(each, 0, command)[0])
-    other.close()
+    for each in (bench, other):
+        each.open()
+        results.append(each.exchange(0, command)[0])
     assert np.array_equal(*results)

@@ -13,7 +13,7 @@ from hilctl_drivers.profile_modbus import EnsureStep, ModbusProfile, RegisterSte
 from hilctl_drivers.profile_problems import value_at
 
 NAMES = (
-    "adam_4024", "adam_4024_ascii", "adam_6024", "adam_6224", "beckhoff_bk9000", "cobs_board",
+    "adam_4024", "adam_4024_ascii", "adam_6024", "adam_6224", "agilent_34970a", "beckhoff_bk9000", "cobs_board",
     "cobs_board_fifo", "icp_et7000", "icp_m7024", "icp_m7024_dcon", "kepco_bop", "labjack_t4",
     "labjack_t7", "labjack_t8", "tdk_lambda_gen", "wago_750", "waveshare_ao_8ch",
     "waveshare_ao_8ch_b",

@@ -1,0 +1,249 @@
+"""An emulated device that speaks lines of text: a profile's templates in front of the rig."""
+
+import re
+
+from hilctl_drivers.emulator.answer import Answer
+from hilctl_drivers.emulator.ascii_templates import Template, in_style
+from hilctl_drivers.emulator.emulated import Wiring
+from hilctl_drivers.emulator.rig import Rig
+from hilctl_drivers.emulator.write_log import WriteLog
+from hilctl_drivers.profile_ascii import (
+    AsciiInput,
+    AsciiProfile,
+    AsciiStep,
+    AskStep,
+    NumberStep,
+    Reply,
+    SendStep,
+)
+
+_OUT_OF_RANGE = '-222,"Data out of range"'
+_UNDEFINED = '-113,"Undefined header"'
+_REFUSED = '-200,"Execution error"'
+
+
+class EmulatedAscii:
+    """The device.
+
+    Args:
+        profile: What it is.
+        rig: What it drives, or what its sensor stands on.
+        log: Where what it puts out goes.
+        wiring: Amplifier and sensor between.
+        output: Output that drives the rig; None where another device does.
+        sensor: Input that shows the displacement; None where another device does.
+        address: Its address.
+    """
+
+    def __init__(
+        self,
+        profile: AsciiProfile,
+        rig: Rig,
+        log: WriteLog,
+        wiring: Wiring,
+        *,
+        output: str | None,
+        sensor: str | None,
+        address: int,
+    ) -> None:
+        self._profile = profile
+        self._rig = rig
+        self._log = log
+        self._wiring = wiring
+        self._output, self._sensor = output, sensor
+        self._address = address
+        rest = -wiring.offset_a / wiring.gain_a
+        self._values = {
+            name: min(max(rest if name == output else 0.0, each.min), each.max)
+            for name, each in profile.outputs.items()
+        }
+        self._safe = dict(self._values)
+        self._errors: list[str] = []
+        self._timeout_ns = 0
+        self._heard_ns = 0
+        self._now_ns = 0
+        self.tripped = False
+
+    def tick(self, now_ns: int) -> None:
+        """Let time pass; the watchdog may trip on the way."""
+        due_ns = self._heard_ns + self._timeout_ns
+        if self._timeout_ns and not self.tripped and due_ns <= now_ns:
+            self.tripped = True
+            self._trip(due_ns)
+        self._now_ns = max(self._now_ns, now_ns)
+        self._rig.advance(self._now_ns)
+
+    def hear(self, message: bytes, now_ns: int) -> Answer | None:
+        """Carry out a line; None where it is for another address."""
+        self.tick(now_ns)
+        text = message.decode("ascii", "replace")
+        watchdog = self._profile.watchdog
+        if watchdog != "none" and watchdog.kick == "any":
+            self._heard_ns = self._now_ns
+        for part in (self._outputs, self._inputs, self._watchdog, self._questions, self._steps):
+            found = part(text)
+            if found is not None:
+                return self._answer(found)
+        if self._is_for_another(text):
+            return None
+        return self._unknown()
+
+    def refusal(self, message: bytes) -> Answer | None:
+        """Return an answer that says no."""
+        del message
+        if self._profile.errors:
+            return self._answer(self._profile.errors[-1].example)
+        self._errors.append(_REFUSED)
+        return Answer(None)
+
+    def wrong_id(self, reply: bytes) -> bytes:
+        """Return a reply in another's name; where none is in it, one to something else."""
+        own = f"{self._address:02X}".encode()
+        if len(reply) >= 3 and reply[1:3] == own:
+            return reply[:1] + f"{self._address ^ 3:02X}".encode() + reply[3:]
+        return b"ANOTHER," + reply
+
+    def _answer(self, text: str) -> Answer:
+        """Return a reply; an example's address becomes our own."""
+        shipped = self._profile.address
+        if isinstance(shipped, int) and text[:1] in {"!", "?"} and text[1:3] == f"{shipped:02X}":
+            text = f"{text[:1]}{self._address:02X}{text[3:]}"
+        return Answer(text.encode() if text else None)
+
+    def _is_for_another(self, text: str) -> bool:
+        if self._profile.address == "none" or not re.match(r"[#$~%@][0-9A-F]{2}", text):
+            return False
+        return text[1:3] != f"{self._address:02X}"
+
+    def _unknown(self) -> Answer:
+        if self._profile.errors:
+            return self._answer(self._profile.errors[-1].example)
+        self._errors.append(_UNDEFINED)
+        return Answer(None)
+
+    def _outputs(self, text: str) -> str | None:
+        for name, output in self._profile.outputs.items():
+            fields = Template(output.write, self._address).heard(text)
+            if fields is not None:
+                reply = "" if output.reply == "none" else output.reply.example
+                return self._set(name, fields["value"], reply)
+            readback = output.readback
+            if readback != "none" and Template(readback.ask, self._address).heard(text) is not None:
+                return in_style(readback.example, readback.pattern, self._values[name])
+        combined = self._profile.exchange
+        if combined == "none":
+            return None
+        fields = Template(combined.write, self._address).heard(text)
+        if fields is None:
+            return None
+        source = self._profile.inputs[combined.input]
+        reading = self._reading(combined.input, source)
+        reply = in_style(combined.example, combined.pattern, reading)
+        return self._set(combined.output, fields["value"], reply)
+
+    def _set(self, name: str, value: float, reply: str) -> str:
+        watchdog, output = self._profile.watchdog, self._profile.outputs[name]
+        if self.tripped and watchdog != "none" and watchdog.refuses_while_tripped:
+            return "" if watchdog.refusal == "none" else watchdog.refusal.example
+        if watchdog != "none" and watchdog.kick == "write":
+            self._heard_ns = self._now_ns
+        if not output.min <= value <= output.max:
+            if self._profile.errors:
+                return self._profile.errors[0].example
+            self._errors.append(_OUT_OF_RANGE)
+            return reply
+        self._put_out(name, value, "write", self._now_ns)
+        return reply
+
+    def _inputs(self, text: str) -> str | None:
+        for name, source in self._profile.inputs.items():
+            if Template(source.ask, self._address).heard(text) is not None:
+                return in_style(source.example, source.pattern, self._reading(name, source))
+        return None
+
+    def _reading(self, name: str, source: AsciiInput) -> float:
+        if source.measures == "output":
+            value = next(iter(self._values.values())) if self._output is None else (
+                self._values[self._output]
+            )  # fmt: skip
+        elif name == self._sensor:
+            value = (self._rig.displacement_um - self._wiring.offset_um) / self._wiring.sensor_um
+        else:
+            value = 0.0
+        value = min(max(value, source.min), source.max)
+        return (value - source.offset) / source.scale
+
+    def _watchdog(self, text: str) -> str | None:
+        watchdog = self._profile.watchdog
+        if watchdog == "none":
+            return None
+        if watchdog.tripped != "none" and self._hears(watchdog.tripped.ask, text):
+            example = watchdog.tripped.example
+            return example if self.tripped else example[:-1] + "0"
+        for name in ("arm", "disarm", "feed", "clear"):
+            steps = getattr(watchdog, name)
+            for step in steps:
+                if isinstance(step, SendStep) and self._hears(step.text, text):
+                    if step is steps[-1]:
+                        self._switch(name, step.text, text)
+                    return "" if step.reply == "none" else step.reply.example
+        for name, steps in watchdog.safe.items():
+            for step in steps:
+                if isinstance(step, NumberStep) and self._hears(step.ask, text):
+                    return in_style(step.example, step.pattern, self._safe[name])
+        return None
+
+    def _switch(self, name: str, template: str, text: str) -> None:
+        watchdog = self._profile.watchdog
+        assert watchdog != "none"
+        self._heard_ns = self._now_ns
+        if name == "arm":
+            fields = Template(template, self._address).heard(text) or {}
+            counts = fields.get("timeout", watchdog.min_s / watchdog.unit_s)
+            self._timeout_ns = round(counts * watchdog.unit_s * 1e9)
+        elif name == "disarm":
+            self._timeout_ns = 0
+        elif name == "clear":
+            self.tripped = False
+
+    def _questions(self, text: str) -> str | None:
+        query = self._profile.error_query
+        if query != "none" and self._hears(query.ask, text):
+            return self._errors.pop(0) if self._errors else query.example
+        test = self._profile.selftest
+        return test.example if test != "none" and self._hears(test.ask, text) else None
+
+    def _steps(self, text: str) -> str | None:
+        watchdog = self._profile.watchdog
+        steps: tuple[AsciiStep, ...] = (*self._profile.init, *self._profile.close)
+        if watchdog != "none":
+            steps += tuple(step for each in watchdog.safe.values() for step in each)
+        for step in steps:
+            if isinstance(step, SendStep) and self._hears(step.text, text):
+                return step.reply.example if isinstance(step.reply, Reply) else ""
+            if isinstance(step, AskStep | NumberStep) and self._hears(step.ask, text):
+                return step.example
+        return None
+
+    def _hears(self, template: str, text: str) -> bool:
+        return Template(template, self._address).heard(text) is not None
+
+    def _put_out(self, name: str, value: float, event: str, now_ns: int) -> None:
+        self._values[name] = value
+        more: dict[str, float] = {}
+        if name == self._output:
+            self._rig.put_out(self._wiring.gain_a * value + self._wiring.offset_a, now_ns)
+            more["current_a"] = self._rig.current_a
+        unit = self._profile.outputs[name].unit
+        self._log.event(now_ns, event, output=name, value=value, unit=unit, **more)
+
+    def _trip(self, due_ns: int) -> None:
+        watchdog = self._profile.watchdog
+        assert watchdog != "none"
+        for name in self._values:
+            if watchdog.on_trip == "safe":
+                self._put_out(name, self._safe[name], "watchdog", due_ns)
+            elif watchdog.on_trip in {"zero", "reset"}:
+                self._put_out(name, 0.0, "watchdog", due_ns)
+            else:
+                self._put_out(name, self._values[name], "watchdog", due_ns)

@@ -1,0 +1,225 @@
+"""An emulated microcontroller board: protocol 1 in front of the simulated rig."""
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+from hilctl.arrays import F64
+from hilctl_drivers import board_protocol as board
+from hilctl_drivers.board_protocol import Status
+from hilctl_drivers.board_session import Values
+from hilctl_drivers.emulator.answer import Answer
+from hilctl_drivers.emulator.emulated import Wiring
+from hilctl_drivers.emulator.rig import Rig
+from hilctl_drivers.emulator.stream_player import StreamPlayer
+from hilctl_drivers.emulator.write_log import WriteLog
+from hilctl_drivers.profile_frames import FrameProfile, FrameStreaming
+
+
+class _Refuse(Exception):  # noqa: N818  a reply, not a mistake
+    def __init__(self, status: Status) -> None:
+        super().__init__(status)
+        self.status = status
+
+
+class EmulatedBoard:
+    """The board.
+
+    Args:
+        profile: What it is.
+        rig: What it drives sample by sample.
+        log: Where what it puts out goes.
+        wiring: Amplifier and sensor between.
+        noise: Whether the sensor has noise, when streaming.
+    """
+
+    def __init__(
+        self, profile: FrameProfile, rig: Rig, log: WriteLog, wiring: Wiring, *, noise: bool
+    ) -> None:
+        self._profile = profile
+        self._rig = rig
+        self._log = log
+        self._wiring = wiring
+        self._output_name, self._output = next(iter(profile.outputs.items()))
+        self._outputs = Values(self._output)
+        self._sensor = next(iter(profile.inputs.values()))
+        self._inputs = Values(self._sensor)
+        streaming = profile.streaming
+        self._streaming = streaming if isinstance(streaming, FrameStreaming) else None
+        depth = self._streaming.fifo_depth if self._streaming else 0
+        self.player = StreamPlayer(depth, noise=noise, on_played=self._played)
+        self._prefill = 0
+        self._timeout_ns = 0
+        self._safe = 0.0
+        self._heard_ns = 0
+        self._now_ns = 0
+        self.tripped = False
+        self._kinds: dict[int, Callable[[bytes, bytes], Answer]] = {
+            board.EXCHANGE: self._exchange,
+            board.STREAM: self._stream,
+            board.WATCHDOG: self._watchdog,
+            board.SAFE: self._put_safe,
+            board.INFO: self._info,
+            board.CLOCK: self._clock,
+        }
+
+    def tick(self, now_ns: int) -> None:
+        """Let time pass; the watchdog may trip on the way."""
+        due_ns = self._heard_ns + self._timeout_ns
+        if self._timeout_ns and not self.tripped and due_ns <= now_ns:
+            self.player.advance(due_ns)
+            self.player.stop()
+            self.tripped = True
+            self._put_out(self._safe, "watchdog", due_ns)
+        self._now_ns = max(self._now_ns, now_ns)
+        self.player.advance(self._now_ns)
+        if not self.player.running:
+            self._rig.advance(self._now_ns)
+
+    def hear(self, message: bytes, now_ns: int) -> Answer:
+        """Take one message and return what to answer; a refused one changes nothing."""
+        self.tick(now_ns)
+        self._heard_ns = self._now_ns
+        head = message[: board.HEAD.size]
+        if len(head) < board.HEAD.size or head[0] not in self._kinds:
+            return self.refusal(message, Status.BAD_MESSAGE)
+        try:
+            return self._kinds[head[0]](head, message[board.HEAD.size :])
+        except _Refuse as refused:
+            return self.refusal(message, refused.status)
+
+    def refusal(self, message: bytes, status: int = Status.BAD_MESSAGE) -> Answer:
+        """Return a reply that says no."""
+        kind, seq = (*message[:2], 0, 0)[:2]
+        return Answer(board.STATUS_REPLY.pack(kind | board.REPLY_BIT, seq, status))
+
+    def wrong_id(self, reply: bytes) -> bytes:
+        """Return a reply as if to another message."""
+        return reply[:1] + bytes([reply[1] ^ 0x55]) + reply[2:]
+
+    def _values(self, data: bytes, count: int) -> F64:
+        """Return the values of a message, all of them good."""
+        if count < 1 or len(data) != count * self._outputs.size:
+            raise _Refuse(Status.BAD_MESSAGE)
+        values = self._outputs.decode(data)
+        low, high = self._output.limits
+        slack = 1e-6 * (high - low)  # a float32 is that coarse
+        if not ((values >= low - slack) & (values <= high + slack)).all():
+            raise _Refuse(Status.OUT_OF_RANGE)
+        return values
+
+    def _exchange(self, head: bytes, body: bytes) -> Answer:
+        size = board.EXCHANGE_REQUEST.size - board.HEAD.size
+        if len(body) < size or body[:size] != b"\1\0" or self.player.running:
+            raise _Refuse(Status.BAD_MESSAGE)
+        values = self._values(body[size:], 1)
+        if self.tripped:
+            raise _Refuse(Status.TRIPPED)
+        reading = self._terminal(np.array([self._rig.displacement_um]))
+        self._put_out(float(values[0]), "write", self._now_ns)
+        reply = board.EXCHANGE_REPLY.pack(head[0] | board.REPLY_BIT, head[1], 0, 1)
+        return Answer(reply + self._inputs.encode(reading) + board.FIFO_TAIL.pack(0, 0))
+
+    def _stream(self, head: bytes, body: bytes) -> Answer:
+        size = board.STREAM_REQUEST.size - board.HEAD.size
+        player, streaming = self.player, self._streaming
+        if len(body) < size or streaming is None:
+            raise _Refuse(Status.BAD_MESSAGE)
+        _, _, first, count = board.STREAM_REQUEST.unpack(head + body[:size])
+        values = self._values(body[size:], count)
+        if self.tripped:
+            raise _Refuse(Status.TRIPPED)
+        if not player.running or count > streaming.block_max:
+            raise _Refuse(Status.BAD_MESSAGE)
+        if first != player.queued & 0xFFFFFFFF:
+            raise _Refuse(Status.WRONG_FIRST)
+        if player.level + count > player.depth:
+            raise _Refuse(Status.FIFO_FULL)
+        player.queue(values * self._wiring.gain_a + self._wiring.offset_a, self._now_ns)
+        until = max(0, player.queued - self._prefill)
+        due_ns = player.due_ns(until) if until else 0
+        return Answer(None, due_ns or 0, lambda now_ns: self._stream_reply(head, until, now_ns))
+
+    def _stream_reply(self, head: bytes, until: int, now_ns: int) -> bytes:
+        self.tick(now_ns)
+        player = self.player
+        if player.played < until:  # it was stopped meanwhile
+            until = player.played
+        first = player.returned
+        readings = self._terminal(player.take(until))
+        level, underruns = min(player.level, 0xFFFF), min(player.underruns, 0xFFFF)
+        reply = board.STREAM_REPLY.pack(
+            head[0] | board.REPLY_BIT, head[1], 0, first & 0xFFFFFFFF, readings.size
+        )
+        return reply + self._inputs.encode(readings) + board.FIFO_TAIL.pack(level, underruns)
+
+    def _watchdog(self, head: bytes, body: bytes) -> Answer:
+        size = board.WATCHDOG_REQUEST.size - board.HEAD.size
+        if len(body) < size or self._profile.watchdog == "none":
+            raise _Refuse(Status.BAD_MESSAGE)
+        _, _, timeout_ms = board.WATCHDOG_REQUEST.unpack(head + body[:size])
+        self._safe = float(self._values(body[size:], 1)[0])
+        self._timeout_ns = timeout_ms * 1_000_000
+        self.tripped = False
+        reply = board.WATCHDOG_REPLY.pack(head[0] | board.REPLY_BIT, head[1], 0, timeout_ms)
+        return Answer(reply)
+
+    def _put_safe(self, head: bytes, body: bytes) -> Answer:
+        value = float(self._values(body, 1)[0])
+        if self.tripped:
+            raise _Refuse(Status.TRIPPED)
+        self.player.stop()
+        self._put_out(value, "safe", self._now_ns)
+        return Answer(board.STATUS_REPLY.pack(head[0] | board.REPLY_BIT, head[1], 0))
+
+    def _info(self, head: bytes, body: bytes) -> Answer:
+        del body
+        low, high = self._output.limits
+        streaming = self._streaming
+        reply = board.INFO_REPLY.pack(
+            head[0] | board.REPLY_BIT,
+            head[1],
+            0,
+            board.VERSION,
+            streaming.fifo_depth if streaming else 0,
+            streaming.block_max if streaming else 1,
+            self._profile.max_rate_hz,
+            low,
+            high,
+        )
+        return Answer(reply + b"hilctl emulated board")
+
+    def _clock(self, head: bytes, body: bytes) -> Answer:
+        if len(body) != board.CLOCK_REQUEST.size - board.HEAD.size or self._streaming is None:
+            raise _Refuse(Status.BAD_MESSAGE)
+        _, _, rate_hz, prefill = board.CLOCK_REQUEST.unpack(head + body)
+        too_fast = not 0.0 <= rate_hz <= self._profile.max_rate_hz * (1.0 + 1e-6)
+        if too_fast or prefill > self.player.depth or not math.isfinite(rate_hz):
+            raise _Refuse(Status.BAD_MESSAGE)
+        self._prefill = prefill
+        self.player.set_clock(rate_hz, prefill)
+        return Answer(board.CLOCK_REPLY.pack(head[0] | board.REPLY_BIT, head[1], 0, rate_hz))
+
+    def _put_out(self, value: float, event: str, now_ns: int) -> None:
+        current_a = self._wiring.gain_a * value + self._wiring.offset_a
+        self._rig.put_out(current_a, now_ns)
+        self.player.current_a = current_a
+        self._log.event(
+            now_ns, event, output=self._output_name, value=value, unit=self._output.unit,
+            current_a=current_a,
+        )  # fmt: skip
+
+    def _played(self, first: int, current_a: F64, now_ns: int) -> None:
+        value = (float(current_a[-1]) - self._wiring.offset_a) / self._wiring.gain_a
+        self._log.event(
+            now_ns, "played", output=self._output_name, first=first, samples=current_a.size,
+            value=value, unit=self._output.unit, current_a=float(current_a[-1]),
+        )  # fmt: skip
+
+    def _terminal(self, displacement_um: F64) -> F64:
+        """Return what the sensor gives at the input's terminal; an ADC ends at its range."""
+        low, high = self._sensor.limits
+        values = (displacement_um - self._wiring.offset_um) / self._wiring.sensor_um
+        clipped: F64 = np.clip(values, low, high)
+        return clipped

@@ -1,0 +1,125 @@
+"""The registers of an emulated device: which exist, what can be read, what can be written."""
+
+import struct
+from collections.abc import Sequence
+
+from hilctl_drivers.profile_parts import Register
+from hilctl_drivers.registers import RegisterFormat
+
+Key = tuple[str, int]
+"""Area and wire address."""
+
+
+class NoSuchRegister(LookupError):  # noqa: N818  a condition of the protocol, not a mistake
+    """The device has nothing at this address."""
+
+
+class Words:
+    """The words of one value, shared by all addresses that show it.
+
+    Args:
+        register: How the value is written.
+    """
+
+    def __init__(self, register: Register) -> None:
+        self.register = register
+        self._format = (
+            None
+            if register.type == "bit"
+            else RegisterFormat(register.type, register.order, register.scale, register.offset)
+        )
+        self.words = [0] * register.words
+
+    def encoded(self, value: float) -> list[int]:
+        """Return the words that stand for ``value``."""
+        if self._format is None:
+            return [int(value != 0.0)]
+        data = self._format.encode(value)
+        return list(struct.unpack(f">{len(data) // 2}H", data))
+
+    @property
+    def value(self) -> float:
+        """The value that the words stand for."""
+        if self._format is None:
+            return float(self.words[0])
+        return self._format.decode(struct.pack(f">{len(self.words)}H", *self.words))
+
+    @value.setter
+    def value(self, value: float) -> None:
+        self.words[:] = self.encoded(value)
+
+
+class Memory:
+    """Addresses in two maps, because couplers read at one address what they don't write there."""
+
+    def __init__(self) -> None:
+        self._readable: dict[Key, tuple[Words, int]] = {}
+        self._writable: dict[Key, tuple[Words, int]] = {}
+
+    def place(
+        self, words: Words, area: str, address: int, *, read: bool = True, write: bool = True
+    ) -> Words:
+        """Put a value at an address, unless there is one; return what stands there.
+
+        Args:
+            words: The value.
+            area: coil, discrete, input or holding.
+            address: Wire address of its first word.
+            read: Whether it can be read there.
+            write: Whether it can be written there.
+        """
+        maps = [
+            each for each, wanted in ((self._readable, read), (self._writable, write)) if wanted
+        ]
+        there = next((each[area, address] for each in maps if (area, address) in each), None)
+        found = words if there is None else there[0]
+        for each in maps:
+            for k in range(len(found.words)):
+                each.setdefault((area, address + k), (found, k))
+        return found
+
+    def read(self, areas: Sequence[str], address: int, count: int) -> list[int]:
+        """Return words as they are read, each from the first area that has it.
+
+        Raises:
+            NoSuchRegister: None of them has.
+        """
+        return self._values(self._readable, areas, address, count)
+
+    def written(self, area: str, address: int, count: int) -> list[int]:
+        """Return words as they were last written."""
+        return self._values(self._writable, [area], address, count)
+
+    def targets(
+        self, area: str, address: int, values: Sequence[int]
+    ) -> list[tuple[Words, list[int]]]:
+        """Return which values a write would change, and to which words.
+
+        Raises:
+            NoSuchRegister: An address is not there, or only a part of a value would be written.
+        """
+        found: list[tuple[Words, list[int]]] = []
+        position = 0
+        while position < len(values):
+            words, k = self._find(self._writable, [area], address + position)
+            size = len(words.words)
+            if k or position + size > len(values):
+                raise NoSuchRegister
+            found.append((words, list(values[position : position + size])))
+            position += size
+        return found
+
+    def _values(
+        self, where: dict[Key, tuple[Words, int]], areas: Sequence[str], address: int, count: int
+    ) -> list[int]:
+        found = (self._find(where, areas, address + k) for k in range(count))
+        return [words.words[k] for words, k in found]
+
+    @staticmethod
+    def _find(
+        where: dict[Key, tuple[Words, int]], areas: Sequence[str], address: int
+    ) -> tuple[Words, int]:
+        for area in areas:
+            if (area, address) in where:
+                return where[area, address]
+        raise NoSuchRegister

@@ -1,0 +1,180 @@
+"""Modbus as an emulated device speaks it: pymodbus's framing and messages.
+
+The only module that imports pymodbus. It is used on this side because the driver has framing of its
+own: a mistake in either then shows. Its server is not used: it loses the second of two requests in
+one segment, and has no way to cut, double or reset what it sends. Its serial client sleeps for
+milliseconds in each transaction.
+"""
+
+import struct
+from collections.abc import Coroutine, Sequence
+from typing import Any, Literal, TypeAlias
+
+from pymodbus.constants import ExcCodes
+from pymodbus.exceptions import ModbusException
+from pymodbus.framer import FramerRTU, FramerSocket
+from pymodbus.pdu import DecodePDU, ExceptionResponse, ModbusPDU
+
+from hilctl_drivers.emulator.emulated import Declined, EmulatedDevice
+
+LinkKind: TypeAlias = Literal["tcp", "rtu"]
+
+CORRUPT_AT = 3
+"""Byte of a reply whose change no receiver may miss: the protocol id (TCP), data (RTU)."""
+
+_AREAS: dict[int, tuple[str, ...]] = {
+    1: ("coil",),
+    2: ("discrete",),
+    3: ("holding",),
+    4: ("input",),
+    23: ("holding", "input"),
+    76: ("holding", "input"),
+}
+
+
+class FeedbackPdu(ModbusPDU):
+    """LabJack's Modbus Feedback, function 76: read and write frames in one message."""
+
+    function_code = 76
+    rtu_byte_count_pos = 2  # it is not spoken over RTU, but pymodbus asks
+
+    def __init__(self, data: bytes = b"") -> None:
+        super().__init__()
+        self.data = data
+
+    def encode(self) -> bytes:
+        """Return the data."""
+        return self.data
+
+    def decode(self, data: bytes) -> None:
+        """Keep the data."""
+        self.data = data
+
+    async def datastore_update(self, context: Any, device_id: int) -> ModbusPDU:
+        """Carry out frame after frame, as LabJack's protocol page describes them."""
+        reply = b""
+        rest = self.data
+        while rest:
+            if len(rest) < 4 or rest[0] > 1:
+                return ExceptionResponse(76, ExcCodes.ILLEGAL_VALUE)
+            write, address, count = struct.unpack_from(">BHB", rest)
+            rest = rest[4:]
+            if write:
+                words = struct.unpack_from(f">{count}H", rest)
+                rest = rest[2 * count :]
+                done = await context.async_setValues(device_id, 76, address, words)
+            else:
+                done = await context.async_getValues(device_id, 76, address, count)
+                if not isinstance(done, ExcCodes):
+                    reply += struct.pack(f">{count}H", *done)
+            if isinstance(done, ExcCodes):
+                return ExceptionResponse(76, done)
+        return FeedbackPdu(reply)
+
+
+class _Context:
+    """What pymodbus's messages act on: the device's registers."""
+
+    def __init__(self, device: EmulatedDevice) -> None:
+        self._device = device
+
+    async def async_getValues(  # noqa: N802  pymodbus calls it by this name
+        self, device_id: int, function: int, address: int, count: int
+    ) -> list[int] | ExcCodes:
+        try:
+            if function in {5, 6}:  # read back for the echo
+                return self._device.memory.written(
+                    "coil" if function == 5 else "holding", address, count
+                )
+            return self._device.read(_AREAS[function], address, count)
+        except Declined as declined:
+            return ExcCodes(declined.code)
+
+    async def async_setValues(  # noqa: N802  pymodbus calls it by this name
+        self, device_id: int, function: int, address: int, values: Sequence[int]
+    ) -> ExcCodes | None:
+        area = "coil" if function in {5, 15} else "holding"
+        try:
+            self._device.write(area, address, [int(value) for value in values])
+        except Declined as declined:
+            return ExcCodes(declined.code)
+        return None
+
+
+def _finish(call: Coroutine[Any, Any, ModbusPDU]) -> ModbusPDU:
+    """Return what a coroutine that never waits returns."""
+    try:
+        call.send(None)
+    except StopIteration as end:
+        result: ModbusPDU = end.value
+        return result
+    raise AssertionError("a register access waited")
+
+
+class ModbusWire:
+    """Requests out of bytes, and replies back into bytes.
+
+    Args:
+        kind: ``tcp`` or ``rtu``.
+        device: What carries requests out.
+        lacking: Functions that the device is to refuse as unknown, with exception 1.
+    """
+
+    def __init__(
+        self, kind: LinkKind, device: EmulatedDevice, lacking: frozenset[int] = frozenset()
+    ) -> None:
+        self._kind = kind
+        self._device = device
+        self._context: Any = _Context(device)  # all that the messages ask for
+        self._decoder = DecodePDU(is_server=True)
+        self._decoder.register(FeedbackPdu)
+        self._framer = (FramerSocket if kind == "tcp" else FramerRTU)(self._decoder)
+        exchange = device.profile.exchange
+        self._lacking = lacking | ({23, 76} - {exchange})
+
+    def take(self, received: bytes) -> tuple[int, bytes]:
+        """Find one request.
+
+        Args:
+            received: All that has come and was not used yet.
+
+        Returns:
+            How many bytes are used up, and the request with its envelope's ids; empty where it is
+            not complete or was not for us.
+        """
+        used, unit, transaction, pdu = self._framer.decode(received)
+        if not pdu or (self._kind == "rtu" and unit != self._device.profile.unit_id):
+            return used, b""
+        return used, struct.pack(">HB", transaction, unit) + pdu
+
+    def answer(self, request: bytes, now_ns: int) -> bytes:
+        """Carry out a request of :meth:`take` and return the reply's bytes."""
+        self._device.request(now_ns)
+        function = request[3]
+        if function in self._lacking:
+            return self.refusal(request, 1)
+        try:
+            message = self._decoder.decode(request[3:])
+            if message is None:
+                known = function in self._decoder.pdu_table
+                return self.refusal(request, 3 if known else 1)
+            reply = _finish(message.datastore_update(self._context, request[2]))
+        except (ModbusException, struct.error, KeyError):
+            return self.refusal(request, 3)
+        return self._framed(reply, request)
+
+    def refusal(self, request: bytes, code: int) -> bytes:
+        """Return the bytes of an exception reply to a request."""
+        return self._framed(ExceptionResponse(request[3], code), request)
+
+    def wrong_id(self, request: bytes, reply: bytes) -> bytes:
+        """Return a reply in the name of another transaction (TCP) or unit (RTU)."""
+        transaction, unit = struct.unpack_from(">HB", request)
+        data = reply[7:] if self._kind == "tcp" else reply[1:-2]
+        if self._kind == "tcp":
+            return self._framer.encode(data, unit, (transaction + 1) & 0xFFFF)
+        return self._framer.encode(data, unit % 247 + 1, 0)
+
+    def _framed(self, reply: ModbusPDU, request: bytes) -> bytes:
+        reply.transaction_id, reply.dev_id = struct.unpack_from(">HB", request)
+        return self._framer.buildFrame(reply)

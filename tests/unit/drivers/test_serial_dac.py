@@ -1,0 +1,349 @@
+"""``serial_dac`` on lines of text and on single frames, against emulated devices on a pty."""
+
+import json
+import time
+
+import numpy as np
+import pytest
+
+from hilctl.errors import DeviceError, InputError
+from hilctl_drivers.emulator.faults import parse_fault
+from hilctl_drivers.emulator.serial_server import SerialEmulation, emulated_serial
+from hilctl_drivers.profile import shipped_profiles
+from hilctl_drivers.serial_dac import SerialDac
+from hilctl_drivers.serial_setup import SerialOptions
+
+DCON = """\
+vendor: nobody
+model: DCON module with an output and an input
+source: [this test]
+verified: "yes"
+link: {kind: ascii, baud: 115200, terminator: "\\r", reply_terminator: "\\r", checksum: dcon}
+address: 2
+exchange: none
+turnaround_s: 0.0
+max_rate_hz: 1000.0
+outputs:
+  AO0:
+    write: "#{address:02X}0{value:+07.3f}"
+    reply: {pattern: ">", example: ">"}
+    readback: {ask: "${address:02X}60", pattern: "![0-9A-F]{2}([+-][0-9]+\\\\.[0-9]+)",
+               example: "!02+05.000"}
+    unit: V
+    min: -10.0
+    max: 10.0
+    resolution: 1.0e-3
+inputs:
+  AI0: {ask: "#{address:02X}0", pattern: ">([+-][0-9]{2}\\\\.[0-9]{3})", example: ">+05.123",
+        unit: V, min: -10.0, max: 10.0}
+errors:
+  - {pattern: "\\\\?", example: "?", meaning: out of range}
+  - {pattern: "\\\\?[0-9A-F]{2}", example: "?02", meaning: invalid command}
+watchdog:
+  unit_s: 0.1
+  min_s: 0.1
+  max_s: 25.5
+  kick: strict
+  on_trip: safe
+  refuses_while_tripped: true
+  refusal: {pattern: "!", example: "!"}
+  tripped: {ask: "~{address:02X}0", pattern: "![0-9A-F]{3}[4-7C-F]", example: "!0204"}
+  arm:
+    - {kind: send, text: "~{address:02X}31{timeout:02X}",
+       reply: {pattern: "![0-9A-F]{2}", example: "!02"}}
+  disarm:
+    - {kind: send, text: "~{address:02X}30{timeout:02X}",
+       reply: {pattern: "![0-9A-F]{2}", example: "!02"}}
+  feed:
+    - {kind: send, text: "~**"}
+  clear:
+    - {kind: send, text: "~{address:02X}1", reply: {pattern: "![0-9A-F]{2}", example: "!02"}}
+selftest: {ask: "${address:02X}M", pattern: "![0-9A-F]{2}7.*", example: "!027024"}
+"""
+KINDS = ["dcon", "scpi", "cobs", "length"]
+
+
+@pytest.fixture
+def profiles(tmp_path):
+    """Return paths of one profile of each kind, none of which waits for a board to boot."""
+    board = shipped_profiles()["cobs_board"].read_text()
+    board = board.replace("boot_wait_s: 2.0", "boot_wait_s: 0.0")
+    texts = {
+        "dcon": DCON,
+        "cobs": board,
+        "length": board.replace("framing: cobs", "framing: length"),
+    }
+    for name, text in texts.items():
+        (tmp_path / f"{name}.yaml").write_text(text)
+    made = {name: str(tmp_path / f"{name}.yaml") for name in texts}
+    return {**made, "scpi": "agilent_34970a"}
+
+
+class Clock:
+    """The emulator's time: the machine's, and what a test lets pass on top."""
+
+    def __init__(self):
+        self.extra_ns = 0
+
+    def __call__(self):
+        return time.monotonic_ns() + self.extra_ns
+
+
+class Rig:
+    """A device that is wired to its emulator."""
+
+    def __init__(self, emulator, log, clock, **options):
+        self.emulator = emulator
+        self.log = log
+        self.clock = clock
+        made = {**emulator.options, "timeout_s": 0.1, **options}
+        self.device = SerialDac(SerialOptions.model_validate(made))
+        self.sample = 0
+
+    def open(self):
+        self.device.open(20.0, 1)
+
+    def pass_s(self, seconds):
+        self.clock.extra_ns += round(seconds * 1e9)
+
+    def exchange(self, command):
+        displacement_um, measured = np.full(1, np.nan), np.full(1, np.nan)
+        self.device.exchange(self.sample, np.array([command]), displacement_um, measured)
+        self.sample += 1
+        return displacement_um[0]
+
+    def events(self):
+        return [json.loads(line) for line in self.log.read_text().splitlines()]
+
+    def current_a(self):
+        """What the coil carries by the emulator's log."""
+        return [event["current_a"] for event in self.events() if "current_a" in event][-1]
+
+
+@pytest.fixture
+def rig(profiles, tmp_path):
+    """Return a function that wires a device of a kind to its emulator."""
+    stack = []
+
+    def of(kind, faults=(), reader=None, own_line=False, **options):
+        log = tmp_path / f"log{len(stack)}.jsonl"
+        wanted = SerialEmulation(
+            profiles.get(kind, kind),
+            log=log,
+            faults=tuple(parse_fault(text) for text in faults),
+            reader=reader,
+            own_line=own_line,
+        )
+        clock = Clock()
+        served = emulated_serial(wanted, clock)
+        made = Rig(served.__enter__(), log, clock, **options)
+        stack.append((made, served))
+        return made
+
+    yield of
+    for made, served in stack:
+        made.device.wire.release()
+        served.__exit__(None, None, None)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_command_arrives_and_a_reading_comes_back(rig, kind):
+    """Through amplifier and sensor, the coil carries what was asked and the rig is seen to move."""
+    bench = rig(kind)
+    bench.open()
+    assert abs(bench.exchange(0.0)) < 1.0
+    bench.exchange(5.0)
+    assert bench.current_a() == pytest.approx(5.0, abs=2e-3)
+    bench.pass_s(0.5)
+    assert 20.0 < bench.exchange(5.0) < 45.0
+    bench.device.close()
+    assert bench.current_a() == pytest.approx(5.0, abs=2e-3)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 10.1, -10.1])
+def test_bad_commands_are_refused_and_nothing_is_sent(rig, kind, bad):
+    """Nothing reaches the device, and the next good command does."""
+    bench = rig(kind)
+    bench.open()
+    with pytest.raises(DeviceError, match=r"serial_dac .*: command\[0\] must be in .*nothing was"):
+        bench.exchange(bad)
+    with pytest.raises(DeviceError, match="nothing was sent"):
+        bench.device.make_safe(bad)
+    assert not [event for event in bench.events() if event["event"] == "write"]
+    bench.exchange(1.0)
+
+
+FAULTS = {
+    "silence": "no answer within 0.1 s",
+    "delay": "no answer within 0.1 s",
+    "corrupt": "checksum of|not an answer to this|crc16_ccitt_false of .* is wrong",
+    "cut": "only . bytes, 1 short, within 0.1 s",
+    "duplicate": "must be one line|bytes behind",
+    "wrong_id": "not an answer to this|reply 90 to message",
+    "exception": "invalid command|no answer within|refused by the board",
+}
+
+
+def exchange_until_it_fails(bench):
+    for _ in range(40):
+        assert abs(bench.exchange(2.0)) < 30.0
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_bad_answer_is_an_error_and_the_output_can_still_be_made_safe(rig, kind, fault):
+    """No wrong reading is taken; the next request is not confused by what is left on the line."""
+    bench = rig(kind, faults=[f"{fault}:0.12@30" if fault == "delay" else f"{fault}@30"])
+    bench.open()
+    with pytest.raises(DeviceError, match=FAULTS[fault]) as caught:
+        exchange_until_it_fails(bench)
+    assert str(caught.value).startswith("serial_dac ")
+    with pytest.raises(DeviceError, match="not open"):
+        bench.exchange(2.0)
+    bench.device.make_safe(-1.0)
+    assert bench.current_a() == pytest.approx(-1.0, abs=2e-3)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_an_unplugged_port_is_an_error_everywhere(rig, kind):
+    """Exchange and make_safe say so within the time-out, and nothing hangs."""
+    bench = rig(kind, faults=["unplug@30"])
+    bench.open()
+    with pytest.raises(DeviceError, match="unplugged"):
+        exchange_until_it_fails(bench)
+    with pytest.raises(DeviceError, match="can't be opened"):
+        bench.device.make_safe(0.0)
+    bench.device.close()
+
+
+@pytest.mark.parametrize("kind", ["dcon", "cobs"])
+def test_a_silent_host_is_noticed_by_the_device(rig, kind):
+    """The device's own watchdog puts the output at the safe value, and then refuses commands."""
+    bench = rig(kind, watchdog={"timeout_s": 0.2, "safe_command": 0.0})
+    bench.open()
+    for _ in range(10):
+        bench.exchange(3.0)
+    bench.pass_s(0.2)
+    with pytest.raises(DeviceError, match="watchdog has tripped"):
+        bench.exchange(3.0)
+    assert (bench.events()[-1]["event"], bench.current_a()) == ("watchdog", 0.0)
+    bench.device.make_safe(0.5)
+    assert bench.current_a() == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize("kind", ["dcon", "cobs"])
+def test_exchanges_feed_the_watchdog_and_close_disarms_it(rig, kind):
+    """Through several of its timeouts nothing trips, nor after closing."""
+    bench = rig(kind, watchdog={"timeout_s": 0.3, "safe_command": 0.0})
+    bench.open()
+    for _ in range(20):
+        bench.exchange(3.0)
+        bench.pass_s(0.05)
+    bench.device.close()
+    bench.pass_s(1.0)
+    bench.open()
+    assert {event["event"] for event in bench.events()} == {"write"}
+
+
+def test_a_trip_of_an_earlier_run_is_cleared_at_open(rig):
+    """Opening clears it, and does not move the output."""
+    bench = rig("dcon", watchdog={"timeout_s": 0.1, "safe_command": 0.0})
+    bench.device.open(60.0, 1)
+    bench.exchange(3.0)
+    bench.device.wire.release()
+    with pytest.raises(DeviceError, match="not open"):
+        bench.device.close()
+    bench.pass_s(0.3)
+    bench.device.open(60.0, 1)
+    assert (bench.events()[-1]["event"], bench.current_a()) == ("watchdog", 0.0)
+    assert bench.exchange(1.0) < 45.0
+
+
+@pytest.mark.parametrize("own_line", [True, False])
+def test_the_sensor_may_stand_on_another_device(rig, profiles, tmp_path, own_line):
+    """On a line of its own, or on the same one at another address."""
+    path = tmp_path / "reader.yaml"
+    path.write_text(DCON.replace("checksum: dcon", "checksum: none"))
+    bench = rig("icp_m7024_dcon", reader=str(path), own_line=own_line, baud=115200)
+    bench.device.open(50.0, 1)
+    assert abs(bench.exchange(0.0)) < 1.0
+    bench.exchange(5.0)
+    bench.pass_s(0.5)
+    assert 20.0 < bench.exchange(5.0) < 45.0
+    assert bench.device.info.max_rate_hz < 200.0
+
+
+def test_scpi_supply_is_set_up_and_checked(rig):
+    """A Kepco BOP is put in current mode, and an error that it keeps is found on the way out."""
+    bench = rig("kepco_bop", reader="agilent_34970a", own_line=True)
+    bench.open()
+    bench.exchange(2.5)
+    assert bench.current_a() == pytest.approx(2.5)
+    bench.emulator.device.refusal(b"")  # leaves an error to be asked for
+    with pytest.raises(DeviceError, match=r"SYST:ERR\? says -200"):
+        bench.device.close()
+
+
+def test_another_device_is_noticed_at_open(rig, tmp_path):
+    """A self-test that is answered by something else ends the opening."""
+    path = tmp_path / "other.yaml"
+    path.write_text(DCON.replace("{2}7.*", "{2}9.*").replace("!027024", "!029024"))
+    bench = rig("dcon", profile=str(path))
+    with pytest.raises(DeviceError, match=r"\$02M must be answered like '!029024', got '!027024'"):
+        bench.open()
+
+
+def test_nobody_there_is_said(rig):
+    """A port that does not exist, and one that somebody else holds."""
+    bench = rig("dcon")
+    away = SerialDac(
+        SerialOptions.model_validate({**bench.emulator.options, "serial_port": "/dev/ttyNOWHERE"})
+    )
+    with pytest.raises(DeviceError, match=r"at /dev/ttyNOWHERE: can't be opened"):
+        away.open(20.0, 1)
+    bench.open()
+    second = SerialDac(SerialOptions.model_validate(bench.emulator.options))
+    with pytest.raises(DeviceError, match="lock"):
+        second.open(20.0, 1)
+
+
+def test_impossible_rates_and_blocks_are_refused(rig):
+    """At open, with what would be possible."""
+    bench = rig("dcon")
+    highest = bench.device.info.max_rate_hz
+    assert 250.0 < highest < 400.0
+    with pytest.raises(DeviceError, match=rf"must be in \(0, {highest:.6g}\] Hz"):
+        bench.device.open(1.01 * highest, 1)
+    with pytest.raises(DeviceError, match="block must be 1"):
+        bench.device.open(50.0, 2)
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({"output": "AO9"}, "output must be one that nobody DCON"),
+        ({"input": "AI9"}, "input must be one that nobody DCON"),
+        ({"profile": "labjack_t7"}, "use modbus_dac"),
+        ({"profile": "kepco_bop", "output": "current", "input": "current"}, "as reader"),
+        ({"reader_address": 3}, "go with reader"),
+        ({"watchdog": {"timeout_s": 100.0}}, "timeout_s must be 0.1 to 25.5"),
+        ({"watchdog": {"timeout_s": 1.0, "safe_command": 11.0}}, "safe_command must be -10 to 10"),
+        ({"sensor": {"um_per_ma": 1.0}}, "the input is in V"),
+        ({"reader": "icp_m7024_dcon"}, "can't share the line"),
+    ],
+)
+def test_options_that_do_not_go_together_are_refused(profiles, changes, text):
+    """Before anything is opened."""
+    options = {
+        "profile": profiles["dcon"],
+        "serial_port": "/dev/x",
+        "output": "AO0",
+        "input": "AI0",
+        "amplifier": {"gain_a_per_v": 1.0},
+        "sensor": {"um_per_v": 12.5},
+        "watchdog": "none",
+        **changes,
+    }
+    with pytest.raises(InputError, match=text):
+        SerialDac(SerialOptions.model_validate(options))
