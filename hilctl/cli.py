@@ -25,6 +25,8 @@ app = typer.Typer(
     add_completion=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
+devices_app = typer.Typer(help="List devices, or probe one.", no_args_is_help=False)
+app.add_typer(devices_app, name="devices")
 
 ExperimentFile = Annotated[
     Path, typer.Argument(help="Experiment file (YAML).", metavar="EXPERIMENT")
@@ -255,6 +257,63 @@ def identify(
         _print_json({"output": str(output) if output else None, **finding.to_mapping()})
     else:
         print_finding(finding, output)
+
+
+@devices_app.callback(invoke_without_command=True)
+def devices(context: typer.Context, as_json: AsJson = False) -> None:
+    """List devices, shipped profiles and the serial ports of this machine; nothing is opened."""
+    if context.invoked_subcommand is not None:
+        return
+    from hilctl.console import print_inventory
+    from hilctl.devices import inventory
+
+    found = inventory()
+    if as_json:
+        _print_json(found.to_mapping())
+    else:
+        print_inventory(found)
+
+
+@devices_app.command()
+def probe(experiment: ExperimentFile, settings: Settings = None, as_json: AsJson = False) -> None:
+    """Open an experiment's device and run its self-test; the output does not move."""
+    from hilctl.console import print_probed
+    from hilctl.devices import probe as open_and_close
+
+    answered = open_and_close(experiment, settings or [])
+    if as_json:
+        _print_json(answered.to_mapping())
+    else:
+        print_probed(answered)
+
+
+@app.command()
+def emulate(
+    profile: Annotated[str, typer.Argument(help="Shipped profile, or path of one.")],
+    link: Annotated[str | None, typer.Option(help="tcp or rtu; else the profile's own.")] = None,
+    host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(help="TCP port; 0 takes a free one.")] = 0,
+    log: Annotated[Path | None, typer.Option(help="File for a log of every write.")] = None,
+    fault: Annotated[
+        list[str] | None, typer.Option(help="KIND@COUNT or KIND@SECONDSs; may be repeated.")
+    ] = None,
+    output: Annotated[str | None, typer.Option(help="Output that drives the rig.")] = None,
+    sensor: Annotated[str | None, typer.Option(help="Input that shows the displacement.")] = None,
+) -> None:
+    """Serve the simulated rig as a real device would, until Ctrl-C."""
+    from hilctl.emulate import emulate as serve
+
+    serve(
+        profile,
+        link=link,
+        host=host,
+        port=port,
+        log=log,
+        faults=fault or [],
+        output=output,
+        sensor=sensor,
+        on_ready=lambda address: print(f"{profile} answers at {address}", flush=True),
+    )
 
 
 def _rows(text: str) -> tuple[int, int | None]:

@@ -11,6 +11,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemaining
 from rich.table import Table
 
 from hilctl.analysis.report import render, summarize
+from hilctl.devices import Inventory, Probed
 from hilctl.preflight import Checked
 from hilctl.recording.reader import read
 from hilctl.replay import ReplayResult
@@ -109,6 +110,32 @@ def print_run(result: RunResult) -> None:
 def print_rich(renderable: RenderableType) -> None:
     """Print a table or text."""
     Console().print(renderable)
+
+
+def print_inventory(found: Inventory) -> None:
+    """Print devices, profiles and serial ports."""
+    table = Table(title="devices", title_justify="left", show_header=False, box=None)
+    for kind, place in sorted(found.devices.items()):
+        table.add_row(kind, place)
+    profiles = Table(title="profiles", title_justify="left", show_header=False, box=None)
+    for name in found.profiles:
+        profiles.add_row(name)
+    ports = Table(title="serial ports", title_justify="left", show_header=False, box=None)
+    for port in found.serial_ports:
+        ports.add_row(port.path, port.description)
+    console = Console()
+    console.print(table, profiles)
+    console.print(ports if found.serial_ports else "no serial port found", soft_wrap=True)
+
+
+def print_probed(answered: Probed) -> None:
+    """Print what a device said of itself."""
+    console = Console()
+    console.print(f"[green]{answered.name} answers[/]: {answered.description}", highlight=False)
+    note = f": {answered.rate_note}" if answered.rate_note else ""
+    console.print(f"at most {answered.max_rate_hz:.6g} samples a second{note}", highlight=False)
+    for key, value in answered.details.items():
+        console.print(f"  {key}: {value}", highlight=False, markup=False)
 
 
 def print_forecast(checked: Checked) -> None:
