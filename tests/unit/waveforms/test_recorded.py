@@ -47,7 +47,7 @@ def record(path: Path, firsts: list[int], columns: F64) -> None:
     with path.open("xb") as stream:
         writer = RecordingWriter(stream, facts, 1_700_000_000_000_000_000)
         writer.batch(batch)
-        writer.finish({"code": "completed"})
+        writer.finish({"code": "completed"}, writer.samples)
 
 
 @pytest.fixture
