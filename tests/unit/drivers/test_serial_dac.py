@@ -1,6 +1,7 @@
 """``serial_dac`` on lines of text and on single frames, against emulated devices on a pty."""
 
 import json
+import os
 import time
 
 import numpy as np
@@ -118,6 +119,13 @@ class Rig:
     def current_a(self):
         """What the coil carries by the emulator's log."""
         return [event["current_a"] for event in self.events() if "current_a" in event][-1]
+
+    def await_current(self, current_a):
+        """Let the emulator come to a setting that it does not answer; fail where it never does."""
+        deadline = time.monotonic() + 20.0
+        while self.current_a() != pytest.approx(current_a):
+            assert time.monotonic() < deadline, f"still at {self.current_a()} A"
+            os.sched_yield()
 
 
 @pytest.fixture
@@ -279,7 +287,7 @@ def test_scpi_supply_is_set_up_and_checked(rig):
     bench = rig("kepco_bop", reader="agilent_34970a", own_line=True)
     bench.open()
     bench.exchange(2.5)
-    assert bench.current_a() == pytest.approx(2.5)
+    bench.await_current(2.5)
     bench.emulator.device.refusal(b"")  # leaves an error to be asked for
     with pytest.raises(DeviceError, match=r"SYST:ERR\? says -200"):
         bench.device.close()
