@@ -43,6 +43,9 @@ class DeviceInfo:
             displacements. 0 where they are the same; more where blocks are played from a FIFO of
             the device, which then keeps the pace: :meth:`Device.exchange` waits for its clock.
         measures_command: Whether :meth:`Device.exchange` fills ``measured``.
+        holds: What it holds alone while it is open, each by a name that is the same for every
+            device that would hold it (``serial:/dev/ttyUSB0``, ``tcp:10.0.0.5:502``): one run at a
+            time may hold it. Empty where any number may run side by side.
         details: Anything worth keeping with a recording (serial numbers, physical parameters).
     """
 
@@ -59,6 +62,7 @@ class DeviceInfo:
     fifo_depth: int = 0
     latency_blocks: int = 0
     measures_command: bool = False
+    holds: tuple[str, ...] = ()
     details: Mapping[str, str] = field(default_factory=dict)
 
 
