@@ -5,6 +5,7 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from hilctl.arrays import F64, U32
 from hilctl.compensator import Compensator
@@ -26,6 +27,8 @@ class ReplayResult:
 
     Attributes:
         samples: Samples recomputed.
+        left_out_samples: Samples behind a damaged stretch of the file, where the compensator's
+            memory is not known.
         identical: Whether every wanted command, command and flag has the same bits.
         first_difference: Index of the first sample that differs, or None.
         differing_samples: How many differ.
@@ -38,6 +41,7 @@ class ReplayResult:
     """
 
     samples: int
+    left_out_samples: int
     identical: bool
     first_difference: int | None
     differing_samples: int
@@ -78,13 +82,15 @@ def replay(recording: Recording, model: HysteresisModel | None = None) -> Replay
     wanted = np.empty_like(samples.wanted)
     command = np.empty_like(samples.command)
     flags = np.zeros_like(samples.flags)
+    known = np.zeros(samples.index.size, dtype=bool)
     for start, rows in _stretches(recording):
+        known[rows] = True
         limiter.last = start.previous_command
         if model is None:
             compensator.restore(start.state)
         for part in _alike(samples.flags, rows):
             _recompute(samples, part, compensator, limiter, (wanted, command, flags))
-    return _compare(recording, wanted, command, flags)
+    return _compare(recording, known, (wanted, command, flags))
 
 
 def _recorded_model(recording: Recording) -> HysteresisModel | None:
@@ -94,10 +100,15 @@ def _recorded_model(recording: Recording) -> HysteresisModel | None:
 
 
 def _stretches(recording: Recording) -> list[tuple[Start, slice]]:
-    """Return where each gapless stretch starts, and its rows."""
+    """Return where each gapless stretch starts, and its rows.
+
+    Blocks lost from a damaged file leave gaps that no start stands behind: what follows them, up to
+    the next start, is left out.
+    """
     index = recording.samples.index
     firsts = [int(np.searchsorted(index, start.sample)) for start in recording.starts]
-    ends = [*firsts[1:], index.size]
+    gaps = np.append(np.flatnonzero(np.diff(index) != 1) + 1, index.size)
+    ends = gaps[np.searchsorted(gaps, firsts, side="right")].tolist()
     return [
         (start, slice(first, end))
         for start, first, end in zip(recording.starts, firsts, ends, strict=True)
@@ -130,20 +141,26 @@ def _recompute(
     limiter.limit(wanted, command, flags)
 
 
-def _compare(recording: Recording, wanted: F64, command: F64, flags: U32) -> ReplayResult:
+def _compare(
+    recording: Recording, known: npt.NDArray[np.bool_], recomputed: tuple[F64, F64, U32]
+) -> ReplayResult:
     samples = recording.samples
+    wanted, command = recomputed[0][known], recomputed[1][known]
+    flags = recomputed[2][known]
+    recorded = samples.command[known]
     same = (
-        (wanted.view(np.uint64) == samples.wanted.view(np.uint64))
-        & (command.view(np.uint64) == samples.command.view(np.uint64))
-        & (flags == samples.flags & np.uint32(_LIMIT_BITS))
+        (wanted.view(np.uint64) == samples.wanted[known].view(np.uint64))
+        & (command.view(np.uint64) == recorded.view(np.uint64))
+        & (flags == samples.flags[known] & np.uint32(_LIMIT_BITS))
     )
     different = np.flatnonzero(~same)
-    change = command - samples.command
+    change = command - recorded
     limited = flags & (Flag.RANGE_LIMITED | Flag.SLEW_LIMITED).value
     return ReplayResult(
         samples=command.size,
+        left_out_samples=samples.index.size - command.size,
         identical=different.size == 0,
-        first_difference=int(samples.index[different[0]]) if different.size else None,
+        first_difference=int(samples.index[known][different[0]]) if different.size else None,
         differing_samples=different.size,
         largest_difference=float(np.max(np.abs(change))),
         rms_difference=float(np.sqrt(np.mean(change**2))),

@@ -75,6 +75,7 @@ class Event:
         level: ``info``, ``warning`` or ``error``.
         code: Short name for programs, for example ``run_ended``.
         text: One line for people.
+        before: The last samples up to it; None where they are not told.
     """
 
     time_ns: int
@@ -82,6 +83,7 @@ class Event:
     level: str
     code: str
     text: str
+    before: Samples | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,26 +1,29 @@
 """From an MCAP file to a recording in memory."""
 
 import json
-import struct
-from collections.abc import Iterator
+import logging
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from google.protobuf.message import DecodeError
-from mcap.exceptions import McapError
 from mcap.records import Attachment, Channel, Message, Metadata
-from mcap.stream_reader import StreamReader
 
 from hilctl.arrays import F64
 from hilctl.errors import DataError
 from hilctl.recording import schema
 from hilctl.recording.data import Event, Recording, Samples, Start, Ticks
+from hilctl.recording.salvage import Salvage
+from hilctl.recording.writer import is_being_recorded
 from hilctl.segments import Segment
+
+_log = logging.getLogger(__name__)
 
 
 def read(path: Path) -> Recording:
-    """Read a recording; one that was cut short gives what it holds.
+    """Read a recording; of one that was cut short or damaged, all that is whole.
+
+    Nothing is written. That something is missing is logged as a warning, in one line.
 
     Raises:
         DataError: The file can't be read, is not an MCAP file, or was not written by hilctl.
@@ -28,27 +31,46 @@ def read(path: Path) -> Recording:
     contents = _Contents()
     try:
         with path.open("rb") as stream:
-            for record in _records(stream):
+            salvage = Salvage(stream)
+            for record in salvage.records():
                 contents.take(record)
+            live = not salvage.sound and is_being_recorded(stream)
     except FileNotFoundError:
         raise DataError(f"{path}: no such file") from None
     except OSError as error:
         raise DataError(f"{path}: can't be read: {error.strerror}") from None
-    except (McapError, DecodeError, struct.error, ValueError) as error:
-        if not contents.run:
-            raise DataError(f"{path}: is not an MCAP recording: {error}") from None
+    except (DecodeError, UnicodeDecodeError) as error:
+        raise DataError(f"{path}: holds what hilctl did not write: {error}") from None
     if not contents.run:
-        raise DataError(f"{path}: holds no run of hilctl (metadata hilctl.run is missing)")
-    return contents.recording(path)
+        problem = "" if salvage.is_mcap else "is not an MCAP file, or its start is lost: "
+        raise DataError(f"{path}: {problem}holds no run of hilctl (metadata hilctl.run is missing)")
+    recording = contents.recording(path)
+    if not salvage.sound:
+        _warn(recording, "is still being recorded" if live else salvage.describe(), live=live)
+    return recording
 
 
-def _records(stream: Any) -> Iterator[Any]:
-    try:
-        yield from StreamReader(stream, record_size_limit=None).records
-    except McapError:
-        raise
-    except Exception as error:  # decompressors raise errors of their own
-        raise ValueError(f"damaged record: {error}") from error
+def _warn(recording: Recording, problem: str, *, live: bool) -> None:
+    advice = "" if live else " ('hilctl recover' makes it a whole file again, and keeps this one)"
+    samples = recording.samples.index.size
+    _log.warning("%s: %s; %d samples are read%s", recording.path, problem, samples, advice)
+
+
+def _event(time_ns: int, decoded: Any) -> Event:
+    before = None
+    if decoded.before_sample:
+        small = "v" if decoded.before_drive_v else "a"
+        command = decoded.before_drive_v or decoded.before_current_a
+        before = Samples(
+            index=np.array(decoded.before_sample, dtype=np.int64),
+            reference_um=np.array(decoded.before_reference_um),
+            wanted=np.array(getattr(decoded, f"before_wanted_{small}")),
+            command=np.array(command),
+            measured=np.empty(0),
+            displacement_um=np.array(decoded.before_displacement_um),
+            flags=np.array(decoded.before_flags, dtype=np.uint32),
+        )
+    return Event(time_ns, decoded.sample, decoded.level, decoded.code, decoded.text, before)
 
 
 class _Contents:
@@ -86,11 +108,21 @@ class _Contents:
         elif topic == "/ticks":
             self._ticks.append(decoded)
         else:
-            self._events.append(
-                Event(record.log_time, decoded.sample, decoded.level, decoded.code, decoded.text)
-            )
+            self._events.append(_event(record.log_time, decoded))
 
     def recording(self, path: Path) -> Recording:
+        """Put it together.
+
+        Raises:
+            DataError: A fact of the run is missing or damaged.
+        """
+        try:
+            return self._recording(path)
+        except (KeyError, ValueError, TypeError) as error:
+            text = f"{path}: metadata hilctl.run or hilctl.end: missing or damaged: {error}"
+            raise DataError(text) from None
+
+    def _recording(self, path: Path) -> Recording:
         unit = "V" if self.run.get("command_unit") == "V" else "A"
         return Recording(
             path=path,
@@ -116,8 +148,10 @@ class _Contents:
         )
 
     def _dropped(self) -> int:
-        counted: int = sum(block.dropped for block in self._blocks)
-        return max(counted, int(self.end.get("missing_samples", "0")))
+        recorded: int = sum(block.n for block in self._blocks)
+        last = self._blocks[-1] if self._blocks else None
+        gaps = last.tick0 + last.n - recorded if last else 0
+        return max(gaps, int(self.end.get("missing_samples", "0")))
 
     def _samples(self, unit: str) -> Samples:
         small = unit.lower()

@@ -69,6 +69,15 @@ _MESSAGES: dict[str, dict[str, tuple[int, Any, bool]]] = {
         "level": (2, _STRING, False),
         "code": (3, _STRING, False),
         "text": (4, _STRING, False),
+        # The last samples up to it, so that one message tells what led there.
+        "before_sample": (5, _UINT64, True),
+        "before_reference_um": (6, _DOUBLE, True),
+        "before_wanted_a": (7, _DOUBLE, True),
+        "before_current_a": (8, _DOUBLE, True),
+        "before_displacement_um": (9, _DOUBLE, True),
+        "before_flags": (10, _UINT32, True),
+        "before_wanted_v": (11, _DOUBLE, True),
+        "before_drive_v": (12, _DOUBLE, True),
     },
 }
 

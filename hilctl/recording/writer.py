@@ -5,28 +5,24 @@ closed and handed to the kernel at least every ``flush_s``, so that a killed rec
 than that.
 """
 
+import errno
+import fcntl
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
-import numpy as np
 from mcap.writer import CompressionType, Writer
 
 from hilctl import __version__
-from hilctl.arrays import F64, U32
+from hilctl.blocks import Batch
 from hilctl.ports import CommandUnit
-from hilctl.recording import schema
 from hilctl.recording.data import Event
-from hilctl.ring import Batch, Head
+from hilctl.recording.messages import Layout, MessageMaker, Topics
 from hilctl.segments import Segment
 
-_COLUMNS = {
-    "A": ("wanted_a", "current_a", "measured_a"),
-    "V": ("wanted_v", "drive_v", "measured_v"),
-}
-_MAX_BLOCK = 500
+_CHUNK_BYTES = 8 << 20  # each chunk's index stays in memory until the end of the run
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,6 +49,16 @@ class RunFacts:
     measures_command: bool
     scope_rate_hz: float
 
+    def layout(self, start_unix_ns: int) -> Layout:
+        """Return what the run's messages are made by."""
+        return Layout(
+            sample_rate_hz=self.sample_rate_hz,
+            command_unit=self.command_unit,
+            measures_command=self.measures_command,
+            scope_rate_hz=self.scope_rate_hz,
+            start_unix_ns=start_unix_ns,
+        )
+
 
 class RecordingWriter:
     """Writes one run.
@@ -64,38 +70,37 @@ class RecordingWriter:
     """
 
     def __init__(self, stream: BinaryIO, run: RunFacts, start_unix_ns: int) -> None:
-        self._run = run
-        self._start_unix_ns = start_unix_ns
-        self._writer = Writer(stream, compression=CompressionType.ZSTD)
-        self._stride = max(1, int(np.ceil(run.sample_rate_hz / run.scope_rate_hz)))
-        self._sequence = dict.fromkeys(schema.TOPICS, 0)
-        self._next_sample = 0
-        self.samples = 0
-        self.missing = 0
-        self._begin()
+        self._writer = Writer(stream, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
+        self._topics = Topics(self._writer)
+        layout = run.layout(start_unix_ns)
+        self._maker = MessageMaker(layout)
+        self._unit = layout.command_unit
+        self._late_missing = 0
+        self._begin(run, layout)
 
-    def _begin(self) -> None:
-        writer, run = self._writer, self._run
-        writer.start(profile="", library=f"hilctl {__version__}")
+    def _begin(self, run: RunFacts, layout: Layout) -> None:
+        self._writer.start(profile="", library=f"hilctl {__version__}")
         segments = json.dumps([segment.to_mapping() for segment in run.segments])
-        writer.add_metadata("hilctl.run", {**run.facts, "segments": segments})
-        self._attach("experiment.yaml", run.experiment_yaml)
+        facts = {**run.facts, **layout.to_facts(), "segments": segments}
+        self._writer.add_metadata("hilctl.run", facts)
+        self._attach("experiment.yaml", run.experiment_yaml, layout.start_unix_ns)
         if run.model_yaml:
-            self._attach("model.yaml", run.model_yaml)
-        descriptors = schema.descriptor_set()
-        self._channels = {
-            topic: writer.register_channel(
-                topic=topic,
-                message_encoding="protobuf",
-                schema_id=writer.register_schema(f"hilctl.{name}", "protobuf", descriptors),
-            )
-            for topic, name in schema.TOPICS.items()
-        }
-        writer.flush()
+            self._attach("model.yaml", run.model_yaml, layout.start_unix_ns)
+        self._topics.register()
+        self._writer.flush()
 
-    def _attach(self, name: str, text: str) -> None:
-        time_ns = self._start_unix_ns
+    def _attach(self, name: str, text: str, time_ns: int) -> None:
         self._writer.add_attachment(time_ns, time_ns, name, "application/yaml", text.encode())
+
+    @property
+    def samples(self) -> int:
+        """Samples written."""
+        return self._maker.samples
+
+    @property
+    def missing(self) -> int:
+        """Samples known to be missing."""
+        return max(self._maker.missing, self._late_missing)
 
     def flush(self) -> None:
         """Close the chunk in work and hand it to the kernel."""
@@ -109,95 +114,19 @@ class RecordingWriter:
             ended_at: Index after the last sample that was exchanged; what is not recorded before
                 it is missing, also where no later block could say so.
         """
-        self.missing = max(self.missing, ended_at - self.samples)
+        self._late_missing = ended_at - self.samples
         counted = {"recorded_samples": str(self.samples), "missing_samples": str(self.missing)}
         self._writer.add_metadata("hilctl.end", {**end, **counted})
         self._writer.finish()
 
     def event(self, event: Event) -> None:
         """Write one event."""
-        out = schema.message("Event")
-        out.sample, out.level, out.code, out.text = (
-            event.sample,
-            event.level,
-            event.code,
-            event.text,
-        )
-        self._add("/events", event.time_ns, out.SerializeToString())
+        self._topics.add(self._maker.event(event, self._unit))
 
     def batch(self, batch: Batch) -> None:
         """Write all samples and ticks of a batch."""
-        firsts = batch.heads[:, Head.FIRST_SAMPLE]
-        gaps = batch.heads[:, Head.DROPPED_BEFORE]
-        block = batch.flags.shape[1]
-        largest = max(1, _MAX_BLOCK // block)
-        row = 0
-        while row < firsts.size:
-            stop = row + 1
-            while stop < firsts.size and stop - row < largest and gaps[stop] == 0:
-                stop += 1
-            self._block(batch, row, stop)
-            row = stop
-        self._ticks(batch)
-
-    def _block(self, batch: Batch, row: int, stop: int) -> None:
-        rows = slice(row, stop)
-        first = int(batch.heads[row, Head.FIRST_SAMPLE])
-        flags = batch.flags[rows].ravel()
-        columns = batch.columns[rows].transpose(1, 0, 2).reshape(5, -1)
-        dropped = int(batch.heads[row, Head.DROPPED_BEFORE])
-        t_rel = (first + np.arange(flags.size)) / self._run.sample_rate_hz
-        wanted, command, measured = _COLUMNS[self._run.command_unit]
-        out = schema.message("SampleBlock")
-        out.tick0, out.n, out.dropped = first, flags.size, dropped
-        out.t_rel.extend(t_rel.tolist())
-        out.flags.extend(flags.tolist())
-        out.reference_um.extend(columns[0].tolist())
-        getattr(out, wanted).extend(columns[1].tolist())
-        getattr(out, command).extend(columns[2].tolist())
-        out.displacement_um.extend(columns[3].tolist())
-        if self._run.measures_command:
-            getattr(out, measured).extend(columns[4].tolist())
-        if self.samples == 0 or dropped:
-            out.state.extend(batch.states[row, :-1].tolist())
-            out.previous_command.append(float(batch.states[row, -1]))
-        self._add("/samples", self._time_ns(first), out.SerializeToString())
-        self.samples += flags.size
-        self.missing += dropped
-        self._scope(first, t_rel, columns, flags)
-
-    def _scope(self, first: int, t_rel: F64, columns: F64, flags: U32) -> None:
-        wanted, command, _ = _COLUMNS[self._run.command_unit]
-        for k in range(-first % self._stride, flags.size, self._stride):
-            out = schema.message("Sample")
-            out.sample, out.t_rel, out.flags = first + k, t_rel[k], int(flags[k])
-            out.reference_um, out.displacement_um = columns[0, k], columns[3, k]
-            setattr(out, wanted, columns[1, k])
-            setattr(out, command, columns[2, k])
-            self._add("/scope", self._time_ns(first + k), out.SerializeToString())
-
-    def _ticks(self, batch: Batch) -> None:
-        out = schema.message("TickBlock")
-        heads = batch.heads
-        out.first_sample.extend(heads[:, Head.FIRST_SAMPLE].tolist())
-        out.deadline_ns.extend(heads[:, Head.DEADLINE_NS].tolist())
-        out.late_ns.extend(heads[:, Head.LATE_NS].tolist())
-        out.exchange_ns.extend(heads[:, Head.EXCHANGE_NS].tolist())
-        first = int(heads[0, Head.FIRST_SAMPLE])
-        self._add("/ticks", self._time_ns(first), out.SerializeToString())
-
-    def _time_ns(self, sample: int) -> int:
-        return self._start_unix_ns + round(sample * 1e9 / self._run.sample_rate_hz)
-
-    def _add(self, topic: str, time_ns: int, data: bytes) -> None:
-        self._writer.add_message(
-            self._channels[topic],
-            log_time=time_ns,
-            data=data,
-            publish_time=time_ns,
-            sequence=self._sequence[topic],
-        )
-        self._sequence[topic] += 1
+        for message in self._maker.batch(batch):
+            self._topics.add(message)
 
 
 class OutputFile:
@@ -211,13 +140,14 @@ class OutputFile:
 
     Raises:
         FileExistsError: It exists and ``overwrite`` is False.
-        OSError: It can't be written.
+        OSError: It can't be written, or another run is recording to it.
     """
 
     def __init__(self, path: Path, *, overwrite: bool) -> None:
         self._path = path
         self._ours = not path.exists()
         self.stream: BinaryIO = path.open("r+b" if overwrite and not self._ours else "xb")
+        lock(self.stream, fcntl.LOCK_EX)
 
     def begin(self) -> BinaryIO:
         """Empty the file and return it, open for writing."""
@@ -230,3 +160,33 @@ class OutputFile:
         self.stream.close()
         if self._ours:
             self._path.unlink()
+
+
+def lock(stream: BinaryIO, kind: int) -> None:
+    """Mark a recording as being written (``LOCK_EX``) or recovered (``LOCK_SH``) till it is closed.
+
+    A lock ends with the process that holds it, however that ends.
+
+    Raises:
+        BlockingIOError: It is being written by another.
+    """
+    try:
+        fcntl.flock(stream, kind | fcntl.LOCK_NB)
+    except BlockingIOError:
+        stream.close()
+        raise BlockingIOError(errno.EAGAIN, "another hilctl is recording to it") from None
+    except OSError as error:
+        if error.errno not in {errno.ENOLCK, errno.ENOTSUP}:  # a file system without locks
+            raise
+
+
+def is_being_recorded(stream: BinaryIO) -> bool:
+    """Return whether a run is recording to an open file; where there are no locks, False."""
+    try:
+        fcntl.flock(stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:
+        return False
+    fcntl.flock(stream, fcntl.LOCK_UN)
+    return False

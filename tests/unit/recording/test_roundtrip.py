@@ -10,66 +10,23 @@ from mcap_protobuf.decoder import DecoderFactory
 from hilctl.errors import DataError
 from hilctl.recording.data import Event
 from hilctl.recording.reader import read
-from hilctl.recording.writer import RecordingWriter, RunFacts
-from hilctl.ring import Batch
-from hilctl.segments import Segment
-
-RATE_HZ = 50_000.0
-START_NS = 1_800_000_000_000_000_000
-BLOCK = 50
-SEGMENT = Segment("sine", 0, 5000, 100, 4900, 200.0)
-
-
-def batch(first, blocks, *, dropped=0, seed=0):
-    """Random blocks that follow one another, the first after a gap."""
-    rng = np.random.default_rng(seed)
-    heads = np.zeros((blocks, 7), dtype=np.int64)
-    heads[:, 1] = first + BLOCK * np.arange(blocks)
-    heads[:, 2] = BLOCK
-    heads[0, 3] = dropped
-    heads[:, 4] = heads[:, 1] * 20_000
-    heads[:, 5] = rng.integers(0, 90_000, blocks)
-    heads[:, 6] = rng.integers(0, 50_000, blocks)
-    return Batch(
-        heads,
-        rng.normal(size=(blocks, 4)),
-        rng.normal(size=(blocks, 5, BLOCK)),
-        rng.integers(0, 31, (blocks, BLOCK)).astype(np.uint32),
-    )
-
-
-def write(stream, batches, *, unit="A", measures=True, finish=True, ended_at=0):
-    facts = RunFacts(
-        facts={"command_unit": unit, "sample_rate_hz": repr(RATE_HZ), "compensator": "rdpi"},
-        segments=(SEGMENT,),
-        experiment_yaml="name: x\n",
-        model_yaml="model: y\n",
-        sample_rate_hz=RATE_HZ,
-        command_unit=unit,
-        measures_command=measures,
-        scope_rate_hz=1000.0,
-    )
-    writer = RecordingWriter(stream, facts, START_NS)
-    for each in batches:
-        writer.batch(each)
-        writer.flush()
-    writer.event(Event(START_NS + 5, 17, "info", "run_ended", "waveform completed"))
-    if finish:
-        writer.finish({"code": "completed", "late_ticks": "3"}, ended_at)
-    return writer
 
 
 @pytest.fixture
-def recorded(tmp_path):
+def recorded(tmp_path, make):
     """A finished recording of three batches with a gap before the last."""
-    batches = [batch(0, 4), batch(200, 30, seed=1), batch(1900, 3, dropped=200, seed=2)]
+    batches = [
+        make.batch(0, 4),
+        make.batch(200, 30, seed=1),
+        make.batch(1900, 3, dropped=200, seed=2),
+    ]
     path = tmp_path / "run.mcap"
     with path.open("wb") as stream:
-        write(stream, batches)
+        make.write(stream, batches)
     return path, batches
 
 
-def test_everything_comes_back(recorded):
+def test_everything_comes_back(recorded, make):
     """Samples, ticks, events, facts, segments and attachments are read back as written."""
     path, batches = recorded
     back = read(path)
@@ -83,19 +40,19 @@ def test_everything_comes_back(recorded):
     assert samples.index.tolist() == [*range(1700), *range(1900, 2050)]
     assert back.dropped == 200
     assert back.ticks.late_ns.tolist() == np.concatenate([b.heads[:, 5] for b in batches]).tolist()
-    assert back.events == (Event(START_NS + 5, 17, "info", "run_ended", "waveform completed"),)
-    assert back.segments == (SEGMENT,)
+    assert back.events == (Event(make.start_ns + 5, 17, "info", "run_ended", "waveform completed"),)
+    assert back.segments == (make.segment,)
     assert (back.experiment_yaml, back.model_yaml) == ("name: x\n", "model: y\n")
     assert back.end["recorded_samples"] == "1850"
     assert back.end["missing_samples"] == "200"
     assert back.compensated
 
 
-def test_samples_lost_at_the_very_end_are_counted(tmp_path):
+def test_samples_lost_at_the_very_end_are_counted(tmp_path, make):
     """Where no later block can tell of a loss, the end does."""
     path = tmp_path / "run.mcap"
     with path.open("wb") as stream:
-        write(stream, [batch(0, 4)], ended_at=350)
+        make.write(stream, [make.batch(0, 4)], ended_at=350)
     assert read(path).dropped == 150
 
 
@@ -108,7 +65,7 @@ def test_replay_can_start_first_and_after_each_gap(recorded):
     assert starts[1].previous_command == batches[2].states[0, -1]
 
 
-def test_independent_reader_agrees(recorded):
+def test_independent_reader_agrees(recorded, make):
     """The stock MCAP reader, indexed and with CRCs, decodes the same by the file's own schema."""
     path, batches = recorded
     counts, samples = {}, []
@@ -121,9 +78,9 @@ def test_independent_reader_agrees(recorded):
             assert schema.name.startswith("hilctl.")
             assert message.sequence == counts[channel.topic] - 1
             if channel.topic == "/samples":
-                assert message.log_time == START_NS + decoded.tick0 * 20_000
+                assert message.log_time == make.start_ns + decoded.tick0 * 20_000
                 assert decoded.n == len(decoded.t_rel) == len(decoded.current_a)
-                assert decoded.t_rel[0] == pytest.approx(decoded.tick0 / RATE_HZ)
+                assert decoded.t_rel[0] == pytest.approx(decoded.tick0 / make.rate_hz)
                 samples += list(decoded.displacement_um)
     assert header.library.startswith("hilctl ")
     assert names == ["hilctl.run", "hilctl.end"]
@@ -141,16 +98,16 @@ def test_scope_is_on_a_grid_of_its_own(recorded):
     assert picked == [*range(0, 1700, 50), *range(1900, 2050, 50)]
 
 
-def test_voltage_devices_have_voltage_fields(tmp_path):
+def test_voltage_devices_have_voltage_fields(tmp_path, make):
     """Volts are recorded in fields that say V, and no ampere field is filled."""
     path = tmp_path / "run.mcap"
-    one = batch(0, 2)
+    one = make.batch(0, 2)
     with path.open("wb") as stream:
-        write(stream, [one], unit="V", measures=False)
+        make.write(stream, [one], unit="V", measures=False)
     with path.open("rb") as stream:
         reader = make_reader(stream, decoder_factories=[DecoderFactory()])
         decoded = next(d for *_, d in reader.iter_decoded_messages(topics=["/samples"]))
-    assert len(decoded.drive_v) == 2 * BLOCK
+    assert len(decoded.drive_v) == 2 * make.block
     assert len(decoded.current_a) == len(decoded.measured_a) == len(decoded.measured_v) == 0
     back = read(path)
     assert back.command_unit == "V"
@@ -158,12 +115,12 @@ def test_voltage_devices_have_voltage_fields(tmp_path):
     assert back.samples.measured.size == 0
 
 
-def test_cut_short_file_gives_what_it_holds(tmp_path):
+def test_cut_short_file_gives_what_it_holds(tmp_path, make):
     """A file cut anywhere after its start is read as far as it goes, and never wrongly."""
     path = tmp_path / "run.mcap"
-    batches = [batch(200 * i, 4, seed=i) for i in range(10)]
+    batches = [make.batch(200 * i, 4, seed=i) for i in range(10)]
     stream = io.BytesIO()
-    write(stream, batches)
+    make.write(stream, batches)
     whole = stream.getvalue()
     path.write_bytes(whole)
     full = read(path).samples

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from hilctl.arrays import F64
+from hilctl.blocks import Batch
 from hilctl.errors import DataError, InputError
 from hilctl.recording.writer import RecordingWriter, RunFacts
-from hilctl.ring import Batch
 from hilctl.waveforms.build import Reference
 
 RATE_HZ = 1000.0
@@ -114,5 +114,5 @@ def test_gap(made: Made, tmp_path: Path) -> None:
 def test_not_a_recording(made: Made, tmp_path: Path) -> None:
     """Bytes that are no recording are refused by name."""
     (tmp_path / "run.mcap").write_bytes(b"not an MCAP file at all")
-    with pytest.raises(DataError, match=r"run\.mcap: is not an MCAP recording"):
+    with pytest.raises(DataError, match=r"run\.mcap: is not an MCAP file"):
         made(RATE_HZ, tmp_path, kind="file", path="run.mcap", column="command")

@@ -1,0 +1,168 @@
+"""Make a sound recording out of one that was cut short or damaged; its bytes are kept.
+
+The file is walked through twice: first to see what is wrong and what it holds, then, only where
+something is wrong, to save every whole record into a new file through the MCAP library's writer,
+which makes index, statistics and checksums anew.
+"""
+
+import fcntl
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from google.protobuf.message import DecodeError
+
+from hilctl.blocks import Batch, Head
+from hilctl.control_page import LoopEvent
+from hilctl.errors import DataError, InputError
+from hilctl.recording.keep import Replacement
+from hilctl.recording.messages import Layout
+from hilctl.recording.resave import Resaved, Survey
+from hilctl.recording.salvage import Damage, Salvage
+from hilctl.recording.writer import lock
+
+
+@dataclass(frozen=True, slots=True)
+class Recovered:
+    """What became of a recording.
+
+    Attributes:
+        path: The sound file.
+        original: Where the bytes as they were are kept; None where the file was sound, so that
+            nothing was written.
+        reason: What was wrong and what is lost, in one line.
+        samples: Samples in the sound file.
+        added_samples: Those of them that were not in the old file.
+        missing_samples: Samples known to be missing.
+        damages: Stretches that could not be read.
+    """
+
+    path: Path
+    original: Path | None
+    reason: str
+    samples: int
+    added_samples: int
+    missing_samples: int
+    damages: tuple[Damage, ...]
+
+    @property
+    def sound(self) -> bool:
+        """Whether the file was sound."""
+        return self.original is None
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return the fields as plain values."""
+        return {
+            "path": str(self.path),
+            "sound": self.sound,
+            "original": str(self.original) if self.original else None,
+            "reason": self.reason,
+            "samples": self.samples,
+            "added_samples": self.added_samples,
+            "missing_samples": self.missing_samples,
+            "damages": [str(damage) for damage in self.damages],
+        }
+
+
+def recover_recording(
+    path: Path,
+    extra: Iterable[Batch] = (),
+    end: Mapping[str, str] | None = None,
+    *,
+    events: Sequence[LoopEvent] = (),
+    ended_at: int = 0,
+    output: Path | None = None,
+) -> Recovered:
+    """Make a recording sound.
+
+    The new file takes the place of the old one, which is kept beside it as ``NAME.torn``, with a
+    number where there is one already. A sound file is left alone unless ``extra`` holds more.
+
+    Args:
+        path: The recording; nobody may have it open for recording.
+        extra: Batches that were exchanged and perhaps not written, in order. Blocks whose samples
+            are in the file already are left out; what is missing before the others counts as
+            dropped. A block is in a file as a whole or not at all.
+        end: Facts of the run's end where the file has none of its own, with ``code`` and
+            ``reason``; else the code is ``recovered``.
+        events: Events of the loop that were perhaps not written; told where anything is added.
+        ended_at: Index after the last sample that was exchanged; 0 where that is not known.
+        output: Put the sound file here instead, and leave the old one where it is.
+
+    Raises:
+        DataError: The file can't be read, holds nothing to recover, or lacks what is needed to add
+            ``extra``.
+        InputError: It is being recorded, or the sound file can't be written. Nothing has changed.
+    """
+    try:
+        with path.open("rb") as stream:
+            lock(stream, fcntl.LOCK_SH)
+            survey = Survey(stream)
+            more = list(_not_in_file(extra, survey.next_sample))
+            if survey.salvage.sound and not more:
+                return _sound(path, survey)
+            layout = _check(path, survey, more)
+            with closing(Replacement(path, output)) as replacement:
+                saved = Resaved(replacement.stream, survey)
+                saved.copy(Salvage(stream).records())
+                if layout:
+                    saved.add(more, layout)
+                    saved.tell(events, layout)
+                reason = saved.finish(end, ended_at)
+                kept = replacement.put()
+    except FileNotFoundError as error:
+        raise DataError(f"{error.filename or path}: no such file or folder") from None
+    except FileExistsError:
+        raise InputError(f"{output}: exists already: give another --output") from None
+    except DecodeError as error:
+        raise DataError(f"{path}: holds what hilctl did not write: {error}") from None
+    except OSError as error:
+        where = error.filename or path
+        raise InputError(f"{where}: can't be recovered: {error.strerror}") from None
+    return Recovered(
+        path=replacement.final,
+        original=kept,
+        reason=reason,
+        samples=saved.samples,
+        added_samples=saved.added,
+        missing_samples=saved.missing,
+        damages=tuple(survey.salvage.damages),
+    )
+
+
+def _sound(path: Path, survey: Survey) -> Recovered:
+    missing = survey.next_sample - survey.samples
+    text = "sound: nothing to recover"
+    return Recovered(path, None, text, survey.samples, 0, missing, ())
+
+
+def _check(path: Path, survey: Survey, more: list[Batch]) -> Layout | None:
+    """Refuse what nothing can be made of; return how to add what is to be added."""
+    if not survey.records:
+        raise DataError(f"{path}: holds no whole record: there is nothing to recover")
+    if not more:
+        return None
+    try:
+        return Layout.from_facts(survey.run)
+    except DataError as error:
+        raise DataError(f"{path}: samples can't be added: {error}") from None
+
+
+def _not_in_file(extra: Iterable[Batch], next_sample: int) -> Iterator[Batch]:
+    """Yield the blocks from ``next_sample`` on, with the gaps before them counted anew."""
+    for batch in extra:
+        firsts = batch.heads[:, Head.FIRST_SAMPLE].tolist()
+        rows: list[int] = []
+        gaps: list[int] = []
+        for row, first in enumerate(firsts):
+            if first >= next_sample:
+                rows.append(row)
+                gaps.append(first - next_sample)
+                next_sample = first + batch.flags.shape[1]
+        if rows:
+            chosen = batch.rows(np.array(rows, dtype=np.int64))
+            chosen.heads[:, Head.DROPPED_BEFORE] = gaps
+            yield chosen

@@ -1,0 +1,233 @@
+"""Walk through an MCAP file, sound or not, and take every record that is whole.
+
+Chunks count by their checksum, all other records by their lengths. Behind a place that can't be
+read the walk goes on at the next thing that looks like a chunk, metadata, an attachment or the end
+of the data. Of a chunk that the file ends in, the messages are taken as far as its stream can be
+read; no checksum covers those, so each must be whole and decode. Of a damaged chunk with more
+behind it nothing is taken: any number in it may be wrong.
+"""
+
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import BinaryIO, NamedTuple
+
+from mcap.opcode import Opcode
+from mcap.records import (
+    Channel,
+    Chunk,
+    ChunkIndex,
+    DataEnd,
+    Footer,
+    Header,
+    McapRecord,
+    Message,
+    Statistics,
+)
+from mcap.writer import MCAP0_MAGIC as MAGIC
+
+from hilctl.recording.records import FRAME, LARGEST_BYTES, Contents, contents, parse
+from hilctl.recording.torn import next_likely, own_channels, tail_kind, take_chunk
+
+_INDEX_KINDS = {Opcode.MESSAGE_INDEX, Opcode.DATA_END, Opcode.FOOTER}
+_KNOWN = {opcode.value for opcode in Opcode}
+
+
+@dataclass(frozen=True, slots=True)
+class Damage:
+    """A stretch of a file that could not be read, or not all of it.
+
+    Attributes:
+        start: Offset of its first byte.
+        size: Bytes.
+        what: ``torn chunk``, ``damaged chunk``, ``damaged record``, ``index`` (nothing of the run
+            is lost with it), ``zeros``, ``unreadable bytes`` or ``message of no channel``.
+        saved: Messages saved from it.
+    """
+
+    start: int
+    size: int
+    what: str
+    saved: int = 0
+
+    def __str__(self) -> str:
+        saved = f", {self.saved} messages of it saved without a checksum" if self.saved else ""
+        return f"{self.what} at byte {self.start} ({self.size} bytes{saved})"
+
+
+class _Found(NamedTuple):
+    """A whole record (None for a message index), what it holds if it is a chunk, and its end."""
+
+    record: McapRecord | None
+    inside: Contents | None
+    end: int
+
+
+class Salvage:
+    """What can be read of a file; all attributes are right once :meth:`records` is exhausted.
+
+    Args:
+        stream: Open binary file that can seek.
+
+    Attributes:
+        size: Bytes of the file.
+        is_mcap: Whether the file begins as an MCAP file does.
+        header: The file's header, where it is whole.
+        damages: Stretches that could not be read.
+        finished: Whether footer and closing magic are there and the index fits the data.
+    """
+
+    def __init__(self, stream: BinaryIO) -> None:
+        self._stream = stream
+        self.size = stream.seek(0, 2)
+        self.is_mcap = self._read(0, len(MAGIC)) == MAGIC
+        self.header: Header | None = None
+        self.damages: list[Damage] = []
+        self.finished = False
+        self._data_ended = False
+        self._channels: set[int] = set()
+        self._indexes: dict[int, bytes] = {}
+        self._chunks: list[int] = []
+        self._indexed: list[int] = []
+        self._messages = 0
+        self._counted = -1
+
+    @property
+    def sound(self) -> bool:
+        """Whether nothing is damaged and nothing missing."""
+        return self.finished and not self.damages
+
+    def describe(self) -> str:
+        """Return what is wrong with the file, in one line."""
+        serious = [damage for damage in self.damages if damage.what != "index"]
+        if not self.damages:
+            return "its end and index are missing"
+        if not serious:
+            return "its index is damaged or cut"
+        more = f" and {len(serious) - 2} more" if len(serious) > 2 else ""
+        return ", ".join(str(damage) for damage in serious[:2]) + more
+
+    def records(self) -> Iterator[McapRecord]:
+        """Yield header, metadata, attachments, schemas, channels and messages in order.
+
+        Every message comes after its channel, and every channel after its schema.
+
+        Raises:
+            OSError: The file can't be read.
+        """
+        at = len(MAGIC)
+        if not self.is_mcap:
+            at = next_likely(self._stream, 1, self.size)
+            self._note(0, at, "damaged record")
+        while at < self.size:
+            found = self._whole(at)
+            if found is None:
+                after = next_likely(self._stream, at + 1, self.size)
+                yield from self._with_channels(self._damaged(at, after), at)
+                at = after
+                continue
+            yield from self._with_channels(self._take(at, found), at)
+            if isinstance(found.record, Footer):
+                self._close(at, found.end, found.record)
+                return
+            at = found.end
+
+    def _read(self, at: int, size: int) -> bytes:
+        self._stream.seek(at)
+        return self._stream.read(size)
+
+    def _whole(self, at: int) -> _Found | None:
+        frame = self._read(at, FRAME.size)
+        if len(frame) < FRAME.size:
+            return None
+        opcode, length = FRAME.unpack(frame)
+        end = at + FRAME.size + length
+        if opcode not in _KNOWN or length > LARGEST_BYTES or end > self.size:
+            return None
+        body = self._read(at + FRAME.size, length)
+        if opcode == Opcode.MESSAGE_INDEX:  # its chunk says what it must be, byte for byte
+            right = self._indexes.pop(int.from_bytes(body[:2], "little"), None)
+            return _Found(None, None, end) if body == right else None
+        record = parse(opcode, body)
+        inside = contents(record) if isinstance(record, Chunk) else None
+        if record is None or (isinstance(record, Chunk) and inside is None):
+            return None
+        return _Found(record, inside, end)
+
+    def _take(self, at: int, found: _Found) -> list[McapRecord]:
+        """Note a whole record; return what of it is data."""
+        record = found.record
+        if record is None:
+            return []
+        if self._indexes:  # of the chunk before: not all of them are there
+            self._note(at, at, "index")
+            self._indexes = {}
+        if found.inside is not None:
+            self._chunks.append(at)
+            self._indexes = dict(found.inside.indexes)
+            return list(found.inside.records)
+        if self._data_ended or isinstance(record, DataEnd):
+            self._take_summary(record)
+            return []
+        if isinstance(record, Header):
+            self.header = record
+        return [record]
+
+    def _take_summary(self, record: McapRecord) -> None:
+        self._data_ended = True
+        if isinstance(record, Statistics):
+            self._counted = record.message_count
+        elif isinstance(record, ChunkIndex):
+            self._indexed.append(record.chunk_start_offset)
+
+    def _close(self, start: int, at: int, footer: Footer) -> None:
+        """Judge the file's end: the footer from ``start``, and what stands from ``at`` on."""
+        begin = footer.summary_start
+        summary = self._read(begin, start + FRAME.size + 16 - begin) if begin < start else b""
+        right = footer.summary_crc in {0, zlib.crc32(summary)}
+        fits = self._counted == self._messages and self._indexed == self._chunks
+        end = at + len(MAGIC)
+        self.finished = bool(begin) and right and fits and self._read(at, len(MAGIC)) == MAGIC
+        if not self.finished:
+            self._note(start, self.size, "index")
+        elif end < self.size:
+            self._note(end, self.size, tail_kind(self._stream, end, self.size))
+
+    def _with_channels(self, records: list[McapRecord], at: int) -> Iterator[McapRecord]:
+        """Yield records, with hilctl's own channels before a message whose channel is lost."""
+        for record in records:
+            if isinstance(record, Channel):
+                self._channels.add(record.id)
+            elif isinstance(record, Message):
+                if record.channel_id not in self._channels:
+                    yield from self._lost_channels()
+                if record.channel_id not in self._channels:
+                    self._note(at, 0, "message of no channel")
+                    continue
+                self._messages += 1
+            yield record
+
+    def _lost_channels(self) -> Iterator[McapRecord]:
+        for number, pair in own_channels().items():
+            if number not in self._channels:
+                self._channels.add(number)
+                yield from pair
+
+    def _damaged(self, at: int, after: int) -> list[McapRecord]:
+        """Note a damaged stretch; return what can be taken from it."""
+        opcode, records = self._read(at, 1)[0], list[McapRecord]()
+        if self._data_ended or opcode in _INDEX_KINDS:
+            what = "index"
+        elif opcode == Opcode.CHUNK:
+            raw = self._read(at, min(after - at, LARGEST_BYTES))
+            records, what = take_chunk(raw, last=after == self.size)
+        elif opcode in _KNOWN:
+            what = "damaged record"
+        else:
+            what = tail_kind(self._stream, at, after)
+        saved = sum(isinstance(record, Message) for record in records)
+        self._note(at, after, what, saved)
+        return records
+
+    def _note(self, at: int, after: int, what: str, saved: int = 0) -> None:
+        self.damages.append(Damage(at, max(0, after - at), what, saved))

@@ -1,0 +1,153 @@
+"""What is left of records that are not whole, and where to go on behind them."""
+
+import re
+import struct
+from functools import cache
+from typing import BinaryIO
+
+from google.protobuf.message import DecodeError
+from mcap.opcode import Opcode
+from mcap.records import Channel, Chunk, McapRecord, Message, Schema
+
+from hilctl.recording import schema
+from hilctl.recording.records import FRAME, LARGEST_BYTES, contents, inflate, split
+
+_CHUNK = struct.Struct("<QQQII")
+_LENGTH = struct.Struct("<Q")
+_WINDOW_BYTES = 4 * 2**20
+_IN_CHUNKS = {Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE}
+_COLUMNS = {"t_rel", "reference_um", "displacement_um", "flags"}
+# Lengths are little-endian and far below 2**40, so their three highest bytes are 0.
+_LIKELY = re.compile(
+    rb"\x06.{5}\0{3}.{16}.{5}\0{3}.{4}(?:\x04\0{3}zstd|\x03\0{3}lz4|\0{4}).{5}\0{3}"
+    rb"|\x0c.{5}\0{3}.\0{3}hilctl\."
+    rb"|\x09.{5}\0{3}.{16}.\0{3}(?:experiment|model)\.yaml"
+    rb"|\x0f\x04\0{7}.{4}[\x02\x03\x04\x0b]",
+    re.DOTALL,
+)
+_LIKELY_BYTES = 64
+_SECTOR = bytes(512)
+
+
+def next_likely(stream: BinaryIO, at: int, size: int) -> int:
+    """Return the offset of what looks like a record from ``at`` on, or ``size``."""
+    for start in range(at, size, _WINDOW_BYTES):
+        stream.seek(start)
+        found = _LIKELY.search(stream.read(_WINDOW_BYTES + _LIKELY_BYTES))
+        if found:
+            return start + found.start()
+    return size
+
+
+def tail_kind(stream: BinaryIO, at: int, size: int) -> str:
+    """Return what a tail that holds no record is: ``zeros`` or ``unreadable bytes``."""
+    for start in range(at, size, _WINDOW_BYTES):
+        stream.seek(start)
+        if stream.read(_WINDOW_BYTES).strip(b"\0"):
+            return "unreadable bytes"
+    return "zeros"
+
+
+def take_chunk(raw: bytes, *, last: bool) -> tuple[list[McapRecord], str]:
+    """Take what can be had of a chunk that is not whole.
+
+    Args:
+        raw: The chunk from its opcode on, up to the next readable record.
+        last: Whether the file ends with these bytes.
+
+    Returns:
+        Records, and what the stretch is (see :class:`hilctl.recording.salvage.Damage`).
+    """
+    chunk = _as_far_as_it_goes(raw)
+    if chunk is None:
+        return [], "torn chunk" if last else "damaged chunk"
+    inside = contents(chunk)
+    if inside is not None:  # only the frame around it is damaged
+        return list(inside.records), "index"
+    if not last or not _is_cut(chunk, raw):
+        return [], "damaged chunk"
+    data = inflate(chunk.compression, _before_zeros(chunk), chunk.uncompressed_size)
+    return _believable(data), "torn chunk"
+
+
+def _before_zeros(chunk: Chunk) -> bytes:
+    """Return data up to where a failing power left zeros; values of 0.0 at the cut go with them."""
+    data = chunk.data
+    if chunk.compression and _SECTOR in data:  # a compressed stream has no such stretch
+        data = data[: data.index(_SECTOR)]
+    return data.rstrip(b"\0")
+
+
+def _as_far_as_it_goes(raw: bytes) -> Chunk | None:
+    """Return a chunk by the length of its data, not of the record; its data ends with ``raw``."""
+    start = FRAME.size + _CHUNK.size
+    if len(raw) < start:
+        return None
+    first, last, size, crc, name_length = _CHUNK.unpack_from(raw, FRAME.size)
+    name = raw[start : start + name_length]
+    begin = start + name_length + _LENGTH.size
+    if name not in {b"", b"lz4", b"zstd"} or len(raw) < begin or size > LARGEST_BYTES:
+        return None
+    (length,) = _LENGTH.unpack_from(raw, begin - _LENGTH.size)
+    return Chunk(
+        compression=name.decode(),
+        data=raw[begin : begin + length],
+        message_end_time=last,
+        message_start_time=first,
+        uncompressed_crc=crc,
+        uncompressed_size=size,
+    )
+
+
+def _is_cut(chunk: Chunk, raw: bytes) -> bool:
+    """Return whether a chunk ends early, with the file or in zeros, rather than being wrong."""
+    length = FRAME.unpack_from(raw)[1]
+    return len(raw) < FRAME.size + length or chunk.data.endswith(b"\0")
+
+
+def _believable(data: bytes) -> list[McapRecord]:
+    """Return records that no checksum covers, up to the first that is not hilctl's.
+
+    Where nonsense follows rather than the beginning of one more record, the last record may have
+    some of it in its own last bytes, and is left out.
+    """
+    records: list[McapRecord] = []
+    end = 0
+    for at, record in split(data):
+        if isinstance(record, Message) and not _decodes(record):
+            return records[:-1]
+        records.append(record)
+        end = at + FRAME.size + FRAME.unpack_from(data, at)[1]
+    rest = data[end:]
+    if len(rest) >= FRAME.size:
+        opcode, length = FRAME.unpack_from(rest)
+        begun = opcode in _IN_CHUNKS and len(rest) - FRAME.size < length <= LARGEST_BYTES
+        return records if begun else records[:-1]
+    return records if not rest or rest[0] in _IN_CHUNKS else records[:-1]
+
+
+def _decodes(message: Message) -> bool:
+    own = own_channels().get(message.channel_id)
+    if own is None:
+        return False
+    name = schema.TOPICS[own[1].topic]
+    decoded = schema.message(name)
+    try:
+        decoded.ParseFromString(message.data)
+    except DecodeError:
+        return False
+    columns = [values for field, values in decoded.ListFields() if field.name in _COLUMNS]
+    return name != "SampleBlock" or all(len(each) == decoded.n for each in columns)
+
+
+@cache
+def own_channels() -> dict[int, tuple[Schema, Channel]]:
+    """Return the schema and channel of each of hilctl's channel ids, in order."""
+    descriptors = schema.descriptor_set()
+    return {
+        number: (
+            Schema(number, descriptors, "protobuf", f"hilctl.{name}"),
+            Channel(number, topic, "protobuf", {}, number),
+        )
+        for number, (topic, name) in enumerate(schema.TOPICS.items(), start=1)
+    }
