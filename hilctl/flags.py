@@ -15,4 +15,14 @@ class Flag(IntFlag):
     RAMP = 8
     """On the way out: the ramp to the safe value, without a reference."""
     SENSOR_INVALID = 16
-    """The displacement was not finite or outside the stroke limits."""
+    """The displacement was not finite, outside the stroke limits or at an end of the sensor."""
+    UNANSWERED = 32
+    """The device did not answer the exchange: the command may not have reached it."""
+    SENSOR_FROZEN = 64
+    """The displacement had not changed for too long while the command moved."""
+    DEVIATION = 128
+    """The measured command was too far from the one put out for too long, or was lost."""
+    THERMAL = 256
+    """The thermal budget of the coil was used up."""
+    TRACKING_ERROR = 512
+    """The displacement was too far from the reference for too long."""

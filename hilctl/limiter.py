@@ -44,6 +44,11 @@ class CommandLimits:
             )
 
 
+_RANGE_LIMITED = int(Flag.RANGE_LIMITED)
+_SLEW_LIMITED = int(Flag.SLEW_LIMITED)
+_INVALID = int(Flag.INVALID)
+
+
 class Limiter:
     """Holds commands to their limits and remembers the last one.
 
@@ -58,9 +63,13 @@ class Limiter:
         self._step = limits.slew_per_s * dt_s
         self._ramp_step = limits.ramp_per_s * dt_s
 
-    def limit(self, wanted: F64, command: F64, flags: U32) -> None:
-        """Fill ``command`` (float64[n]) with what may be put out; add to ``flags`` (uint32[n])."""
-        self._apply(wanted, self._step, command, flags)
+    def limit(self, wanted: F64, command: F64, flags: U32) -> int:
+        """Fill ``command`` (float64[n]) with what may be put out; add to ``flags`` (uint32[n]).
+
+        Returns:
+            Index of the first wish that was not finite, or -1.
+        """
+        return self._apply(wanted, self._step, command, flags)
 
     def ramp(self, command: F64, flags: U32) -> bool:
         """Fill ``command`` with the next stretch of the way to the safe value.
@@ -75,19 +84,20 @@ class Limiter:
         self._apply(wanted, self._ramp_step, command, scratch)
         return self.last == self.limits.safe
 
-    def _apply(self, wanted: F64, max_step: float, command: F64, flags: U32) -> None:
+    def _apply(self, wanted: F64, max_step: float, command: F64, flags: U32) -> int:
         limits = self.limits
-        limit_block(
+        first_invalid = limit_block(
             wanted,
             self.last,
             limits.low,
             limits.high,
             max_step,
-            Flag.RANGE_LIMITED.value,
-            Flag.SLEW_LIMITED.value,
-            Flag.INVALID.value,
+            _RANGE_LIMITED,
+            _SLEW_LIMITED,
+            _INVALID,
             command,
             flags,
         )
         if command.size:
-            self.last = float(command[-1])
+            self.last = command.item(-1)
+        return first_invalid

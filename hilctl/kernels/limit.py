@@ -5,7 +5,7 @@ from hilctl.kernels.jit import kernel
 
 
 @kernel(
-    "void(float64[::1], float64, float64, float64, float64, uint32, uint32, uint32,"
+    "int64(float64[::1], float64, float64, float64, float64, uint32, uint32, uint32,"
     " float64[::1], uint32[::1])"
 )
 def limit_block(
@@ -19,7 +19,7 @@ def limit_block(
     invalid_bit: int,
     command: F64,
     flags: U32,
-) -> None:
+) -> int:
     """Bring wanted commands within a range and a largest change from sample to sample.
 
     A wanted value that is not finite is replaced by the last command. ``previous`` must lie within
@@ -36,13 +36,19 @@ def limit_block(
         invalid_bit: Flag to set where ``wanted`` was not finite.
         command: float64[n], filled.
         flags: uint32[n]; bits are added to what is there.
+
+    Returns:
+        Index of the first wanted value that was not finite, or -1.
     """
     last = previous
+    first_invalid = -1
     for k in range(wanted.size):
         value = wanted[k]
         if not abs(value) < float("inf"):
             value = last
             flags[k] |= invalid_bit
+            if first_invalid < 0:
+                first_invalid = k
         if value > high:
             value = high
             flags[k] |= range_bit
@@ -57,15 +63,4 @@ def limit_block(
             flags[k] |= slew_bit
         command[k] = value
         last = value
-
-
-@kernel("int64(float64[::1], float64, float64)")
-def first_outside(values: F64, low: float, high: float) -> int:
-    """Return the index of the first value that is not within [low, high], or -1.
-
-    NaN is not within anything.
-    """
-    for k in range(values.size):
-        if not low <= values[k] <= high:
-            return k
-    return -1
+    return first_invalid

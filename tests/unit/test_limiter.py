@@ -76,21 +76,48 @@ def test_ramp_ends_exactly_at_the_safe_value():
     assert len(way) == 56  # 2.5 / 0.05 = 50 samples, in blocks of 7
 
 
+def test_a_block_of_no_samples_changes_nothing():
+    """An empty block leaves the last command as it is."""
+    limiter = Limiter(LIMITS, DT_S)
+    limited(limiter, [0.55])
+    limited(limiter, [])
+    assert limiter.last == 0.55
+    assert not limiter.ramp(np.empty(0), np.zeros(0, dtype=np.uint32))
+
+
+FIELDS = {"low": -2.0, "high": 3.0, "slew_per_s": 100.0, "safe": 0.5, "ramp_per_s": 50.0}
+RANGE = "limits must be finite and rising: "
+SAFE = "the safe value must lie within -2.0 to 3.0: "
+RAMP = "the ramp must be > 0 and no faster than the slew limit "
+
+
 @pytest.mark.parametrize(
     ("change", "text"),
     [
-        ({"low": 4.0}, "finite and rising"),
-        ({"high": np.inf}, "finite and rising"),
-        ({"low": np.nan}, "finite and rising"),
-        ({"safe": 3.1}, "safe value must lie within"),
-        ({"safe": np.nan}, "safe value must lie within"),
-        ({"ramp_per_s": 0.0}, "ramp must be > 0"),
-        ({"ramp_per_s": 101.0}, "no faster than the slew limit"),
-        ({"slew_per_s": np.inf}, "no faster than the slew limit"),
+        ({"low": 4.0}, RANGE + "4.0, 3.0"),
+        ({"low": 3.0}, RANGE + "3.0, 3.0"),
+        ({"high": np.inf}, RANGE + "-2.0, inf"),
+        ({"low": -np.inf}, RANGE + "-inf, 3.0"),
+        ({"low": np.nan}, RANGE + "nan, 3.0"),
+        ({"safe": 3.1}, SAFE + "3.1"),
+        ({"safe": -2.1}, SAFE + "-2.1"),
+        ({"safe": np.nan}, SAFE + "nan"),
+        ({"ramp_per_s": 0.0}, RAMP + "100.0: 0.0"),
+        ({"ramp_per_s": 101.0}, RAMP + "100.0: 101.0"),
+        ({"slew_per_s": np.inf}, RAMP + "inf: 50.0"),
     ],
 )
 def test_limits_that_mean_nothing_are_refused(change, text):
-    """Limits themselves are checked, each rule by name."""
-    fields = {"low": -2.0, "high": 3.0, "slew_per_s": 100.0, "safe": 0.5, "ramp_per_s": 50.0}
-    with pytest.raises(InputError, match=text):
-        CommandLimits(**{**fields, **change})
+    """Limits themselves are checked, each rule by name and with the values that break it."""
+    with pytest.raises(InputError) as caught:
+        CommandLimits(**{**FIELDS, **change})
+    assert str(caught.value) == text
+
+
+@pytest.mark.parametrize(
+    "change", [{"safe": -2.0}, {"safe": 3.0}, {"ramp_per_s": 100.0}, {"ramp_per_s": 1e-3}]
+)
+def test_edges_of_limits_are_allowed(change):
+    """The safe value may be at an end of the range, and the ramp as fast as the slew or slow."""
+    limits = CommandLimits(**{**FIELDS, **change})
+    assert {name: getattr(limits, name) for name in FIELDS} == {**FIELDS, **change}

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from hilctl.kernels import hysteresis
-from hilctl.kernels.limit import first_outside, limit_block
+from hilctl.kernels.limit import limit_block
 
 PLAYS = (1.3, np.array([0.2, 0.5, 0.9]), np.array([0.7, 0.1, 0.4]))
 DEADBANDS = (1.7, np.array([0.4, 1.1]), np.array([-0.2, -0.3]), np.array([-0.3]), np.array([0.25]))
@@ -123,8 +123,6 @@ def test_float32_is_refused_everywhere_else():
         hysteresis.play_outputs(narrow, WIDENING, PLAYS[1], memory, grid)
     with pytest.raises(TypeError, match="No matching definition"):
         limit_block(narrow, 0.0, -1.0, 1.0, 0.1, 1, 2, 4, out, flags)
-    with pytest.raises(TypeError, match="No matching definition"):
-        first_outside(narrow, -1.0, 1.0)
 
 
 def test_a_strided_view_is_refused():

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hilctl.kernels.limit import first_outside, limit_block
+from hilctl.kernels.limit import limit_block
 
 LOW, HIGH, STEP = -1.5, 2.0, 0.25
 RANGE, SLEW, INVALID = 1, 2, 4
@@ -132,12 +132,3 @@ def test_any_cut_gives_the_same_commands(settings, wanted, cut):
     second, second_flags = limited(wanted[cut:], last, *rest)
     assert np.concatenate((first, second)).tobytes() == whole.tobytes()
     np.testing.assert_array_equal(np.concatenate((first_flags, second_flags)), flags)
-
-
-@pytest.mark.parametrize(("values", "index"), [
-    ([], -1), ([0.0, LOW, HIGH], -1), ([0.0, 2.1, 9.0], 1), ([-1.6], 0),
-    ([0.0, 0.0, np.nan], 2), ([np.inf], 0), ([0.0, -np.inf], 1),
-])  # fmt: skip
-def test_first_outside_finds_the_first(values, index):
-    """The index of the first value out of range, NaN counting as out of it; else -1."""
-    assert first_outside(np.array(values, dtype=np.float64), LOW, HIGH) == index

@@ -1,0 +1,164 @@
+"""Interlocks on the samples of a run: all of them in one pass, with memory from block to block.
+
+Settings and memory are arrays with a named place for each number, so that one call a block does it
+all; see :class:`hilctl.interlocks.Interlocks` for what they mean. A time is a whole number of
+samples; one that is infinite switches its interlock off.
+"""
+
+from hilctl.arrays import F64, U32
+from hilctl.flags import Flag
+from hilctl.kernels.jit import kernel
+
+(
+    STROKE_LOW,
+    STROKE_HIGH,
+    RAIL_LOW,
+    RAIL_HIGH,
+    FROZEN_UM,
+    FROZEN_TRAVEL,
+    FROZEN_SAMPLES,
+    DEVIATION,
+    DEVIATION_SAMPLES,
+    WARMING,
+    BUDGET,
+    TRACKING_UM,
+    TRACKING_SAMPLES,
+) = range(13)
+SETTINGS = 13
+
+COMMAND, READING, LOWEST, HIGHEST, FROZEN_RUN, DEVIATION_RUN, HEAT, TRACKING_RUN = range(8)
+MEMORY = 8
+
+_INVALID = int(Flag.SENSOR_INVALID)
+_FROZEN = int(Flag.SENSOR_FROZEN)
+_DEVIATION = int(Flag.DEVIATION)
+_THERMAL = int(Flag.THERMAL)
+_TRACKING = int(Flag.TRACKING_ERROR)
+
+
+@kernel("int64(float64, float64[::1])", inline=True)
+def _invalid(displacement_um: float, settings: F64) -> int:
+    """Judge one reading by itself: within the stroke, and short of the sensor's ends."""
+    within = settings[STROKE_LOW] <= displacement_um <= settings[STROKE_HIGH]
+    seen = settings[RAIL_LOW] < displacement_um < settings[RAIL_HIGH]
+    return 0 if within and seen else _INVALID
+
+
+@kernel("int64(float64, float64, float64[::1], float64[::1])", inline=True)
+def _frozen(displacement_um: float, command: float, settings: F64, memory: F64) -> int:
+    """Count the samples for which the reading has stayed although the command has travelled.
+
+    Time counts from the moment the command has gone far enough, so that a hold, however long, or
+    a step out of one does not look like a dead sensor.
+    """
+    reading, run = memory[READING], memory[FROZEN_RUN]
+    low, high = min(memory[LOWEST], command), max(memory[HIGHEST], command)
+    if not abs(displacement_um - reading) <= settings[FROZEN_UM]:
+        reading, low, high, run = displacement_um, command, command, 0.0
+    if high - low > settings[FROZEN_TRAVEL]:
+        run += 1.0
+    memory[READING], memory[FROZEN_RUN] = reading, run
+    memory[LOWEST], memory[HIGHEST] = low, high
+    return _FROZEN if run > settings[FROZEN_SAMPLES] else 0
+
+
+@kernel("int64(float64, float64, float64[::1], float64[::1])", inline=True)
+def _deviating(measured: float, command: float, settings: F64, memory: F64) -> int:
+    """Count the samples at which the measured command is away from what was put out.
+
+    A reading may be taken before or after its own command takes effect, so it is held against the
+    span of this command and the one before. NaN is away from anything.
+    """
+    previous, away = memory[COMMAND], settings[DEVIATION]
+    low, high = min(previous, command) - away, max(previous, command) + away
+    run = memory[DEVIATION_RUN] + 1.0
+    if low <= measured <= high:
+        run = 0.0
+    memory[DEVIATION_RUN] = run
+    return _DEVIATION if run > settings[DEVIATION_SAMPLES] else 0
+
+
+@kernel("float64(float64, float64, float64, float64)", inline=True)
+def _warmed(heat: float, command: float, measured: float, warming: float) -> float:
+    """Advance d(heat)/dt = (current^2 - heat) / tau by one sample of constant current."""
+    load = command * command
+    if load < measured * measured < float("inf"):  # what is not finite was not measured
+        load = measured * measured
+    return heat + (load - heat) * warming
+
+
+@kernel("int64(float64, float64, float64[::1], float64[::1])", inline=True)
+def _too_hot(command: float, measured: float, settings: F64, memory: F64) -> int:
+    heat = _warmed(memory[HEAT], command, measured, settings[WARMING])
+    memory[HEAT] = heat
+    return _THERMAL if heat > settings[BUDGET] else 0
+
+
+@kernel("int64(float64, float64, float64[::1], float64[::1])", inline=True)
+def _off_track(reference: float, displacement_um: float, settings: F64, memory: F64) -> int:
+    """Count the samples with too large an error; NaN, no reference, is none."""
+    run = memory[TRACKING_RUN] + 1.0
+    if not abs(reference - displacement_um) > settings[TRACKING_UM]:
+        run = 0.0
+    memory[TRACKING_RUN] = run
+    return _TRACKING if run > settings[TRACKING_SAMPLES] else 0
+
+
+@kernel(
+    "int64(float64[::1], float64[::1], float64[::1], float64[::1], float64[::1], float64[::1],"
+    " uint32[::1])"
+)
+def interlock_block(
+    settings: F64,
+    memory: F64,
+    command: F64,
+    reference: F64,
+    displacement_um: F64,
+    measured: F64,
+    flags: U32,
+) -> int:
+    """Hold a block of samples against all interlocks.
+
+    Args:
+        settings: float64[13], see the names above.
+        memory: float64[8], updated in place; any cut into blocks gives the same bits.
+        command: float64[n], in A or V.
+        reference: float64[n], in um; NaN where there is none.
+        displacement_um: float64[n].
+        measured: float64[n], the command as measured, in A or V; NaN where it is not.
+        flags: uint32[n]; the bit of each interlock is added where it trips.
+
+    Returns:
+        Index of the first sample at which one trips, or -1.
+    """
+    first = -1
+    for k in range(command.size):
+        bits = _invalid(displacement_um[k], settings)
+        bits |= _frozen(displacement_um[k], command[k], settings, memory)
+        bits |= _deviating(measured[k], command[k], settings, memory)
+        bits |= _too_hot(command[k], measured[k], settings, memory)
+        bits |= _off_track(reference[k], displacement_um[k], settings, memory)
+        memory[COMMAND] = command[k]
+        flags[k] |= bits
+        if first < 0 < bits:
+            first = k
+    return first
+
+
+@kernel("float64(float64[::1], float64, float64, float64[::1])")
+def heat_block(command: F64, warming: float, heat: float, out: F64) -> float:
+    """Follow the heat of a coil through a block of commands, as :func:`interlock_block` does.
+
+    Args:
+        command: float64[n], in A.
+        warming: 1 - exp(-dt / tau).
+        heat: Heat before the block, in A^2.
+        out: float64[n], filled with the heat after each sample, in A^2.
+
+    Returns:
+        Heat after the block.
+    """
+    for k in range(command.size):
+        heat = _warmed(heat, command[k], command[k], warming)
+        out[k] = heat
+    return heat

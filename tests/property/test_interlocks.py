@@ -1,0 +1,154 @@
+"""Interlocks against the rules written out in plain Python, and cut into blocks anywhere."""
+
+import math
+from itertools import pairwise
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hilctl.flags import Flag
+from hilctl.interlocks import InterlockLimits, Interlocks
+
+RATE_HZ = 100.0
+LEVELS = st.sampled_from([-9.0, -2.0, -0.5, 0.0, 0.25, 0.5, 1.0, 3.0, 4.0, math.nan, math.inf])
+COMMANDS = st.sampled_from([-3.0, -0.5, 0.0, 0.25, 0.5, 2.0])
+ROWS = st.lists(st.tuples(COMMANDS, LEVELS, LEVELS, LEVELS), min_size=1, max_size=60)
+TIMES = st.sampled_from([0.0, 0.01, 0.03])
+
+
+@st.composite
+def limits(draw):
+    """Any interlocks, each on or off."""
+    return InterlockLimits(
+        stroke_um=(-5.0, 3.5),
+        sensor_um=draw(st.sampled_from([(-math.inf, math.inf), (-8.0, 8.0), (-2.0, 3.0)])),
+        safe=draw(COMMANDS),
+        frozen_s=draw(st.sampled_from([0.01, 0.03, math.inf])),
+        frozen_um=draw(st.sampled_from([0.0, 0.3])),
+        frozen_travel=draw(st.sampled_from([0.3, 2.0])),
+        deviation=draw(st.sampled_from([0.0, 0.5, math.inf])),
+        deviation_s=draw(TIMES),
+        rms_current_a=draw(st.sampled_from([0.5, 2.0, math.inf])),
+        time_constant_s=draw(st.sampled_from([0.02, 1.0])),
+        tracking_um=draw(st.sampled_from([0.5, 2.0, math.inf])),
+        tracking_s=draw(TIMES),
+    )
+
+
+def columns(rows):
+    """Return command, reference, displacement and measured, float64[n] each."""
+    return [np.array(column, dtype=np.float64) for column in zip(*rows, strict=True)]
+
+
+def judged(settings, rows, cuts=()):
+    """Return the first trip and the flags, with the rows cut into blocks."""
+    interlocks, given_columns = Interlocks(settings, RATE_HZ), columns(rows)
+    flags = np.zeros(len(rows), dtype=np.uint32)
+    bounds = sorted({0, len(rows), *(cut % (len(rows) + 1) for cut in cuts)})
+    trip = None
+    for start, stop in pairwise(bounds):
+        part = slice(start, stop)
+        found = interlocks.check(start, *[each[part] for each in given_columns], flags[part])
+        trip = trip or found
+    return trip, flags
+
+
+class Rules:
+    """The interlocks as they are described, one sample after the other."""
+
+    def __init__(self, settings):
+        self.settings = settings
+        self.history = []
+        self.heat = settings.safe**2
+
+    def flags(self, command, reference, displacement, measured):
+        self.history.append((command, reference, displacement, measured))
+        settings, found = self.settings, 0
+        (low, high), (left, right) = settings.stroke_um, settings.sensor_um
+        if not (low <= displacement <= high and left < displacement < right):
+            found |= Flag.SENSOR_INVALID
+        if self.frozen():
+            found |= Flag.SENSOR_FROZEN
+        if math.isfinite(settings.deviation) and self.lasts(self.deviates, settings.deviation_s):
+            found |= Flag.DEVIATION
+        load = max(command**2, measured**2 if math.isfinite(measured) else 0.0)
+        share = 1.0 - math.exp(-1.0 / (settings.time_constant_s * RATE_HZ))
+        self.heat += (load - self.heat) * share
+        if self.heat > settings.rms_current_a**2:
+            found |= Flag.THERMAL
+        if self.lasts(self.off_track, settings.tracking_s):
+            found |= Flag.TRACKING_ERROR
+        return found
+
+    def lasts(self, condition, time_s):
+        """Whether a condition has held in this sample and for the time before it."""
+        n = round(time_s * RATE_HZ) + 1
+        last = range(len(self.history) - n, len(self.history))
+        return last.start >= 0 and all(condition(k) for k in last)
+
+    def deviates(self, k):
+        before = self.history[k - 1][0] if k else self.settings.safe
+        command, _, _, measured = self.history[k]
+        away = self.settings.deviation
+        return not min(before, command) - away <= measured <= max(before, command) + away
+
+    def off_track(self, k):
+        _, reference, displacement, _ = self.history[k]
+        return abs(reference - displacement) > self.settings.tracking_um
+
+    def frozen(self):
+        """Whether the reading has stayed the same for the time after the command had moved."""
+        settings = self.settings
+        if not math.isfinite(settings.frozen_s):
+            return False
+        start = 0
+        for k, (_, _, reading, _) in enumerate(self.history):
+            if not abs(reading - self.history[start][2]) <= settings.frozen_um:
+                start = k
+        commands = [row[0] for row in self.history[start:]]
+        for k in range(len(commands)):
+            if max(commands[: k + 1]) - min(commands[: k + 1]) > settings.frozen_travel:
+                return len(commands) - 1 - k >= round(settings.frozen_s * RATE_HZ)
+        return False
+
+
+@given(limits(), ROWS)
+def test_follows_the_stated_rules(settings, rows):
+    """Flags and the first trip are those of the rules; where nothing is flagged nothing trips."""
+    trip, flags = judged(settings, rows)
+    rules = Rules(settings)
+    expected = [int(rules.flags(*row)) for row in rows]
+    assert flags.tolist() == expected
+    flagged = np.flatnonzero(flags)
+    assert (trip is None) == (flagged.size == 0)
+    if trip is not None:
+        assert trip.sample == flagged[0]
+        assert f"at sample {trip.sample}" in trip.reason
+
+
+@given(limits(), ROWS, st.lists(st.integers(0, 60), max_size=6))
+def test_any_cut_gives_the_same_trip(settings, rows, cuts):
+    """Cut into blocks anywhere: the same trip for the same reason, the same flags."""
+    assert_same(judged(settings, rows), judged(settings, rows, cuts))
+    assert_same(judged(settings, rows), judged(settings, rows, range(len(rows))))
+
+
+def assert_same(whole, cut):
+    assert whole[0] == cut[0]
+    np.testing.assert_array_equal(whole[1], cut[1])
+
+
+@given(limits(), ROWS, st.integers(1, 10_000))
+def test_any_reading_after_a_gap_is_judged(settings, rows, gap):
+    """A gap of any length before any samples leaves the memory fit for what follows."""
+    finite = [row for row in rows if all(map(math.isfinite, row))]
+    if not finite:
+        return
+    interlocks = Interlocks(settings, RATE_HZ)
+    for k, row in enumerate(finite):
+        flags = np.zeros(1, dtype=np.uint32)
+        trip = interlocks.check(k * (gap + 1), *columns([row]), flags)
+        assert (trip is None) == (flags[0] == 0)
+        outside = not -5.0 <= row[2] <= 3.5
+        assert bool(flags[0] & Flag.SENSOR_INVALID) >= outside
