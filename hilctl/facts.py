@@ -5,11 +5,13 @@ import json
 import platform
 import sys
 import uuid
+from pathlib import Path
 
 import numba
 import numpy as np
 
 from hilctl import __version__
+from hilctl.doctor.diagnosis import machine_facts
 from hilctl.models.files import dump_model
 from hilctl.preflight import Checked
 
@@ -59,4 +61,5 @@ def run_facts(checked: Checked, started: str) -> dict[str, str]:
             }
         ),
     }
+    facts |= machine_facts(config.realtime, Path(config.recording.folder))
     return facts | {f"device.{key}": value for key, value in info.details.items()}

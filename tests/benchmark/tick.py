@@ -1,0 +1,160 @@
+"""Time what a tick costs beside the device: from each wake-up to the next sleep, less the exchange.
+
+Run it with ``python tests/benchmark/tick.py``; see README.md beside it. It runs the loop process's
+own code on the simulated rig, one sample a tick, with a clock that takes notes. Where LinuxCNC is
+installed, a thread of its HAL does the closest thing it has, for comparison.
+"""
+
+import argparse
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+
+from hilctl import loop_process
+from hilctl.blocks import Head
+from hilctl.compensator import Compensator
+from hilctl.config_parts import Realtime
+from hilctl.control_page import Field
+from hilctl.experiment import LoadedExperiment, load_experiment
+from hilctl.pacer import SystemClock
+from hilctl.realtime import prepare
+from hilctl.ring import SampleRing, memory_folder
+from hilctl.waveforms.build import build
+
+EXPERIMENT = Path(__file__).parents[2] / "configs" / "terfenol_sine_6a.yaml"
+HAL = """\
+loadrt threads name1=servo period1={period_ns}
+loadrt siggen num_chan=1
+loadrt limit3 count=1
+loadrt sampler depth=4000 cfg=ffff
+net wanted siggen.0.sine limit3.0.in sampler.0.pin.0
+net command limit3.0.out sampler.0.pin.1
+setp limit3.0.min -10
+setp limit3.0.max 10
+setp limit3.0.maxv 1e9
+setp limit3.0.maxa 1e9
+addf siggen.0.update servo
+addf limit3.0 servo
+addf sampler.0 servo
+start
+"""
+LOOKS = 50
+NOBODY = 65534
+
+
+class NotingClock(SystemClock):
+    """The loop's clock, which notes when each sleep began and ended."""
+
+    slept: ClassVar[list[int]] = []
+    woke: ClassVar[list[int]] = []
+
+    def sleep_until_ns(self, deadline_ns: int) -> None:
+        """Sleep as ever."""
+        self.slept.append(time.monotonic_ns())
+        super().sleep_until_ns(deadline_ns)
+        self.woke.append(time.monotonic_ns())
+
+
+def experiment(options: argparse.Namespace) -> LoadedExperiment:
+    """Return the shipped experiment at one sample a tick."""
+    settings = {
+        "sample_rate_hz": float(options.rate),
+        "block": 1,
+        "waveform.frequency_hz": 1.0,
+        "waveform.duration_s": options.ticks / options.rate,
+    }
+    return load_experiment(EXPERIMENT, [f"{key}={value}" for key, value in settings.items()])
+
+
+def job(folder: Path, loaded: LoadedExperiment) -> dict[str, Any]:
+    """Return what the supervisor hands to the loop process, with nobody to be silent."""
+    reference = folder / "reference.npy"
+    np.save(reference, build(loaded.config.waveform, loaded.config.sample_rate_hz, folder).values)
+    return {"reference": str(reference), "supervisor": os.getppid(), "silence_s": 1e9}
+
+
+def ticks_us(options: argparse.Namespace) -> tuple[np.ndarray, np.ndarray]:
+    """Run the loop; return the cost of each tick beside the exchange, and the exchange, in us."""
+    loaded = experiment(options)
+    slots = options.ticks + 10 * round(loaded.config.safe.ramp_s * options.rate)
+    state = Compensator(loaded.model, options.rate).state_size + 1
+    loop_process.SystemClock = NotingClock  # type: ignore[misc]
+    with tempfile.TemporaryDirectory(prefix="hilctl-", dir=memory_folder()) as name:
+        ring = SampleRing.create(Path(name) / "ring", slots=slots, block=1, state_size=state)
+        work = job(Path(name), loaded)
+        for step in prepare(Realtime(priority=options.priority)):
+            print(f"{step.name:>13}  {step.outcome}: {step.detail}")
+        ring.put(Field.START_NS, time.monotonic_ns() + 50_000_000)
+        ring.put(Field.GO, 1)
+        outcome = loop_process._run(work, ring, loaded)
+        batch = ring.pop()
+    if outcome.code != "completed" or batch is None:
+        sys.exit(f"the run ended as {outcome.code}: {outcome.reason}")
+    exchange_ns = batch.heads[:, Head.EXCHANGE_NS]
+    slept, woke = np.array([NotingClock.slept, NotingClock.woke])
+    busy_ns = slept[1:] - woke[:-1] - exchange_ns[: slept.size - 1]
+    return busy_ns[: options.ticks] * 1e-3, exchange_ns[: options.ticks] * 1e-3
+
+
+def linuxcnc(options: argparse.Namespace) -> str:
+    """Run a HAL thread with signal generator, limiter and sampler; say what a cycle takes."""
+    if shutil.which("halrun") is None:
+        return "not installed (Debian: linuxcnc-uspace)"
+    looks = "loadusr -w sleep 0.05\ngetp servo.time\n" * LOOKS
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        folder.chmod(0o777)  # where root starts it, its own process is nobody's
+        script = folder / "tick.hal"
+        script.write_text(HAL.format(period_ns=round(1e9 / options.rate)) + looks)
+        environment = os.environ | {"RTAPI_FIFO_PATH": str(folder / "fifo")}
+        if os.geteuid() == 0:
+            environment["RTAPI_UID"] = str(NOBODY)
+        command = ["halrun", "-f", str(script)]
+        ran = subprocess.run(
+            command, capture_output=True, text=True, stdin=subprocess.DEVNULL, env=environment
+        )
+    cycles = [int(line) for line in ran.stdout.split() if line.isdigit()]
+    said = ran.stderr + ran.stdout
+    if not cycles:
+        return f"would not run: {said.strip().splitlines()[-1]}"
+    real = "without real time, " if "non-realtime" in said else ""
+    return f"{real}median {np.median(cycles):.0f} CPU cycles, {np.median(cycles) / mhz():.2f} us"
+
+
+def mhz() -> float:
+    """Return the rate of the CPU's cycle counter."""
+    text = Path("/proc/cpuinfo").read_text(encoding="utf-8")
+    return float(re.search(r"cpu MHz\s*: ([\d.]+)", text)[1])
+
+
+def figures(values_us: np.ndarray) -> str:
+    """Return p50, p99, p99.9 and max as text."""
+    p50, p99, p999, top = np.percentile(values_us, [50, 99, 99.9, 100])
+    return f"median {p50:6.1f}  p99 {p99:6.1f}  p99.9 {p999:6.1f}  max {top:7.1f} us"
+
+
+def main() -> int:
+    """Run the benchmark; the exit code is 1 where the median is above ``--max-us``."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
+    parser.add_argument("--ticks", type=int, default=10_000)
+    parser.add_argument("--rate", type=float, default=1000.0, help="ticks a second")
+    parser.add_argument("--priority", type=int, default=80)
+    parser.add_argument("--max-us", type=float, default=25.0)
+    options = parser.parse_args()
+    tick_us, exchange_us = ticks_us(options)
+    print(f"tick beside the device  {figures(tick_us)}")
+    print(f"simulated device        {figures(exchange_us)}")
+    print(f"LinuxCNC HAL thread     {linuxcnc(options)}")
+    return int(np.median(tick_us) > options.max_us)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,130 @@
+"""Compare hilctl's wake-up lateness with cyclictest's: same priority, same rate, same minute.
+
+Run it with ``python tests/benchmark/wakeup.py``; see README.md beside it. It needs cyclictest
+(Debian: rt-tests). hilctl's side is measured through the loop's own pacer, clock and set-up.
+"""
+
+import argparse
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from hilctl.config_parts import Realtime
+from hilctl.doctor.latency import Latency, measure
+
+SOURCE = Path(__file__).with_suffix(".c")
+LONGEST_US = 60_000
+QUANTILE = 99.9
+BAR = 30
+
+
+def theirs_us(options: argparse.Namespace, allowed: set[str]) -> np.ndarray:
+    """Run cyclictest as hilctl was allowed to run; return each wake-up's lateness in us.
+
+    Without SCHED_FIFO cyclictest won't start; then the same measurement in C takes its place.
+    """
+    interval_us, loops = round(1e6 / options.rate), round(options.rate * options.seconds)
+    if "fifo" in allowed:
+        command = [options.cyclictest, "--threads=1", "--quiet", f"--priority={options.priority}"]
+        command += [f"--interval={interval_us}", f"--loops={loops}", f"--histogram={LONGEST_US}"]
+        command += ["--mlockall"] if "memory" in allowed else []
+        command += [] if "dma_latency" in allowed else ["--laptop"]
+    else:
+        command = [options.plain, str(interval_us), str(loops), str(LONGEST_US)]
+    ran = subprocess.run(command, capture_output=True, text=True)
+    if ran.returncode:
+        sys.exit(f"{command[0]} failed: {(ran.stderr or ran.stdout).strip()}")
+    rows = [line.split() for line in ran.stdout.splitlines() if line[:1].isdigit()]
+    late_us, counts = np.array(rows, dtype=np.int64).T
+    overflows = next(line for line in ran.stdout.splitlines() if "Histogram Overflows" in line)
+    beyond = np.full(int(overflows.split(":")[1]), LONGEST_US)
+    return np.concatenate([np.repeat(late_us, counts), beyond])
+
+
+def other_side(folder: Path, allowed: set[str]) -> dict[str, str]:
+    """Return what hilctl is compared with: cyclictest, or a program built in ``folder``."""
+    if "fifo" in allowed:
+        cyclictest = shutil.which("cyclictest")
+        if cyclictest is None:
+            sys.exit("no cyclictest: apt-get install rt-tests")
+        return {"name": "cyclictest", "cyclictest": cyclictest}
+    print("SCHED_FIFO is refused here: both run without it, and wakeup.c instead of cyclictest")
+    compiler = shutil.which("gcc") or shutil.which("cc")
+    if compiler is None:
+        sys.exit("no C compiler: install gcc")
+    program = folder / "wakeup"
+    subprocess.run([compiler, "-O2", "-o", str(program), str(SOURCE)], check=True)
+    return {"name": "wakeup.c", "plain": str(program)}
+
+
+def hilctl_us(options: argparse.Namespace, allowed: set[str]) -> np.ndarray:
+    """Measure hilctl; return each wake-up's lateness in whole us, cut as cyclictest's is."""
+    latency = measure(options.rate, options.seconds, Realtime(priority=options.priority))
+    assert done(latency) == allowed, "what is allowed has changed"
+    return np.minimum(latency.late_ns // 1000, LONGEST_US)
+
+
+def done(latency: Latency) -> set[str]:
+    """Return the steps of the set-up that were not refused."""
+    return {step.name for step in latency.steps if step.outcome == "done"}
+
+
+def figures(late_us: np.ndarray) -> str:
+    """Return p50, p99, p99.9 and max as text."""
+    p50, p99, p999, top = np.percentile(late_us, [50, 99, QUANTILE, 100])
+    return f"p50 {p50:5.0f}  p99 {p99:6.0f}  p99.9 {p999:6.0f}  max {top:6.0f}"
+
+
+def print_histograms(name: str, ours: np.ndarray, theirs: np.ndarray) -> None:
+    """Print both histograms side by side; bars grow with the logarithm of the count."""
+    edges = np.concatenate([[0], 2 ** np.arange(0, 17)])
+    counts = [np.histogram(late_us, edges)[0] for late_us in (ours, theirs)]
+    longest = np.log1p(max(count.max() for count in counts))
+    print(f"\n{'us':>13}  {'hilctl':<{BAR + 9}}{name}")
+    for k in range(edges.size - 1):
+        if counts[0][k] + counts[1][k] == 0:
+            continue
+        bars = [f"{c[k]:>7} {'#' * round(BAR * np.log1p(c[k]) / longest):<{BAR}}" for c in counts]
+        print(f"{edges[k]:>5} - {edges[k + 1]:>5}  {' '.join(bars).rstrip()}")
+
+
+def compare(options: argparse.Namespace, folder: Path) -> float:
+    """Run all pairs and print them; return the median ratio."""
+    first = measure(options.rate, options.seconds / 10, Realtime(priority=options.priority))
+    for step in first.steps:
+        print(f"{step.name:>13}  {step.outcome}: {step.detail}")
+    vars(options).update(other_side(folder, done(first)))
+    sides, late_us, ratios = (hilctl_us, theirs_us), ([], []), []
+    for pair in range(options.pairs):
+        for side in ((0, 1), (1, 0))[pair % 2]:
+            late_us[side].append(sides[side](options, done(first)))
+        mine, other = late_us[0][-1], late_us[1][-1]
+        ratios.append(float(np.percentile(mine, QUANTILE) / np.percentile(other, QUANTILE)))
+        print(f"pair {pair + 1}  hilctl {figures(mine)}  |  {options.name} {figures(other)}  us  "
+              f"ratio of p99.9 {ratios[-1]:.2f}", flush=True)  # fmt: skip
+    print_histograms(options.name, *map(np.concatenate, late_us))
+    return float(np.median(ratios))
+
+
+def main() -> int:
+    """Run the benchmark; the exit code is 1 where the median ratio is above ``--max-ratio``."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
+    parser.add_argument("--pairs", type=int, default=5)
+    parser.add_argument("--seconds", type=float, default=30.0, help="length of each run")
+    parser.add_argument("--rate", type=float, default=1000.0, help="ticks a second")
+    parser.add_argument("--priority", type=int, default=80)
+    parser.add_argument("--max-ratio", type=float, default=1.5)
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as name:
+        ratio = compare(options, Path(name))
+    print(f"\nmedian ratio of p99.9 over {options.pairs} pairs: {ratio:.2f} "
+          f"(at most {options.max_ratio:g})")  # fmt: skip
+    return int(ratio > options.max_ratio)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
