@@ -31,9 +31,11 @@ class Compensator:
         self.process(np.zeros(2), np.zeros(2))
         self.restore(state)
 
-    def state(self) -> F64:
-        """Return a copy of the hysteresis memory: float64[state_size]."""
-        return np.empty(0) if self._operator is None else self._operator.state()
+    def state(self, out: F64 | None = None) -> F64:
+        """Return a copy of the hysteresis memory: float64[state_size], in ``out`` if given."""
+        if self._operator is None:
+            return np.empty(0) if out is None else out
+        return self._operator.state(out)
 
     def restore(self, state: F64) -> None:
         """Go back to a state that :meth:`state` returned.

@@ -1,15 +1,17 @@
 """Blocks that have been sent and wait for their displacements, in memory claimed beforehand.
 
 A device that plays blocks from a FIFO gives a block's displacements some exchanges later; one that
-does not gives them in the same exchange, and then there is one block here, over and over.
+does not gives them in the same exchange, and then there is one block here, over and over. The
+memory is the ring's, so that what was sent outlives the loop.
 """
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
-import numpy as np
+from hilctl.arrays import F64, I64, U32
+from hilctl.blocks import Batch, Head
 
-from hilctl.arrays import F64, U32
+_SEQUENCE = int(Head.SEQUENCE)
 
 
 @dataclass(slots=True)
@@ -17,7 +19,8 @@ class SentBlock:
     """One block, from its commands to its displacements.
 
     Attributes:
-        columns: float64[5, B], see :class:`hilctl.ring.Batch`; its rows are the arrays below.
+        head: int64[len(Head)], what others see of it while it is on its way.
+        columns: float64[5, B], see :data:`hilctl.blocks.COLUMNS`; its rows are the arrays below.
         flags: uint32[B].
         state: float64[s], the memory before the block.
         first_sample: Its first sample.
@@ -26,6 +29,7 @@ class SentBlock:
         ramping: Whether all of it is on the way out.
     """
 
+    head: I64
     columns: F64
     flags: U32
     state: F64
@@ -38,29 +42,27 @@ class SentBlock:
     command: F64 = field(init=False)
     displacement_um: F64 = field(init=False)
     measured: F64 = field(init=False)
+    memory: F64 = field(init=False)
+    numbers: "memoryview[int]" = field(init=False)
 
     def __post_init__(self) -> None:
         self.reference, self.wanted, self.command = self.columns[:3]
         self.displacement_um, self.measured = self.columns[3:]
+        self.memory = self.state[:-1]
+        self.numbers = self.head.data.cast("B").cast("q")
 
 
 class DelayLine:
     """The blocks between the exchange that sends them and the one that answers them.
 
     Args:
-        latency_blocks: Exchanges from one to the other; 0 where they are the same.
-        block: Samples in a block.
-        state_size: Numbers of state kept with a block.
+        storage: Room for as many blocks as exchanges from one to the other, and one more.
     """
 
-    def __init__(self, latency_blocks: int, block: int, state_size: int) -> None:
-        self._blocks = [
-            SentBlock(
-                np.full((5, block), np.nan), np.zeros(block, dtype=np.uint32), np.zeros(state_size)
-            )
-            for _ in range(latency_blocks + 1)
-        ]
-        self._latency_blocks = latency_blocks
+    def __init__(self, storage: Batch) -> None:
+        parts = zip(storage.heads, storage.columns, storage.flags, storage.states, strict=True)
+        self._blocks = [SentBlock(*part) for part in parts]
+        self._latency_blocks = len(self._blocks) - 1
         self._exchanges = 0
         self._sent = 0
         self._answered = 0
@@ -85,16 +87,22 @@ class DelayLine:
         """Whether a block that is to be recorded has no answer yet."""
         return self._answered < self._sent
 
-    def exchanged(self, *, recorded: bool) -> None:
-        """Move on after an exchange.
+    def sending(self) -> None:
+        """Note that the newest block is on its way and to be recorded, before it is."""
+        block = self.newest
+        self._sent = self._exchanges + 1
+        deadline_ns, late_ns, _ = block.times_ns
+        size = block.flags.size
+        head = block.numbers
+        head[1], head[2], head[3] = block.first_sample, size, block.skipped
+        head[4], head[5], head[6] = deadline_ns, late_ns, 0
+        head[_SEQUENCE] = self._sent
 
-        Args:
-            recorded: Whether the block just sent is to be recorded.
-        """
+    def exchanged(self) -> None:
+        """Move on after an exchange."""
         if not self.filling:
             self._answered += 1
         self._exchanges += 1
-        self._sent += recorded
 
     def unanswered(self) -> Iterator[SentBlock]:
         """Return the blocks to be recorded that have no answer, oldest first."""

@@ -9,81 +9,20 @@ for theirs before they are recorded, and after the ramp the loop goes on at the 
 the last of them has come.
 """
 
-from dataclasses import dataclass
-from typing import Literal, Protocol, TypeAlias
-
 import numpy as np
 
 from hilctl.arrays import F64, U32
 from hilctl.compensator import Compensator
+from hilctl.control_page import LoopEvent
 from hilctl.delay_line import DelayLine, SentBlock
 from hilctl.errors import DeviceError
 from hilctl.flags import Flag
-from hilctl.kernels.limit import first_outside
+from hilctl.interlocks import Interlocks
 from hilctl.limiter import Limiter
 from hilctl.pacer import Pacer
+from hilctl.plan import Code, Outcome, Oversight, Plan, SampleSink
 from hilctl.ports import Clock, Device
-
-Code: TypeAlias = Literal["completed", "stopped", "fault"]
-
-
-class SampleSink(Protocol):
-    """Where the loop leaves its blocks: the ring, or a list in tests."""
-
-    def push(
-        self, head: tuple[int, int, int, int, int, int], state: F64, columns: F64, flags: U32
-    ) -> bool:
-        """Take one block, see :meth:`hilctl.ring.SampleRing.push`."""
-        ...
-
-
-class StopRequest(Protocol):
-    """Whether someone wants the run to end."""
-
-    def __call__(self) -> str:
-        """Return why the run should end, or an empty text."""
-        ...
-
-
-@dataclass(frozen=True, slots=True)
-class Outcome:
-    """How a run ended.
-
-    Attributes:
-        code: ``completed``, ``stopped`` on request, or ``fault``.
-        reason: One line for people.
-        ended_at: Index after the last sample exchanged.
-        safe: Whether the output is known to be at its safe value.
-        dropped: Samples that were exchanged but found no room in the ring.
-    """
-
-    code: Code
-    reason: str
-    ended_at: int
-    safe: bool
-    dropped: int
-
-
-@dataclass(frozen=True, slots=True)
-class Plan:
-    """What a run does.
-
-    Attributes:
-        reference: float64[n], in um, or in the command's unit where nothing compensates.
-        in_um: Whether the reference is a displacement.
-        block: Samples in each exchange.
-        stroke_um: Lowest and highest displacement that may be measured.
-        max_late_ns: Lateness that ends the run.
-        latency_blocks: Exchanges after which a block's displacements come, as
-            :attr:`hilctl.ports.DeviceInfo.latency_blocks`.
-    """
-
-    reference: F64
-    in_um: bool
-    block: int
-    stroke_um: tuple[float, float]
-    max_late_ns: float
-    latency_blocks: int = 0
+from hilctl.tuner import Tuner
 
 
 class Loop:
@@ -94,10 +33,12 @@ class Loop:
         device: Open device.
         compensator: Warmed up.
         limiter: Last thing before the device.
+        interlocks: Judges every answer.
         pacer: Not yet begun.
         clock: Time, for the length of each exchange.
+        line: Where blocks wait for their answer.
         sink: Where blocks go.
-        stop_request: Asked once a tick.
+        oversight: Whom it answers to.
     """
 
     def __init__(
@@ -106,20 +47,24 @@ class Loop:
         device: Device,
         compensator: Compensator,
         limiter: Limiter,
+        interlocks: Interlocks,
         pacer: Pacer,
         clock: Clock,
+        line: DelayLine,
         sink: SampleSink,
-        stop_request: StopRequest,
+        oversight: Oversight,
     ) -> None:
         self._plan = plan
         self._device = device
         self._compensator = compensator
         self._limiter = limiter
+        self._interlocks = interlocks
         self._pacer = pacer
         self._clock = clock
+        self._line = line
         self._sink = sink
-        self._stop_request = stop_request
-        self._line = DelayLine(plan.latency_blocks, plan.block, compensator.state_size + 1)
+        self._oversight = oversight
+        self._tuner = Tuner()
         self._start_ns = 0
         self._next_sample = 0
         self._ended_at = 0
@@ -128,6 +73,7 @@ class Loop:
         self._code: Code = "completed"
         self._reason = "waveform completed"
         self._ramping = False
+        self._first_invalid = -1
 
     def run(self, start_ns: int) -> Outcome:
         """Run until the end, ramp to the safe value, and say how it went.
@@ -149,11 +95,9 @@ class Loop:
     def _tick(self) -> bool:
         """Run one tick; return whether the safe value is reached in it."""
         block = self._next_block()
-        if not self._ramping:
-            self._before()
+        self._attend()
         done = self._fill(block)
         self._exchange(block, recorded=True)
-        self._ended_at = self._next_sample
         if not self._ramping:
             self._judge(block)
         return done
@@ -161,6 +105,7 @@ class Loop:
     def _hold(self) -> None:
         """Hold the safe value for one more block, for the sake of the answer that comes with it."""
         block = self._next_block()
+        self._oversight.beat(self._next_sample)
         block.command[:] = self._limiter.limits.safe
         self._exchange(block, recorded=False)
 
@@ -171,97 +116,139 @@ class Loop:
         block = self._line.newest
         block.skipped = skipped
         block.first_sample = self._next_sample
+        pacer = self._pacer
+        block.times_ns = (pacer.deadline_ns - self._start_ns, pacer.late_ns, 0)
         return block
 
-    def _before(self) -> None:
-        if self._pacer.late_ns > self._plan.max_late_ns:
-            late_s = self._pacer.late_ns * 1e-9
-            text = f"tick {self._pacer.tick} woke {late_s:.3f} s late, more than the limit"
-            self._leave("fault", text)
-        elif stop := self._stop_request():
-            self._leave("stopped", stop)
+    def _attend(self) -> None:
+        """Give a sign of life, and follow what is wanted of the run."""
+        order = self._oversight.beat(self._next_sample)
+        if self._ramping:
+            return
+        if late := self._too_late():
+            self._leave("fault", "late", late)
+        elif order:
+            self._leave("stopped", "stopped", order)
+        elif tuning := self._oversight.tuning():
+            self._tuner.move(tuning)
+            text = f"reference gain to {tuning.gain:g}, offset to {tuning.offset:g}"
+            text += f", over {tuning.samples} samples"
+            self._oversight.tell(LoopEvent(self._next_sample, "info", "tuned", text))
 
-    def _leave(self, code: Code, reason: str) -> None:
+    def _too_late(self) -> str:
+        pacer, plan = self._pacer, self._plan
+        if pacer.tick < plan.grace_ticks:
+            return ""
+        if pacer.late_ns > plan.max_late_ns:
+            late_s = pacer.late_ns * 1e-9
+            return f"tick {pacer.tick} woke {late_s:.3f} s late, more than the limit"
+        if 0 < plan.max_consecutive_late <= pacer.late_run:
+            return f"{pacer.late_run} ticks in a row woke late, up to tick {pacer.tick}"
+        return ""
+
+    def _leave(self, code: Code, event: str, reason: str, sample: int | None = None) -> None:
         """Take the way out from the next block on."""
         self._code, self._reason, self._ramping = code, reason, True
+        if code == "fault":
+            at = self._next_sample if sample is None else sample
+            self._oversight.tell(LoopEvent(at, "error", event, reason))
 
     def _fill(self, block: SentBlock) -> bool:
         """Work out one block of commands; return whether the safe value is reached in it."""
-        block.state[:-1] = self._compensator.state()
+        plan = self._plan
+        self._compensator.state(block.memory)
         block.state[-1] = self._limiter.last
-        block.flags[:] = 0
-        block.measured[:] = np.nan
+        block.flags.fill(0)
+        block.measured.fill(np.nan)
         block.ramping = self._ramping
         start = self._next_sample
-        reference = self._plan.reference[start : start + self._plan.block]
+        reference = plan.reference[start : start + plan.block]
         n = 0 if self._ramping else reference.size
-        if n:
-            block.reference[:n] = reference if self._plan.in_um else np.nan
-            self._compensator.process(reference, block.wanted[:n])
-            self._limiter.limit(block.wanted[:n], block.command[:n], block.flags[:n])
-        if n == self._plan.block:
+        self._first_invalid = -1
+        if n == plan.block:
+            self._work_out(reference, block.reference, block.wanted, block.command, block.flags)
             return False
         block.reference[n:] = np.nan
         block.wanted[n:] = self._limiter.limits.safe
+        if n:
+            parts = (block.reference[:n], block.wanted[:n], block.command[:n], block.flags[:n])
+            self._work_out(reference, *parts)
         return self._limiter.ramp(block.command[n:], block.flags[n:])
+
+    def _work_out(
+        self, reference: F64, tuned_um: F64, wanted: F64, command: F64, flags: U32
+    ) -> None:
+        """Fill what comes of the reference: tuned, through the compensator, through the limiter."""
+        tuned = tuned_um if self._plan.in_um else wanted
+        self._tuner.apply(reference, tuned)
+        self._compensator.process(tuned, wanted)
+        self._first_invalid = self._limiter.limit(wanted, command, flags)
+        if not self._plan.in_um:
+            tuned_um.fill(np.nan)
 
     def _exchange(self, sent: SentBlock, *, recorded: bool) -> None:
         """Send a block; check and record the one whose displacements come back."""
-        answered = self._line.oldest
+        line = self._line
+        answered = line.oldest
+        self._next_sample += self._plan.block
+        if recorded:
+            line.sending()
+            self._ended_at = self._next_sample
         before_ns = self._clock.now_ns()
         self._device.exchange(
             sent.first_sample, sent.command, answered.displacement_um, answered.measured
         )
-        exchange_ns = self._clock.now_ns() - before_ns
-        deadline_ns = self._pacer.deadline_ns - self._start_ns
-        sent.times_ns = (deadline_ns, self._pacer.late_ns, exchange_ns)
-        self._next_sample += self._plan.block
-        early = self._line.filling
-        self._line.exchanged(recorded=recorded)
+        deadline_ns, late_ns, _ = sent.times_ns
+        sent.times_ns = (deadline_ns, late_ns, self._clock.now_ns() - before_ns)
+        early = line.filling
+        line.exchanged()
         if not early:
-            self._check_sensor(answered)
-            self._push(answered)
+            self._take(answered)
 
-    def _check_sensor(self, block: SentBlock) -> None:
-        low, high = self._plan.stroke_um
-        bad = first_outside(block.displacement_um, low, high)
-        if bad < 0:
-            return
-        block.flags[bad:] |= Flag.SENSOR_INVALID.value
-        if block.ramping or self._code != "completed":
-            return
-        self._leave(
-            "fault",
-            f"displacement {block.displacement_um[bad]:.4g} um at sample "
-            f"{block.first_sample + bad} is not within the stroke limits {low:g} to {high:g} um",
+    def _take(self, block: SentBlock) -> None:
+        """Judge and record a block whose displacements have come."""
+        trip = self._interlocks.check(
+            block.first_sample,
+            block.command,
+            block.reference,
+            block.displacement_um,
+            block.measured,
+            block.flags,
         )
+        self._push(block)
+        if trip is not None and not block.ramping and self._code == "completed":
+            self._leave("fault", trip.code, trip.reason, trip.sample)
 
     def _judge(self, block: SentBlock) -> None:
         """Leave where a wish of the block just sent was not a number."""
-        invalid = np.flatnonzero(block.flags & Flag.INVALID.value)
-        if invalid.size:
-            sample = block.first_sample + int(invalid[0])
-            self._leave("fault", f"wanted command is not a finite number at sample {sample}")
+        if self._first_invalid >= 0:
+            sample = block.first_sample + self._first_invalid
+            reason = f"wanted command is not a finite number at sample {sample}"
+            self._leave("fault", "invalid_command", reason)
 
     def _push(self, block: SentBlock) -> None:
         missing = self._missing + block.skipped
         head = (block.first_sample, self._plan.block, missing, *block.times_ns)
         if self._sink.push(head, block.state, block.columns, block.flags):
             self._missing = 0
-        else:
-            self._missing = missing + self._plan.block
-            self._dropped += self._plan.block
+            return
+        self._missing = missing + self._plan.block
+        self._dropped += self._plan.block
+        if self._plan.keep_all and not self._ramping:
+            reason = f"no room for sample {block.first_sample}: the recorder does not keep up"
+            self._leave("fault", "dropped", reason)
 
     def _lost_device(self, error: DeviceError) -> Outcome:
-        for block in self._line.unanswered():
-            block.displacement_um[:] = block.measured[:] = np.nan
-            block.flags |= Flag.SENSOR_INVALID.value
-            self._push(block)
         text = str(error) if self._code == "completed" else f"{self._reason}; then {error}"
+        self._oversight.tell(LoopEvent(self._next_sample, "error", "device_lost", str(error)))
         safe = True
         try:
             self._device.make_safe(self._limiter.limits.safe)
         except DeviceError as second:
             text += f"; the safe value could not be confirmed: {second}"
             safe = False
+        for block in self._line.unanswered():
+            block.displacement_um[:] = block.measured[:] = np.nan
+            block.flags |= (Flag.SENSOR_INVALID | Flag.UNANSWERED).value
+            self._push(block)
         return Outcome("fault", text, self._ended_at, safe, self._dropped)

@@ -4,8 +4,8 @@ Started by the supervisor as ``python -m hilctl.loop_process`` with a JSON job o
 It prints nothing and writes no file: all it has to say goes into the ring's control page.
 """
 
-import gc
 import json
+import math
 import os
 import signal
 import sys
@@ -18,40 +18,91 @@ import numpy as np
 
 from hilctl.compensator import Compensator
 from hilctl.config import Experiment
-from hilctl.errors import DeviceError, HilctlError
+from hilctl.control_page import Field, LoopEvent, Phase
+from hilctl.delay_line import DelayLine
+from hilctl.errors import DeviceError, HilctlError, InputError
 from hilctl.experiment import LoadedExperiment, resolve
+from hilctl.interlock_setup import interlock_limits
+from hilctl.interlocks import Interlocks
 from hilctl.limiter import Limiter
-from hilctl.loop import Loop, Outcome, Plan
+from hilctl.loop import Loop
 from hilctl.pacer import LatePolicy, Pacer, SystemClock
+from hilctl.plan import Outcome, Plan, Tuning
 from hilctl.ports import DeviceInfo
-from hilctl.ring import Field, Phase, SampleRing
+from hilctl.realtime import prepare, require, step_facts
+from hilctl.ring import SampleRing
 from hilctl.yamlio import Document
 
+# Plain numbers: looking up an enumeration's member takes longer than writing it.
+_LOOP_BEAT_NS, _NEXT_SAMPLE = int(Field.LOOP_BEAT_NS), int(Field.NEXT_SAMPLE)
+_LATE_TICKS, _STOP = int(Field.LATE_TICKS), int(Field.STOP)
+_SUPERVISOR_BEAT_NS = int(Field.SUPERVISOR_BEAT_NS)
+_TUNE_WANTED, _TUNE_TAKEN = int(Field.TUNE_WANTED), int(Field.TUNE_TAKEN)
+
+_ALWAYS_LATE_S = 2.0
 STOP_REASONS = {
     1: "stopped by Ctrl-C",
     2: "stopped by SIGTERM",
     3: "stopped by SIGHUP: the terminal went away",
     4: "stopped because the recording can't be written",
+    5: "stopped by hilctl stop",
 }
 
 
 class Supervision:
-    """What the loop and its supervisor tell each other once a tick."""
+    """The loop's view of its supervisor, by the control page.
 
-    def __init__(self, ring: SampleRing, pacer: Pacer, clock: SystemClock, supervisor: int) -> None:
-        self._control = ring.control
-        self._pacer = pacer
+    Args:
+        ring: Shared with the supervisor.
+        pacer: Whose counters it passes on.
+        clock: Time.
+        supervisor: Its process number.
+        silence_s: Longest that it may be silent.
+    """
+
+    def __init__(
+        self,
+        ring: SampleRing,
+        pacer: Pacer,
+        clock: SystemClock,
+        supervisor: int,
+        silence_s: float,
+    ) -> None:
+        self._ring = ring
+        self._control = ring.numbers
+        self._counters = pacer.counters
         self._clock = clock
         self._supervisor = supervisor
+        self._silence_ns = silence_s * 1e9
 
-    def __call__(self) -> str:
-        """Return why the run should end, or an empty text."""
+    def beat(self, next_sample: int) -> str:
+        """Show that the loop lives; return why the run should end, or an empty text."""
         control = self._control
-        control[Field.LOOP_BEAT_NS] = self._clock.now_ns()
-        control[Field.LATE_TICKS] = self._pacer.counters.late_ticks
-        if control[Field.STOP]:
-            return STOP_REASONS.get(int(control[Field.STOP]), "stopped on request")
-        return "" if self.supervised() else "stopped because the supervisor died"
+        now_ns = self._clock.now_ns()
+        control[_LOOP_BEAT_NS] = now_ns
+        control[_NEXT_SAMPLE] = next_sample
+        control[_LATE_TICKS] = self._counters.late_ticks
+        if control[_STOP]:
+            return STOP_REASONS.get(control[Field.STOP], "stopped on request")
+        if not self.supervised():
+            return "stopped because the supervisor died"
+        if now_ns - control[_SUPERVISOR_BEAT_NS] > self._silence_ns:
+            return f"stopped because the supervisor was silent for {self._silence_ns * 1e-9:g} s"
+        return ""
+
+    def tuning(self) -> Tuning | None:
+        """Return a change of the reference that is wanted and new."""
+        control, ring = self._control, self._ring
+        wanted = control[_TUNE_WANTED]
+        if wanted == control[_TUNE_TAKEN]:
+            return None
+        gain, offset = ring.get_float(Field.TUNE_GAIN), ring.get_float(Field.TUNE_OFFSET)
+        control[Field.TUNE_TAKEN] = wanted
+        return Tuning(gain, offset, ring.get(Field.TUNE_SAMPLES))
+
+    def tell(self, event: LoopEvent) -> None:
+        """Leave an event for the recording."""
+        self._ring.push_event(event)
 
     def supervised(self) -> bool:
         """Return whether the supervisor is still there."""
@@ -67,6 +118,8 @@ def main() -> int:
     try:
         loaded = resolve(Document("experiment", job["experiment"]), Path(job["folder"]))
         outcome = _run(job, ring, loaded)
+    except InputError as error:  # before the device was opened
+        return _failed(ring, str(error), Phase.REFUSED)
     except HilctlError as error:
         return _failed(ring, str(error))
     except Exception as error:  # noqa: BLE001  the supervisor must hear of it and make the rig safe
@@ -76,36 +129,40 @@ def main() -> int:
     return 0
 
 
-def _failed(ring: SampleRing, text: str) -> int:
+def _failed(ring: SampleRing, text: str, phase: Phase = Phase.FAILED) -> int:
     ring.write_text(text)
-    ring.put(Field.PHASE, Phase.FAILED)
+    ring.put(Field.PHASE, phase)
     return 1
 
 
 def _run(job: dict[str, Any], ring: SampleRing, loaded: LoadedExperiment) -> Outcome:
     config, device = loaded.config, loaded.device
-    compensator = Compensator(loaded.model, config.sample_rate_hz)
-    compensator.warm_up()
     clock = SystemClock()
     period_ns = config.tick_s * 1e9
     policy = _late_policy(config, device.info)
     pacer = Pacer(clock, period_ns, policy, config.timing.late_after * period_ns)
-    supervision = Supervision(ring, pacer, clock, job["supervisor"])
-    plan = Plan(
-        reference=np.load(job["reference"], mmap_mode="r"),
-        in_um=config.waveform.unit == "um",
-        block=config.block,
-        stroke_um=config.limits.stroke_um,
-        max_late_ns=config.timing.max_late_s * 1e9,
-        latency_blocks=device.info.latency_blocks,
+    supervision = Supervision(ring, pacer, clock, job["supervisor"], job["silence_s"])
+    compensator = Compensator(loaded.model, config.sample_rate_hz)
+    compensator.warm_up()
+    limits = interlock_limits(config, device.info)
+    loop = Loop(
+        _plan(job, config),
+        device,
+        compensator,
+        Limiter(config.command_limits(), 1.0 / config.sample_rate_hz),
+        Interlocks(limits, config.sample_rate_hz),
+        pacer,
+        clock,
+        DelayLine(ring.sent),
+        ring,
+        supervision,
     )
-    limiter = Limiter(config.command_limits(), 1.0 / config.sample_rate_hz)
-    loop = Loop(plan, device, compensator, limiter, pacer, clock, ring, supervision)
+    steps = prepare(config.realtime)
+    if config.realtime.require:
+        require(steps)
     device.open(config.sample_rate_hz, config.block)
     try:
-        gc.collect()
-        gc.freeze()
-        gc.disable()
+        ring.write_text(json.dumps(step_facts(steps)))
         ring.put(Field.PHASE, Phase.READY)
         _await_go(ring, supervision)
         ring.put(Field.PHASE, Phase.RUNNING)
@@ -115,8 +172,22 @@ def _run(job: dict[str, Any], ring: SampleRing, loaded: LoadedExperiment) -> Out
         raise
     finally:
         device.close()
-    _leave_counters(ring, pacer)
+        _leave_counters(ring, pacer)
     return outcome
+
+
+def _plan(job: dict[str, Any], config: Experiment) -> Plan:
+    timing = config.timing
+    late = timing.max_consecutive_late
+    return Plan(
+        reference=np.load(job["reference"], mmap_mode="r").view(np.ndarray),  # quicker to slice
+        in_um=config.waveform.unit == "um",
+        block=config.block,
+        max_late_ns=timing.max_late_s * 1e9,
+        max_consecutive_late=math.ceil(_ALWAYS_LATE_S / config.tick_s) if late is None else late,
+        grace_ticks=int(timing.grace_s / config.tick_s),
+        keep_all=config.recording.on_failure == "stop",
+    )
 
 
 def _late_policy(config: Experiment, info: DeviceInfo) -> LatePolicy:

@@ -23,13 +23,12 @@ class SystemClock:
     """CLOCK_MONOTONIC, with sleeps to an absolute time that don't drift."""
 
     def __init__(self) -> None:
-        self._nanosleep = ctypes.CDLL(None, use_errno=True).clock_nanosleep
+        self._nanosleep = ctypes.CDLL(None).clock_nanosleep  # returns its error, never sets errno
         self._spec = _Timespec()
         self._pointer = ctypes.byref(self._spec)
 
-    def now_ns(self) -> int:
-        """Return the time in ns."""
-        return time.monotonic_ns()
+    now_ns = staticmethod(time.monotonic_ns)
+    """Returns the time in ns."""
 
     def sleep_until_ns(self, deadline_ns: int) -> None:
         """Sleep until ``deadline_ns``; return at once where that is past."""
@@ -81,7 +80,8 @@ class Pacer:
         self._policy = policy
         self._late_after_ns = late_after_ns
         self._origin_ns = 0
-        self._run = 0
+        self.late_run = 0
+        """Late ticks one after the other, up to this one."""
         self.tick = -1
         self.deadline_ns = 0
         self.late_ns = 0
@@ -133,7 +133,7 @@ class Pacer:
             counters.worst_tick = self.tick
         if self.late_ns > self._late_after_ns:
             counters.late_ticks += 1
-            self._run += 1
-            counters.longest_run = max(counters.longest_run, self._run)
+            self.late_run += 1
+            counters.longest_run = max(counters.longest_run, self.late_run)
         else:
-            self._run = 0
+            self.late_run = 0

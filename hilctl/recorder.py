@@ -6,13 +6,17 @@ from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 
+from hilctl.blocks import Batch
+from hilctl.control_page import LoopEvent
 from hilctl.errors import InputError
 from hilctl.facts import run_facts
 from hilctl.models.files import dump_model
 from hilctl.preflight import Checked
 from hilctl.recording.data import Event
+from hilctl.recording.tail import Tail
 from hilctl.recording.writer import OutputFile, RecordingWriter, RunFacts
-from hilctl.ring import Batch
+
+_SAMPLES_BEFORE = 50
 
 
 class Recorder:
@@ -35,6 +39,8 @@ class Recorder:
         self.lost = 0
         self._checked = checked
         self._writer: RecordingWriter | None = None
+        self._start_unix_ns = 0
+        self._tail = Tail(_SAMPLES_BEFORE)
         try:
             self._file = OutputFile(path, overwrite=overwrite)
         except FileExistsError:
@@ -47,15 +53,20 @@ class Recorder:
     def _unwritable(self, error: OSError) -> InputError:
         return InputError(f"{self.path}: can't be written: {error.strerror}")
 
-    def begin(self, start_unix_ns: int) -> None:
+    def begin(self, start_unix_ns: int, set_up: Mapping[str, str]) -> None:
         """Write what is known before the first sample.
+
+        Args:
+            start_unix_ns: When it is due.
+            set_up: How the loop's process was set up, see :func:`hilctl.realtime.step_facts`.
 
         Raises:
             InputError: The file can't be written.
         """
+        self._start_unix_ns = start_unix_ns
         try:
             self._writer = RecordingWriter(
-                self._file.begin(), self._facts(start_unix_ns), start_unix_ns
+                self._file.begin(), self._facts(start_unix_ns, set_up), start_unix_ns
             )
         except OSError as error:
             raise self._unwritable(error) from None
@@ -68,7 +79,16 @@ class Recorder:
         """Write a batch, or count it as lost where the file can't be written any more."""
         if self.error:
             self.lost += batch.flags.size
+        self._tail.add(batch)
         self._write(partial(self._begun.batch, batch))
+
+    def event(self, event: LoopEvent) -> None:
+        """Write what the loop told."""
+        rate_hz = self._checked.loaded.config.sample_rate_hz
+        time_ns = self._start_unix_ns + round(event.sample * 1e9 / rate_hz)
+        before = self._tail.up_to(event.sample)
+        told = Event(time_ns, event.sample, event.level, event.code, event.text, before)
+        self._write(partial(self._begun.event, told))
 
     def flush(self) -> None:
         """Hand all that was written to the kernel."""
@@ -97,6 +117,11 @@ class Recorder:
         return self._begun.samples
 
     @property
+    def next_sample(self) -> int:
+        """Index after the last sample written or lost."""
+        return self.samples + self.missing
+
+    @property
     def missing(self) -> int:
         """Samples known to be missing: counted in the recording, or lost after it ended."""
         return self._begun.missing + self.lost
@@ -114,11 +139,11 @@ class Recorder:
         except OSError as error:
             self.error = f"{self.path}: can't be written: {error.strerror}"
 
-    def _facts(self, start_unix_ns: int) -> RunFacts:
+    def _facts(self, start_unix_ns: int, set_up: Mapping[str, str]) -> RunFacts:
         loaded = self._checked.loaded
         config, info = loaded.config, loaded.device.info
         return RunFacts(
-            facts=run_facts(self._checked, iso_time(start_unix_ns)),
+            facts={**run_facts(self._checked, iso_time(start_unix_ns)), **set_up},
             segments=self._checked.reference.segments,
             experiment_yaml=loaded.yaml_text,
             model_yaml=dump_model(loaded.model) if loaded.model else "",

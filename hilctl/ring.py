@@ -1,93 +1,39 @@
-"""Shared memory between the loop and the recorder: a ring of sample blocks, and a control page.
+"""Shared memory between the loop and the recorder: a ring of sample blocks behind a control page.
 
 One producer (the loop) and one consumer (the supervisor). The producer never waits: where the ring
 is full, the block is counted as dropped and the next one that fits says how many samples are
-missing before it. The ring is a file in memory, so that it outlives either process.
+missing before it. The ring is a file in memory, so that it outlives either process: a block's room
+is given back only once the block is safe in the recording.
 
 Each slot carries its own sequence number, written after everything else in it; the consumer takes a
-slot only when the number is the one it expects.
+slot only when the number is the one it expects. Blocks that have been sent to the device and have
+no answer yet stand in an area of their own, so that a loop that dies leaves them behind as well.
 """
 
 import mmap
 import os
-from dataclasses import dataclass
-from enum import IntEnum
 from pathlib import Path
+from struct import Struct
 from typing import Any, Self
 
 import numpy as np
 
-from hilctl.arrays import F64, I64, U32
+from hilctl.arrays import F64, U32
+from hilctl.blocks import COLUMNS, Batch, Head
+from hilctl.control_page import SIZE as _PAGE_SIZE
+from hilctl.control_page import ControlPage, Field
+from hilctl.flags import Flag
 
-_PAGE = 4096
-_TEXT_BYTES = 8192
 _LINE = 64
+_HEAD, _TAIL = int(Field.HEAD), int(Field.TAIL)
+_HEAD_NUMBERS = len(Head)
+_HEAD_BYTES = 8 * _HEAD_NUMBERS
+_HEAD_BUT_SEQUENCE = Struct(f"{len(Head) - 1}q")
 _MAGIC = 0x48494C43_52494E47
-_COLUMNS = ("reference", "wanted", "command", "displacement_um", "measured")
+_DISPLACEMENT = COLUMNS.index("displacement_um")
 
 
-class Field(IntEnum):
-    """Numbers in the control page, int64 each."""
-
-    MAGIC = 0
-    SLOTS = 1
-    BLOCK = 2
-    STATE_SIZE = 3
-    HEAD = 8
-    TAIL = 16
-    PHASE = 24
-    GO = 25
-    STOP = 26
-    LOOP_BEAT_NS = 27
-    START_NS = 29
-    LATE_TICKS = 32
-    SKIPPED_TICKS = 33
-    WORST_LATE_NS = 34
-    WORST_LATE_TICK = 35
-    LONGEST_LATE_RUN = 36
-
-
-class Phase(IntEnum):
-    """How far the loop process has come."""
-
-    STARTING = 0
-    READY = 1
-    RUNNING = 2
-    ENDED = 3
-    FAILED = 4
-
-
-class Head(IntEnum):
-    """Numbers at the head of each slot, int64 each."""
-
-    SEQUENCE = 0
-    FIRST_SAMPLE = 1
-    SAMPLES = 2
-    DROPPED_BEFORE = 3
-    DEADLINE_NS = 4
-    LATE_NS = 5
-    EXCHANGE_NS = 6
-
-
-@dataclass(frozen=True, slots=True)
-class Batch:
-    """Blocks taken out of the ring together, k of them with B samples each.
-
-    Attributes:
-        heads: int64[k, len(Head)].
-        states: float64[k, s]: the compensator's memory before each block, then the command
-            before it.
-        columns: float64[k, 5, B]: reference, wanted, command, displacement_um, measured.
-        flags: uint32[k, B].
-    """
-
-    heads: I64
-    states: F64
-    columns: F64
-    flags: U32
-
-
-class SampleRing:
+class SampleRing(ControlPage):
     """The ring, seen from either side.
 
     Args:
@@ -96,57 +42,82 @@ class SampleRing:
         slots: Number of blocks it holds, when created.
         block: Samples in a block, when created.
         state_size: Numbers of state kept with each block, when created.
+        in_flight: Blocks that may wait for their answer, when created.
     """
 
     def __init__(
-        self, path: Path, *, create: bool, slots: int = 0, block: int = 0, state_size: int = 0
+        self,
+        path: Path,
+        *,
+        create: bool,
+        slots: int = 0,
+        block: int = 0,
+        state_size: int = 0,
+        in_flight: int = 0,
     ) -> None:
         self.path = path
         if create:
-            size = sum(_extents(slots, block, state_size)[-1])
+            size = _size(slots, block, state_size) + _size(in_flight, block, state_size)
             descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
-            os.posix_fallocate(descriptor, 0, size)
+            os.posix_fallocate(descriptor, 0, _PAGE_SIZE + size)
         else:
             descriptor = os.open(path, os.O_RDWR)
-            size = os.fstat(descriptor).st_size
-        self._map = mmap.mmap(descriptor, size)
+        memory = mmap.mmap(descriptor, os.fstat(descriptor).st_size)
         os.close(descriptor)
-        self.control: I64 = np.frombuffer(self._map, dtype=np.int64, count=_PAGE // 8)
+        super().__init__(memory)
         if create:
-            self.control[Field.SLOTS] = slots
-            self.control[Field.BLOCK] = block
-            self.control[Field.STATE_SIZE] = state_size
-            self.control[Field.MAGIC] = _MAGIC
-        elif self.control[Field.MAGIC] != _MAGIC:
+            self.put(Field.SLOTS, slots)
+            self.put(Field.BLOCK, block)
+            self.put(Field.STATE_SIZE, state_size)
+            self.put(Field.IN_FLIGHT, in_flight)
+            self.put(Field.MAGIC, _MAGIC)
+        elif self.get(Field.MAGIC) != _MAGIC:
             raise ValueError(f"{path}: is not a hilctl ring")
-        self.slots = int(self.control[Field.SLOTS])
-        self.block = int(self.control[Field.BLOCK])
-        self._map_slots(int(self.control[Field.STATE_SIZE]))
-        self._head = int(self.control[Field.HEAD])
-        self._tail = int(self.control[Field.TAIL])
+        self.slots, self.block = self.get(Field.SLOTS), self.get(Field.BLOCK)
+        state_size, in_flight = self.get(Field.STATE_SIZE), self.get(Field.IN_FLIGHT)
+        self._slots = self._area(_PAGE_SIZE, self.slots, state_size)
+        self._heads = self._slots.heads.data.cast("B")
+        self._heads_numbers = self._heads.cast("q")
+        after = _PAGE_SIZE + _size(self.slots, self.block, state_size)
+        self.sent = self._area(after, in_flight, state_size)
+        """Blocks on their way: the sequence number is 0 where there is none."""
+        self._head, self._tail = self.get(Field.HEAD), self.get(Field.TAIL)
 
     @classmethod
-    def create(cls, path: Path, *, slots: int, block: int, state_size: int) -> Self:
+    def create(
+        cls, path: Path, *, slots: int, block: int, state_size: int, in_flight: int = 1
+    ) -> Self:
         """Make a new ring; its memory is claimed at once."""
-        return cls(path, create=True, slots=slots, block=block, state_size=state_size)
+        return cls(
+            path,
+            create=True,
+            slots=slots,
+            block=block,
+            state_size=state_size,
+            in_flight=in_flight,
+        )
 
     @classmethod
     def attach(cls, path: Path) -> Self:
-        """Attach to a ring that another process made."""
+        """Attach to a ring that another process made.
+
+        Raises:
+            ValueError: It is no ring, or a damaged one.
+            OSError: It can't be opened.
+        """
         return cls(path, create=False)
 
-    def _map_slots(self, state_size: int) -> None:
-        numbers, floats, bits = np.dtype(np.int64), np.dtype(np.float64), np.dtype(np.uint32)
-        heads, states, columns, flags = _extents(self.slots, self.block, state_size)
-        width = len(_COLUMNS)
-        self._heads: I64 = self._part(numbers, heads).reshape(self.slots, len(Head))
-        self._states: F64 = self._part(floats, states).reshape(self.slots, state_size)
-        self._columns: F64 = self._part(floats, columns).reshape(self.slots, width, self.block)
-        self._flags: U32 = self._part(bits, flags).reshape(self.slots, self.block)
-
-    def _part(self, dtype: np.dtype[Any], extent: tuple[int, int]) -> Any:
-        offset, size = extent
-        return np.frombuffer(self._map, dtype, count=size // dtype.itemsize, offset=offset)
+    def _area(self, offset: int, slots: int, state_size: int) -> Batch:
+        parts: list[Any] = []
+        for (size, dtype), shape in zip(
+            _sizes(slots, self.block, state_size),
+            _shapes(slots, self.block, state_size),
+            strict=True,
+        ):
+            count = size // np.dtype(dtype).itemsize
+            parts.append(np.frombuffer(self._map, dtype, count, offset).reshape(shape))
+            offset += _padded(size)
+        return Batch(*parts)
 
     def push(
         self, head: tuple[int, int, int, int, int, int], state: F64, columns: F64, flags: U32
@@ -154,77 +125,93 @@ class SampleRing:
         """Put one block in; never waits.
 
         Args:
-            head: Numbers of :class:`Head` after the sequence.
-            state: float64[s], see :class:`Batch`.
-            columns: float64[5, B], see :class:`Batch`.
+            head: Numbers of :class:`~hilctl.blocks.Head` after the sequence.
+            state: float64[s], see :class:`~hilctl.blocks.Batch`.
+            columns: float64[5, B], see :class:`~hilctl.blocks.Batch`.
             flags: uint32[B].
 
         Returns:
             False where the ring is full: then nothing was put in.
         """
-        control = self.control
-        if self._head - control[Field.TAIL] >= self.slots:
+        numbers, number = self.numbers, self._head
+        if number - numbers[_TAIL] >= self.slots:
             return False
-        slot = self._head % self.slots
-        self._states[slot] = state
-        self._columns[slot] = columns
-        self._flags[slot] = flags
-        row = self._heads[slot]
-        row[1:] = head
-        row[Head.SEQUENCE] = self._head + 1
-        self._head += 1
-        control[Field.HEAD] = self._head
+        slot = number % self.slots
+        area = self._slots
+        area.states[slot] = state
+        area.columns[slot] = columns
+        area.flags[slot] = flags
+        at = slot * _HEAD_BYTES
+        _HEAD_BUT_SEQUENCE.pack_into(self._heads, at + 8, *head)
+        self._heads_numbers[slot * _HEAD_NUMBERS] = number + 1
+        self._head = number + 1
+        numbers[_HEAD] = number + 1
         return True
 
     def pop(self) -> Batch | None:
-        """Take out all blocks there are, up to the end of the ring; None where there are none."""
-        head = int(self.control[Field.HEAD])
-        if head == self._tail:
+        """Take out all blocks there are, up to the end of the ring; None where there are none.
+
+        They keep their room until :meth:`release`.
+        """
+        there = min(max(self.get(Field.HEAD) - self._tail, 0), self.slots)
+        if there == 0:
             return None
         first = self._tail % self.slots
-        count = min(head - self._tail, self.slots - first)
-        rows = slice(first, first + count)
-        heads = self._heads[rows].copy()
+        count = min(there, self.slots - first)
+        batch = self._slots.rows(slice(first, first + count))
         expected = np.arange(self._tail + 1, self._tail + count + 1)
-        wrong = np.flatnonzero(heads[:, Head.SEQUENCE] != expected)
+        wrong = np.flatnonzero(batch.heads[:, Head.SEQUENCE] != expected)
         if wrong.size:  # not yet visible, or damaged: what stands before it is good
             count = int(wrong[0])
             if count == 0:
                 return None
-        rows = slice(first, first + count)
-        batch = Batch(
-            heads[:count],
-            self._states[rows].copy(),
-            self._columns[rows].copy(),
-            self._flags[rows].copy(),
-        )
+            batch = batch.rows(slice(count))
         self._tail += count
-        self.control[Field.TAIL] = self._tail
         return batch
 
-    def get(self, field: Field) -> int:
-        """Return a number of the control page."""
-        return int(self.control[field])
+    def skip_damaged(self) -> int:
+        """Pass over blocks that will never come out; for when the producer has ended.
 
-    def put(self, field: Field, value: int) -> None:
-        """Set a number of the control page."""
-        self.control[field] = value
+        Returns:
+            How many there were.
+        """
+        there = min(max(self.get(Field.HEAD) - self._tail, 0), self.slots)
+        passed = 0
+        while passed < there:
+            slot = (self._tail + passed) % self.slots
+            if self._slots.heads[slot, Head.SEQUENCE] == self._tail + passed + 1:
+                break
+            passed += 1
+        self._tail += passed
+        return passed
 
-    def write_text(self, text: str) -> None:
-        """Leave a text for the other side, cut to what fits."""
-        raw = text.encode()[: _TEXT_BYTES - 8].decode(errors="ignore").encode()
-        self._map[_PAGE + 8 : _PAGE + 8 + len(raw)] = raw
-        self._map[_PAGE : _PAGE + 8] = len(raw).to_bytes(8, "little")
+    def release(self) -> None:
+        """Give the room of all that was taken back to the producer: it is safe elsewhere."""
+        super().release()
+        self.control[Field.TAIL] = self._tail
 
-    def read_text(self) -> str:
-        """Return the text that the other side left."""
-        length = int.from_bytes(self._map[_PAGE : _PAGE + 8], "little")
-        length = min(length, _TEXT_BYTES - 8)
-        return bytes(self._map[_PAGE + 8 : _PAGE + 8 + length]).decode(errors="replace")
+    def unanswered(self, next_sample: int) -> Batch | None:
+        """Return the blocks that were sent and never answered; for when the producer has died.
 
-    def unlink(self) -> None:
-        """Remove the file; both sides keep what they have mapped."""
-        self.path.unlink(missing_ok=True)
+        Args:
+            next_sample: Index after the last sample that came out of the ring; what was sent
+                before it has come out.
+
+        Returns:
+            The blocks in order, with :attr:`~hilctl.flags.Flag.UNANSWERED` on every sample, or
+            None. The last may not have reached the device.
+        """
+        numbers = self.sent.heads[:, Head.SEQUENCE]
+        order = np.argsort(numbers, kind="stable")
+        firsts = self.sent.heads[order, Head.FIRST_SAMPLE]
+        batch = self.sent.rows(order[(numbers[order] > 0) & (firsts >= next_sample)])
+        if not batch.heads.shape[0]:
+            return None
+        batch.columns[:, _DISPLACEMENT:] = np.nan
+        batch.flags[:] |= np.uint32((Flag.SENSOR_INVALID | Flag.UNANSWERED).value)
+        ends = [next_sample, *(batch.heads[:-1, Head.FIRST_SAMPLE] + self.block).tolist()]
+        batch.heads[:, Head.DROPPED_BEFORE] = batch.heads[:, Head.FIRST_SAMPLE] - ends
+        return batch
 
 
 def memory_folder() -> Path:
@@ -237,17 +224,25 @@ def memory_folder() -> Path:
     return Path(tempfile.gettempdir())
 
 
-def _extents(slots: int, block: int, state_size: int) -> list[tuple[int, int]]:
-    """Return offset and size in bytes of heads, states, columns and flags."""
-    sizes = (
-        slots * len(Head) * 8,
-        slots * state_size * 8,
-        slots * len(_COLUMNS) * block * 8,
-        slots * block * 4,
-    )
-    extents = []
-    offset = _PAGE + _TEXT_BYTES
-    for size in sizes:
-        extents.append((offset, size))
-        offset += -(-size // _LINE) * _LINE
-    return extents
+def _shapes(slots: int, block: int, state_size: int) -> tuple[tuple[int, ...], ...]:
+    """Return the shapes of heads, states, columns and flags."""
+    width = len(COLUMNS)
+    return (slots, len(Head)), (slots, state_size), (slots, width, block), (slots, block)
+
+
+def _sizes(slots: int, block: int, state_size: int) -> list[tuple[int, Any]]:
+    """Return bytes and types of heads, states, columns and flags."""
+    types = (np.int64, np.float64, np.float64, np.uint32)
+    shapes = _shapes(slots, block, state_size)
+    return [
+        (int(np.prod(shape)) * np.dtype(dtype).itemsize, dtype)
+        for shape, dtype in zip(shapes, types, strict=True)
+    ]
+
+
+def _padded(size: int) -> int:
+    return -(-size // _LINE) * _LINE
+
+
+def _size(slots: int, block: int, state_size: int) -> int:
+    return sum(_padded(size) for size, _ in _sizes(slots, block, state_size))

@@ -1,5 +1,6 @@
 """From an experiment file to a finished run: load, check, run."""
 
+import os
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -7,7 +8,8 @@ from pathlib import Path
 from hilctl.errors import InputError
 from hilctl.experiment import load_experiment
 from hilctl.preflight import Checked, check
-from hilctl.supervisor import Progress, RunResult, Supervisor, default_output
+from hilctl.run_result import Progress, RunResult
+from hilctl.supervisor import Supervisor
 
 
 def checked_experiment(path: Path, settings: Sequence[str]) -> Checked:
@@ -17,6 +19,22 @@ def checked_experiment(path: Path, settings: Sequence[str]) -> Checked:
         InputError: It can't be used; all problems are listed.
     """
     return check(load_experiment(path, settings))
+
+
+def output_of(checked: Checked, output: Path | None) -> Path:
+    """Return the recording to write: the one given, or a new name in the experiment's folder.
+
+    Raises:
+        InputError: The folder can't be made.
+    """
+    if output is not None:
+        return output
+    folder = Path(checked.loaded.config.recording.folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{folder}: can't be made: {error.strerror}") from None
+    return default_output(checked.loaded.config.name, folder, time.localtime())
 
 
 def start_run(
@@ -40,11 +58,16 @@ def start_run(
         RunError: The device could not be opened; nothing has moved, and no file is left.
     """
     checked = checked_experiment(path, settings)
-    if output is None:
-        folder = Path(checked.loaded.config.recording.folder)
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise InputError(f"{folder}: can't be made: {error.strerror}") from None
-        output = default_output(checked.loaded.config.name, folder, time.localtime())
+    output = output_of(checked, output)
     return Supervisor(checked, output, overwrite=overwrite, on_progress=on_progress).run()
+
+
+def default_output(name: str, folder: Path, now: time.struct_time) -> Path:
+    """Return the file for a run that was given none: ``folder/name-date-time.mcap``."""
+    stamp = time.strftime("%Y%m%d-%H%M%S", now)
+    candidate = folder / f"{name}-{stamp}.mcap"
+    number = 2
+    while os.path.lexists(candidate):
+        candidate = folder / f"{name}-{stamp}-{number}.mcap"
+        number += 1
+    return candidate

@@ -1,78 +1,42 @@
 """The supervisor: starts the loop process, records what it exchanges, and makes the rig safe.
 
-It holds no device while the loop lives. Should the loop process die, it drains the ring to the last
-sample, puts the output at its safe value by a connection of its own, and closes the recording.
+It holds no device while the loop lives. Should the loop process die or hang, it drains the ring to
+the last sample, puts the output at its safe value by a connection of its own, and closes the
+recording.
 """
 
 import json
 import os
 import signal
-import subprocess
-import sys
-import tempfile
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import FrameType
 
-import numpy as np
-
 from hilctl.compensator import Compensator
+from hilctl.control import ControlServer
+from hilctl.control_page import Field
+from hilctl.ending import end_facts
 from hilctl.errors import DeviceError, InputError, RunError
-from hilctl.loop import Outcome
+from hilctl.loop_child import LoopChild
+from hilctl.notify import Notifier
+from hilctl.orders import Orders
+from hilctl.plan import Outcome
 from hilctl.preflight import Checked
+from hilctl.realtime import be_ordinary
 from hilctl.recorder import Recorder
-from hilctl.ring import Batch, Field, Phase, SampleRing, memory_folder
+from hilctl.ring import SampleRing
+from hilctl.run_result import Progress, RunResult
+from hilctl.runs import RunFolder, held_devices, run_folder
+from hilctl.watch import HangWatch
 
 _POLL_S = 0.02
-_READY_TIMEOUT_S = 120.0
 _START_DELAY_NS = 50_000_000
+_HANG_MARGIN_S = 0.5
 _SIGNALS = {signal.SIGINT: 1, signal.SIGTERM: 2, signal.SIGHUP: 3}
 _RECORDER_FAILED = 4
-
-
-@dataclass(frozen=True, slots=True)
-class RunResult:
-    """How a run ended.
-
-    Attributes:
-        path: The recording.
-        code: ``completed``, ``stopped`` or ``fault``.
-        reason: One line for people.
-        safe: Whether the output is known to be at its safe value.
-        stop_signal: Number of the signal that stopped it, or 0.
-        samples: Samples recorded.
-        missing: Samples counted as dropped, skipped or lost.
-        late_ticks: Ticks that woke late.
-    """
-
-    path: Path
-    code: str
-    reason: str
-    safe: bool
-    stop_signal: int
-    samples: int
-    missing: int
-    late_ticks: int
-
-
-@dataclass(frozen=True, slots=True)
-class Progress:
-    """Where a run stands.
-
-    Attributes:
-        samples: Samples recorded so far.
-        total: Samples of the waveform.
-        late_ticks: Ticks that woke late so far.
-        batch: The newest samples.
-    """
-
-    samples: int
-    total: int
-    late_ticks: int
-    batch: Batch
+_STOP_ORDER = 5
 
 
 class Supervisor:
@@ -98,37 +62,59 @@ class Supervisor:
         self._output = output
         self._overwrite = overwrite
         self._on_progress = on_progress
+        self._notifier = Notifier()
         self._stop_signal = 0
 
     def run(self) -> RunResult:
         """Run to the end.
 
         Raises:
-            InputError: The recording can't be written; nothing has moved, and no file is left.
+            InputError: The recording can't be written, or another run holds the device; nothing has
+                moved, and no file is left.
             RunError: The loop could not be started; nothing has moved, and no file is left.
         """
-        recorder = Recorder(self._checked, self._output, overwrite=self._overwrite)
-        with (
-            self._signals(),
-            tempfile.TemporaryDirectory(prefix="hilctl-", dir=memory_folder()) as folder,
-        ):
-            ring = self._make_ring(Path(folder))
-            process = self._start(Path(folder), ring)
+        be_ordinary()
+        config = self._config
+        with ExitStack() as stack:
+            user = f"run {config.name} (process {os.getpid()}, recording {self._output})"
+            locks = stack.enter_context(held_devices(self._checked.loaded.device.info.holds, user))
+            recorder = Recorder(self._checked, self._output, overwrite=self._overwrite)
             try:
-                self._await_ready(process, ring)
-                start_ns = time.monotonic_ns() + _START_DELAY_NS
-                recorder.begin(time.time_ns() + start_ns - time.monotonic_ns())
-            except (RunError, InputError):
-                process.kill()  # it waits for the word to start, so nothing has moved
-                process.wait()
+                folder, own = stack.enter_context(
+                    run_folder(config.name, self._output, time.time())
+                )
+                stack.enter_context(self._signals())
+                ring = self._make_ring(folder)
+                child = LoopChild(self._checked, folder, ring, locks + own, self._silence_s)
+            except BaseException:
                 recorder.give_back()
                 raise
+            try:
+                child.await_ready(lambda: self._stop_signal != 0)
+                start_ns = time.monotonic_ns() + _START_DELAY_NS
+                started = time.time_ns() + start_ns - time.monotonic_ns()
+                recorder.begin(started, json.loads(ring.read_text()))
+            except (RunError, InputError):
+                child.kill()  # it waits for the word to start, so nothing has moved
+                recorder.give_back()
+                raise
+            ring.put(Field.SUPERVISOR_BEAT_NS, time.monotonic_ns())
             ring.put(Field.START_NS, start_ns)
             ring.put(Field.GO, 1)
-            self._drain_while_alive(ring, process, recorder)
-            outcome = self._outcome(ring, process, recorder)
-            recorder.finish(_end_facts(outcome, ring), outcome.ended_at)
-            return self._result(outcome, ring, recorder)
+            self._notifier.say("READY=1", f"STATUS=recording to {self._output}")
+            orders = Orders(self._checked, folder, ring, recorder)
+            with ControlServer(folder.socket, orders.answer) as server:
+                hung = self._drain_while_alive(ring, child, recorder, server, orders)
+            self._notifier.say("STOPPING=1")
+            outcome = self._outcome(ring, child, recorder, hung)
+            recorder.finish(end_facts(outcome, ring), outcome.ended_at)
+            return self._result(outcome, ring, recorder, ordered=orders.stop)
+
+    @property
+    def _silence_s(self) -> float:
+        """Longest that this side may be silent: then half of the ring is full."""
+        recording = self._config.recording
+        return recording.ring_s / 2.0 if recording.on_failure == "stop" else float("inf")
 
     @contextmanager
     def _signals(self) -> Iterator[None]:
@@ -142,127 +128,103 @@ class Supervisor:
             for number, handler in before.items():
                 signal.signal(number, handler)
 
-    def _make_ring(self, folder: Path) -> SampleRing:
-        config = self._config
+    def _make_ring(self, folder: RunFolder) -> SampleRing:
+        config, info = self._config, self._checked.loaded.device.info
         slots = max(16, int(config.recording.ring_s / config.tick_s))
         state = Compensator(self._checked.loaded.model, config.sample_rate_hz).state_size + 1
-        return SampleRing.create(folder / "ring", slots=slots, block=config.block, state_size=state)
-
-    def _start(self, folder: Path, ring: SampleRing) -> subprocess.Popen[bytes]:
-        reference = folder / "reference.npy"
-        np.save(reference, self._checked.reference.values)
-        job = {
-            "experiment": self._checked.loaded.yaml_text,
-            "folder": str(self._checked.loaded.folder.resolve()),
-            "ring": str(ring.path),
-            "reference": str(reference),
-            "supervisor": os.getpid(),
-        }
-        process = subprocess.Popen(
-            [sys.executable, "-m", "hilctl.loop_process"],
-            stdin=subprocess.PIPE,
-            start_new_session=True,  # a Ctrl-C in the terminal is the supervisor's to handle
+        return SampleRing.create(
+            folder.ring,
+            slots=slots,
+            block=config.block,
+            state_size=state,
+            in_flight=info.latency_blocks + 1,
         )
-        assert process.stdin is not None
-        with suppress(BrokenPipeError):  # it died at once, which is told where it is waited for
-            process.stdin.write(json.dumps(job).encode())
-            process.stdin.close()
-        return process
-
-    def _await_ready(self, process: subprocess.Popen[bytes], ring: SampleRing) -> None:
-        deadline = time.monotonic() + _READY_TIMEOUT_S
-        while ring.get(Field.PHASE) == Phase.STARTING and process.poll() is None:
-            if self._stop_signal:
-                raise RunError("stopped before the start; nothing has moved")
-            if time.monotonic() > deadline:
-                raise RunError(f"the loop was not ready within {_READY_TIMEOUT_S:g} s")
-            time.sleep(0.005)
-        if ring.get(Field.PHASE) == Phase.FAILED:
-            raise RunError(ring.read_text())
-        if ring.get(Field.PHASE) != Phase.READY:
-            raise RunError(f"the loop process died before the start: {_death(process)}")
 
     def _drain_while_alive(
-        self, ring: SampleRing, process: subprocess.Popen[bytes], recorder: Recorder
-    ) -> None:
+        self,
+        ring: SampleRing,
+        child: LoopChild,
+        recorder: Recorder,
+        server: ControlServer,
+        orders: Orders,
+    ) -> bool:
+        """Record until the loop is gone; return whether it hung and had to be killed."""
+        limit_s = self._config.tick_s + self._config.timing.max_late_s + _HANG_MARGIN_S
+        watch = HangWatch(ring, limit_s)
         flushed = time.monotonic()
+        hung = False
         while True:
-            ended = process.poll() is not None
-            if self._stop_signal:
-                ring.put(Field.STOP, _SIGNALS[signal.Signals(self._stop_signal)])
-            elif recorder.error:
-                ring.put(Field.STOP, _RECORDER_FAILED)
-            while (batch := ring.pop()) is not None:
-                recorder.batch(batch)
-                self._show(recorder, ring, batch)
+            ended = child.ended
+            ring.put(Field.SUPERVISOR_BEAT_NS, time.monotonic_ns())
+            self._order_stop(ring, recorder, orders)
+            self._drain(ring, recorder)
             now = time.monotonic()
             if now - flushed >= self._config.recording.flush_s:
                 recorder.flush()
+                ring.release()
                 flushed = now
             if ended:
-                return
-            time.sleep(_POLL_S)
+                return hung
+            if watch.hangs(time.monotonic_ns()):
+                hung = True
+                child.kill()
+            self._notifier.alive()
+            server.serve(_POLL_S)
 
-    def _show(self, recorder: Recorder, ring: SampleRing, batch: Batch) -> None:
-        total = self._checked.forecast.samples
-        late = ring.get(Field.LATE_TICKS)
-        self._on_progress(Progress(recorder.samples, total, late, batch))
+    def _order_stop(self, ring: SampleRing, recorder: Recorder, orders: Orders) -> None:
+        if self._stop_signal:
+            ring.put(Field.STOP, _SIGNALS[signal.Signals(self._stop_signal)])
+        elif orders.stop:
+            ring.put(Field.STOP, _STOP_ORDER)
+        elif recorder.error and self._config.recording.on_failure == "stop":
+            ring.put(Field.STOP, _RECORDER_FAILED)
+
+    def _drain(self, ring: SampleRing, recorder: Recorder) -> None:
+        while (batch := ring.pop()) is not None:
+            recorder.batch(batch)
+            total, late = self._checked.forecast.samples, ring.get(Field.LATE_TICKS)
+            self._on_progress(Progress(recorder.samples, total, late, batch))
+        for event in ring.pop_events():
+            recorder.event(event)
 
     def _outcome(
-        self, ring: SampleRing, process: subprocess.Popen[bytes], recorder: Recorder
+        self, ring: SampleRing, child: LoopChild, recorder: Recorder, hung: bool
     ) -> Outcome:
-        if ring.get(Field.PHASE) == Phase.ENDED:
-            return Outcome(**json.loads(ring.read_text()))
-        failed = ring.get(Field.PHASE) == Phase.FAILED
-        reason = ring.read_text() if failed else f"the loop process died: {_death(process)}"
+        said = child.outcome()
+        if isinstance(said, Outcome):
+            self._salvage(ring, recorder)
+            return said
+        reason = "the loop process hung, and was killed" if hung else said
         safe = True
         try:
             self._checked.loaded.device.make_safe(self._config.safe.value)
         except DeviceError as error:
             reason += f"; the safe value could not be confirmed: {error}"
             safe = False
-        return Outcome("fault", reason, recorder.samples + recorder.missing, safe, 0)
+        self._salvage(ring, recorder)
+        if (batch := ring.unanswered(recorder.next_sample)) is not None:
+            recorder.batch(batch)
+        return Outcome("fault", reason, recorder.next_sample, safe, 0)
 
-    def _result(self, outcome: Outcome, ring: SampleRing, recorder: Recorder) -> RunResult:
+    def _salvage(self, ring: SampleRing, recorder: Recorder) -> None:
+        """Take what stands behind damaged blocks, now that no more will come."""
+        while ring.skip_damaged():
+            self._drain(ring, recorder)
+
+    def _result(
+        self, outcome: Outcome, ring: SampleRing, recorder: Recorder, *, ordered: bool
+    ) -> RunResult:
+        stop_signal = self._stop_signal or (signal.SIGTERM if ordered else 0)
         cut = f"; the recording is cut short: {recorder.error}" if recorder.error else ""
-        code = "fault" if recorder.error else outcome.code
+        fault = recorder.error or (outcome.code == "stopped" and not stop_signal)
+        code = "fault" if fault else outcome.code
         return RunResult(
             path=self._output,
             code=code,
             reason=outcome.reason + cut,
             safe=outcome.safe,
-            stop_signal=self._stop_signal if code == "stopped" else 0,
+            stop_signal=stop_signal if code == "stopped" else 0,
             samples=recorder.samples,
             missing=recorder.missing,
             late_ticks=ring.get(Field.LATE_TICKS),
         )
-
-
-def _end_facts(outcome: Outcome, ring: SampleRing) -> dict[str, str]:
-    return {
-        "code": outcome.code,
-        "reason": outcome.reason,
-        "output_safe": str(outcome.safe).lower(),
-        "late_ticks": str(ring.get(Field.LATE_TICKS)),
-        "skipped_ticks": str(ring.get(Field.SKIPPED_TICKS)),
-        "worst_late_ns": str(ring.get(Field.WORST_LATE_NS)),
-        "worst_late_tick": str(ring.get(Field.WORST_LATE_TICK)),
-        "longest_late_run": str(ring.get(Field.LONGEST_LATE_RUN)),
-        "dropped_in_ring": str(outcome.dropped),
-    }
-
-
-def _death(process: subprocess.Popen[bytes]) -> str:
-    code = process.wait()
-    return f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
-
-
-def default_output(name: str, folder: Path, now: time.struct_time) -> Path:
-    """Return the file for a run that was given none: ``folder/name-date-time.mcap``."""
-    stamp = time.strftime("%Y%m%d-%H%M%S", now)
-    candidate = folder / f"{name}-{stamp}.mcap"
-    number = 2
-    while os.path.lexists(candidate):
-        candidate = folder / f"{name}-{stamp}-{number}.mcap"
-        number += 1
-    return candidate

@@ -1,10 +1,57 @@
 """Settings and fixtures that all tests share."""
 
 import os
+import tempfile
+from pathlib import Path
 
+import pytest
 from hypothesis import settings
+
+from hilctl.ring import memory_folder
+
+HARDWARE = Path(__file__).parent / "hardware"
 
 # A shared machine stalls now and then, and a failure in CI must come back when it is run again.
 settings.register_profile("local", deadline=None)
 settings.register_profile("ci", deadline=None, derandomize=True)
 settings.load_profile("ci" if os.environ.get("CI") else "local")
+
+
+def pytest_addoption(parser):
+    parser.addoption(
+        "--device",
+        metavar="EXPERIMENT.yaml",
+        type=Path,
+        help="also run tests/hardware, which moves the real device of this experiment a little",
+    )
+
+
+def pytest_collection_modifyitems(config, items):
+    """Leave tests on real devices out, unless one is named."""
+    if config.getoption("--device") is not None:
+        return
+    hardware = [item for item in items if HARDWARE in item.path.parents]
+    if hardware:
+        config.hook.pytest_deselected(items=hardware)
+        items[:] = [item for item in items if item not in hardware]
+
+
+def pytest_report_collectionfinish(config, items):
+    """Say what a real device is in for, in one line."""
+    experiment = config.getoption("--device")
+    if experiment is None:
+        return "tests/hardware: left out; --device EXPERIMENT.yaml runs it on a real device"
+    return f"tests/hardware: drives the device of {experiment}"
+
+
+@pytest.fixture(scope="session")
+def memory():
+    """A folder in memory of this session's own."""
+    with tempfile.TemporaryDirectory(prefix="hilctl-tests-", dir=memory_folder()) as folder:
+        yield Path(folder)
+
+
+@pytest.fixture(autouse=True)
+def own_runs(memory, monkeypatch, request):
+    """Keep each test's runs apart from those of other tests and of this user."""
+    monkeypatch.setenv("HILCTL_RUNS", str(memory / f"{abs(hash(request.node.nodeid)):x}"))

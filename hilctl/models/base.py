@@ -65,9 +65,12 @@ class Operator:
             out += self._output_offset
         return out
 
-    def state(self) -> F64:
+    def state(self, out: F64 | None = None) -> F64:
         """Return a copy of the memory: operator outputs, then the previous input."""
-        return self._memory.copy()
+        if out is None:
+            return self._memory.copy()
+        out[:] = self._memory
+        return out
 
     def restore(self, state: F64) -> None:
         """Go back to a state that :meth:`state` returned.

@@ -5,13 +5,18 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
+from hilctl.blocks import Batch, Head
 from hilctl.compensator import Compensator
+from hilctl.control_page import LoopEvent
+from hilctl.delay_line import DelayLine
 from hilctl.errors import DeviceError
 from hilctl.flags import Flag
+from hilctl.interlocks import InterlockLimits, Interlocks
 from hilctl.limiter import CommandLimits, Limiter
-from hilctl.loop import Loop, Plan
+from hilctl.loop import Loop
 from hilctl.models.published import terfenol_rdpi
 from hilctl.pacer import Pacer
+from hilctl.plan import Plan, Tuning
 
 RATE_HZ = 1000.0
 LIMITS = CommandLimits(low=-5.0, high=5.0, slew_per_s=2000.0, safe=0.0, ramp_per_s=100.0)
@@ -116,6 +121,26 @@ class Sink:
         return np.concatenate([c[row] for c in self.columns])
 
 
+@dataclass
+class Oversight:
+    """Asks for a stop when told to, hands out tunings by sample, and keeps events."""
+
+    stop: object = field(default=lambda: "")
+    tunings: dict[int, Tuning] = field(default_factory=dict)
+    events: list[LoopEvent] = field(default_factory=list)
+    beats: list[int] = field(default_factory=list)
+
+    def beat(self, next_sample):
+        self.beats.append(next_sample)
+        return self.stop()
+
+    def tuning(self):
+        return self.tunings.pop(self.beats[-1], None)
+
+    def tell(self, event):
+        self.events.append(event)
+
+
 class Bench:
     """One loop with all its parts, to be run once."""
 
@@ -130,17 +155,22 @@ class Bench:
         policy = options.get("policy", "skip")
         self.pacer = Pacer(self.clock, period_ns, policy, 0.5 * period_ns)
         stroke_um = options.get("stroke_um", (-60.0, 60.0))
-        max_late, latency = options.get("max_late", 1e9), getattr(self.device, "latency", 0)
-        plan = Plan(reference, model is not None, block, stroke_um, max_late, latency)
+        rules = {"max_late_ns": 1e9, "keep_all": False, **options.get("rules", {})}
+        plan = Plan(reference, model is not None, block, **rules)
+        self.oversight = options.get("oversight") or Oversight(options.get("stop", lambda: ""))
+        latency, states = getattr(self.device, "latency", 0), self.compensator.state_size + 1
+        self.sent = Batch.empty(latency + 1, block, states)
         self.loop = Loop(
             plan,
             self.device,
             self.compensator,
             self.limiter,
+            Interlocks(InterlockLimits(stroke_um=stroke_um), RATE_HZ),
             self.pacer,
             self.clock,
+            DelayLine(self.sent),
             self.sink,
-            options.get("stop", lambda: ""),
+            self.oversight,
         )
 
     def run(self):
@@ -262,7 +292,18 @@ def test_lost_device_is_made_safe():
     assert (outcome.code, outcome.safe) == ("fault", True)
     assert outcome.reason == "fake: no answer within 0.1 s"
     assert bench.device.made_safe == [0.0]
-    assert outcome.ended_at == 60
+    assert outcome.ended_at == 61
+    assert [event.code for event in bench.oversight.events] == ["device_lost"]
+
+
+def test_sample_that_the_device_did_not_answer_is_recorded():
+    """Its command may have reached the device: it is in the recording, without a displacement."""
+    bench = Bench(np.full(1000, 2.0), device=FakeDevice(break_at=60))
+    bench.run()
+    assert bench.sink.column(2).size == 61
+    assert np.isnan(bench.sink.column(3)[60])
+    assert bench.sink.flags[60][0] & Flag.UNANSWERED
+    assert not bench.sink.flags[59][0] & Flag.UNANSWERED
 
 
 def test_lost_device_that_stays_lost_is_said():
@@ -387,16 +428,17 @@ def test_blocks_under_way_to_a_lost_device_are_recorded(break_at):
     outcome = bench.run()
     assert (outcome.code, outcome.reason) == ("fault", "fake: no answer within 0.1 s")
     assert device.made_safe == [LIMITS.safe]
-    recorded = bench.sink.column(2) if bench.sink.columns else np.empty(0)
-    assert recorded.tolist() == device.commands[: outcome.ended_at]
-    if recorded.size:
-        answered = max(0, 10 * (device.exchanges - 3))
-        assert np.isnan(bench.sink.column(3)[answered:]).all()
-        assert np.isfinite(bench.sink.column(3)[:answered]).all()
-        flags = np.concatenate(bench.sink.flags)
-        assert ((flags & Flag.SENSOR_INVALID) != 0).tolist() == [
-            k >= answered for k in range(recorded.size)
-        ]
+    recorded = bench.sink.column(2)
+    assert recorded.size == outcome.ended_at
+    known = min(len(device.commands), recorded.size)
+    assert recorded[:known].tolist() == device.commands[:known]
+    answered = max(0, 10 * (device.exchanges - 3))
+    assert np.isnan(bench.sink.column(3)[answered:]).all()
+    assert np.isfinite(bench.sink.column(3)[:answered]).all()
+    flags = np.concatenate(bench.sink.flags)
+    assert ((flags & Flag.UNANSWERED) != 0).tolist() == [
+        k >= answered for k in range(recorded.size)
+    ]
 
 
 def test_full_ring_behind_a_fifo_is_a_counted_gap():
@@ -406,3 +448,69 @@ def test_full_ring_behind_a_fifo_is_a_counted_gap():
     outcome = bench.run()
     assert {head[0]: head[2] for head in bench.sink.heads if head[2]} == {80: 30}
     assert outcome.dropped == 30
+
+
+@pytest.mark.parametrize("latency", [0, 3])
+def test_what_is_on_its_way_can_be_seen_before_it_is_sent(latency):
+    """Whoever outlives the loop finds the commands of every exchange that has begun."""
+    seen = []
+
+    class Looked(FifoDevice):
+        def exchange(self, first_sample, command, displacement_um, measured):
+            heads = bench.sent.heads
+            row = int(np.argmax(heads[:, Head.SEQUENCE]))
+            there = (int(heads[row, Head.FIRST_SAMPLE]), bench.sent.columns[row, 2].tolist())
+            seen.append(there == (first_sample, command.tolist()))
+            super().exchange(first_sample, command, displacement_um, measured)
+
+    bench = Bench(sine(100), block=10, device=Looked(latency))
+    outcome = bench.run()
+    assert outcome.ended_at > 100
+    assert all(seen[: outcome.ended_at // 10])
+
+
+def test_loop_gives_a_sign_of_life_in_every_tick():
+    """Also on the ramp, where no order is followed any more."""
+    oversight = Oversight(lambda: "stopped by a test" if len(oversight.beats) > 20 else "")
+    bench = Bench(np.full(1000, 2.0), oversight=oversight)
+    outcome = bench.run()
+    assert (outcome.code, outcome.reason) == ("stopped", "stopped by a test")
+    assert oversight.beats == list(range(outcome.ended_at))
+
+
+def test_reference_is_tuned_without_a_bump():
+    """A new gain is reached over its ramp, recorded with the reference, and told once."""
+    oversight = Oversight(tunings={40: Tuning(0.5, 0.1, 20)})
+    bench = Bench(np.full(200, 2.0), model=terfenol_rdpi(), oversight=oversight)
+    bench.run()
+    reference = bench.sink.column(0)[:200]
+    assert (reference[:40] == 2.0).all()
+    assert reference[59:] == pytest.approx(1.1)
+    assert np.diff(reference[39:60]) == pytest.approx(-0.9 / 20)
+    assert [(event.sample, event.code) for event in oversight.events] == [(40, "tuned")]
+
+
+def test_many_late_ticks_in_a_row_end_the_run():
+    """A machine that can't keep up is not asked to go on."""
+    clock = FakeClock(stall_ns=dict.fromkeys(range(50, 80), 700_000))
+    bench = Bench(np.full(1000, 2.0), clock=clock, rules={"max_consecutive_late": 5})
+    outcome = bench.run()
+    assert outcome.code == "fault"
+    assert outcome.reason == "5 ticks in a row woke late, up to tick 54"
+    assert bench.oversight.events[0].code == "late"
+
+
+def test_lateness_at_the_start_has_grace():
+    """Within the grace late ticks count, but do not end the run."""
+    clock = FakeClock(stall_ns={3: 2_000_000_000})
+    bench = Bench(np.full(4000, 2.0), clock=clock, rules={"grace_ticks": 2005, "max_late_ns": 1e9})
+    assert bench.run().code == "completed"
+    assert bench.pacer.counters.late_ticks == 1
+
+
+def test_recorder_that_does_not_keep_up_ends_the_run():
+    """Where everything is to be recorded, the first block without room is the last."""
+    bench = Bench(sine(200), block=10, sink=Sink(full=range(50, 60)), rules={"keep_all": True})
+    outcome = bench.run()
+    assert (outcome.code, outcome.dropped) == ("fault", 10)
+    assert outcome.reason == "no room for sample 50: the recorder does not keep up"

@@ -1,0 +1,180 @@
+"""Processes that are killed, stopped, or find garbage in the memory they share."""
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from hilctl.orphans import recover_orphans
+from hilctl.recording.reader import read
+from hilctl.replay import replay
+from hilctl.runs import runs
+
+KILLS = Path(__file__).parents[1] / "benchmark" / "kills.py"
+EXPERIMENT = {
+    "name": "process_fault",
+    "device": {"kind": "simulated_terfenol", "seed": 3},
+    "sample_rate_hz": 1000,
+    "waveform": {
+        "kind": "sine",
+        "unit": "A",
+        "amplitude": 4.0,
+        "frequency_hz": 5.0,
+        "duration_s": 60.0,
+        "soft_start_s": 0.1,
+    },
+    "compensator": "none",
+    "limits": {"peak_current_a": 5.0, "slew_a_per_s": 1000.0, "stroke_um": [-60.0, 60.0]},
+    "safe": {"value": 0.0, "ramp_s": 0.2},
+    "timing": {"max_late_s": 1.0},
+    "recording": {"flush_s": 0.1, "ring_s": 5.0},
+}
+
+
+class Run:
+    """A ``hilctl run`` in a process of its own, once it exchanges samples."""
+
+    def __init__(self, folder, **changes):
+        self.output = folder / "run.mcap"
+        path = folder / "experiment.yaml"
+        path.write_text(yaml.safe_dump({**EXPERIMENT, **changes}), encoding="utf-8")
+        words = ["run", str(path), "--output", str(self.output), "--json"]
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "hilctl.cli", *words],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        deadline = time.monotonic() + 60.0
+        while not (self.output.exists() and self.output.stat().st_size > 20_000):
+            assert self.process.poll() is None, self.process.communicate()
+            assert time.monotonic() < deadline
+            time.sleep(0.02)
+        children = Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children")
+        self.loop = int(children.read_text().split()[0])
+
+    def end(self):
+        out, err = self.process.communicate(timeout=60)
+        assert "Traceback" not in err
+        return self.process.returncode, json.loads(out)
+
+
+def contiguous(recording):
+    return np.array_equal(recording.samples.index, np.arange(recording.samples.index.size))
+
+
+def test_killed_processes_leave_a_safe_output_and_a_whole_recording():
+    """Judged by the device's own log: every write is in the file, and the last is the safe one."""
+    words = [sys.executable, str(KILLS), "--count", "2", "--within-ms", "30000", "--json"]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=200)
+    assert done.returncode == 0, done.stdout + done.stderr
+    kills = json.loads(done.stdout)
+    assert [kill["victim"] for kill in kills] == ["loop"] * 2 + ["supervisor"] * 2
+    assert all(kill["written"] > 20 for kill in kills)
+
+
+def test_loop_that_hangs_is_killed_and_the_device_made_safe(tmp_path):
+    """A loop that is stopped for good ends the run; what it had exchanged is in the file."""
+    run = Run(tmp_path)
+    os.kill(run.loop, signal.SIGSTOP)
+    returned, printed = run.end()
+    assert returned == 3
+    assert printed["reason"] == "the loop process hung, and was killed"
+    assert printed["output_safe"]
+    recording = read(run.output)
+    assert contiguous(recording)
+    assert recording.end["code"] == "fault"
+    assert replay(recording).identical
+
+
+@pytest.mark.parametrize("stopped_s", [0.01, 0.4])
+def test_short_stop_of_the_loop_costs_no_sample(tmp_path, stopped_s):
+    """Below the limit the run goes on; a device with a clock of its own is caught up with."""
+    run = Run(tmp_path)
+    os.kill(run.loop, signal.SIGSTOP)
+    time.sleep(stopped_s)
+    os.kill(run.loop, signal.SIGCONT)
+    time.sleep(0.5)
+    run.process.send_signal(signal.SIGINT)
+    returned, _printed = run.end()
+    assert returned == 130
+    recording = read(run.output)
+    assert contiguous(recording)
+    assert recording.dropped == 0
+    assert int(recording.end["worst_late_ns"]) >= 0.9e9 * stopped_s
+    assert replay(recording).identical
+
+
+def test_stop_beyond_the_limit_ends_the_run(tmp_path):
+    """A loop that wakes too late takes the way out, if it was not killed before."""
+    run = Run(tmp_path, timing={"max_late_s": 0.3})
+    os.kill(run.loop, signal.SIGSTOP)
+    time.sleep(0.5)
+    os.kill(run.loop, signal.SIGCONT)
+    returned, printed = run.end()
+    assert returned == 3
+    assert "late, more than the limit" in printed["reason"] or "hung" in printed["reason"]
+    assert printed["output_safe"]
+
+
+def test_supervisor_that_falls_silent_ends_the_run(tmp_path):
+    """Before the ring is full the loop ramps down by itself; nothing is lost."""
+    run = Run(tmp_path)
+    os.kill(run.process.pid, signal.SIGSTOP)
+    deadline = time.monotonic() + 60.0
+    while Path(f"/proc/{run.loop}/stat").read_text().split()[2] != "Z":
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    os.kill(run.process.pid, signal.SIGCONT)
+    returned, printed = run.end()
+    assert returned == 3
+    assert printed["reason"] == "stopped because the supervisor was silent for 2.5 s"
+    recording = read(run.output)
+    assert contiguous(recording)
+    assert recording.dropped == 0
+    assert recording.samples.command[-1] == 0.0
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_garbage_in_the_ring_is_survived(tmp_path, seed):
+    """Whatever is overwritten there, the run comes to an end, and its recording can be read."""
+    run = Run(tmp_path)
+    (folder,) = runs()
+    chance = random.Random(seed)
+    with folder.ring.open("r+b") as ring:
+        size = ring.seek(0, os.SEEK_END)
+        for _ in range(30):
+            ring.seek(chance.randrange(50_000, size - 200))
+            ring.write(chance.randbytes(200))
+    time.sleep(0.5)
+    run.process.send_signal(signal.SIGINT)
+    returned, printed = run.end()
+    assert returned in {130, 3}
+    assert printed["output_safe"]
+    assert read(run.output).end["reason"] == printed["reason"]
+
+
+def test_both_processes_dead_is_told_and_recovered(tmp_path):
+    """Nobody is left to make the output safe: the next command says so, and saves the samples."""
+    run = Run(tmp_path)
+    os.kill(run.process.pid, signal.SIGSTOP)
+    time.sleep(0.3)
+    os.kill(run.loop, signal.SIGKILL)
+    run.process.kill()
+    run.process.communicate()
+    (orphan,) = recover_orphans()
+    assert not orphan.safe
+    assert "NOT known to be safe" in orphan.text
+    recording = read(run.output)
+    assert contiguous(recording)
+    assert recording.end["reason"] == "supervisor and loop died"
+    assert recording.end["output_safe"] == "false"
+    assert replay(recording).identical
