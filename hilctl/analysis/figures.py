@@ -99,6 +99,7 @@ class RunReport(Figures):
             those later than half a tick period. None where neither is known.
         lateness_us: ``p50``, ``p90``, ``p99``, ``p99.9`` and ``max`` of how late ticks woke; empty
             without ticks.
+        lateness_by_minute: The same of each minute, with ``minute`` from 0 and its ``ticks``.
         exchange_us: The same of how long exchanges with the device took.
         segments: Figures of each segment.
     """
@@ -126,6 +127,7 @@ class RunReport(Figures):
     sensor_invalid_samples: int
     late_ticks: int | None
     lateness_us: dict[str, float]
+    lateness_by_minute: list[dict[str, float]]
     exchange_us: dict[str, float]
     segments: tuple[SegmentReport, ...]
 

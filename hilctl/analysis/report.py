@@ -41,6 +41,7 @@ def summarize(recording: Recording) -> RunReport:
         **_extremes(recording),
         **_worst(segments),
         lateness_us=timing.percentiles_us(recording.ticks.late_ns),
+        lateness_by_minute=timing.by_minute(recording.ticks),
         exchange_us=timing.percentiles_us(recording.ticks.exchange_ns),
         segments=segments,
     )

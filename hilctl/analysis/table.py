@@ -107,6 +107,8 @@ def render(report: RunReport) -> Group:
     parts = [quality, _two_columns("", run_rows(report))]
     if len(report.segments) > 1:
         parts.append(_segments(report))
+    if len(report.lateness_by_minute) > 1:
+        parts.append(_minutes(report))
     return Group(*parts)
 
 
@@ -128,6 +130,15 @@ def _segments(report: RunReport) -> Table:
         table.add_column(headings[i], justify="right" if i else "left", no_wrap=True)
     for cells in rows:
         table.add_row(*(Text(cells[i]) for i in shown))
+    return table
+
+
+def _minutes(report: RunReport) -> Table:
+    table = Table(title="lateness by minute, us", title_justify="left")
+    for heading in report.lateness_by_minute[0]:
+        table.add_column(heading, justify="right", no_wrap=True)
+    for minute in report.lateness_by_minute:
+        table.add_row(*(f"{value:.4g}" for value in minute.values()))
     return table
 
 

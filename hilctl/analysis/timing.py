@@ -5,6 +5,7 @@ import numpy as np
 from hilctl.arrays import I64
 from hilctl.recording.data import Ticks
 
+_MINUTE_NS = 60_000_000_000
 _PERCENTILES = {"p50": 50.0, "p90": 90.0, "p99": 99.0, "p99.9": 99.9}
 
 
@@ -18,6 +19,24 @@ def percentiles_us(times_ns: I64) -> dict[str, float]:
     values = np.percentile(times_ns, list(_PERCENTILES.values())) * 1e-3
     figures = dict(zip(_PERCENTILES, values.tolist(), strict=True))
     return {**figures, "max": float(times_ns.max()) * 1e-3}
+
+
+def by_minute(ticks: Ticks) -> list[dict[str, float]]:
+    """Return the lateness of each minute of a run, in order.
+
+    Returns:
+        For each minute with ticks: ``minute`` from 0, its ``ticks``, and the figures of
+        :func:`percentiles_us`.
+    """
+    if ticks.deadline_ns.size == 0:
+        return []
+    minutes = ticks.deadline_ns // _MINUTE_NS
+    numbers, first = np.unique(minutes, return_index=True)  # deadlines rise, so do minutes
+    parts = np.split(ticks.late_ns, first[1:])
+    return [
+        {"minute": int(number), "ticks": part.size, **percentiles_us(part)}
+        for number, part in zip(numbers.tolist(), parts, strict=True)
+    ]
 
 
 def tick_period_ns(ticks: Ticks) -> float | None:

@@ -43,3 +43,13 @@ def test_fewer_than_two_ticks_have_no_period() -> None:
     """With one tick nobody knows what late means."""
     assert timing.late_ticks(ticks([5_000_000])) is None
     assert timing.late_ticks(ticks([])) is None
+
+
+def test_minutes_are_told_apart() -> None:
+    """Each minute of deadlines has its own figures; one without ticks is left out."""
+    run = ticks([1_000] * 60 + [2_000] * 60 + [5_000] * 10, period_ns=1_000_000_000)
+    run.deadline_ns[120:] += 60_000_000_000
+    found = timing.by_minute(run)
+    assert [(each["minute"], each["ticks"]) for each in found] == [(0, 60), (1, 60), (3, 10)]
+    assert [each["max"] for each in found] == [1.0, 2.0, 5.0]
+    assert timing.by_minute(ticks([])) == []
