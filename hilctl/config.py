@@ -1,45 +1,16 @@
 """The experiment file: frozen, strict models of the YAML, and all of its problems at once."""
 
-import re
 from typing import Annotated, Any, Literal, Self, TypeVar
 
-from pydantic import (
-    AfterValidator,
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
-    Field,
-    WithJsonSchema,
-    model_validator,
-)
+from pydantic import BeforeValidator, Field, model_validator
 
+from hilctl.config_parts import Interval, Name, Part, Realtime, RecordingConfig, Timing
+from hilctl.interlock_keys import InterlockKeys
 from hilctl.limiter import CommandLimits
 from hilctl.ports import CommandUnit
 from hilctl.waveforms.spec import AnyWaveform
 
 T = TypeVar("T")
-_NAME = "[A-Za-z0-9][A-Za-z0-9_.-]{0,79}"
-
-
-def _name(text: str) -> str:
-    if not re.fullmatch(_NAME, text):
-        raise ValueError(
-            "must be at most 80 letters, digits, '.', '_' and '-', "
-            f"and begin with a letter or digit: {text!r}"
-        )
-    return text
-
-
-def _two(value: Any) -> Any:
-    if isinstance(value, tuple) and len(value) != 2:
-        raise ValueError(f"must be [lowest, highest]: {list(value)}")
-    return value
-
-
-def _rising(interval: tuple[float, float]) -> tuple[float, float]:
-    if not interval[0] < interval[1]:
-        raise ValueError(f"must be [lowest, highest]: {list(interval)}")
-    return interval
 
 
 def _none_or_mapping(value: Any) -> Any:
@@ -51,23 +22,8 @@ def _none_or_mapping(value: Any) -> Any:
     return value
 
 
-Name = Annotated[
-    str, AfterValidator(_name), WithJsonSchema({"type": "string", "pattern": f"^{_NAME}$"})
-]
-Interval = Annotated[
-    tuple[float, float],
-    BeforeValidator(_two),
-    AfterValidator(_rising),
-    Field(description="lowest, highest"),
-]
-
-
-class _Part(BaseModel):
-    model_config = ConfigDict(frozen=True, strict=True, extra="forbid", allow_inf_nan=False)
-
-
-class Limits(_Part):
-    """What the limiter and the loop hold the run to; the limiter is last before the device.
+class Limits(InterlockKeys):
+    """What the limiter and the interlocks hold the run to; the limiter is last before the device.
 
     Attributes:
         peak_current_a: Largest magnitude of the coil current, for devices driven in A.
@@ -115,7 +71,7 @@ class Limits(_Part):
         return self.slew_v_per_s or self.slew_a_per_s or 0.0
 
 
-class Safe(_Part):
+class Safe(Part):
     """Where the output goes on every way out of a run.
 
     Attributes:
@@ -127,7 +83,7 @@ class Safe(_Part):
     ramp_s: Annotated[float, Field(gt=0.0)] = 0.2
 
 
-class CompensatorConfig(_Part):
+class CompensatorConfig(Part):
     """The model whose inverse stands before the actuator.
 
     Attributes:
@@ -137,39 +93,7 @@ class CompensatorConfig(_Part):
     model: str
 
 
-class Timing(_Part):
-    """What happens to late ticks.
-
-    Attributes:
-        late_policy: For devices paced by this machine: ``skip`` whole ticks and keep the phase,
-            ``catch_up`` with a burst, or ``slip`` the phase. Devices with a sample clock of their
-            own always catch up: their FIFO takes the burst.
-        late_after: A tick counts as late when it wakes this many tick periods after it was due.
-        max_late_s: A tick later than this ends the run.
-    """
-
-    late_policy: Literal["skip", "catch_up", "slip"] = "skip"
-    late_after: Annotated[float, Field(gt=0.0)] = 0.5
-    max_late_s: Annotated[float, Field(gt=0.0)] = 1.0
-
-
-class RecordingConfig(_Part):
-    """Where and how a run is recorded.
-
-    Attributes:
-        folder: Folder for recordings without a name of their own, relative to where hilctl runs.
-        flush_s: Longest time that a sample stays out of the file.
-        scope_rate_hz: Highest rate of the ``/scope`` topic.
-        ring_s: Seconds of samples that the ring between loop and recorder holds.
-    """
-
-    folder: str = "recordings"
-    flush_s: Annotated[float, Field(gt=0.0, le=10.0)] = 0.1
-    scope_rate_hz: Annotated[float, Field(gt=0.0, le=1000.0)] = 1000.0
-    ring_s: Annotated[float, Field(ge=1.0, le=60.0)] = 10.0
-
-
-class Experiment(_Part):
+class Experiment(Part):
     """One experiment: everything that a run needs to know.
 
     Attributes:
@@ -184,6 +108,7 @@ class Experiment(_Part):
         safe: Where the output goes on the way out.
         timing: What happens to late ticks.
         recording: Where and how the run is recorded.
+        realtime: How the loop's process asks for real time.
     """
 
     name: Name
@@ -202,6 +127,7 @@ class Experiment(_Part):
     safe: Safe = Field(default_factory=Safe)
     timing: Timing = Field(default_factory=Timing)
     recording: RecordingConfig = Field(default_factory=RecordingConfig)
+    realtime: Realtime = Field(default_factory=Realtime)
 
     @property
     def tick_s(self) -> float:

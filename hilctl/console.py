@@ -1,6 +1,8 @@
 """What a terminal shows: progress of a run, and results in words."""
 
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -15,10 +17,11 @@ from hilctl.devices import Inventory, Probed
 from hilctl.preflight import Checked
 from hilctl.recording.reader import read
 from hilctl.replay import ReplayResult
-from hilctl.supervisor import Progress as RunProgress
-from hilctl.supervisor import RunResult
+from hilctl.run_result import Progress as RunProgress
+from hilctl.run_result import RunResult
 
 _REFRESH_S = 0.1
+_COUNTS = ("recorded_samples", "missing_samples", "late_ticks")
 _LARGEST_REPORTED = 5_000_000
 
 
@@ -68,6 +71,22 @@ class LiveView:
             self._task = self._progress.add_task("run", total=progress.total, live="")
         done = min(progress.samples, progress.total)
         self._progress.update(self._task, completed=done, live=_live_text(progress))
+
+
+@contextmanager
+def measuring(seconds: float, *, quiet: bool) -> Iterator[Callable[[float], None]]:
+    """Show a bar on standard error; yield what to call with the time that has passed, in s."""
+    console = Console(stderr=True)
+    with Progress(
+        TextColumn("[bold]measuring"),
+        BarColumn(bar_width=24),
+        TimeRemainingColumn(),
+        console=console,
+        disable=quiet or not console.is_terminal,
+        transient=True,
+    ) as progress:
+        task = progress.add_task("measuring", total=seconds)
+        yield lambda elapsed_s: progress.update(task, completed=min(elapsed_s, seconds))
 
 
 def _live_text(progress: RunProgress) -> str:
@@ -149,6 +168,8 @@ def print_forecast(checked: Checked) -> None:
         "experiment": config.name,
         "device": checked.loaded.device.info.description,
         "samples": f"{forecast.samples} at {config.sample_rate_hz:g} Hz, {config.block} a tick",
+        "highest rate": f"{forecast.highest_rate_hz:.6g} Hz"
+        + (f" ({forecast.rate_note})" if forecast.rate_note else ""),
         "duration": f"{forecast.duration_s:g} s",
         "reference": f"{forecast.reference_min:.4g} to {forecast.reference_max:.4g} "
         f"{reference_unit}",
@@ -157,6 +178,8 @@ def print_forecast(checked: Checked) -> None:
         "slew": f"{forecast.slew_per_s:.4g} {unit}/s (limit {limits.slew_per_s:g})",
         "recording": f"about {forecast.recording_mb:.3g} MB",
     }
+    if forecast.heating_rms_a is not None:
+        rows["heating"] = f"{forecast.heating_rms_a:.4g} A rms (limit {limits.rms_current_a:g})"
     for name, text in rows.items():
         table.add_row(name, text)
     console = Console()
@@ -164,10 +187,26 @@ def print_forecast(checked: Checked) -> None:
     console.print("[green]may start[/]")
 
 
+def print_status(found: list[dict[str, Any]]) -> None:
+    """Print which runs are going on."""
+    if not found:
+        Console().print("no run is going on")
+        return
+    table = Table("run", "state", "at", "recorded", "missing", "late", "recording")
+    for run in found:
+        total, rate_hz = run.get("total_samples", 0), run.get("sample_rate_hz", 1.0)
+        at = f"{run['sample'] / rate_hz:.1f} of {total / rate_hz:.1f} s" if total else ""
+        counts = [f"{run[key]:,}" if key in run else "" for key in _COUNTS]
+        table.add_row(run["name"], run["state"], at, *counts, run["recording"])
+    Console().print(table)
+
+
 def print_replay(result: ReplayResult, *, other: Path | None) -> None:
     """Print how recomputed commands compare with the recorded ones."""
     console = Console()
     unit = result.command_unit
+    if result.left_out_samples:
+        console.print(f"{result.left_out_samples} samples behind lost ones can't be replayed")
     if other is None and result.identical:
         console.print(f"[green]identical[/]: {result.samples} commands, bit for bit")
         return

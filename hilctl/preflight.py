@@ -13,6 +13,7 @@ import numpy as np
 from hilctl.compensator import Compensator
 from hilctl.errors import ConfigError, InputError, ModelError, Problem
 from hilctl.experiment import LoadedExperiment
+from hilctl.interlock_setup import HeatForecast, interlock_problems
 from hilctl.waveforms.build import Reference, build
 
 _CHUNK = 1_000_000
@@ -32,7 +33,11 @@ class Forecast:
         command_min: Lowest command.
         command_max: Highest command.
         slew_per_s: Fastest change of the command.
+        heating_rms_a: Highest running rms of the coil current, as the thermal budget has it; None
+            where there is no budget.
         recording_mb: About how large the recording will be.
+        highest_rate_hz: Highest sample rate that the device can keep.
+        rate_note: Why that is so; empty where there is no more to say.
     """
 
     samples: int
@@ -43,7 +48,10 @@ class Forecast:
     command_min: float
     command_max: float
     slew_per_s: float
+    heating_rms_a: float | None
     recording_mb: float
+    highest_rate_hz: float
+    rate_note: str
 
     def to_mapping(self) -> dict[str, Any]:
         """Return the fields as plain values."""
@@ -74,7 +82,7 @@ def check(loaded: LoadedExperiment) -> Checked:
     Raises:
         ConfigError: The run must not start; all reasons are listed, each saying by how much.
     """
-    problems = _device_problems(loaded)
+    problems = _device_problems(loaded) + interlock_problems(loaded)
     config = loaded.config
     try:
         reference = build(config.waveform, config.sample_rate_hz, loaded.folder)
@@ -82,15 +90,49 @@ def check(loaded: LoadedExperiment) -> Checked:
         problems.append(_problem(loaded, "waveform", str(error)))
         raise ConfigError(problems) from None
     problems += _reference_problems(loaded, reference)
+    heat = HeatForecast(config)
     try:
-        forecast = _forecast(loaded, reference)
+        forecast = _forecast(loaded, reference, heat)
     except ModelError as error:
         problems.append(_problem(loaded, "compensator.model", str(error)))
         raise ConfigError(problems) from None
-    problems += _command_problems(loaded, forecast)
+    problems += _command_problems(loaded, forecast) + heat.problems(loaded)
     if problems:
         raise ConfigError(problems)
     return Checked(loaded, reference, forecast)
+
+
+def check_tuned(
+    checked: Checked, now: tuple[float, float], wanted: tuple[float, float], samples: int
+) -> None:
+    """Work out what a running reference would do with another gain and offset.
+
+    Args:
+        checked: The experiment that runs.
+        now: Gain and offset of the reference at this moment.
+        wanted: Gain and offset that it is to have.
+        samples: Samples that the change takes.
+
+    Raises:
+        ConfigError: It would leave device, model or limits; the error says by how much.
+    """
+    loaded, plain = checked.loaded, checked.reference
+    values = plain.values * wanted[0] + wanted[1]
+    lead_in = np.linspace(0.0, values[0], samples + 1)[:-1]
+    change = abs(wanted[0] - now[0]) * np.abs(plain.values).max() + abs(wanted[1] - now[1])
+    tuned = Reference(
+        np.concatenate((lead_in, values)), plain.unit, plain.sample_rate_hz, plain.segments
+    )
+    heat = HeatForecast(loaded.config)
+    problems = _reference_problems(loaded, tuned)
+    problems += _command_problems(loaded, _forecast(loaded, tuned, heat)) + heat.problems(loaded)
+    if loaded.model is None:
+        fastest = change / samples * plain.sample_rate_hz + checked.forecast.slew_per_s
+        if fastest > loaded.config.limits.slew_per_s:
+            rule = f"the change must take longer: at most {loaded.config.limits.slew_per_s:g}/s"
+            problems.append(_problem(loaded, "limits", rule, f"{fastest:.4g}/s"))
+    if problems:
+        raise ConfigError(problems)
 
 
 def _problem(
@@ -122,8 +164,10 @@ def _device_problems(loaded: LoadedExperiment) -> list[Problem]:
         add(
             "block", f"must be 1: {info.name} has no sample clock and FIFO of its own", config.block
         )
-    if info.buffered and 2 * config.block > info.fifo_depth:
-        rule = f"must be at most half the FIFO of {info.name}, {info.fifo_depth} samples"
+    blocks = max(2, info.latency_blocks + 1)
+    if info.buffered and blocks * config.block > info.fifo_depth:
+        fifo = f"the FIFO of {info.name}, {info.fifo_depth} samples"
+        rule = f"must be <= {info.fifo_depth // blocks}: {blocks} blocks must fit into {fifo}"
         add("block", rule, config.block)
     low_um, high_um = config.limits.stroke_um
     if low_um < info.sensor_min_um or high_um > info.sensor_max_um:
@@ -155,7 +199,7 @@ def _reference_problems(loaded: LoadedExperiment, reference: Reference) -> list[
     return found
 
 
-def _forecast(loaded: LoadedExperiment, reference: Reference) -> Forecast:
+def _forecast(loaded: LoadedExperiment, reference: Reference, heat: HeatForecast) -> Forecast:
     config = loaded.config
     compensator = Compensator(loaded.model, config.sample_rate_hz)
     last = config.safe.value
@@ -172,6 +216,7 @@ def _forecast(loaded: LoadedExperiment, reference: Reference) -> Forecast:
         high = float(np.maximum(high, out.max()))
         step = float(np.maximum(step, steps.max()))
         last = float(out[-1])
+        heat.add(out)
     return Forecast(
         samples=values.size,
         duration_s=values.size / config.sample_rate_hz,
@@ -181,7 +226,10 @@ def _forecast(loaded: LoadedExperiment, reference: Reference) -> Forecast:
         command_min=low,
         command_max=high,
         slew_per_s=step * config.sample_rate_hz,
+        heating_rms_a=heat.rms_a,
         recording_mb=values.size * _BYTES_A_SAMPLE / 1e6,
+        highest_rate_hz=loaded.device.info.max_rate_hz,
+        rate_note=loaded.device.info.rate_note,
     )
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from hilctl import cli, supervisor
+from hilctl import cli
 
 GOOD = """\
 name: tiny
@@ -56,7 +56,7 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """A working folder; what a run keeps in memory goes to a folder that must stay empty."""
     memory = tmp_path / "memory"
     memory.mkdir()
-    monkeypatch.setattr(supervisor, "memory_folder", lambda: memory)
+    monkeypatch.setenv("HILCTL_RUNS", str(memory))
     folder = tmp_path / "place"
     folder.mkdir()
     monkeypatch.chdir(folder)
@@ -324,7 +324,7 @@ class TestOtherCommands:
         for name, message in [
             ("lost.mcap", "lost.mcap: no such file"),
             ("folder.mcap", "folder.mcap: can't be read: Is a directory"),
-            ("text.mcap", "text.mcap: is not an MCAP recording"),
+            ("text.mcap", "text.mcap: is not an MCAP file"),
         ]:
             filled = [argument.format(name) for argument in arguments]
             ended = hilctl(*filled)

@@ -52,11 +52,14 @@ timing:
   late_policy: catch_up
   late_after: 0.25
   max_late_s: 2.0
+  max_consecutive_late: 7
+  grace_s: 0.5
 recording:
   folder: runs
   flush_s: 0.5
   scope_rate_hz: 500.0
   ring_s: 20.0
+  on_failure: go_on
 """
 LINES = {
     line.split(":")[0].strip(): number for number, line in enumerate(FULL.splitlines(), start=1)
@@ -133,11 +136,13 @@ class TestAccepted:
         assert (config.safe.value, config.safe.ramp_s) == (0.5, 0.2)
         assert config.timing.late_policy == "catch_up"
         assert (config.timing.late_after, config.timing.max_late_s) == (0.25, 2.0)
+        assert (config.timing.max_consecutive_late, config.timing.grace_s) == (7, 0.5)
         assert config.recording.model_dump() == {
             "folder": "runs",
             "flush_s": 0.5,
             "scope_rate_hz": 500.0,
             "ring_s": 20.0,
+            "on_failure": "go_on",
         }
         assert config.tick_s == pytest.approx(1e-3)
         assert loaded.device.info.details["seed"] == "3"
@@ -159,12 +164,15 @@ class TestAccepted:
             "late_policy": "skip",
             "late_after": 0.5,
             "max_late_s": 1.0,
+            "max_consecutive_late": None,
+            "grace_s": 0.0,
         }
         assert config.recording.model_dump() == {
             "folder": "recordings",
-            "flush_s": 0.1,
+            "flush_s": 2.0,
             "scope_rate_hz": 1000.0,
             "ring_s": 10.0,
+            "on_failure": "stop",
         }
         assert config.waveform.model_dump()["offset"] == 0.0
 
@@ -317,6 +325,13 @@ ONE_RULE: list[tuple[str, str, str, str]] = [
 def test_one_broken_rule(folder: Path, key: str, old: str, new: str, message: str) -> None:
     """One broken rule is one problem, with its line, key, rule, value and what to do."""
     assert problems(changed(old, new), folder) == [f"x.yaml:{LINES[key]}: {message}"]
+
+
+def test_ring_must_bridge_the_time_between_flushes(folder: Path) -> None:
+    """The rule ties two keys together: it is told at their section."""
+    text = changed("ring_s: 20.0", "ring_s: 1.0")
+    rule = "ring_s must be at least three times flush_s, which the ring has to bridge: 1 and 0.5"
+    assert problems(text, folder) == [f"x.yaml:{LINES['recording']}: recording: {rule}"]
 
 
 @pytest.mark.parametrize(

@@ -369,9 +369,19 @@ class TestDevice:
     def test_fifo(self) -> None:
         """Two blocks must fit in the FIFO: one that plays and one that is sent."""
         assert refusals(CURRENT, "block=33", buffered=True, fifo_depth=64) == [
-            "x.yaml: block: must be at most half the FIFO of fake, 64 samples, got 33"
+            "x.yaml: block: must be <= 32: 2 blocks must fit into the FIFO of fake, 64 samples, "
+            "got 33"
         ]
         checked(CURRENT, "block=32", buffered=True, fifo_depth=64)
+
+    def test_blocks_kept_in_the_fifo(self) -> None:
+        """All blocks that the device keeps in its FIFO must fit, and the one being sent."""
+        kept = {"buffered": True, "fifo_depth": 64, "latency_blocks": 7}
+        assert refusals(CURRENT, "block=9", **kept) == [
+            "x.yaml: block: must be <= 8: 8 blocks must fit into the FIFO of fake, 64 samples, "
+            "got 9"
+        ]
+        checked(CURRENT, "block=8", **kept)
 
     @pytest.mark.parametrize("stroke", ["[-100.5, 60.0]", "[-75.0, 100.5]"])
     def test_sensor(self, stroke: str) -> None:

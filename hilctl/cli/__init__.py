@@ -1,0 +1,77 @@
+"""The command line: the only place that prints.
+
+Heavy parts are imported by the command that needs them, so that ``--help`` is quick.
+
+Exit codes: 0 done; 1 a replay that differs, or a rate that this machine does not keep; 2 the input
+can't be used, nothing has moved; 3 a run that ended by a fault; 128 + n a run stopped by signal n.
+"""
+
+import logging
+import signal
+import sys
+from typing import Annotated, NoReturn
+
+import typer
+
+from hilctl import __version__
+from hilctl.cli import machine, recordings, running
+from hilctl.cli.options import app, devices_app, print_json
+from hilctl.errors import ConfigError, HilctlError, InputError
+
+__all__ = ["app", "main"]
+
+_COMMANDS = (
+    running.run,
+    running.check,
+    running.status,
+    running.set_,
+    running.stop,
+    recordings.report,
+    recordings.replay,
+    recordings.export,
+    recordings.recover,
+    recordings.identify,
+    machine.doctor,
+    machine.emulate,
+    machine.schema,
+)
+for _command in _COMMANDS:
+    app.command(name=_command.__name__.rstrip("_"))(_command)
+app.add_typer(devices_app, name="devices")
+
+
+def main() -> None:
+    """Run the command line; every error raised on purpose becomes a message and an exit code."""
+    shown = logging.StreamHandler()
+    shown.setFormatter(logging.Formatter("hilctl: %(message)s"))
+    logging.getLogger("hilctl").handlers[:] = [shown]
+    try:
+        app()
+    except HilctlError as error:
+        _refuse(error)
+    except KeyboardInterrupt:
+        raise SystemExit(128 + signal.SIGINT) from None
+
+
+def _refuse(error: HilctlError) -> NoReturn:
+    if "--json" in sys.argv:
+        problems = [str(p) for p in error.problems] if isinstance(error, ConfigError) else []
+        print_json({"error": str(error), "problems": problems})
+    for line in str(error).splitlines():
+        print(f"hilctl: {line}", file=sys.stderr)
+    raise SystemExit(2 if isinstance(error, InputError) else 3)
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        print(f"hilctl {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _root(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    del version

@@ -1,0 +1,5 @@
+"""``python -m hilctl.cli``."""
+
+from hilctl.cli import main
+
+main()

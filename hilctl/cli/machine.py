@@ -1,0 +1,128 @@
+"""Commands about machine and devices: doctor, devices, emulate, schema."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hilctl.cli.options import (
+    AsJson,
+    ExperimentFile,
+    Settings,
+    devices_app,
+    print_json,
+)
+from hilctl.errors import InputError
+
+
+def doctor(
+    rate: Annotated[
+        float | None,
+        typer.Option(min=1.0, max=20e3, help="Ticks a second; else the experiment's, or 1000."),
+    ] = None,
+    seconds: Annotated[float, typer.Option(min=0.1, help="Length of the measurement.")] = 10.0,
+    experiment: Annotated[
+        Path | None, typer.Option(help="Experiment whose rate and set-up count.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Say what keeps this machine from real time, and measure whether it keeps a rate."""
+    from hilctl.console import measuring, print_rich
+    from hilctl.doctor.diagnosis import diagnose
+    from hilctl.doctor.report import render
+
+    with measuring(seconds, quiet=as_json) as on_progress:
+        diagnosis = diagnose(experiment, rate, seconds, on_progress)
+    if as_json:
+        print_json(diagnosis.to_mapping())
+    else:
+        print_rich(render(diagnosis))
+    if not diagnosis.latency.kept:
+        raise typer.Exit(1)
+
+
+def schema(
+    output: Annotated[Path | None, typer.Option(help="File to write; else print.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Print the JSON schema of experiment files, for editors."""
+    from hilctl.schema import schema_text
+
+    del as_json  # it is JSON either way
+    if output is None:
+        print(schema_text(), end="")
+        return
+    try:
+        output.write_text(schema_text(), encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{output}: can't be written: {error.strerror}") from None
+
+
+@devices_app.callback(invoke_without_command=True)
+def devices(context: typer.Context, as_json: AsJson = False) -> None:
+    """List devices, shipped profiles and the serial ports of this machine; nothing is opened."""
+    if context.invoked_subcommand is not None:
+        return
+    from hilctl.console import print_inventory
+    from hilctl.devices import inventory
+
+    found = inventory()
+    if as_json:
+        print_json(found.to_mapping())
+    else:
+        print_inventory(found)
+
+
+@devices_app.command()
+def probe(experiment: ExperimentFile, settings: Settings = None, as_json: AsJson = False) -> None:
+    """Open an experiment's device and run its self-test; the output does not move."""
+    from hilctl.console import print_probed
+    from hilctl.devices import probe as open_and_close
+
+    answered = open_and_close(experiment, settings or [])
+    if as_json:
+        print_json(answered.to_mapping())
+    else:
+        print_probed(answered)
+
+
+def emulate(
+    profile: Annotated[str, typer.Argument(help="Shipped profile, or path of one.")],
+    link: Annotated[str | None, typer.Option(help="tcp or rtu; else the profile's own.")] = None,
+    host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(help="TCP port; 0 takes a free one.")] = 0,
+    log: Annotated[Path | None, typer.Option(help="File for a log of every write.")] = None,
+    fault: Annotated[
+        list[str] | None, typer.Option(help="KIND@COUNT or KIND@SECONDSs; may be repeated.")
+    ] = None,
+    output: Annotated[str | None, typer.Option(help="Output that drives the rig.")] = None,
+    sensor: Annotated[str | None, typer.Option(help="Input that shows the displacement.")] = None,
+    reader: Annotated[
+        str | None, typer.Option(help="Profile of the device that has the input, if another one.")
+    ] = None,
+    reader_line: Annotated[
+        str | None, typer.Option(help="The reader's: same or own; own for Modbus TCP devices.")
+    ] = None,
+    reader_unit_id: Annotated[int | None, typer.Option(help="The reader's unit id.")] = None,
+    reader_port: Annotated[
+        int, typer.Option(help="The reader's own TCP port; 0 takes a free one.")
+    ] = 0,
+) -> None:
+    """Serve the simulated rig as a real device would, until Ctrl-C."""
+    from hilctl.emulate import emulate as serve
+
+    serve(
+        profile,
+        link=link,
+        host=host,
+        port=port,
+        log=log,
+        faults=fault or [],
+        output=output,
+        sensor=sensor,
+        reader=reader,
+        reader_line=reader_line,
+        reader_unit_id=reader_unit_id,
+        reader_port=reader_port,
+        on_ready=lambda name, address: print(f"{name} answers at {address}", flush=True),
+    )

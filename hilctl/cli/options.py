@@ -1,0 +1,43 @@
+"""What the commands share: the applications, their common options, printing."""
+
+import json
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+app = typer.Typer(
+    name="hilctl",
+    help="Real-time hysteresis compensation for smart-material actuators.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    add_completion=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+devices_app = typer.Typer(help="List devices, or probe one.", no_args_is_help=False)
+
+ExperimentFile = Annotated[
+    Path, typer.Argument(help="Experiment file (YAML).", metavar="EXPERIMENT")
+]
+RecordingFile = Annotated[Path, typer.Argument(help="Recording (MCAP).", metavar="RUN")]
+Settings = Annotated[
+    list[str] | None,
+    typer.Option("--set", help="Set dotted.key=value over the file; may be repeated."),
+]
+AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object for programs.")]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace the file if it exists.")]
+
+
+def print_json(value: dict[str, Any]) -> None:
+    """Print one JSON object."""
+    print(json.dumps(value, indent=2, allow_nan=False))
+
+
+def finish_orphans() -> None:
+    """Recover what runs whose processes have died left in memory, and say so."""
+    from hilctl.orphans import recover_orphans
+
+    for orphan in recover_orphans():
+        print(f"hilctl: {orphan.name} had died: {orphan.text}", file=sys.stderr)
+        print(f"hilctl: recovered into {orphan.recording}", file=sys.stderr)

@@ -1,0 +1,139 @@
+"""Commands about runs: start, check, status, set, stop."""
+
+import signal
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hilctl.cli.options import (
+    AsJson,
+    ExperimentFile,
+    Overwrite,
+    Settings,
+    finish_orphans,
+    print_json,
+)
+
+
+def run(
+    experiment: ExperimentFile,
+    output: Annotated[Path | None, typer.Option(help="Recording to write.")] = None,
+    settings: Settings = None,
+    overwrite: Overwrite = False,
+    detach: Annotated[
+        bool, typer.Option("--detach", help="Run in the background; see status, set and stop.")
+    ] = False,
+    require_rt: Annotated[
+        bool, typer.Option("--require-rt", help="Refuse without SCHED_FIFO and locked memory.")
+    ] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Run an experiment and record it; Ctrl-C ramps to the safe value first."""
+    if require_rt:
+        settings = [*(settings or []), "realtime.require=true"]
+    if detach:
+        _detach(experiment, output, settings or [], overwrite=overwrite, as_json=as_json)
+        return
+    from hilctl.console import LiveView, print_run, run_mapping
+    from hilctl.start import start_run
+
+    finish_orphans()
+    with LiveView(quiet=as_json) as view:
+        result = start_run(experiment, settings or [], output, overwrite, view.update)
+        if result.stop_signal:  # impatience must not cost the result of a run that has ended
+            signal.signal(result.stop_signal, signal.SIG_IGN)
+    if as_json:
+        print_json(run_mapping(result))
+    else:
+        print_run(result)
+    if result.code == "fault":
+        raise typer.Exit(3)
+    if result.stop_signal:
+        raise typer.Exit(128 + result.stop_signal)
+
+
+def _detach(
+    experiment: Path, output: Path | None, settings: list[str], *, overwrite: bool, as_json: bool
+) -> None:
+    from hilctl.daemon import start_detached
+    from hilctl.runs import facts_of
+
+    flags = ["--overwrite"] if overwrite else []
+    started = start_detached(experiment, settings, output, flags)
+    if as_json:
+        print_json({**facts_of(started.run), "log": str(started.log)})
+    else:
+        print(f"{started.run.card.name} runs; recording: {started.run.card.recording}")
+        print("  hilctl status    hilctl set gain=0.5 --over 2    hilctl stop")
+
+
+def status(as_json: AsJson = False) -> None:
+    """Say which runs are going on, and where each stands."""
+    from hilctl.console import print_status
+    from hilctl.daemon import status_of
+    from hilctl.runs import runs
+
+    finish_orphans()
+    found = [status_of(each) for each in runs()]
+    if as_json:
+        print_json({"runs": found})
+    else:
+        print_status(found)
+
+
+RunName = Annotated[
+    str | None, typer.Option("--run", help="Name of the run; only needed where there are several.")
+]
+
+
+def stop(
+    name: RunName = None,
+    wait_s: Annotated[float, typer.Option("--wait", help="Longest wait for its end, s.")] = 60.0,
+    as_json: AsJson = False,
+) -> None:
+    """End a run by its way out: ramp to the safe value, close, record why."""
+    from hilctl.daemon import find_run, stop_run
+
+    chosen = find_run(name)
+    answer = stop_run(chosen, wait_s)
+    if as_json:
+        print_json(answer)
+    elif answer["ended"]:
+        print(f"{chosen.card.name} has ended; recording: {chosen.card.recording}")
+    else:
+        print(f"{chosen.card.name} was told to stop, and is still going after {wait_s:g} s")
+    if not answer["ended"]:
+        raise typer.Exit(3)
+
+
+def set_(
+    assignments: Annotated[
+        list[str], typer.Argument(help="gain=NUMBER, offset=NUMBER.", metavar="KEY=VALUE...")
+    ],
+    over_s: Annotated[float, typer.Option("--over", help="Time that the change takes, s.")] = 1.0,
+    name: RunName = None,
+    as_json: AsJson = False,
+) -> None:
+    """Move the reference of a run without a bump: gain * reference + offset."""
+    from hilctl.daemon import find_run, set_run
+
+    chosen = find_run(name)
+    answer = set_run(chosen, assignments, over_s)
+    if as_json:
+        print_json(answer)
+    else:
+        values = f"gain {answer['gain']:g}, offset {answer['offset']:g}"
+        print(f"{chosen.card.name}: {values}, over {over_s:g} s")
+
+
+def check(experiment: ExperimentFile, settings: Settings = None, as_json: AsJson = False) -> None:
+    """Check an experiment and say what it would do; nothing moves."""
+    from hilctl.console import print_forecast
+    from hilctl.start import checked_experiment
+
+    checked = checked_experiment(experiment, settings or [])
+    if as_json:
+        print_json({"experiment": str(experiment), **checked.forecast.to_mapping()})
+    else:
+        print_forecast(checked)

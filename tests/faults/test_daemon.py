@@ -1,0 +1,156 @@
+"""Runs in the background: status, set and stop from outside, and what they may not do."""
+
+import json
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from hilctl.recording.reader import read
+from hilctl.replay import replay
+from hilctl.runs import runs
+
+EXPERIMENT = {
+    "name": "background",
+    "device": {"kind": "simulated_terfenol", "seed": 3},
+    "sample_rate_hz": 5000,
+    "block": 25,
+    "waveform": {
+        "kind": "sine",
+        "unit": "A",
+        "amplitude": 4.0,
+        "frequency_hz": 5.0,
+        "duration_s": 120.0,
+        "soft_start_s": 0.1,
+    },
+    "compensator": "none",
+    "limits": {"peak_current_a": 5.0, "slew_a_per_s": 1000.0, "stroke_um": [-60.0, 60.0]},
+    "safe": {"value": 0.0, "ramp_s": 0.2},
+}
+
+
+def hilctl(*words, code=0):
+    """Run a command; return what it printed as JSON, or its error text where it must fail."""
+    command = [sys.executable, "-m", "hilctl.cli", *map(str, words)]
+    if code == 0:
+        command.append("--json")
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert done.returncode == code, done.stderr
+    assert "Traceback" not in done.stderr
+    return json.loads(done.stdout) if code == 0 else done.stderr
+
+
+@pytest.fixture
+def background(tmp_path):
+    """A run in the background; the test may end it, or leave that to the fixture."""
+    path = tmp_path / "experiment.yaml"
+    path.write_text(yaml.safe_dump(EXPERIMENT), encoding="utf-8")
+    started = hilctl("run", path, "--output", tmp_path / "run.mcap", "--detach")
+    yield Path(started["recording"])
+    for run in runs():
+        if run.supervised:
+            hilctl("stop", "--run", run.card.name)
+
+
+def await_state(state, timeout_s=60.0):
+    deadline = time.monotonic() + timeout_s
+    while True:
+        found = hilctl("status")["runs"]
+        if found and found[0]["state"] == state:
+            return found[0]
+        assert time.monotonic() < deadline, found
+        time.sleep(0.05)
+
+
+def test_background_run_is_seen_changed_and_stopped(background):
+    """From start to end by commands: the gain moves without a bump, and stop ramps down."""
+    status = await_state("running")
+    assert status["recording"] == str(background)
+    assert status["gain"] == 1.0
+    assert hilctl("set", "gain=0.5", "--over", "0.4")["gain"] == 0.5
+    time.sleep(1.0)
+    refused = hilctl("set", "gain=2.0", code=2)
+    assert "the run must stay within -5 to 5 A, got -8 to 8 A" in refused
+    assert hilctl("stop")["ended"]
+    assert hilctl("status")["runs"] == []
+    recording = read(background)
+    assert recording.end["reason"] == "stopped by hilctl stop"
+    assert [event.code for event in recording.events] == ["tuned", "run_ended"]
+    assert replay(recording).identical
+    samples = recording.samples
+    assert np.array_equal(samples.index, np.arange(samples.index.size))
+    at = recording.events[0].sample
+    settled = samples.command[at + 2000 : at + 4000]
+    assert np.abs(settled).max() == pytest.approx(2.0, rel=1e-3)
+    steepest = 4.0 * 2.0 * np.pi * 5.0 / 5000.0 + 4.0 * 0.5 / 2000.0
+    assert np.abs(np.diff(samples.command[at - 1000 : at + 4000])).max() <= steepest
+
+
+def test_bad_messages_change_nothing(background):
+    """Garbage, unknown orders and wrong types are refused in words, and the run goes on."""
+    await_state("running")
+    (run,) = runs()
+    for raw, words in {
+        b"not json\n": "Invalid JSON",
+        b"{}\n": "command",
+        b'{"command": "explode"}\n': "does not match any of the expected tags",
+        b'{"command": "set", "gain": "1"}\n': "valid number",
+        b'{"command": "set", "gain": NaN}\n': "finite number",
+        b'{"command": "set", "gain": 0.5, "extra": 1}\n': "Extra inputs",
+        b'{"command": "set"}\n': "gain or offset is required",
+        b'{"command": "set", "gain": 0.5, "over_s": 0.0}\n': "greater than 0",
+        b"[" * 5000: "longer than",
+        b"\xff\xfe\n": "Invalid JSON",
+    }.items():
+        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as client:
+            client.connect(str(run.socket))
+            client.settimeout(10.0)
+            client.sendall(raw)
+            answer = json.loads(client.recv(65536))
+        assert answer["ok"] is False
+        assert words in answer["error"], (raw, answer)
+    status = await_state("running")
+    assert (status["gain"], status["offset"], status["missing_samples"]) == (1.0, 0.0, 0)
+
+
+def test_second_run_into_the_same_recording_is_refused(background, tmp_path):
+    """The recording of a run that goes on can't be taken by another."""
+    path = tmp_path / "experiment.yaml"
+    text = hilctl("run", path, "--output", background, "--overwrite", code=2)
+    assert "another hilctl is recording to it" in text
+
+
+def test_refused_experiment_is_told_at_once(tmp_path):
+    """What the foreground would refuse, the background refuses too, and leaves nothing."""
+    path = tmp_path / "experiment.yaml"
+    path.write_text(yaml.safe_dump({**EXPERIMENT, "sample_rate_hz": -1}), encoding="utf-8")
+    text = hilctl("run", path, "--output", tmp_path / "run.mcap", "--detach", code=2)
+    assert "sample_rate_hz" in text
+    assert sorted(each.name for each in tmp_path.iterdir()) == ["experiment.yaml"]
+
+
+def test_without_a_run_there_is_nothing_to_stop():
+    """Stop and set say so."""
+    assert "no run is going on" in hilctl("stop", code=2)
+    assert "no run is going on" in hilctl("set", "gain=1", code=2)
+
+
+@pytest.mark.parametrize("stopped_s", [0.01, 0.3])
+def test_short_stop_of_the_supervisor_loses_nothing(background, stopped_s):
+    """The ring takes what comes meanwhile."""
+    status = await_state("running")
+    (run,) = runs()
+    for number, wait_s in ((signal.SIGSTOP, stopped_s), (signal.SIGCONT, 0.2)):
+        subprocess.run(["kill", f"-{number.value}", str(run.card.supervisor)], check=True)
+        time.sleep(wait_s)
+    assert hilctl("stop")["ended"]
+    recording = read(background)
+    assert recording.samples.index.size > status["sample"]
+    assert recording.dropped == 0
+    assert replay(recording).identical
