@@ -17,6 +17,7 @@ BUILTIN: dict[str, str] = {
     "simulated_terfenol": "hilctl_drivers.simulated:SimulatedTerfenol",
     "simulated_piezo": "hilctl_drivers.simulated:SimulatedPiezo",
     "modbus_dac": "hilctl_drivers.modbus_dac:ModbusDac",
+    "modbus_stream": "hilctl_drivers.modbus_stream:ModbusStream",
     "serial_dac": "hilctl_drivers.serial_dac:SerialDac",
 }
 

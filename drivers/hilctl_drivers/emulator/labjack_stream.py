@@ -1,0 +1,235 @@
+"""Stream-out and stream-in of an emulated LabJack T4 or T7: registers in front of a scan clock.
+
+It does what :mod:`hilctl_drivers.modbus_stream_protocol` says of the device. What no document was
+seen for is made up: that a trip of the watchdog ends the stream, and in which order queued sets of
+values are put out.
+"""
+
+import struct
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from hilctl.arrays import F64
+from hilctl_drivers import modbus_stream_protocol as stream
+from hilctl_drivers.emulator.emulated import Declined
+from hilctl_drivers.emulator.labjack_input import LabJackInput
+from hilctl_drivers.emulator.scan_clock import Played, ScanClock
+from hilctl_drivers.profile_modbus import ModbusProfile
+from hilctl_drivers.profile_steps import RegisterStep
+from hilctl_drivers.profile_stream import BYTES_A_SAMPLE, LabJackStreaming
+
+_VALUE_EXCEPTION, _FAILURE_EXCEPTION = 3, 4
+_PERIOD_NS, _PERIODS_MAX = 100, 65_536
+
+
+class LabJackStream:
+    """The registers.
+
+    Args:
+        profile: What the device is.
+        streaming: What it can stream.
+        output: Output that drives the rig.
+        sensor: Input that shows the displacement.
+        current_a: From the output's value to the rig's current.
+        volts: From displacements in um to volts at the input.
+        on_played: Told what was put out.
+        noise: Whether the sensor has noise.
+    """
+
+    def __init__(
+        self,
+        profile: ModbusProfile,
+        streaming: LabJackStreaming,
+        output: str,
+        sensor: str,
+        *,
+        current_a: Callable[[F64], F64],
+        volts: Callable[[F64], F64],
+        on_played: Played,
+        noise: bool,
+    ) -> None:
+        self._streaming = streaming
+        self._limits = profile.outputs[output].limits
+        self._target = profile.wire_address(profile.outputs[output])
+        self._source = profile.wire_address(profile.inputs[sensor])
+        self._analog = {profile.wire_address(each) for each in profile.inputs.values()}
+        self._current_a = current_a
+        self._volts = volts
+        self.clock = ScanClock(noise=noise, on_played=on_played)
+        self.input = LabJackInput(streaming)
+        self._words = {address: [0, 0] for address in _plain(profile, streaming)}
+        self._pending: list[F64] = []
+        self._writes: dict[int, Callable[[bytes], None]] = {
+            stream.SCANRATE_HZ: self._set_rate,
+            stream.OUT_ENABLE: self._enable_output,
+            stream.OUT_BUFFER_F32: self._take_values,
+            stream.OUT_SET_LOOP: self._use_values,
+            stream.ENABLE: self._enable,
+        }
+        self._reads: dict[int, Callable[[int], bytes]] = {
+            stream.OUT_BUFFER_STATUS: lambda count: stream.u32(self._capacity - self._held),
+            stream.ENABLE: lambda count: stream.u32(int(self.clock.running)),
+            stream.DATA_CR: self._data,
+            stream.FLASH_READ: self._read_flash,
+        }
+        self._now_ns = 0
+
+    @property
+    def running(self) -> bool:
+        """Whether it streams."""
+        return self.clock.running
+
+    def has(self, address: int) -> bool:
+        """Return whether an address is the stream's business; inputs are while it runs."""
+        known = address in self._words or address in self._reads or address in self._writes
+        scanned = stream.SCANLIST_ADDRESS <= address < stream.SCANLIST_ADDRESS + 256
+        return known or scanned or (self.running and address in self._analog)
+
+    def tick(self, now_ns: int) -> None:
+        """Let time pass."""
+        self._now_ns = max(self._now_ns, now_ns)
+        volts = self._volts(self.clock.advance(self._now_ns))
+        if volts.size:
+            self.input.keep(volts)
+
+    def stop(self, now_ns: int) -> None:
+        """Stop streaming at a time that may be past; the output holds its value."""
+        self.tick(now_ns)
+        self.clock.stop()
+
+    def read(self, address: int, count: int) -> list[int]:
+        """Return register words.
+
+        Raises:
+            Declined: Not readable, or not now.
+        """
+        if address in self._reads:
+            data = self._reads[address](count)
+        elif address in self._words:
+            data = struct.pack(">2H", *self._words[address])
+        else:
+            raise Declined(_FAILURE_EXCEPTION)
+        if len(data) != 2 * count:
+            raise Declined(_VALUE_EXCEPTION)
+        return list(struct.unpack(f">{count}H", data))
+
+    def write(self, address: int, values: Sequence[int]) -> None:
+        """Write register words.
+
+        Raises:
+            Declined: Not writable, or not this, or not now.
+        """
+        data = struct.pack(f">{len(values)}H", *values)
+        if address in self._writes:
+            self._writes[address](data)
+            return
+        for start in range(0, len(values), 2):
+            if address + start not in self._words:
+                raise Declined(_VALUE_EXCEPTION)
+        for start in range(0, len(values), 2):
+            self._words[address + start] = list(values[start : start + 2])
+
+    @property
+    def _capacity(self) -> int:
+        return self._number(stream.OUT_ALLOCATE_BYTES) // BYTES_A_SAMPLE
+
+    @property
+    def _held(self) -> int:
+        return self.clock.level + sum(part.size for part in self._pending)
+
+    def _number(self, address: int) -> int:
+        high, low = self._words[address]
+        return high << 16 | low
+
+    def _set_rate(self, data: bytes) -> None:
+        """Keep the rate that the clock can make (description of STREAM_SCANRATE_HZ)."""
+        (rate_hz,) = struct.unpack(">f", data)
+        if not 0.0 < rate_hz <= self._streaming.samples_per_s_max:
+            raise Declined(_VALUE_EXCEPTION)
+        unit_ns = _PERIOD_NS
+        while round(1e9 / rate_hz / unit_ns) > _PERIODS_MAX:
+            unit_ns *= 10
+        real_hz = 1e9 / (unit_ns * round(1e9 / rate_hz / unit_ns))
+        self._words[stream.SCANRATE_HZ] = list(struct.unpack(">2H", stream.f32(real_hz)))
+
+    def _enable_output(self, data: bytes) -> None:
+        self._words[stream.OUT_ENABLE] = list(struct.unpack(">2H", data))
+        size = self._number(stream.OUT_ALLOCATE_BYTES)
+        allowed = 32 <= size <= self._streaming.buffer_bytes and not size & (size - 1)
+        if self._number(stream.OUT_ENABLE) and (
+            not allowed or self._number(stream.OUT_TARGET) != self._target
+        ):
+            raise Declined(_FAILURE_EXCEPTION)
+        self.clock.clear()
+        self._pending.clear()
+
+    def _take_values(self, data: bytes) -> None:
+        values = np.frombuffer(data, ">f4").astype(np.float64)
+        low, high = self._limits
+        slack = 1e-6 * (high - low)
+        if not ((values >= low - slack) & (values <= high + slack)).all():
+            raise Declined(_VALUE_EXCEPTION)
+        enabled = self._number(stream.OUT_ENABLE)
+        if not enabled or self._held + values.size > self._capacity:
+            raise Declined(_FAILURE_EXCEPTION)
+        self._pending.append(values)
+
+    def _use_values(self, data: bytes) -> None:
+        if data != stream.u32(stream.USE_AT_ONCE):
+            raise Declined(_VALUE_EXCEPTION)
+        for values in self._pending:
+            self.clock.queue(self._current_a(values))
+        self._pending.clear()
+
+    def _enable(self, data: bytes) -> None:
+        if data == stream.u32(0):
+            if not self.running:
+                raise Declined(_FAILURE_EXCEPTION)
+            self.clock.stop()
+            return
+        addresses = [self._number(stream.SCANLIST_ADDRESS + 2 * k) for k in range(2)]
+        settings = (self._number(stream.NUM_ADDRESSES), self._number(stream.AUTO_TARGET))
+        wanted = (2, stream.COMMAND_RESPONSE)
+        scanned = [self._source, stream.STREAM_OUT0]
+        rate_hz = self._rate_hz
+        if (
+            self.running
+            or addresses != scanned
+            or settings != wanted
+            or not 0.0 < rate_hz <= self._streaming.rate_max_hz
+        ):
+            raise Declined(_FAILURE_EXCEPTION)
+        self.input.start(self._number(stream.BUFFER_SIZE_BYTES))
+        self.clock.start(rate_hz, self._now_ns)
+
+    @property
+    def _rate_hz(self) -> float:
+        data = struct.pack(">2H", *self._words[stream.SCANRATE_HZ])
+        return float(struct.unpack(">f", data)[0])
+
+    def _data(self, count: int) -> bytes:
+        if not self.running:
+            raise Declined(_FAILURE_EXCEPTION)
+        return self.input.fetch(count)
+
+    def _read_flash(self, count: int) -> bytes:
+        start = self._number(stream.FLASH_READ_POINTER) - self._streaming.calibration_address
+        if start < 0:
+            raise Declined(_VALUE_EXCEPTION)
+        return self.input.flash[start : start + 2 * count]
+
+
+def _plain(profile: ModbusProfile, streaming: LabJackStreaming) -> set[int]:
+    """Return addresses that hold two words and do nothing by themselves."""
+    settings = {
+        stream.SCANRATE_HZ, stream.NUM_ADDRESSES, stream.SETTLING_US, stream.RESOLUTION_INDEX,
+        stream.BUFFER_SIZE_BYTES, stream.AUTO_TARGET, stream.DATATYPE, stream.NUM_SCANS,
+        stream.OUT_TARGET, stream.OUT_ALLOCATE_BYTES, stream.OUT_LOOP_NUM_VALUES,
+        stream.OUT_ENABLE, stream.FLASH_READ_POINTER,
+    }  # fmt: skip
+    scanned = {stream.SCANLIST_ADDRESS + 2 * k for k in range(128)}
+    steps = {
+        profile.wire_address(step) for step in streaming.setup if isinstance(step, RegisterStep)
+    }
+    return settings | scanned | steps

@@ -1,0 +1,91 @@
+"""Whole runs that stream over Modbus with things going wrong: one way out, judged by the device."""
+
+import os
+import signal
+
+import numpy as np
+import pytest
+
+from hilctl.flags import Flag
+
+TIMEOUT_S = 0.5
+WATCHDOG_S = 2.0
+FAULT_AT = 150
+BLOCK = 200
+FIFO_BLOCKS = 12
+STREAM = {"sample_rate_hz": 5000, "block": BLOCK}
+T7 = {
+    "kind": "modbus_stream",
+    "profile": "labjack_t7",
+    "output": "DAC0",
+    "input": "AIN0",
+    "timeout_s": TIMEOUT_S,
+    "fifo_blocks": FIFO_BLOCKS,
+    "amplifier": {"gain_a_per_v": 4.0, "offset_a": -10.0},
+    "sensor": {"um_per_v": 12.5},
+    "watchdog": {"timeout_s": WATCHDOG_S},
+}
+FAULTS = {
+    "silence": "no answer within 0.5 s",
+    "exception": "function 76 refused with exception 4 (device failure)",
+    "corrupt": "not a Modbus TCP header",
+    "cut": "short, within 0.5 s",
+    "reset": "connection lost: connection reset by peer",
+}
+
+
+def over_tcp(address):
+    host, port = address.split(":")
+    return {**T7, "host": host, "port": int(port)}
+
+
+def assert_made_safe(device):
+    """The last write was the safe value; nothing was played after it, and a late trip is safe."""
+    events = device.log.events("DAC0")
+    last = max(k for k, each in enumerate(events) if each["event"] == "write")
+    assert {each["event"] for each in events[last + 1 :]} <= {"watchdog"}
+    assert [each["current_a"] for each in events[last:]] == pytest.approx(
+        [0.0] * (len(events) - last), abs=1e-5
+    )
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_fault_ends_the_run_safely(emulate, run, fault):
+    """The run says in one line what happened where; what was queued gives way to the safe value."""
+    device = emulate("labjack_t7", "--fault", f"{fault}@{FAULT_AT}")
+    started = run(over_tcp(device.address), **STREAM)
+    printed = started.end()
+    assert printed["code"] == "fault"
+    assert printed["output_safe"] is True
+    said = printed["reason"]
+    assert said.startswith(f"modbus_stream labjack_t7 at {device.address}: ")
+    assert FAULTS[fault] in said
+    assert "stream DAC0 and AIN0" in said
+    assert "\n" not in said
+    assert_made_safe(device)
+    recording = started.assert_recorded(at_least=10 * BLOCK)
+    unanswered = (recording.samples.flags & Flag.SENSOR_INVALID) != 0
+    assert FIFO_BLOCKS * BLOCK <= unanswered.sum() <= (FIFO_BLOCKS + 1) * BLOCK
+    assert np.isfinite(recording.samples.displacement_um[~unanswered]).all()
+
+
+def test_pulled_cable_leaves_it_to_the_watchdog(emulate, run):
+    """Nobody can be reached: the run says so, and the device makes its output safe by itself."""
+    device = emulate("labjack_t7", "--fault", f"unplug@{FAULT_AT}")
+    printed = run(over_tcp(device.address), **STREAM).end()
+    trip = device.log.await_event("DAC0", "watchdog")
+    assert printed["output_safe"] is False
+    assert "the safe value could not be confirmed" in printed["reason"]
+    assert trip["current_a"] == pytest.approx(0.0, abs=1e-5)
+
+
+def test_killed_loop_is_made_safe_by_the_supervisor(emulate, run):
+    """Its connection is gone with it; the supervisor's own stops the stream."""
+    device = emulate("labjack_t7")
+    started = run(over_tcp(device.address), **STREAM)
+    device.log.await_events("DAC0", FAULT_AT)
+    os.kill(started.loop_pid(), signal.SIGKILL)
+    printed = started.end()
+    assert "the loop process died: killed by SIGKILL" in printed["reason"]
+    assert printed["output_safe"] is True
+    assert_made_safe(device)
