@@ -13,7 +13,7 @@ size of what it lets pass.
 import zlib
 from array import array
 from binascii import crc_hqx
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import TypeAlias
@@ -98,21 +98,9 @@ def _word_table() -> "array[int]":
     return table
 
 
-_MODBUS_WORDS = _word_table()
-
-
-def crc16_modbus_words(words: Iterable[int], start: int) -> int:
-    """Return :func:`crc16_modbus` of bytes taken two at a time, in less than half the time.
-
-    Args:
-        words: Pairs of bytes, the first the low one.
-        start: CRC of what went before.
-    """
-    table = _MODBUS_WORDS
-    crc = start
-    for word in words:
-        crc = table[crc ^ word]
-    return crc
+MODBUS_WORDS = _word_table()
+"""For loops that can't afford a call: ``crc = MODBUS_WORDS[crc ^ word]`` is :func:`crc16_modbus` of
+two bytes, the first the low one of ``word``, in less than half the time."""
 
 
 def _crc16_ccitt_false(data: Bytes) -> int:

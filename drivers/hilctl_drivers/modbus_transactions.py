@@ -1,15 +1,14 @@
 """Modbus requests built once and sent many times: the loop's hot path.
 
-A transaction keeps its whole request and the beginning of its good reply as bytes. A tick patches
-transaction id and data, and compares. Only a reply that differs goes the long way through
+A transaction keeps what never changes of its request and of its good reply. A tick puts transaction
+id, data and CRC to it, and compares. Only a reply that differs goes the long way through
 :mod:`hilctl_drivers.modbus_frames`, which says what is wrong with it.
 """
 
 import struct
-from collections.abc import Callable
-from typing import Protocol
+from typing import Protocol, cast
 
-from hilctl_drivers.checks import Bytes, crc16_modbus, crc16_modbus_words
+from hilctl_drivers.checks import MODBUS_WORDS, Bytes, crc16_modbus
 from hilctl_drivers.modbus_frames import (
     FEEDBACK,
     PDU_MAX,
@@ -28,9 +27,7 @@ from hilctl_drivers.wire_errors import BadRequest, Incomplete
 
 _TCP_SHORTEST = TCP_HEAD + 2
 _RTU_SHORTEST = 5
-_set_transaction = struct.Struct(">H").pack_into
 _tcp_start = struct.Struct(">HHH").unpack_from
-_set_crc = struct.Struct("<H").pack_into
 
 
 class Transaction(Protocol):
@@ -46,8 +43,8 @@ class Transaction(Protocol):
         """Bytes of a good reply."""
         ...
 
-    def request(self, data: bytes = b"") -> bytearray:
-        """Return the next request; the buffer is reused by the next call.
+    def request(self, data: bytes = b"") -> bytes:
+        """Return the next request.
 
         Args:
             data: Register bytes to write, as many as the PDU was prepared with; empty for those
@@ -91,34 +88,36 @@ def _data_span(pdu: bytes) -> tuple[int, int]:
     return len(pdu), len(pdu)
 
 
-def _words(size: int) -> Callable[[Bytes, int], tuple[int, ...]]:
-    """Return what takes ``size`` bytes from an offset on as little-endian words."""
-    return struct.Struct(f"<{size // 2}H").unpack_from
-
-
 class _Prepared:
-    """A request buffer and the bytes that its good reply begins with."""
+    """What stays the same in all requests and good replies of one PDU."""
 
     def __init__(self, adu: bytes, pdu: bytes, start: int) -> None:
-        """Take the request, its PDU, and where in the request the PDU begins."""
+        """Take the first request, its PDU, and where in the request the PDU begins."""
         first, last = _data_span(pdu)
-        head, data_size = reply_layout(pdu)
-        self._buffer = bytearray(adu)
-        self._first, self._last = start + first, start + last
+        head, read_size = reply_layout(pdu)
+        self._last = adu
+        self._data = pdu[first:last]
         self._data_size = last - first
+        self._before = adu[: start + first]
+        self._after = pdu[last:]
         # The reply to a single write echoes all of the request.
         self._echo = pdu[0] == WRITE_REGISTER
-        self._head = bytearray(adu[:start] + head)
-        self._head_size = len(self._head)
-        self._size = self._head_size + data_size
+        self._head = adu[:start] + head
+        self._read_size = read_size
+        self._reply_size = len(self._head) + read_size
 
-    def _put(self, data: bytes) -> None:
-        """Put ``data`` into the request; raise BadRequest where it does not fit exactly."""
-        if len(data) != self._data_size:
-            raise BadRequest(f"request was prepared for {self._data_size} bytes, got {len(data)}")
-        self._buffer[self._first : self._last] = data
-        if self._echo:
-            self._head[self._head_size - 2 :] = data
+    @property
+    def size(self) -> int:
+        """Bytes of the request."""
+        return len(self._last)
+
+    @property
+    def reply_size(self) -> int:
+        """Bytes of a good reply."""
+        return self._reply_size
+
+    def _bad_size(self, data: bytes) -> BadRequest:
+        return BadRequest(f"request was prepared for {self._data_size} bytes, got {len(data)}")
 
 
 class TcpTransaction(_Prepared):
@@ -133,33 +132,33 @@ class TcpTransaction(_Prepared):
         super().__init__(tcp_adu(transaction, unit, pdu), pdu, TCP_HEAD)
         self._unit = unit
         self._transaction = transaction
-        self._head[4:6] = (self._size - 6).to_bytes(2, "big")
+        self._before = self._before[2:]
+        length = (self._reply_size - 6).to_bytes(2, "big")
+        self._head = self._head[2:4] + length + self._head[6:]
+        sizes = (len(self._before), self._data_size, len(self._after))
+        self._join = struct.Struct(">H{}s{}s{}s".format(*sizes)).pack
+        self._split = struct.Struct(f">H{len(self._head)}s{self._read_size}s").unpack
 
-    @property
-    def size(self) -> int:
-        """Bytes of the request."""
-        return len(self._buffer)
-
-    @property
-    def reply_size(self) -> int:
-        """Bytes of a good reply."""
-        return self._size
-
-    def request(self, data: bytes = b"") -> bytearray:
+    def request(self, data: bytes = b"") -> bytes:
         """See :meth:`Transaction.request`."""
-        self._transaction = transaction = (self._transaction + 1) & 0xFFFF
         if data:
-            self._put(data)
-        _set_transaction(self._buffer, 0, transaction)
-        _set_transaction(self._head, 0, transaction)
-        return self._buffer
+            if len(data) != self._data_size:
+                raise self._bad_size(data)
+            self._data = data
+            if self._echo:
+                self._head = self._head[:-2] + data
+        self._transaction = transaction = (self._transaction + 1) & 0xFFFF
+        self._last = made = self._join(transaction, self._before, self._data, self._after)
+        return made
 
     def reply(self, adu: Bytes) -> bytes:
         """See :meth:`Transaction.reply`."""
-        if len(adu) == self._size and adu[: self._head_size] == self._head:
-            return bytes(adu[self._head_size :])
+        if len(adu) == self._reply_size:
+            transaction, head, read = self._split(adu)
+            if transaction == self._transaction and head == self._head:
+                return cast(bytes, read)
         pdu = tcp_pdu(adu, self._transaction, self._unit)
-        return reply_data(bytes(self._buffer[TCP_HEAD:]), pdu)
+        return reply_data(self._last[TCP_HEAD:], pdu)
 
     def missing(self, received: Bytes) -> int:
         """See :meth:`Transaction.missing`."""
@@ -174,7 +173,10 @@ class TcpTransaction(_Prepared):
 
 
 class RtuTransaction(_Prepared):
-    """A prepared Modbus RTU :class:`Transaction`; there is no id to tell a late reply by."""
+    """A prepared Modbus RTU :class:`Transaction`; there is no id to tell a late reply by.
+
+    CRCs of what never changes are worked out once; the rest is taken two bytes at a time.
+    """
 
     def __init__(self, unit: int, pdu: bytes) -> None:
         """Prepare ``pdu`` for ``unit``.
@@ -184,53 +186,53 @@ class RtuTransaction(_Prepared):
         """
         super().__init__(rtu_adu(unit, pdu), pdu, 1)
         self._unit = unit
-        self._crc_at = len(self._buffer) - 2
-        # CRCs of what never changes: all before the data.
-        self._request_crc = crc16_modbus(self._buffer[: self._first])
-        self._reply_crc = crc16_modbus(self._head)
-        self._request_words = _words(self._crc_at - self._first)
-        self._size += 2
-        self._reply_words = _words(self._size - self._head_size)
-        self._in_words = (self._size - self._head_size) % 2 == 0  # bits may not be
+        self._reply_size += 2
+        self._before_crc = crc16_modbus(self._before)
+        self._head_crc = crc16_modbus(self._head)
+        sizes = (len(self._before), self._data_size, len(self._after))
+        self._join = struct.Struct("<{}s{}s{}sH".format(*sizes)).pack
+        self._split = struct.Struct(f"<{len(self._head)}s{self._read_size}sH").unpack
+        # What is written, and what LabJack's function has after it, is always whole registers.
+        self._written_words = struct.Struct(f"<{self._data_size // 2}H").unpack
+        self._after_words = struct.unpack(f"<{len(self._after) // 2}H", self._after)
+        self._read_words = struct.Struct(f"<{self._read_size // 2}H").unpack
+        self._in_words = self._read_size % 2 == 0  # bits may not be
 
-    @property
-    def size(self) -> int:
-        """Bytes of the request."""
-        return len(self._buffer)
-
-    @property
-    def reply_size(self) -> int:
-        """Bytes of a good reply."""
-        return self._size
-
-    def request(self, data: bytes = b"") -> bytearray:
+    def request(self, data: bytes = b"") -> bytes:
         """See :meth:`Transaction.request`."""
-        if data:
-            self._put(data)
-            words = self._request_words(self._buffer, self._first)
-            crc = crc16_modbus_words(words, self._request_crc)
-            _set_crc(self._buffer, self._crc_at, crc)
-            if self._echo:
-                self._reply_crc = crc16_modbus(self._head)
-        return self._buffer
+        if not data:
+            return self._last
+        if len(data) != self._data_size:
+            raise self._bad_size(data)
+        table, crc = MODBUS_WORDS, self._before_crc
+        for word in self._written_words(data):
+            crc = table[crc ^ word]
+        for word in self._after_words:
+            crc = table[crc ^ word]
+        if self._echo:
+            self._head = self._head[:-2] + data
+            self._head_crc = crc16_modbus(self._head)
+        self._last = made = self._join(self._before, data, self._after, crc)
+        return made
 
     def reply(self, adu: Bytes) -> bytes:
         """See :meth:`Transaction.reply`."""
-        if (
-            self._in_words
-            and len(adu) == self._size
-            and adu[: self._head_size] == self._head
-            and not crc16_modbus_words(self._reply_words(adu, self._head_size), self._reply_crc)
-        ):
-            return bytes(adu[self._head_size : -2])
+        if len(adu) == self._reply_size and self._in_words:
+            head, read, sent = self._split(adu)
+            if head == self._head:
+                table, crc = MODBUS_WORDS, self._head_crc
+                for word in self._read_words(read):
+                    crc = table[crc ^ word]
+                if crc == sent:
+                    return cast(bytes, read)
         missing = self.missing(adu)
         if missing:
             raise Incomplete(f"{missing} more bytes belong to the reply")
-        return reply_data(bytes(self._buffer[1:-2]), rtu_pdu(adu, self._unit))
+        return reply_data(self._last[1:-2], rtu_pdu(adu, self._unit))
 
     def missing(self, received: Bytes) -> int:
         """See :meth:`Transaction.missing`."""
         count = len(received)
         if count < _RTU_SHORTEST:
             return _RTU_SHORTEST - count
-        return 0 if received[1] & 0x80 else max(0, self._size - count)
+        return 0 if received[1] & 0x80 else max(0, self._reply_size - count)

@@ -1,8 +1,8 @@
 """The links of a profile: how bytes get to the device and how they are framed."""
 
-from typing import Literal, TypeAlias
+from typing import Literal, Self, TypeAlias
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from hilctl_drivers.profile_parts import Part
 
@@ -33,8 +33,17 @@ class SerialLine(Part):
     boot_wait_s: float = Field(
         default=0.0, ge=0.0, le=30.0, description="silence after opening the port, s"
     )
+    flow: Literal["none", "xonxoff"] = Field(
+        default="none",
+        description="xonxoff: bytes 0x11 and 0x13 hold the line and let it go, for lines of text",
+    )
     dtr: bool | None = Field(
-        default=None, description="level to hold DTR at; left out: as the system sets it"
+        default=None,
+        description="level to hold DTR at; left out: raised, as opening the port does",
+    )
+    rts: bool | None = Field(
+        default=None,
+        description="level to hold RTS at; left out: raised, as opening the port does",
     )
 
     @property
@@ -49,7 +58,19 @@ class SerialLine(Part):
         return f"{self.baud} {self.bytesize}{self.parity}{self.stopbits}"
 
 
-class RtuLink(SerialLine):
+class BinaryLine(SerialLine):
+    """A serial line that carries all byte values."""
+
+    @model_validator(mode="after")
+    def _all_bytes_pass(self) -> Self:
+        if self.flow != "none":
+            raise ValueError(
+                f"flow must be none where bytes 0x11 and 0x13 are data, got {self.flow}"
+            )
+        return self
+
+
+class RtuLink(BinaryLine):
     """Modbus RTU."""
 
     kind: Literal["rtu"]
@@ -77,12 +98,11 @@ class AsciiLink(SerialLine):
         default="none", description="dcon: two hex digits; gen: $ and two hex digits"
     )
     echo: bool = Field(default=False, description="whether the device repeats what is sent")
-    flow: Literal["none", "xonxoff"] = "none"
     min_gap_s: float = Field(default=0.0, ge=0.0, description="silence between commands, s")
     max_line_chars: int | None = Field(default=None, ge=1, description="longest line it takes")
 
 
-class FramesLink(SerialLine):
+class FramesLink(BinaryLine):
     """Binary frames to a microcontroller board; see :mod:`hilctl_drivers.board_protocol`."""
 
     kind: Literal["frames"]

@@ -45,6 +45,7 @@ class RegisterFormat:
     _struct: struct.Struct = field(init=False, repr=False, compare=False)
     _to_wire: _Permute | None = field(init=False, repr=False, compare=False)
     _from_wire: _Permute | None = field(init=False, repr=False, compare=False)
+    _whole: bool = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         if self.type not in _CODES:
@@ -66,6 +67,7 @@ class RegisterFormat:
         object.__setattr__(self, "_struct", struct.Struct(code))
         object.__setattr__(self, "_to_wire", None if plain else itemgetter(*to_wire))
         object.__setattr__(self, "_from_wire", None if plain else itemgetter(*from_wire))
+        object.__setattr__(self, "_whole", self.is_integer)
         object.__setattr__(self, "order", order)
 
     @property
@@ -110,7 +112,7 @@ class RegisterFormat:
         if not math.isfinite(raw):
             raise BadRequest(f"{self.type} register can't hold {value}")
         try:
-            data = self._struct.pack(round(raw) if self.is_integer else raw)
+            data = self._struct.pack(round(raw) if self._whole else raw)
         except (struct.error, OverflowError):
             raise BadRequest(
                 f"{self.type} register holds {self.limits[0]:g} to {self.limits[1]:g}, got {value}"

@@ -5,6 +5,7 @@ asks for, USB frames, and the device's turnaround. What the operating system add
 a rate that is refused here is impossible, and one that is not may still be out of reach.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -25,8 +26,11 @@ from hilctl_drivers.profile_links import FramesLink, RtuLink
 from hilctl_drivers.profile_modbus import ModbusInput, ModbusOutput, ModbusProfile
 
 Profile: TypeAlias = ModbusProfile | AsciiProfile | FrameProfile
+Line: TypeAlias = tuple[str, str | None]
+"""What is sent, and an example of its reply; None where it is not answered."""
 
-_CHECKSUM_CHARS = {"none": 0, "dcon": 2, "gen": 3}
+CHECKSUM_CHARS = {"none": 0, "dcon": 2, "gen": 3}
+"""Characters that a line's checksum adds."""
 _USB_BITS_PER_S = {True: 19 * 64 * 8e3, False: 13 * 512 * 8 * 8e3}
 """Bulk payload of full-speed (1 ms) and high-speed (125 us) frames (USB 2.0, tables 5-9, 5-10)."""
 
@@ -62,6 +66,18 @@ class WireTime:
     def highest_rate_hz(self) -> float:
         """Highest sample rate that the wire and the device leave."""
         return self.samples / self.total_s if self.total_s > 0.0 else float("inf")
+
+    def then(self, other: "WireTime") -> "WireTime":
+        """Return what this and then ``other`` cost, for the samples of this."""
+        return WireTime(
+            f"{self.what}, then {other.what}",
+            self.request_s + other.request_s,
+            self.reply_s + other.reply_s,
+            self.gaps + other.gaps,
+            self.gaps_s + other.gaps_s,
+            self.turnaround_s + other.turnaround_s,
+            self.samples,
+        )
 
     def __str__(self) -> str:
         parts = []
@@ -99,29 +115,28 @@ def exchange_time(
     if isinstance(profile, ModbusProfile):
         written = profile.outputs[output]
         read = profile.inputs[sensor] if sensor is not None else None
-        return modbus_time(profile, written, read, one_transaction=one_transaction)
+        requests = _modbus_requests(profile, written, read, one_transaction=one_transaction)
+        return requests_time(profile, requests)
     if isinstance(profile, AsciiProfile):
-        return ascii_time(profile, output, sensor, one_transaction=one_transaction)
+        lines = _ascii_lines(profile, output, sensor, one_transaction=one_transaction)
+        return lines_time(profile, lines)
     return frames_time(profile, block)
 
 
-def modbus_time(
-    profile: ModbusProfile,
-    output: ModbusOutput,
-    sensor: ModbusInput | None,
-    *,
-    one_transaction: bool,
-) -> WireTime:
-    """Return what an exchange costs over Modbus."""
-    requests = _modbus_requests(profile, output, sensor, one_transaction=one_transaction)
+def requests_time(profile: ModbusProfile, requests: Sequence[bytes]) -> WireTime:
+    """Return what Modbus requests cost with their replies, one after the other.
+
+    Args:
+        profile: The device.
+        requests: Their PDUs.
+    """
     what = "+".join(f"FC{pdu[0]:02d}" for pdu in requests)
     turnaround_s = len(requests) * profile.turnaround_s
     link = profile.link
     if not isinstance(link, RtuLink):
         return WireTime(f"{what} over TCP", 0.0, 0.0, 0, 0.0, turnaround_s)
-    around = len(rtu_adu(1, requests[0])) - len(requests[0])
-    sent = sum(len(pdu) + around for pdu in requests)
-    received = sum(reply_size(pdu) + around for pdu in requests)
+    sent = sum(len(rtu_adu(1, pdu)) for pdu in requests)
+    received = sum(reply_size(pdu) + 3 for pdu in requests)  # unit and CRC
     gaps = 2 * len(requests)
     return WireTime(
         f"{what} at {link.format}",
@@ -153,13 +168,10 @@ def _modbus_requests(
     return [write, read_pdu(sensor.read_function, source, sensor.words)]
 
 
-def ascii_time(
-    profile: AsciiProfile, output: str, sensor: str | None, *, one_transaction: bool
-) -> WireTime:
-    """Return what an exchange costs in lines of text, for the longest value."""
-    lines = _ascii_lines(profile, output, sensor, one_transaction=one_transaction)
+def lines_time(profile: AsciiProfile, lines: Sequence[Line]) -> WireTime:
+    """Return what lines of text cost with their replies, one after the other."""
     link = profile.link
-    check = _CHECKSUM_CHARS[link.checksum]
+    check = CHECKSUM_CHARS[link.checksum]
     sent = sum(len(line) + check + len(link.terminator) for line, _ in lines)
     replies = [reply for _, reply in lines if reply is not None]
     received = sum(len(reply) + check + len(link.reply_terminator) for reply in replies)
@@ -175,8 +187,8 @@ def ascii_time(
 
 def _ascii_lines(
     profile: AsciiProfile, output: str, sensor: str | None, *, one_transaction: bool
-) -> list[tuple[str, str | None]]:
-    """Return lines to send with an example of the reply, None where there is none."""
+) -> list[Line]:
+    """Return the lines of an exchange, with the longest value."""
     channel = profile.outputs[output]
     address = 0 if profile.address == "none" else profile.address
 
@@ -185,18 +197,11 @@ def _ascii_lines(
         return max(texts, key=len)
 
     combined = profile.exchange
-    if (
-        one_transaction
-        and combined != "none"
-        and (combined.output, combined.input)
-        == (
-            output,
-            sensor,
-        )
-    ):
+    pair = (output, sensor)
+    if one_transaction and combined != "none" and (combined.output, combined.input) == pair:
         return [(longest(combined.write), combined.example)]
     answer = None if channel.reply == "none" else channel.reply.example
-    lines: list[tuple[str, str | None]] = [(longest(channel.write), answer)]
+    lines: list[Line] = [(longest(channel.write), answer)]
     if sensor is not None:
         source = profile.inputs[sensor]
         lines.append((source.ask.format(address=address), source.example))
@@ -231,16 +236,3 @@ def _frames_line(link: FramesLink) -> tuple[float, int, float, str]:
     byte_s = 8.0 / _USB_BITS_PER_S[full_speed]
     speed = "full" if full_speed else "high"
     return byte_s, 1, link.usb_frame_s, f"over {speed}-speed USB"
-
-
-def rate_refusal(profile: Profile, wire: WireTime, rate_hz: float) -> str:
-    """Return why a rate is impossible and what would be possible; empty where it is possible."""
-    possible_hz = min(wire.highest_rate_hz, profile.max_rate_hz)
-    if rate_hz <= possible_hz:
-        return ""
-    if profile.max_rate_hz <= wire.highest_rate_hz:
-        return (
-            f"{profile.title} takes at most {profile.max_rate_hz:g} Hz, got {rate_hz:g} Hz"
-            f" (its wire: {wire})"
-        )
-    return f"{profile.title} can't be exchanged with at {rate_hz:g} Hz: {wire}"

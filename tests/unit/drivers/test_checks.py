@@ -8,8 +8,8 @@ from pymodbus.framer.rtu import FramerRTU
 
 from hilctl_drivers.checks import (
     CRCS,
+    MODBUS_WORDS,
     crc16_modbus,
-    crc16_modbus_words,
     dcon_checksum,
     gen_checksum,
     named_crc,
@@ -74,8 +74,17 @@ def test_every_named_crc_is_checked_here():
 
 def test_unknown_crc_is_refused_with_the_known_ones():
     """The message names what can be chosen."""
-    with pytest.raises(BadRequest, match="unknown CRC 'crc8'; known are crc16_modbus"):
+    known = "crc16_modbus, crc16_ccitt_false, crc16_xmodem, crc32, none"
+    with pytest.raises(BadRequest, match=f"^unknown CRC 'crc8'; known are {known}$"):
         named_crc("crc8")
+
+
+def test_no_check_has_no_parameters():
+    """The one that is none says so in every parameter."""
+    none = named_crc("none")
+    numbers = (none.width, none.poly, none.init, none.xorout, none.check)
+    assert numbers == (0, 0, 0, 0, 0)
+    assert (none.refin, none.refout) == (False, False)
 
 
 def test_modbus_crc_of_a_published_frame():
@@ -158,5 +167,7 @@ def test_modbus_crc_two_bytes_at_a_time_is_the_same():
     source = random.Random(5)
     for _ in range(500):
         data, start = source.randbytes(2 * source.randrange(20)), source.randrange(0x10000)
-        words = np.frombuffer(data, dtype="<u2").tolist()
-        assert crc16_modbus_words(words, start) == crc16_modbus(data, start)
+        crc = start
+        for word in np.frombuffer(data, dtype="<u2").tolist():
+            crc = MODBUS_WORDS[crc ^ word]
+        assert crc == crc16_modbus(data, start)

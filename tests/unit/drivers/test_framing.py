@@ -21,6 +21,9 @@ EACH = pytest.mark.parametrize(
 )
 
 
+COBS, LENGTH = CobsFraming(named_crc("crc16_modbus")), LengthFraming(named_crc("crc16_modbus"))
+
+
 def payloads_of(split):
     """Return what a splitter made of a stream, with lost stretches as None."""
     return [None if isinstance(each, Corrupt) else each for each in split]
@@ -65,6 +68,7 @@ def test_payloads_of_any_size_come_back(framing, size):
         frame = framing.encode(payload)
         assert framing.decode(frame) == payload
         assert framing.decode(bytearray(frame)) == payload
+        assert framing.decode(memoryview(frame)) == payload
         assert len(frame) <= framing.wire_size(size)
 
 
@@ -94,6 +98,60 @@ def test_an_endless_frame_is_corrupt():
         CobsFraming(named_crc("crc32"), payload_max=8).decode(b"\x01" * 40)
     with pytest.raises(Corrupt, match="1 to 8 bytes, got 9"):
         LengthFraming(named_crc("crc32"), payload_max=8).decode(b"\x09\x00")
+
+
+def test_cobs_size_on_the_wire_is_the_largest_there_is():
+    """A payload without a zero takes all of it; a frame may be awaited up to there, no further."""
+    framing = CobsFraming(named_crc("none"), payload_max=8)
+    assert len(framing.encode(b"\xff" * 8)) == framing.wire_size(8) == 10
+    with pytest.raises(Incomplete, match=r"^9 bytes without the final 00$"):
+        framing.decode(b"\x01" * 9)
+    with pytest.raises(Corrupt, match=r"^no final 00 within 10 bytes$"):
+        framing.decode(b"\x01" * 10)
+    splitter = framing.splitter()
+    assert splitter.feed(b"\x01" * 10) == []
+    assert [str(each) for each in splitter.feed(b"\x01")] == ["no end within 9 bytes"]
+
+
+@pytest.mark.parametrize(
+    ("framing", "frame", "text"),
+    [
+        (COBS, b"\0", "payload must have 1 to 4096 bytes, got -2"),
+        (COBS, b"\0\5", "1 bytes behind the final 00"),
+        (COBS, b"\2\1\0\0\0", "2 bytes behind the final 00"),
+        (COBS, b"\5\1\0", "not a COBS frame: not enough input bytes for length code"),
+        (COBS, b"\4\1\2\3\0", "crc16_modbus of 1 bytes is wrong: 01"),
+        (COBS, b"\x15" + 20 * b"\7" + b"\0", "crc16_modbus of 18 bytes is wrong:" + 16 * " 07"),
+        (LENGTH, b"\1\0\7\0\0", "crc16_modbus of 3 bytes is wrong: 01 00 07"),
+        (LENGTH, LENGTH.encode(b"\7") + b"\0\0", "2 bytes behind the end of the frame"),
+        (LENGTH, b"\1\x10", "payload must have 1 to 4096 bytes, got 4097"),
+    ],
+)
+def test_corrupt_frames_are_told_in_words(framing, frame, text):
+    """What is wrong with a frame is said, with sizes and at most its first 16 bytes."""
+    with pytest.raises(Corrupt) as caught:
+        framing.decode(frame)
+    assert str(caught.value) == text
+
+
+def test_refusals_and_beginnings_are_told_in_words():
+    """So are payloads and settings that can't be, and how much of a frame has come."""
+    with pytest.raises(BadRequest, match=r"^payload must have 1 to 4096 bytes, got 0$"):
+        COBS.encode(b"")
+    with pytest.raises(Incomplete, match=r"^3 bytes of a frame$"):
+        LENGTH.decode(b"\2\0\7")
+    for size in (0, 65536):
+        with pytest.raises(BadRequest, match=f"^payload_max must be 1 to 65535, got {size}$"):
+            LengthFraming(named_crc("crc32"), size)
+    with pytest.raises(BadRequest, match=r"^length-prefixed frames need a CRC: name one, or"):
+        LengthFraming(named_crc("none"))
+
+
+@pytest.mark.parametrize("size", [1, 65535])
+def test_length_frames_of_the_extreme_sizes(size):
+    """The limit of a payload may be as small as one byte and as large as two bytes can say."""
+    framing = LengthFraming(named_crc("crc32"), size)
+    assert framing.decode(framing.encode(bytes(size))) == bytes(size)
 
 
 def test_limits_hold_for_what_is_received():

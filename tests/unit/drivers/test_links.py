@@ -12,7 +12,9 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from hilctl.errors import DeviceError
-from hilctl_drivers.links import LostError, NoAnswerError, SerialLink, SerialSettings, TcpLink
+from hilctl_drivers.links import LostError, NoAnswerError
+from hilctl_drivers.serial_link import SerialLink, SerialSettings
+from hilctl_drivers.tcp_link import TcpLink
 
 QUICK_S = 0.05
 PATIENT_S = 5.0
@@ -145,6 +147,43 @@ def test_no_reply_wanted_is_not_waited_for(serve, line):
     for link in (tcp(serve(lambda connection: None)), wire):
         assert link.transact(b"tell", lambda received: 0) == b""
         link.close()
+
+
+@pytest.mark.parametrize(
+    ("sent", "words"), [(b"", "no answer within 0.05 s"), (b"0123", "only 4 bytes, 6 short")]
+)
+def test_a_known_size_moves_no_deadline(serve, line, sent, words):
+    """Silence and cut replies end in time too where the size of a good reply is known."""
+
+    def act(connection):
+        connection.recv(100)
+        connection.sendall(sent)
+
+    master, name = line
+    wire = SerialLink(name, SerialSettings(), QUICK_S)
+    wire.open()
+    wire.drain()
+    thread = threading.Thread(target=lambda: os.write(master, os.read(master, 100) and sent))
+    thread.start()
+    for link in (tcp(serve(act), QUICK_S), wire):
+        with pytest.raises(NoAnswerError, match=words):
+            link.transact(b"ask", missing, len(REPLY))
+        link.close()
+    thread.join()
+
+
+@pytest.mark.parametrize("size", [9, 11, 300])
+def test_a_reply_of_another_size_than_usual_is_asked_about(serve, size):
+    """Shorter, longer, and longer than what is read at once: what comes is what is returned."""
+    sent = bytes(size)
+
+    def act(connection):
+        connection.recv(100)
+        connection.sendall(sent)
+
+    link = tcp(serve(act))
+    assert link.transact(b"ask", lambda got: size - len(got), len(REPLY)) == sent
+    link.close()
 
 
 def test_full_serial_line_times_out(line):

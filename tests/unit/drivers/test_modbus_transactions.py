@@ -229,3 +229,26 @@ def test_transactions_do_not_share_buffers():
         kept = bytes(second.request(OLD))
         first.request(NEW)
         assert second.request(OLD)[2:] == kept[2:]
+
+
+@BOTH
+def test_a_request_stays_what_it_was(wire):
+    """The next one is another object: a log or a test may keep it."""
+    transaction = prepared("multiple", wire)[0]
+    first = transaction.request(OLD)
+    kept = bytes(first)
+    assert transaction.request(NEW) != first
+    assert first == kept
+
+
+@pytest.mark.parametrize("function", [1, 2])
+def test_bits_of_an_odd_number_of_bytes_are_read(function):
+    """17 bits are three bytes, which is no whole number of registers."""
+    reply = bytes((function, 3)) + H("A5 5A 01")
+    transaction = RtuTransaction(17, read_pdu(function, 0, 17))
+    transaction.request()
+    assert transaction.reply(rtu_adu(17, reply)) == H("A5 5A 01")
+    bad = bytearray(rtu_adu(17, reply))
+    bad[3] ^= 1
+    with pytest.raises(Corrupt):
+        transaction.reply(bad)

@@ -7,7 +7,7 @@ import pytest
 from hilctl_drivers.framing import binary_framing
 from hilctl_drivers.modbus_frames import reply_size, rtu_adu, write_pdu
 from hilctl_drivers.profile import Profile, load_profile, parse_profile, with_link
-from hilctl_drivers.wire_time import WireTime, exchange_time, rate_refusal
+from hilctl_drivers.wire_time import WireTime, exchange_time
 
 RTU = """\
 vendor: Acme
@@ -202,23 +202,16 @@ class TestBoards:
         assert many.highest_rate_hz > 50e3
 
 
-class TestRefusal:
-    """Impossible rates."""
+class TestSum:
+    """Exchanges one after the other."""
 
-    def test_wire(self) -> None:
-        """A rate that the wire can't carry is refused with what it could."""
-        profile = rtu()
-        time = exchange_time(profile, "AO", "AI")
-        text = rate_refusal(profile, time, 200.0)
-        assert text.startswith("Acme DAQ-1 can't be exchanged with at 200 Hz: FC23 at 115200 8N1")
-        assert text.endswith("at most 174 Hz")
-        assert rate_refusal(profile, time, 170.0) == ""
-
-    def test_device(self) -> None:
-        """A rate that the device can't keep is refused even where the wire could carry it."""
-        profile = load_profile("adam_6024")
-        text = rate_refusal(profile, exchange_time(profile, "AO0", "AI0"), 100.0)
-        assert text.startswith("Advantech ADAM-6024 takes at most 10 Hz, got 100 Hz")
+    def test_then(self) -> None:
+        """All parts add up, for the samples of the first."""
+        first = WireTime("A", 1.0, 2.0, 1, 3.0, 4.0, samples=10)
+        both = first.then(WireTime("B", 0.1, 0.2, 2, 0.3, 0.4))
+        assert both.what == "A, then B"
+        assert both.total_s == pytest.approx(11.0)
+        assert (both.gaps, both.samples) == (3, 10)
 
     def test_frozen(self) -> None:
         """A worked-out time can't be changed by accident."""
