@@ -21,8 +21,12 @@ class _Serve(Protocol):
         *,
         output: str | None,
         sensor: str | None,
+        reader: str | None,
+        reader_line: str | None,
+        reader_unit_id: int | None,
+        reader_port: int,
         host: str,
-        on_ready: Callable[[str], None],
+        on_ready: Callable[[str, str], None],
     ) -> None: ...
 
 
@@ -36,7 +40,11 @@ def emulate(
     faults: Sequence[str] = (),
     output: str | None = None,
     sensor: str | None = None,
-    on_ready: Callable[[str], None] = lambda address: None,
+    reader: str | None = None,
+    reader_line: str | None = None,
+    reader_unit_id: int | None = None,
+    reader_port: int = 0,
+    on_ready: Callable[[str, str], None] = lambda name, address: None,
 ) -> None:
     """Serve the simulated rig as a profile's device until SIGINT or SIGTERM.
 
@@ -49,7 +57,12 @@ def emulate(
         faults: ``KIND@COUNT`` or ``KIND@SECONDSs``.
         output: Output that drives the rig; the profile's first where None.
         sensor: Input that shows the displacement; the profile's first where None.
-        on_ready: Called with ``host:port`` or the pty's device file once it answers.
+        reader: Profile of the device that has that input, where it is another one.
+        reader_line: ``same`` line or port, or its ``own``; own where None and it is a Modbus TCP
+            device.
+        reader_unit_id: The reader's unit id; its profile's where None, or the next one.
+        reader_port: The reader's TCP port, where it has one of its own; 0 takes a free one.
+        on_ready: Called with a profile and its ``host:port`` or device file once it answers.
 
     Raises:
         InputError: The emulator is not installed, or can't serve this.
@@ -60,5 +73,17 @@ def emulate(
     except (ImportError, AttributeError) as error:
         raise InputError(f"the emulator can't be loaded: {error}") from error
     serve(
-        profile, link, port, log, faults, output=output, sensor=sensor, host=host, on_ready=on_ready
+        profile,
+        link,
+        port,
+        log,
+        faults,
+        output=output,
+        sensor=sensor,
+        reader=reader,
+        reader_line=reader_line,
+        reader_unit_id=reader_unit_id,
+        reader_port=reader_port,
+        host=host,
+        on_ready=on_ready,
     )

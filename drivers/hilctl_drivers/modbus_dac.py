@@ -2,32 +2,20 @@
 
 The profile says what the registers mean, the experiment what they are wired to. A tick is one
 transaction where the device can write and read in one (function 23, or 76 on LabJack's), else a
-write and a read. Nothing is sent twice, and nothing before the last reply has come.
+write and a read; the read may go to another device. Nothing is sent twice, and nothing before the
+last reply has come.
 """
 
-from collections.abc import Callable
-from typing import ClassVar, TypeAlias
+from typing import ClassVar
 
 from hilctl.arrays import F64
 from hilctl.errors import DeviceError
 from hilctl.ports import DeviceInfo, DeviceOptions
-from hilctl_drivers.links import NoAnswerError
-from hilctl_drivers.modbus_frames import (
-    feedback_pdu,
-    read_pdu,
-    write_pdu,
-    write_read_pdu,
-    write_single_pdu,
-)
-from hilctl_drivers.modbus_session import ModbusSession, format_of
-from hilctl_drivers.modbus_setup import ModbusOptions, ModbusSetup
-from hilctl_drivers.profile_modbus import ModbusWatchdog
-from hilctl_drivers.wire_errors import Refused
-
-Swap: TypeAlias = Callable[[bytes], bytes]
-"""Write these register bytes to the output, return those of the input."""
-
-_FEEDS_A_TIMEOUT = 3.0
+from hilctl_drivers.modbus_guard import ModbusGuard
+from hilctl_drivers.modbus_options import ModbusOptions
+from hilctl_drivers.modbus_pair import ModbusPair, Swap
+from hilctl_drivers.modbus_session import format_of
+from hilctl_drivers.modbus_setup import ModbusSetup
 
 
 class ModbusDac:
@@ -51,10 +39,9 @@ class ModbusDac:
         self._info = setup.info()
         self._low, self._high = self._info.command_min, self._info.command_max
         self._action = f"write {options.output}, read {options.input}"
-        self._session: ModbusSession | None = None
+        self._guard = ModbusGuard(setup)
+        self._pair: ModbusPair | None = None
         self._swap: Swap | None = None
-        self._feed_every = 0
-        self._ticks = 0
         self.one_transaction = False
         """Whether a tick is one transaction; known once it is open."""
 
@@ -77,21 +64,18 @@ class ModbusDac:
             raise self._error("open", f"block must be 1, got {block}")
         self._check_rate(sample_rate_hz, self._info.max_rate_hz)
         self.close()
-        session = self._setup.session()
+        pair = ModbusPair(self._setup)
         try:
-            session.link.open()
-            session.check_selftest()
-            self._clear_trip(session)
-            session.run(self._setup.profile.init)
-            self._swap = self._find_swap(session)
+            pair.open()
+            self._guard.clear_trip(pair.writer)
+            pair.set_up()
+            swap, self.one_transaction = pair.find_swap()
             self._check_rate(sample_rate_hz, self._setup.rate(self.one_transaction)[0])
-            self._arm(session, sample_rate_hz)
+            self._guard.arm(pair.writer, sample_rate_hz)
         except DeviceError as error:
-            session.link.close()
-            self._swap = None
+            pair.release()
             raise self._error("open", str(error)) from None
-        self._session = session
-        self._ticks = 0
+        self._pair, self._swap = pair, swap
 
     def exchange(
         self, first_sample: int, command: F64, displacement_um: F64, measured: F64
@@ -119,8 +103,8 @@ class ModbusDac:
         try:
             data = swap(self._encode((value - offset) / gain))
             displacement_um[0] = self._decode(data) * um_per_unit + offset_um
-            if self._feed_every:
-                self._feed()
+            if self._guard.feed_every and self._pair is not None:
+                self._guard.feed(self._pair.writer)
         except DeviceError as error:
             self._abandon()
             raise self._error(self._action, str(error)) from None
@@ -137,16 +121,15 @@ class ModbusDac:
         if not self._low <= command <= self._high:
             raise self._out_of_range(command)
         self._abandon()
-        session = self._setup.session()
+        pair = ModbusPair(self._setup)
         try:
-            session.link.open()
-            self._clear_trip(session)
-            data = self._encode(self._setup.chain.output(command))
-            session.call(session.prepare(self._write_pdu(data)))
+            pair.writer.link.open()
+            self._guard.clear_trip(pair.writer)
+            pair.put_out(self._encode(self._setup.chain.output(command)))
         except DeviceError as error:
             raise self._error(f"make safe, {self._setup.options.output}", str(error)) from None
         finally:
-            session.link.close()
+            pair.release()
 
     def close(self) -> None:
         """Disarm the watchdog, carry out the profile's close steps, and disconnect.
@@ -156,21 +139,21 @@ class ModbusDac:
         Raises:
             DeviceError: A step failed; the link is closed all the same.
         """
-        session, self._session, self._swap = self._session, None, None
-        if session is None:
+        pair, self._pair, self._swap = self._pair, None, None
+        if pair is None:
             return
         try:
-            self._run_watchdog(session, "disarm")
-            session.run(self._setup.profile.close)
+            self._guard.disarm(pair.writer)
+            pair.tear_down()
         except DeviceError as error:
             raise self._error("close", str(error)) from None
         finally:
-            session.link.close()
+            pair.release()
 
     def _abandon(self) -> None:
-        session, self._session, self._swap = self._session, None, None
-        if session is not None:
-            session.link.close()
+        pair, self._pair, self._swap = self._pair, None, None
+        if pair is not None:
+            pair.release()
 
     def _error(self, action: str, what: str) -> DeviceError:
         return DeviceError(f"{self._setup.title}: {what} (to {action})")
@@ -187,87 +170,3 @@ class ModbusDac:
             note = self._setup.rate(self.one_transaction)[1]
             rule = f"sample rate must be in (0, {highest_hz:.6g}] Hz with {how} a sample ({note})"
             raise self._error("open", f"{rule}, got {sample_rate_hz:g}")
-
-    def _write_pdu(self, data: bytes) -> bytes:
-        output, address = self._setup.output, self._setup.address(self._setup.output)
-        return (write_single_pdu if output.function == 6 else write_pdu)(address, data)
-
-    def _find_swap(self, session: ModbusSession) -> Swap:
-        """Return one transaction where the device has it, else a write and a read."""
-        setup = self._setup
-        self.one_transaction = False
-        nothing = bytes(2 * setup.output.words)
-        source = setup.input
-        write = session.prepare(self._write_pdu(nothing))
-        read = session.prepare(read_pdu(source.read_function, setup.address(source), source.words))
-
-        def pair(data: bytes) -> bytes:
-            session.call(write, data)
-            return session.call(read)
-
-        combined = self._combined(session, nothing)
-        readback = setup.output.readback_register
-        if combined is None or readback is None:
-            return pair
-        try:
-            combined(session.read_bytes(readback))
-        except Refused:
-            return pair
-        except NoAnswerError:  # some devices are silent about functions they don't know
-            session.link.open()
-            return pair
-        self.one_transaction = True
-        return combined
-
-    def _combined(self, session: ModbusSession, data: bytes) -> Swap | None:
-        setup = self._setup
-        kind = setup.profile.exchange
-        if kind == "none":
-            return None
-        source, target = setup.address(setup.input), setup.address(setup.output)
-        words = setup.input.words
-        if kind == 23:
-            pdu = write_read_pdu(source, words, target, data)
-        else:
-            pdu = feedback_pdu(target, data, source, words)
-        transaction = session.prepare(pdu)
-        transact, usual = session.link.transact, transaction.reply_size
-        request, missing, reply = transaction.request, transaction.missing, transaction.reply
-        return lambda data: reply(transact(request(data), missing, usual))
-
-    def _clear_trip(self, session: ModbusSession) -> None:
-        """Clear a trip of an earlier run; the output stays where the watchdog has put it."""
-        watchdog = self._setup.profile.watchdog
-        if watchdog == "none" or not watchdog.clear:
-            return
-        if watchdog.tripped == "none" or session.is_set(watchdog.tripped):
-            session.run(self._setup.bound(watchdog.clear) or watchdog.clear)
-
-    def _arm(self, session: ModbusSession, sample_rate_hz: float) -> None:
-        wanted, watchdog = self._setup.options.watchdog, self._setup.profile.watchdog
-        self._feed_every = 0
-        if wanted == "none" or watchdog == "none":
-            return
-        ticks = wanted.timeout_s * sample_rate_hz / _FEEDS_A_TIMEOUT
-        if ticks < 1.0:
-            rule = f"{_FEEDS_A_TIMEOUT:g} samples must come within the watchdog's timeout"
-            raise DeviceError(f"{rule}, {wanted.timeout_s:g} s, got {sample_rate_hz:g} Hz")
-        safe = watchdog.safe.get(self._setup.options.output, ())
-        steps = self._setup.bound((*safe, *watchdog.arm))
-        if session.would_change(steps):
-            self._run_watchdog(session, "unlock")
-        session.run(steps)
-        if watchdog.kick == "strict":
-            self._feed_every = int(ticks)
-
-    def _run_watchdog(self, session: ModbusSession, name: str) -> None:
-        """Run the watchdog's steps of that name, if the experiment uses it."""
-        watchdog = self._setup.profile.watchdog
-        if self._setup.options.watchdog != "none" and isinstance(watchdog, ModbusWatchdog):
-            session.run(self._setup.bound(getattr(watchdog, name)))
-
-    def _feed(self) -> None:
-        """Feed a watchdog that exchanges don't feed; three times in its timeout."""
-        self._ticks += 1
-        if self._ticks % self._feed_every == 0 and self._session is not None:
-            self._run_watchdog(self._session, "feed")

@@ -2,20 +2,21 @@
 
 import time
 from collections.abc import Callable, Sequence
+from typing import Literal
 
 from hilctl.errors import DeviceError
 from hilctl_drivers.links import Link
 from hilctl_drivers.modbus_frames import coil_pdu, read_pdu, write_pdu, write_single_pdu
 from hilctl_drivers.modbus_transactions import RtuTransaction, TcpTransaction, Transaction
-from hilctl_drivers.profile_modbus import (
+from hilctl_drivers.profile_modbus import ModbusProfile
+from hilctl_drivers.profile_parts import Register, WaitStep
+from hilctl_drivers.profile_steps import (
     EnsureStep,
     ExpectStep,
     Flag,
-    ModbusProfile,
     ModbusStep,
     RegisterStep,
 )
-from hilctl_drivers.profile_parts import Register, WaitStep
 from hilctl_drivers.registers import RegisterFormat
 
 
@@ -34,6 +35,8 @@ class ModbusSession:
         link: Not yet open.
         unit: Its unit id.
         sleep: Waits that many s.
+        framing: Of the link, where it is not the profile's: a gateway takes Modbus TCP to devices
+            on a serial line.
     """
 
     def __init__(
@@ -42,8 +45,11 @@ class ModbusSession:
         link: Link,
         unit: int,
         sleep: Callable[[float], None] = time.sleep,
+        *,
+        framing: Literal["tcp", "rtu"] | None = None,
     ) -> None:
         self._profile = profile
+        self._framing = framing or profile.link.kind
         self._link = link
         self._unit = unit
         self._sleep = sleep
@@ -53,9 +59,14 @@ class ModbusSession:
         """The link."""
         return self._link
 
+    @property
+    def profile(self) -> ModbusProfile:
+        """What the device is."""
+        return self._profile
+
     def prepare(self, pdu: bytes) -> Transaction:
         """Return a request that can be sent many times."""
-        if self._profile.link.kind == "tcp":
+        if self._framing == "tcp":
             return TcpTransaction(self._unit, pdu)
         return RtuTransaction(self._unit, pdu)
 

@@ -1,7 +1,7 @@
 """Profiles of devices that speak Modbus, TCP or RTU."""
 
 from collections.abc import Iterator
-from typing import Annotated, Literal, Self, TypeAlias
+from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -12,9 +12,11 @@ from hilctl_drivers.profile_parts import (
     BaseProfile,
     Name,
     Register,
-    WaitStep,
     Watchdog,
+    check_channels,
 )
+from hilctl_drivers.profile_steps import Flag, ModbusStep, RegisterStep
+from hilctl_drivers.profile_stream import LabJackStreaming
 
 
 class ModbusOutput(Channel):
@@ -58,65 +60,6 @@ class ModbusInput(Channel):
     def _readable(self) -> Self:
         if self.area not in {"holding", "input"}:
             raise ValueError(f"area of an input must be holding or input, got {self.area}")
-        return self
-
-
-StepValue: TypeAlias = float | Literal["timeout", "safe"]
-
-
-class RegisterStep(Register):
-    """A step on one register.
-
-    ``timeout`` and ``safe`` stand for what the experiment says of the watchdog.
-    """
-
-    value: StepValue = Field(description="a number, or timeout or safe in watchdog steps")
-    note: str = ""
-
-    @model_validator(mode="after")
-    def _value_fits(self) -> Self:
-        low, high = self.representable
-        if isinstance(self.value, float) and not low <= self.value <= high:
-            raise ValueError(f"value must fit into {self.type}, got {self.value:g}")
-        return self
-
-
-class WriteStep(RegisterStep):
-    """Write a register, and read it again where ``verify`` is set."""
-
-    kind: Literal["write"]
-    verify: bool = False
-
-
-class EnsureStep(RegisterStep):
-    """Read a register; write it only where it differs, then read it again.
-
-    For settings in flash that must not be rewritten at each run.
-    """
-
-    kind: Literal["ensure"]
-
-
-class ExpectStep(RegisterStep):
-    """Read a register and refuse to go on where it differs; writes nothing."""
-
-    kind: Literal["expect"]
-
-
-ModbusStep: TypeAlias = Annotated[
-    WriteStep | EnsureStep | ExpectStep | WaitStep, Field(discriminator="kind")
-]
-
-
-class Flag(Register):
-    """A register that says yes where any bit of ``mask`` is set."""
-
-    mask: int = Field(ge=1, le=0xFFFFFFFF, description="bits of the raw value that say yes")
-
-    @model_validator(mode="after")
-    def _fits(self) -> Self:
-        if self.type.startswith("float") or self.mask > self.representable[1]:
-            raise ValueError(f"mask must fit into {self.type}, got {self.mask:#x}")
         return self
 
 
@@ -193,12 +136,24 @@ class ModbusProfile(BaseProfile):
     exchange: Literal[23, 76, "none"] = Field(
         description="function that writes the output and reads the input in one transaction"
     )
-    outputs: dict[Name, ModbusOutput] = Field(min_length=1)
+    outputs: dict[Name, ModbusOutput]
     inputs: dict[Name, ModbusInput]
     init: tuple[ModbusStep, ...] = Field(default=(), description="steps after connecting")
     close: tuple[ModbusStep, ...] = Field(default=(), description="steps before disconnecting")
     watchdog: ModbusWatchdog | Literal["none"]
     selftest: ModbusSelftest | Literal["none"] = "none"
+    streaming: LabJackStreaming | Literal["none"] = "none"
+
+    @model_validator(mode="after")
+    def _channels(self) -> Self:
+        check_channels(self.outputs, self.inputs)
+        if self.exchange != "none" and not (self.outputs and self.inputs):
+            raise ValueError("exchange must be none where there are no outputs or no inputs")
+        if self.watchdog != "none" and not self.outputs:
+            raise ValueError("watchdog must be none where there are no outputs to make safe")
+        if self.streaming != "none":
+            self.streaming.check_names(self.outputs, self.inputs)
+        return self
 
     @model_validator(mode="after")
     def _addresses(self) -> Self:

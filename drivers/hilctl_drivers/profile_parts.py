@@ -1,6 +1,7 @@
 """The parts of a device profile that all links share: registers, ranges, watchdog, provenance."""
 
 import math
+from collections.abc import Mapping
 from typing import Annotated, Literal, Self, TypeAlias
 
 from pydantic import BeforeValidator, Field, StringConstraints, model_validator
@@ -149,6 +150,16 @@ class Watchdog(Part):
                 f"watchdog timeout_s must be a multiple of {self.unit_s:g}, got {timeout_s:g}"
             )
         return counts
+
+
+def check_channels(outputs: Mapping[str, Range], inputs: Mapping[str, Range]) -> None:
+    """Refuse a profile of nothing; a device with inputs only can be another one's reader.
+
+    Raises:
+        ValueError: There are neither outputs nor inputs.
+    """
+    if not outputs and not inputs:
+        raise ValueError("must have outputs or inputs, or both")
 
 
 class WaitStep(Part):

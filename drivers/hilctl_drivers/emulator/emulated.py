@@ -1,23 +1,17 @@
 """An emulated Modbus device: a profile's registers in front of the simulated rig."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 from hilctl.errors import InputError
-from hilctl_drivers.emulator.memory import Memory, NoSuchRegister, Words
+from hilctl_drivers.emulator.memory import NoSuchRegister, Words
+from hilctl_drivers.emulator.overlay import Overlay
+from hilctl_drivers.emulator.register_map import RegisterMap
 from hilctl_drivers.emulator.rig import Rig
 from hilctl_drivers.emulator.watchdog import HostWatchdog
+from hilctl_drivers.emulator.wiring import Wiring
 from hilctl_drivers.emulator.write_log import WriteLog
-from hilctl_drivers.profile_modbus import (
-    ExpectStep,
-    ModbusInput,
-    ModbusOutput,
-    ModbusProfile,
-    ModbusStep,
-    RegisterStep,
-)
-from hilctl_drivers.profile_parts import Range, Register
-from hilctl_drivers.terfenol import TerfenolParameters
+from hilctl_drivers.profile_modbus import ModbusProfile
+from hilctl_drivers.profile_steps import ModbusStep, RegisterStep
 
 
 class Declined(Exception):  # noqa: N818  a reply, not a mistake
@@ -32,52 +26,31 @@ class Declined(Exception):  # noqa: N818  a reply, not a mistake
         self.code = code
 
 
-@dataclass(frozen=True, slots=True)
-class Wiring:
-    """What stands between the device's terminals and the rig.
-
-    Attributes:
-        gain_a: Amplifier, A for one unit of the output.
-        offset_a: Current at 0 of the output.
-        sensor_um: Sensor, um for one unit of the input.
-        offset_um: Displacement at 0 of the input.
-    """
-
-    gain_a: float
-    offset_a: float
-    sensor_um: float
-    offset_um: float
-
-    @classmethod
-    def spread(cls, output: Range, sensor: Range) -> "Wiring":
-        """Return a wiring that spreads the rig's ranges over those of the two channels.
-
-        An output in A drives the coil itself.
-        """
-        rig = TerfenolParameters()
-        gain_a, offset_a = _spread(output, rig.dac_range_a)
-        if output.unit == "A":
-            gain_a, offset_a = 1.0, 0.0
-        return cls(gain_a, offset_a, *_spread(sensor, rig.sensor_range_um))
-
-
-def _spread(channel: Range, reach: float) -> tuple[float, float]:
-    gain = 2.0 * reach / (channel.max - channel.min)
-    return gain, -0.5 * gain * (channel.max + channel.min)
+def _check_channels(profile: ModbusProfile, output: str | None, sensor: str | None) -> None:
+    outputs, inputs = profile.outputs, profile.inputs
+    if output in {None, *outputs} and sensor in {None, *inputs}:
+        return
+    names = f"outputs {', '.join(outputs) or 'none'}; inputs {', '.join(inputs) or 'none'}"
+    wanted = " and ".join(name for name in (output, sensor) if name is not None)
+    raise InputError(f"{profile.title} has no {wanted}: {names}")
 
 
 class EmulatedDevice:
     """The device: what its registers hold, and what writing them does.
 
     It starts with the output where the rig is at 0 A, as if its power-on value had been set so.
+    Two devices can stand at one rig: one drives it, the other shows its displacement.
 
     Args:
         profile: What it is.
-        rig: What it drives.
+        rig: What it stands at.
         log: Where writes go.
-        output: Output that drives the rig.
-        sensor: Input that shows the displacement.
+        output: Output that drives the rig; None where another device does.
+        sensor: Input that shows the displacement; None where another device does.
         wiring: Amplifier and sensor between; spread over the channels' ranges where None.
+
+    Raises:
+        InputError: It has no such output or input.
     """
 
     def __init__(
@@ -85,27 +58,31 @@ class EmulatedDevice:
         profile: ModbusProfile,
         rig: Rig,
         log: WriteLog,
-        output: str,
-        sensor: str,
+        output: str | None,
+        sensor: str | None,
         wiring: Wiring | None = None,
     ) -> None:
         self.profile = profile
         self._rig = rig
         self._log = log
         self._output, self._sensor = output, sensor
-        self.memory = Memory()
-        self._steps: dict[int, Words] = {}
-        self._outputs = {name: self._place_output(each) for name, each in profile.outputs.items()}
-        self._inputs = {name: self._place_input(each) for name, each in profile.inputs.items()}
-        if output not in self._outputs or sensor not in self._inputs:
-            names = (
-                f"outputs {', '.join(self._outputs)}; inputs {', '.join(self._inputs) or 'none'}"
-            )
-            raise InputError(f"{profile.title} has no {output} and {sensor}: {names}")
-        self.wiring = wiring or Wiring.spread(profile.outputs[output], profile.inputs[sensor])
-        self._watchdog = self._place_rest()
+        _check_channels(profile, output, sensor)
+        registers = RegisterMap(profile)
+        self.memory = registers.memory
+        self._steps = registers.steps
+        self._outputs, self._inputs = registers.outputs, registers.inputs
+        if wiring is None:
+            assert output is not None, "a device that only reads is told of its wiring"
+            assert sensor is not None, "a device that only drives is told of its wiring"
+            wiring = Wiring.spread(profile.outputs[output], profile.inputs[sensor])
+        self.wiring = wiring
+        watchdog = profile.watchdog
+        self._watchdog = None if watchdog == "none" else HostWatchdog(watchdog, self._steps)
         self._now_ns = 0
-        self._outputs[output].value = -self.wiring.offset_a / self.wiring.gain_a
+        self.overlay: Overlay | None = None
+        """Registers that do more than hold a value, before all others."""
+        if output is not None:
+            self._outputs[output].value = -self.wiring.offset_a / self.wiring.gain_a
 
     def tick(self, now_ns: int) -> None:
         """Let time pass; the watchdog may trip on the way."""
@@ -114,6 +91,8 @@ class EmulatedDevice:
             self._watchdog.tripped = True
             self._trip(due_ns)
         self._now_ns = max(self._now_ns, now_ns)
+        if self.overlay is not None:
+            self.overlay.tick(self._now_ns)
         self._rig.advance(self._now_ns)
 
     def request(self, now_ns: int) -> None:
@@ -128,6 +107,8 @@ class EmulatedDevice:
         Raises:
             Declined: Not all of them exist.
         """
+        if self.overlay is not None and self.overlay.has(address):
+            return self.overlay.read(address, count)
         self._measure()
         try:
             return self.memory.read(areas, address, count)
@@ -141,6 +122,9 @@ class EmulatedDevice:
             Declined: Not all of them can be written, a value is beyond its channel's range, or the
                 watchdog has tripped and the device wants that cleared first.
         """
+        if self.overlay is not None and self.overlay.has(address):
+            self.overlay.write(address, values)
+            return
         try:
             targets = self.memory.targets(area, address, values)
         except NoSuchRegister:
@@ -194,6 +178,8 @@ class EmulatedDevice:
     def _trip(self, due_ns: int) -> None:
         watchdog = self.profile.watchdog
         assert watchdog != "none"
+        if self.overlay is not None:
+            self.overlay.stop(due_ns)
         for name, words in self._outputs.items():
             channel = self.profile.outputs[name]
             value: float | None = min(max(0.0, channel.min), channel.max)
@@ -222,63 +208,11 @@ class EmulatedDevice:
         return found
 
     def _measure(self) -> None:
-        channel = self.profile.inputs[self._sensor]
-        at_terminal = (self._rig.displacement_um - self.wiring.offset_um) / self.wiring.sensor_um
-        low, high = channel.limits
-        self._inputs[self._sensor].value = min(max(at_terminal, low), high)  # as an ADC does
+        if self._sensor is not None:
+            offset_um, sensor_um = self.wiring.offset_um, self.wiring.sensor_um
+            at_terminal = (self._rig.displacement_um - offset_um) / sensor_um
+            low, high = self.profile.inputs[self._sensor].limits
+            self._inputs[self._sensor].value = min(max(at_terminal, low), high)  # as an ADC does
         watchdog = self.profile.watchdog
         if watchdog != "none" and watchdog.tripped != "none":
             self._steps[id(watchdog.tripped)].words[-1] = watchdog.tripped.mask * self.tripped
-
-    def _areas(self, register: Register) -> tuple[str, ...]:
-        """Return the areas in which a register is seen.
-
-        LabJack makes no difference between functions 3 and 4, and function 23 reads inputs too.
-        """
-        if register.area in {"coil", "discrete"} or self.profile.exchange == "none":
-            return (register.area,)
-        return ("holding", "input")
-
-    def _place(self, register: Register, *, read: bool, write: bool) -> Words:
-        words = Words(register)
-        address = self.profile.wire_address(register)
-        first = self.memory.place(words, register.area, address, read=read, write=write)
-        for area in self._areas(register):
-            self.memory.place(first, area, address, read=read, write=False)
-        return first
-
-    def _place_output(self, output: ModbusOutput) -> Words:
-        words = self._place(output, read=output.readback == "same", write=True)
-        readback = output.readback_register
-        if readback is not None and readback is not output:
-            address = self.profile.wire_address(readback)
-            for area in {readback.area, *self._areas(readback)}:
-                self.memory.place(words, area, address, write=False)
-        return words
-
-    def _place_input(self, channel: ModbusInput) -> Words:
-        return self._place(channel, read=True, write=False)
-
-    def _place_rest(self) -> HostWatchdog | None:
-        """Place what the profile's steps touch; return the watchdog."""
-        profile = self.profile
-        self._place_steps((*profile.init, *profile.close))
-        if profile.selftest != "none":
-            self._place(profile.selftest, read=True, write=False).value = profile.selftest.expect
-        if profile.watchdog == "none":
-            return None
-        watchdog = profile.watchdog
-        for steps in watchdog.steps().values():
-            self._place_steps(steps)
-        if watchdog.tripped != "none":
-            flag = watchdog.tripped
-            self._steps[id(flag)] = self._place(flag, read=True, write=False)
-        return HostWatchdog(watchdog, self._steps)
-
-    def _place_steps(self, steps: tuple[ModbusStep, ...]) -> None:
-        for step in steps:
-            if isinstance(step, RegisterStep):
-                words = self._place(step, read=True, write=not isinstance(step, ExpectStep))
-                self._steps[id(step)] = words
-                if isinstance(step, ExpectStep) and isinstance(step.value, float):
-                    words.words[:] = Words(step).encoded(step.value)

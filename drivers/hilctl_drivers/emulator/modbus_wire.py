@@ -7,7 +7,7 @@ milliseconds in each transaction.
 """
 
 import struct
-from collections.abc import Coroutine, Sequence
+from collections.abc import Coroutine, Mapping, Sequence
 from typing import Any, Literal, TypeAlias
 
 from pymodbus.constants import ExcCodes
@@ -73,7 +73,7 @@ class FeedbackPdu(ModbusPDU):
 
 
 class _Context:
-    """What pymodbus's messages act on: the device's registers."""
+    """What pymodbus's messages act on: a device's registers."""
 
     def __init__(self, device: EmulatedDevice) -> None:
         self._device = device
@@ -114,23 +114,38 @@ def _finish(call: Coroutine[Any, Any, ModbusPDU]) -> ModbusPDU:
 class ModbusWire:
     """Requests out of bytes, and replies back into bytes.
 
+    Alone on a connection a device answers to any unit id, as such devices do; on a line, or behind
+    a gateway with others, only to its own.
+
     Args:
         kind: ``tcp`` or ``rtu``.
-        device: What carries requests out.
-        lacking: Functions that the device is to refuse as unknown, with exception 1.
+        devices: What carries requests out: one, or several by unit id.
+        lacking: Functions that the devices are to refuse as unknown, with exception 1.
     """
 
     def __init__(
-        self, kind: LinkKind, device: EmulatedDevice, lacking: frozenset[int] = frozenset()
+        self,
+        kind: LinkKind,
+        devices: EmulatedDevice | Mapping[int, EmulatedDevice],
+        lacking: frozenset[int] = frozenset(),
     ) -> None:
         self._kind = kind
-        self._device = device
-        self._context: Any = _Context(device)  # all that the messages ask for
+        if isinstance(devices, EmulatedDevice):
+            devices = {devices.profile.unit_id: devices}
+        self._devices = dict(devices)
+        self._any_unit = kind == "tcp" and len(devices) == 1
         self._decoder = DecodePDU(is_server=True)
         self._decoder.register(FeedbackPdu)
         self._framer = (FramerSocket if kind == "tcp" else FramerRTU)(self._decoder)
-        exchange = device.profile.exchange
-        self._lacking = lacking | ({23, 76} - {exchange})
+        self._lacking = lacking
+
+    def tick(self, now_ns: int) -> None:
+        """Let time pass for all devices."""
+        for device in self._devices.values():
+            device.tick(now_ns)
+
+    def _device(self, unit: int) -> EmulatedDevice | None:
+        return next(iter(self._devices.values())) if self._any_unit else self._devices.get(unit)
 
     def take(self, received: bytes) -> tuple[int, bytes]:
         """Find one request.
@@ -143,22 +158,26 @@ class ModbusWire:
             not complete or was not for us.
         """
         used, unit, transaction, pdu = self._framer.decode(received)
-        if not pdu or (self._kind == "rtu" and unit != self._device.profile.unit_id):
+        if not pdu or (self._kind == "rtu" and unit not in self._devices):
             return used, b""
         return used, struct.pack(">HB", transaction, unit) + pdu
 
     def answer(self, request: bytes, now_ns: int) -> bytes:
         """Carry out a request of :meth:`take` and return the reply's bytes."""
-        self._device.request(now_ns)
-        function = request[3]
-        if function in self._lacking:
+        unit, function = request[2], request[3]
+        device = self._device(unit)
+        if device is None:
+            return self.refusal(request, ExcCodes.GATEWAY_NO_RESPONSE)
+        device.request(now_ns)
+        if function in self._lacking | ({23, 76} - {device.profile.exchange}):
             return self.refusal(request, 1)
         try:
             message = self._decoder.decode(request[3:])
             if message is None:
                 known = function in self._decoder.pdu_table
                 return self.refusal(request, 3 if known else 1)
-            reply = _finish(message.datastore_update(self._context, request[2]))
+            context: Any = _Context(device)  # all that the messages ask for
+            reply = _finish(message.datastore_update(context, unit))
         except (ModbusException, struct.error, KeyError):
             return self.refusal(request, 3)
         return self._framed(reply, request)

@@ -1,6 +1,8 @@
 """The emulated Modbus device: rig, registers, watchdog, wire and faults, with time injected."""
 
 import json
+import re
+import signal
 import socket
 import threading
 from collections.abc import Callable, Iterator
@@ -12,9 +14,11 @@ from pymodbus.client import ModbusTcpClient
 from hilctl.errors import InputError
 from hilctl_drivers.emulator.emulated import Declined, EmulatedDevice
 from hilctl_drivers.emulator.faults import KINDS, Fault, FaultPlan, parse_fault, spoil
-from hilctl_drivers.emulator.main import EmulatorOptions, build, serve
+from hilctl_drivers.emulator.main import serve
+from hilctl_drivers.emulator.modbus_bench import EmulatorOptions, build
 from hilctl_drivers.emulator.modbus_wire import ModbusWire
 from hilctl_drivers.emulator.rig import RATE_HZ, Rig
+from hilctl_drivers.emulator.wiring import Wiring
 from hilctl_drivers.emulator.write_log import WriteLog
 from hilctl_drivers.modbus_frames import (
     feedback_pdu,
@@ -170,6 +174,38 @@ class TestWire:
         assert wire.take(rtu_adu(2, pdu))[1] == b""
         assert wire.take(good[:-1] + bytes([good[-1] ^ 1]))[1] == b""
 
+    def test_units_share_a_line_and_a_rig(self):
+        """One unit drives, the other shows; neither has the other's registers."""
+        rig, log, wiring = Rig(0), WriteLog(None, 0), Wiring(1.0, 0.0, 12.5, 0.0)
+        drives = EmulatedDevice(load_profile("adam_4024"), rig, log, "AO0", None, wiring)
+        reads = EmulatedDevice(load_profile("adam_4117"), rig, log, None, "AI2", wiring)
+        wire = ModbusWire("rtu", {1: drives, 2: reads})
+
+        def transact(unit: int, pdu: bytes, now_ns: int) -> bytes:
+            _, request = wire.take(rtu_adu(unit, pdu))
+            return reply_data(pdu, rtu_pdu(wire.answer(request, now_ns), unit))
+
+        transact(1, write_single_pdu(0, (4095).to_bytes(2, "big")), 0)
+        raw = int.from_bytes(transact(2, read_pdu(3, 2, 1), 10 * MS), "big")
+        assert 12.5 * (raw * 20.0 / 65535.0 - 10.0) == pytest.approx(rig.displacement_um, abs=0.01)
+        assert rig.displacement_um > 40.0
+        with pytest.raises(Refused):
+            transact(2, write_single_pdu(0, bytes(2)), 10 * MS)
+        assert wire.take(rtu_adu(3, read_pdu(3, 0, 1)))[1] == b""
+
+    def test_gateway_says_that_a_unit_is_not_there(self):
+        """Over TCP a unit that nobody has is exception 11; one device alone takes any unit."""
+        device = emulated("labjack_t7", "DAC0", "AIN0")
+        pdu = read_pdu(3, 1000, 2)
+        wire = ModbusWire("tcp", {1: device, 2: emulated("labjack_t7", "DAC0", "AIN0")})
+        _, request = wire.take(tcp_adu(7, 3, pdu))
+        with pytest.raises(Refused) as refusal:
+            reply_data(pdu, tcp_pdu(wire.answer(request, 0), 7, 3))
+        assert refusal.value.code == 11
+        alone = ModbusWire("tcp", device)
+        _, request = alone.take(tcp_adu(7, 3, pdu))
+        assert len(reply_data(pdu, tcp_pdu(alone.answer(request, 0), 7, 3))) == 4
+
     def test_unknown_channels_are_refused(self):
         """The message says which there are."""
         with pytest.raises(InputError, match="DAC9 and AIN0: outputs DAC0, DAC1"):
@@ -279,14 +315,67 @@ class TestServer:
         with pytest.raises(InputError, match=f"can't listen on {address}"):
             served("labjack_t7", port=int(address.split(":")[1]))
 
-    def test_what_can_not_be_emulated_is_refused(self, served):
-        """Profiles without an input, faults that the link hasn't got, and unknown links."""
-        with pytest.raises(InputError, match="has no input"):
-            served("waveshare_ao_8ch")
-        with pytest.raises(InputError, match="reset is for tcp"):
-            served("wago_750", link="rtu", faults=(parse_fault("reset@1"),))
-        with pytest.raises(InputError, match="link must be one of tcp, rtu"):
-            serve("wago_750", link="pigeon")
+    @pytest.mark.parametrize(
+        ("profile", "options", "words"),
+        [
+            ("waveshare_ao_8ch", {}, "has no input to show a displacement at: name a reader"),
+            ("waveshare_ai_8ch", {}, "has no output to drive .*: it can be another one's reader"),
+            ("adam_4024", {"reader": "kepco_bop"}, "kepco_bop: only Modbus profiles"),
+            ("adam_4024", {"reader": "adam_4117", "sensor": "AI9"}, "4117 .* has no AI9: AI0, AI1"),
+            ("adam_4024", {"reader": "adam_4117", "output": "AI0"}, "4024 .* has no AI0: AO0, AO1"),
+            ("adam_4024", {"reader": "adam_4117", "reader_unit_id": 1}, "reader_unit_id must not"),
+            ("wago_750", {"link": "rtu", "faults": (Fault("reset", at_count=1),)}, "is for tcp"),
+        ],
+    )
+    def test_what_can_not_be_emulated_is_refused(self, served, profile, options, words):
+        """Half a bench, channels that are not there, one unit id twice, faults of another link."""
+        with pytest.raises(InputError, match=words):
+            served(profile, **options)
+
+    @pytest.mark.parametrize(
+        ("options", "words"),
+        [
+            ({"link": "pigeon"}, "link must be one of tcp, rtu, got 'pigeon'"),
+            ({"reader_line": "other"}, "reader_line must be one of same, own, got 'other'"),
+        ],
+    )
+    def test_words_that_mean_nothing_are_refused(self, options, words):
+        """The message lists those that do."""
+        with pytest.raises(InputError, match=words):
+            serve("wago_750", **options)
+
+    @pytest.mark.parametrize(
+        ("profile", "reader", "options", "places"),
+        [
+            ("adam_4024", "adam_4117", {}, r"(/dev/pts/\d+), unit 1 \1, unit 2"),
+            ("adam_4024", "adam_4117", {"reader_unit_id": 7}, r"(/dev/\S+), unit 1 \1, unit 7"),
+            ("adam_6224", "adam_6217", {}, r"127.0.0.1:(\d+), unit 1 127.0.0.1:(?!\1)\d+, unit 1"),
+            ("kepco_bop", "agilent_34970a", {}, r"(/dev/pts/\d+) (?!\1)/dev/pts/\d+"),
+        ],
+    )
+    def test_it_says_where_both_answer(self, profile, reader, options, places):
+        """Each with its place, and its unit id where there is one; a signal ends it."""
+        told: list[tuple[str, str]] = []
+
+        def on_ready(name: str, address: str) -> None:
+            told.append((name, address))
+            if len(told) == 2:
+                signal.raise_signal(signal.SIGTERM)
+
+        serve(profile, reader=reader, on_ready=on_ready, **options)
+        assert [name for name, _ in told] == [profile, reader]
+        assert re.fullmatch(places, " ".join(address for _, address in told))
+
+    def test_a_line_of_text_has_no_modbus_reader(self):
+        """Units and ports of a reader are for Modbus; a text device's has a line of its own."""
+        with pytest.raises(InputError, match="are for Modbus profiles, kepco_bop has a line"):
+            serve("kepco_bop", reader="agilent_34970a", reader_unit_id=2)
+
+    def test_second_port_in_use_leaves_nothing_open(self, served):
+        """What was opened before the refusal is let go of."""
+        port = int(served("labjack_t7").split(":")[1])
+        with pytest.raises(InputError, match=f"can't listen on 127.0.0.1:{port}"):
+            served("adam_6224", reader="adam_6217", reader_port=port)
 
     def test_log_tells_time_and_value(self, served, tmp_path):
         """Each write is one JSON object with both clocks, on disk at once."""

@@ -12,9 +12,9 @@ from pydantic import ValidationError
 
 from hilctl.errors import DeviceError, InputError
 from hilctl_drivers.emulator.faults import parse_fault
-from hilctl_drivers.emulator.main import Emulator, EmulatorOptions, build
+from hilctl_drivers.emulator.modbus_bench import Emulator, EmulatorOptions, build
 from hilctl_drivers.modbus_dac import ModbusDac
-from hilctl_drivers.modbus_setup import ModbusOptions
+from hilctl_drivers.modbus_options import ModbusOptions
 from hilctl_drivers.profile import load_profile
 
 T7 = {
@@ -49,6 +49,7 @@ inputs:
   IN: {address: 200, type: float32, unit: V, min: -10.0, max: 10.0}
 watchdog: none
 """
+READS = {"reader": "adam_6217", "reader_unit_id": 2, "input": "AI0"}
 RTU = {
     "output": "OUT",
     "input": "IN",
@@ -141,7 +142,11 @@ class TestOptions:
         [
             ({"serial_port": "/dev/x"}, "either host or serial_port"),
             ({"host": None}, "either host or serial_port"),
-            ({"baud": 9600}, "go with serial_port"),
+            ({"reader_unit_id": 2}, "reader_unit_id goes with reader"),
+            ({"reader_host": "r"}, "reader_host goes with reader"),
+            ({**READS, "reader_host": "r", "reader_serial_port": "/dev/r"}, "one of reader_host"),
+            ({**READS, "reader_tcp_port": 502}, "reader_tcp_port goes with reader_host"),
+            ({**READS, "reader_baud": 9600}, "reader_baud goes with reader_serial_port"),
             ({"amplifier": {"offset_a": 1.0}}, "must have one of gain_a_per_v"),
             ({"amplifier": {"gain_a_per_v": 1.0, "gain_v_per_v": 1.0}}, "must have one of"),
             ({"amplifier": {"gain_v_per_v": 1.0, "offset_a": 1.0}}, "offset must be in the unit"),
@@ -175,6 +180,12 @@ class TestOptions:
             ({"watchdog": {"timeout_s": 1.0, "safe_command": 20.0}}, "safe_command must be -10 to"),
             ({"watchdog": {"timeout_s": 1.0}, "output": "TDAC0"}, "does nothing for TDAC0"),
             ({"timeout_s": 1e-4}, "timeout_s must be > 0.001"),
+            ({"baud": 9600, "parity": "E"}, "baud, parity must be left out: LabJack T7 has no"),
+            ({**READS, "input": "AI9"}, "input must be one that Advantech ADAM-6217 has"),
+            ({**READS, "reader_unit_id": None}, "can't both be unit 1 at h:502: give reader_unit"),
+            ({**READS, "reader": "kepco_bop"}, "kepco_bop is not one of a Modbus device"),
+            ({**READS, "output": "AI0", "profile": "adam_6217"}, "output must be one that"),
+            ({**READS, "reader_serial_port": "/dev/r"}, "adam_6217 is for Modbus tcp: give reader"),
             (
                 {**WAGO, "watchdog": {"timeout_s": 1.0, "safe_command": 3.0}},
                 "puts AO0 at 0 V, which is 0 A here",

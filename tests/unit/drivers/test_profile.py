@@ -18,7 +18,8 @@ from hilctl_drivers.profile import (
 )
 from hilctl_drivers.profile_ascii import AsciiProfile
 from hilctl_drivers.profile_frames import FrameProfile
-from hilctl_drivers.profile_modbus import EnsureStep, ModbusProfile, RegisterStep
+from hilctl_drivers.profile_modbus import ModbusProfile
+from hilctl_drivers.profile_steps import EnsureStep, RegisterStep
 
 MODBUS = """\
 vendor: Acme
@@ -96,7 +97,11 @@ BROKEN: list[tuple[str, dict[str, Any], str]] = [
     ("modbus", {"unverified": []}, "verified must be 'partly' when keys are unverified"),
     ("modbus", {"unverified": ["outputs.A1"]}, "unverified: must name keys that are in this file"),
     ("modbus", {"outptus": {}}, "outptus: unknown key (did you mean 'outputs'?)"),
-    ("modbus", {"outputs": {}}, "outputs: dictionary should have at least 1 item"),
+    ("modbus", {"outputs": {}, "inputs": {}}, "acme.yaml: must have outputs or inputs, or both"),
+    ("modbus", {"outputs": None}, "outputs: is required"),
+    ("modbus", {"outputs": {}, "exchange": 76}, "exchange must be none where there are no outputs"),
+    ("modbus", {"inputs": {}, "exchange": 23}, "exchange must be none where there are no outputs"),
+    ("modbus", {"outputs": {}, "watchdog": WATCHDOG}, "watchdog must be none where there are no"),
     ("modbus", {"link.kind": "udp"}, "link.kind: must be one of tcp, rtu, ascii, frames, got"),
     ("modbus", {"link": None}, "link.kind: must be one of tcp, rtu, ascii, frames, got nothing"),
     ("modbus", {"link.parity": "X"}, "link.parity: must be one of 'N', 'E' or 'O', got 'X'"),
@@ -170,6 +175,7 @@ BROKEN: list[tuple[str, dict[str, Any], str]] = [
                             "pattern": "(1)", "example": "1"}}, "must be an output and an input"),
     ("ascii", {"exchange": {"output": "OUT", "input": "IN", "write": "S?", "pattern": "(1)",
                             "example": "1"}}, "exchange.write must have the field {value}"),
+    ("ascii", {"outputs": {}, "inputs": {}}, "acme.yaml: must have outputs or inputs, or both"),
     ("ascii", {"link.terminator": ";"}, "link.terminator: must be one of"),
     ("ascii", {"watchdog": {**{k: v for k, v in WATCHDOG.items() if k != "arm"},
                             "kick": "strict", "arm": [{"kind": "send", "text": "W{timeout}"}]}},
@@ -199,6 +205,13 @@ class TestRules:
         assert len(found) == 1, found
         assert found[0].startswith("acme.yaml: ")
         assert message in found[0]
+
+    @pytest.mark.parametrize("base", ["modbus", "ascii"])
+    @pytest.mark.parametrize("group", ["outputs", "inputs"])
+    def test_one_of_them_is_enough(self, base: str, group: str) -> None:
+        """A device may only drive, or only read beside another one that drives."""
+        profile = parse_profile(changed(base, {group: {}}), "acme.yaml")
+        assert not getattr(profile, group)
 
     def test_board_with_integers(self) -> None:
         """A board may send whole numbers, where its range fits into them."""

@@ -5,19 +5,20 @@ from typing import get_args
 import pytest
 import yaml
 
-from hilctl_drivers.modbus_frames import rtu_adu, write_single_pdu
+from hilctl_drivers.modbus_frames import read_pdu, rtu_adu, write_single_pdu
 from hilctl_drivers.profile import FOLDER, Profile, load_profile, shipped_profiles
 from hilctl_drivers.profile_ascii import AsciiProfile, SendStep, fields_of
 from hilctl_drivers.profile_frames import FrameProfile
-from hilctl_drivers.profile_modbus import EnsureStep, ModbusProfile, RegisterStep
+from hilctl_drivers.profile_modbus import ModbusProfile
 from hilctl_drivers.profile_problems import value_at
+from hilctl_drivers.profile_steps import EnsureStep, RegisterStep
 
 NAMES = (
-    "adam_4024", "adam_4024_ascii", "adam_6024", "adam_6224", "agilent_34970a",
-    "beckhoff_bk9000", "cobs_board",
-    "cobs_board_fifo", "icp_et7000", "icp_m7024", "icp_m7024_dcon", "kepco_bop", "labjack_t4",
-    "labjack_t7", "labjack_t8", "tdk_lambda_gen", "wago_750", "waveshare_ao_8ch",
-    "waveshare_ao_8ch_b",
+    "adam_4024", "adam_4024_ascii", "adam_4117", "adam_6024", "adam_6217", "adam_6224",
+    "agilent_34970a", "beckhoff_bk9000", "cobs_board", "cobs_board_fifo", "generic_float32",
+    "icp_et7000", "icp_m7017", "icp_m7024", "icp_m7024_dcon", "kepco_bop", "labjack_t4",
+    "labjack_t7", "labjack_t8", "tdk_lambda_gen", "wago_750", "waveshare_ai_8ch",
+    "waveshare_ai_8ch_b", "waveshare_ao_8ch", "waveshare_ao_8ch_b",
 )  # fmt: skip
 
 OUTPUTS = [
@@ -50,6 +51,16 @@ INPUTS = [
     ("adam_6024", "AI0", 0, 3, "0000", -10.0),
     ("adam_6024", "AI5", 5, 3, "ffff", 10.0),
     ("icp_et7000", "AI0", 0, 4, "7fff", 10.0),
+    ("adam_4117", "AI0", 0, 3, "0000", -10.0),
+    ("adam_4117", "AI3", 3, 3, "8000", 10.0 / 65535.0),
+    ("adam_4117", "AI7", 7, 3, "ffff", 10.0),
+    ("adam_6217", "AI0", 0, 3, "ffff", 10.0),
+    ("adam_6217", "AI7", 7, 3, "0000", -10.0),
+    ("icp_m7017", "AI0", 0, 4, "7fff", 10.0),
+    ("icp_m7017", "AI7", 7, 4, "8001", -10.0),
+    ("waveshare_ai_8ch", "AI0", 0, 4, "4e20", 20.0),
+    ("waveshare_ai_8ch", "AI7", 7, 4, "0fa0", 4.0),
+    ("waveshare_ai_8ch_b", "AI7", 7, 4, "2710", 10.0),
     ("wago_750", "AI0", 0, 3, "8001", -10.0),
     ("beckhoff_bk9000", "AI1", 1, 3, "7fff", 10.0),
 ]
@@ -68,6 +79,13 @@ SPECIAL = [
     ("icp_m7024", "watchdog.tripped", "coil", 269),
     ("icp_m7024", "watchdog.clear.0", "coil", 269),
     ("icp_et7000", "init.0", "coil", 631),
+    ("adam_4117", "init.0", "holding", 200),
+    ("adam_4117", "init.7", "holding", 207),
+    ("adam_4117", "selftest", "holding", 210),
+    ("adam_6217", "init.7", "holding", 207),
+    ("icp_m7017", "init.0", "coil", 268),
+    ("waveshare_ai_8ch", "init.0", "holding", 0x1000),
+    ("waveshare_ai_8ch_b", "init.7", "holding", 0x1007),
     ("wago_750", "outputs.AO1.readback", "holding", 0x0201),
     ("wago_750", "watchdog.arm.1", "holding", 0x1000),
     ("wago_750", "watchdog.tripped", "holding", 0x1006),
@@ -83,6 +101,7 @@ WATCHDOGS = {
 }  # fmt: skip
 EXCHANGES = {
     "labjack_t4": 76, "labjack_t7": 76, "labjack_t8": 76, "wago_750": 23, "beckhoff_bk9000": 23,
+    "generic_float32": 23,
 }  # fmt: skip
 
 
@@ -148,6 +167,12 @@ class TestEach:
         said = any("sensor must be read by another device" in note for note in profile.notes)
         assert said is not any(reads)
 
+    def test_no_output_is_said_so(self, name: str) -> None:
+        """A device that only reads says so, and beside which one that drives it can stand."""
+        profile = load_profile(name)
+        said = [note for note in profile.notes if note.startswith("It only reads.")]
+        assert bool(said) is not bool(profile.outputs)
+
     def test_watchdog(self, name: str) -> None:
         """Unit, feeding and trip of the watchdog are the device's."""
         watchdog = load_profile(name).watchdog
@@ -212,6 +237,16 @@ class TestModbus:
         channel = profile.outputs["AO0"]
         pdu = write_single_pdu(profile.wire_address(channel), channel.format.encode(1.0))
         assert rtu_adu(profile.unit_id, pdu).hex(" ") == "01 06 00 00 03 e8 89 74"
+
+    def test_waveshare_input_examples(self) -> None:
+        """The vendor's own example frames come out: all eight values, and their settings."""
+        profile = modbus("waveshare_ai_8ch")
+        values, settings = profile.inputs["AI0"], dict(profile.registers())["init.0"]
+        frames = [
+            rtu_adu(1, read_pdu(each.read_function, profile.wire_address(each), 8)).hex(" ")
+            for each in (values, settings)
+        ]
+        assert frames == ["01 04 00 00 00 08 f1 cc", "01 03 10 00 00 08 40 cc"]
 
     def test_every_limit_can_be_written(self) -> None:
         """Both ends of every output's range fit into its register and its raw limits."""
