@@ -10,8 +10,8 @@
     ascii_lines                         SCPI and DCON lines
     registers, modbus_frames            values and registers, Modbus requests and replies
     modbus_transactions                 the same, prepared once for the loop
-    wire_errors, wire_time              what can go wrong on a wire, and how long it takes
-    links                               bytes over TCP and serial ports, with deadlines
+    wire_errors, *_time                 what can go wrong on a wire, and how long it takes
+    links, tcp_link, serial_link        bytes over TCP and serial ports, with deadlines
     signal_chain                        amplifier and sensor: ampere and um to volts and back
     modbus_*                            Modbus TCP and RTU devices
     ascii_*, serial_*, board_*          SCPI, DCON and framed serial devices, single and streaming

@@ -23,6 +23,13 @@ input when it puts out a command, so ``first`` of a STREAM reply numbers the com
 reading belongs to; a reply carries all readings since the last one. The sample clock starts when
 ``prefill`` samples are queued. With nothing left to put out the board holds the last value, and
 counts that in ``underruns``. A refused message changes nothing.
+
+A STREAM reply is held back until sample ``queued - prefill - 1`` is out, with ``queued`` the
+samples taken since CLOCK, this message included, and carries the readings up to that sample.
+Sample j is put out (j + 1 + underruns) periods after the clock's start. While ``queued <=
+prefill``, where the moment is past, and where the status is not 0, the reply goes out at once. A
+newer message means that a reply held back is never sent; where the watchdog trips meanwhile, it
+says TRIPPED.
 """
 
 from enum import IntFlag

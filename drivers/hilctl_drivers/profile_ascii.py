@@ -13,7 +13,15 @@ from typing import Annotated, Literal, Self, TypeAlias
 from pydantic import AfterValidator, Field, StringConstraints, model_validator
 
 from hilctl_drivers.profile_links import AsciiLink
-from hilctl_drivers.profile_parts import BaseProfile, Name, Part, Range, WaitStep, Watchdog
+from hilctl_drivers.profile_parts import (
+    BaseProfile,
+    Name,
+    Part,
+    Range,
+    WaitStep,
+    Watchdog,
+    check_channels,
+)
 
 _SAMPLES = {"value": 0.0, "safe": 0.0, "address": 1, "timeout": 1}
 
@@ -187,7 +195,7 @@ class AsciiProfile(BaseProfile):
 
     link: AsciiLink
     address: int | Literal["none"] = Field(description="device address as shipped, for {address}")
-    outputs: dict[Name, AsciiOutput] = Field(min_length=1)
+    outputs: dict[Name, AsciiOutput]
     inputs: dict[Name, AsciiInput]
     exchange: AsciiExchange | Literal["none"]
     errors: tuple[ErrorReply, ...] = Field(default=(), description="replies that mean trouble")
@@ -196,6 +204,13 @@ class AsciiProfile(BaseProfile):
     close: tuple[AsciiStep, ...] = ()
     watchdog: AsciiWatchdog | Literal["none"]
     selftest: ErrorQuery | Literal["none"] = "none"
+
+    @model_validator(mode="after")
+    def _channels(self) -> Self:
+        check_channels(self.outputs, self.inputs)
+        if self.watchdog != "none" and not self.outputs:
+            raise ValueError("watchdog must be none where there are no outputs to make safe")
+        return self
 
     @model_validator(mode="after")
     def _exchange_channels(self) -> Self:

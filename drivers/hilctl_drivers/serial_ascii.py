@@ -1,5 +1,8 @@
 """A device that speaks lines of text, sample by sample; its sensor may stand behind another one."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 from hilctl.arrays import F64
 from hilctl.errors import DeviceError
 from hilctl_drivers.ascii_lines import parse_number
@@ -25,6 +28,7 @@ class AsciiWire:
         self._setup = setup
         self._profile = profile
         self._output, self._input = setup.output, setup.input
+        self._measure = setup.measure
         self._link = setup.link()
         self._writer = AsciiSession(profile, self._link, setup.address)
         self._reader_link = self._link
@@ -46,10 +50,10 @@ class AsciiWire:
         writer.check_selftest()
         self._clear_trip()
         writer.run(self._profile.init)
-        if self._reader is not self._writer:
-            self._reader.check_selftest()
-            assert self._setup.reader is not None
-            self._reader.run(self._setup.reader.init)
+        if self._setup.reader is not None:
+            with self._reader_named():
+                self._reader.check_selftest()
+                self._reader.run(self._setup.reader.init)
         self._feed_every = 0
         if watchdog != "none" and self._setup.options.watchdog != "none":
             self._run("safe")
@@ -58,7 +62,7 @@ class AsciiWire:
         writer.check_errors()
         self._ticks = 0
 
-    def exchange(self, first_sample: int, output: F64, reading: F64) -> None:
+    def exchange(self, first_sample: int, output: F64, reading: F64, measured: F64) -> None:
         """See :meth:`~hilctl_drivers.serial_board.Wire.exchange`."""
         del first_sample
         value = output.item() + 0.0  # makes 0.0 of -0.0
@@ -67,9 +71,13 @@ class AsciiWire:
             text = self._writer.text(combined.write, value=value)
             found = parse_number(self._writer.ask(text, combined.pattern)[1])
         else:
+            # First the reading, which must not show yet what the command does.
+            found = self._read()
             self._write(value)
-            found = self._reader.number(self._input)
         reading[0] = found * self._input.scale + self._input.offset
+        if self._measure is not None:
+            found = self._writer.number(self._measure)
+            measured[0] = found * self._measure.scale + self._measure.offset
         self._feed()
 
     def put_out(self, value: float) -> None:
@@ -79,6 +87,8 @@ class AsciiWire:
         except LostError:
             self._link.open()  # a replugged adapter is a new port
             self._put_out(value)
+        except DeviceError:
+            self._put_out(value)  # a late or damaged answer must not cost the safe value
 
     def close(self) -> None:
         """See :meth:`~hilctl_drivers.serial_board.Wire.close`."""
@@ -105,7 +115,29 @@ class AsciiWire:
     def _open_links(self) -> None:
         self._link.open()
         if self._reader_link is not self._link:
-            self._reader_link.open()
+            with self._reader_named():
+                self._reader_link.open()
+
+    def _read(self) -> float:
+        try:
+            return self._reader.number(self._input)
+        except DeviceError as error:
+            raise self._named(error) from None
+
+    @contextmanager
+    def _reader_named(self) -> Iterator[None]:
+        try:
+            yield
+        except DeviceError as error:
+            raise self._named(error) from None
+
+    def _named(self, error: DeviceError) -> DeviceError:
+        """Return an error that says that the reader made it, where it is another device."""
+        if self._setup.reader is None:
+            return error
+        reader, options = self._setup.reader, self._setup.options
+        where = options.reader_port or f"address {self._setup.reader_address}"
+        return DeviceError(f"reader {reader.title} at {where}: {error}")
 
     def _write(self, value: float) -> None:
         text = self._writer.text(self._output.write, value=value)

@@ -25,8 +25,10 @@ class Wire(Protocol):
         """
         ...
 
-    def exchange(self, first_sample: int, output: F64, reading: F64) -> None:
+    def exchange(self, first_sample: int, output: F64, reading: F64, measured: F64) -> None:
         """Send float64[B] and fill ``reading``, float64[B], as :class:`hilctl.ports.Device` has it.
+
+        ``measured``, float64[B] in the output's unit, is filled where the setup has ``measure``.
 
         Raises:
             DeviceError: No good answer in time.
@@ -34,7 +36,7 @@ class Wire(Protocol):
         ...
 
     def put_out(self, value: float) -> None:
-        """Put ``value`` out at once, by the open link or by a new one.
+        """Put ``value`` out at once, by the open link or by a new one; tried twice.
 
         Raises:
             DeviceError: The device can't be reached or does not confirm.
@@ -89,6 +91,8 @@ class BoardWire:
         except LostError:
             self._session.link.open()  # a replugged adapter is a new port
             self._put_out(value)
+        except DeviceError:
+            self._put_out(value)  # a late or damaged answer must not cost the safe value
 
     def _put_out(self, value: float) -> None:
         try:
@@ -142,9 +146,9 @@ class BoardSingle(BoardWire):
         self._connect(self._setup.link())
         self._arm()
 
-    def exchange(self, first_sample: int, output: F64, reading: F64) -> None:
+    def exchange(self, first_sample: int, output: F64, reading: F64, measured: F64) -> None:
         """See :meth:`Wire.exchange`."""
-        del first_sample
+        del first_sample, measured
         found = self._session.exchange(output)
         if found.values.size != 1:
             raise DeviceError(f"{found.values.size} readings came for one sample")

@@ -16,7 +16,8 @@ from hilctl.ports import DeviceInfo, DeviceOptions
 from hilctl_drivers.profile_ascii import AsciiProfile
 from hilctl_drivers.serial_ascii import AsciiWire
 from hilctl_drivers.serial_board import BoardSingle, Wire
-from hilctl_drivers.serial_setup import SerialOptions, SerialSetup
+from hilctl_drivers.serial_options import SerialOptions
+from hilctl_drivers.serial_setup import SerialSetup
 from hilctl_drivers.serial_stream import BoardStream
 
 _NAME = "serial_dac"
@@ -41,11 +42,14 @@ class SerialDac:
         chain = setup.chain
         self._offset = chain.output(0.0)
         self._slope = chain.output(1.0) - self._offset
+        self._gain = chain.command(1.0) - chain.command(0.0)
+        self._offset_command = chain.command(0.0)
         self._um = chain.displacement_um(1.0) - chain.displacement_um(0.0)
         self._offset_um = chain.displacement_um(0.0)
         self._wire = _wire(setup)
         self._block = 0
         self._reading = np.zeros(1)
+        self._measured = np.zeros(1)
         self._answered = 0
 
     @property
@@ -77,6 +81,7 @@ class SerialDac:
             raise self._error("open", str(error)) from None
         self._block = block
         self._reading = np.zeros(block)
+        self._measured = np.zeros(block)
         self._answered = -self._info.latency_blocks
 
     def exchange(
@@ -90,7 +95,6 @@ class SerialDac:
             DeviceError: Out of range or not finite, and then nothing was sent; no good answer in
                 time; not open; a block of another size than agreed.
         """
-        del measured
         if not self._block:
             raise self._error(self._action, "not open")
         sizes = {command.size, displacement_um.size}
@@ -98,8 +102,9 @@ class SerialDac:
             rule = f"block must be {self._block} samples, as at open"
             raise self._error(self._action, f"{rule}, got {sorted(sizes)}")
         self._check(command)
+        output = command * self._slope + self._offset
         try:
-            self._wire.exchange(first_sample, command * self._slope + self._offset, self._reading)
+            self._wire.exchange(first_sample, output, self._reading, self._measured)
         except DeviceError as error:
             self._block = 0
             raise self._error(self._action, str(error)) from None
@@ -107,6 +112,9 @@ class SerialDac:
         if self._answered > 0:
             np.multiply(self._reading, self._um, out=displacement_um)
             displacement_um += self._offset_um
+        if self._info.measures_command:
+            np.multiply(self._measured, self._gain, out=measured)
+            measured += self._offset_command
 
     def make_safe(self, command: float) -> None:
         """Put the output at ``command`` at once; a watchdog that is armed stays so.
@@ -184,5 +192,7 @@ def _info(setup: SerialSetup) -> DeviceInfo:
         buffered=streaming is not None,
         fifo_depth=streaming.fifo_depth if streaming else 0,
         latency_blocks=options.fifo_blocks if streaming else 0,
+        measures_command=setup.measure is not None,
+        holds=setup.holds,
         details=setup.details(),
     )

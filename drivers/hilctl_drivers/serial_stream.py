@@ -51,13 +51,14 @@ class BoardStream(BoardWire):
         self._next_sample = 0
         self.fifo_level_min = prefill
 
-    def exchange(self, first_sample: int, output: F64, reading: F64) -> None:
+    def exchange(self, first_sample: int, output: F64, reading: F64, measured: F64) -> None:
         """Queue a block and wait for the readings of the one that it pushes out.
 
         Raises:
             DeviceError: No good answer in time; samples that don't follow the last ones; the board
                 ran out of samples.
         """
+        del measured
         if first_sample != self._next_sample:
             rule = f"samples must follow one another, {self._next_sample} is next"
             raise DeviceError(f"{rule}, got {first_sample}: open again to start at 0")

@@ -1,7 +1,7 @@
 """The same contract for ``serial_dac``: every shipped profile of a serial line, emulated on a pty.
 
 The checks are those of ``test_devices.py``, run with the benches of this file. Where a device has
-no input, the sensor stands on another one.
+no input, the sensor stands on another one, with a line of its own or on the same.
 """
 
 import importlib.util
@@ -14,12 +14,36 @@ import pytest
 
 from hilctl.errors import DeviceError
 from hilctl.registry import device_class
-from hilctl_drivers.emulator.serial_server import SerialEmulation, emulated_serial
+from hilctl_drivers.emulator.serial_bench import SerialEmulation
+from hilctl_drivers.emulator.serial_server import emulated_serial
 from hilctl_drivers.profile import load_profile, shipped_profiles
 
-READER = "agilent_34970a"
-STREAM_RATE_HZ = 10_000.0
+SERIAL = (
+    "adam_4024_ascii agilent_34970a own", "adam_4024_ascii only_reads same", "agilent_34970a",
+    "cobs_board", "cobs_board_fifo", "icp_m7024_dcon agilent_34970a own",
+    "kepco_bop agilent_34970a own", "tdk_lambda_gen agilent_34970a own",
+)  # fmt: skip
+"""What serial_dac is tried with: what drives, what reads, and whether they share a line."""
+ONLY_READS = """\
+vendor: nobody
+model: a module on the line of another one, with inputs only
+source: [this test]
+verified: "yes"
+link: {kind: ascii, baud: 9600, terminator: "\\r", reply_terminator: "\\r"}
+address: 2
+outputs: {}
+inputs:
+  AI0:
+    {ask: "#{address:02X}0", pattern: ">([-+][0-9]{2}\\\\.[0-9]{4})", example: ">+01.2345", unit: V,
+      min: -10.0, max: 10.0}
+exchange: none
+turnaround_s: 0.001
+max_rate_hz: 100.0
+watchdog: none
+"""
+STREAM_RATE_HZ = 2000.0
 BLOCK = 10
+FIFO_BLOCKS = 32  # 160 ms, which is what a busy machine may stall for
 MUST_BE_AT_REST = {"kepco_bop", "tdk_lambda_gen"}
 
 
@@ -38,7 +62,7 @@ globals().update(
     {
         name: check
         for name, check in vars(CHECKS).items()
-        if name.startswith("test_") and name != "test_every_device_is_tried"
+        if name.startswith("test_") and not name.endswith("_left_out")
     }
 )
 
@@ -63,14 +87,16 @@ class Clock:
 class SerialBench:
     """A serial_dac and how to use it, as the checks expect it.
 
-    Behind a FIFO it holds the last command until the answers of what was sent have come.
+    Behind a FIFO it holds the last command until the answers of what was sent have come. Where a
+    command is not answered, time passes only after it has arrived: another line is no faster.
     """
 
-    def __init__(self, device, rate_hz, clock):
+    def __init__(self, device, rate_hz, clock, arrived_a=None):
         self.device = device
         self.rate_hz = rate_hz
         self.block = BLOCK if device.info.latency_blocks else 1
         self._clock = clock
+        self._arrived_a = arrived_a
         self._sent = 0
 
     def open(self):
@@ -94,9 +120,17 @@ class SerialBench:
             before = sent.copy()
             self.device.exchange(self._sent, sent, displacement_um[part], measured[part])
             assert np.array_equal(sent, before)
+            self._await(float(np.clip(sent[-1], -10.0, 10.0)))  # what the rig's amplifier gives
             self._sent += self.block
         answers = displacement_um[held.size :]
         return answers[: command.size], measured[: command.size]
+
+    def _await(self, sent_a):
+        if self._arrived_a is None:
+            return
+        end_s = time.monotonic() + 5.0
+        while abs(self._arrived_a() - sent_a) > 1e-4:
+            assert time.monotonic() < end_s, f"{sent_a} A did not arrive"
 
     @property
     def middle(self):
@@ -105,24 +139,29 @@ class SerialBench:
         return 0.5 * (info.command_max + max(0.0, info.command_min))
 
 
-def wired(name, tmp_path, stack):
-    """Return a serial_dac that is wired to an emulator of the profile."""
+def wired(case, tmp_path, stack):
+    """Return a serial_dac that is wired to an emulator of the profile, or of two."""
+    name, reader, line = [*case.split(), None, None][:3]
     profile = load_profile(name)
     path = tmp_path / f"{name}.yaml"
     text = shipped_profiles()[name].read_text()
     path.write_text(text.replace("boot_wait_s: 2.0", "boot_wait_s: 0.0"))
+    if reader == "only_reads":
+        reader = str(tmp_path / "only_reads.yaml")
+        Path(reader).write_text(ONLY_READS)
     stream = getattr(profile, "exchange", "none") == "stream"
     clock = Clock(real=stream)
-    measures = [getattr(each, "measures", "terminal") for each in profile.inputs.values()]
-    reader = None if "terminal" in measures else READER
-    wanted = SerialEmulation(str(path), reader=reader, own_line=True)
+    wanted = SerialEmulation(str(path), reader=reader, own_line=line == "own")
     emulator = stack.enter_context(emulated_serial(wanted, clock))
-    options = {**emulator.options, "timeout_s": 5.0, "fifo_blocks": 4}
+    options = {**emulator.options, "timeout_s": 5.0, "fifo_blocks": FIFO_BLOCKS}
     chosen = device_class("serial_dac")
     device = chosen(chosen.Options.model_validate(options))
     stack.callback(device.close)
     rate_hz = STREAM_RATE_HZ if stream else device.info.max_rate_hz
-    return SerialBench(device, rate_hz, clock)
+    silent = getattr(profile.outputs[options["output"]], "reply", "") == "none"
+    apart = silent and line == "own"
+    rig = emulator.device._rig
+    return SerialBench(device, rate_hz, clock, (lambda: rig.current_a) if apart else None)
 
 
 @pytest.fixture
@@ -132,9 +171,9 @@ def make(tmp_path):
         yield lambda name: wired(name, tmp_path, stack)
 
 
-@pytest.fixture(params=serial_profiles())
+@pytest.fixture(params=SERIAL)
 def case(request):
-    """A shipped profile of a serial device."""
+    """A shipped profile of a serial device, and its reader where it needs one."""
     return request.param
 
 
@@ -146,7 +185,7 @@ def bench(make, case):
 
 def test_opening_does_not_move_the_output(bench, case):
     """Supplies that must be set up at 0 A are refused while current flows; others stay put."""
-    if case not in MUST_BE_AT_REST:
+    if case.split()[0] not in MUST_BE_AT_REST:
         CHECKS.test_opening_does_not_move_the_output(bench)
         return
     bench.open()
@@ -156,12 +195,9 @@ def test_opening_does_not_move_the_output(bench, case):
         bench.open()
 
 
-def test_every_kind_of_line_is_tried():
-    """Lines of text, single frames and streams are all among the shipped profiles."""
-    assert {
-        "kepco_bop",
-        "icp_m7024_dcon",
-        "tdk_lambda_gen",
-        "cobs_board",
-        "cobs_board_fifo",
-    } <= set(serial_profiles())
+def test_no_serial_profile_is_left_out():
+    """Each shipped profile of a line of text or of frames meets its own emulation."""
+    drives = {case.split()[0] for case in SERIAL}
+    reads = {word for case in SERIAL for word in case.split()[1:2]}
+    assert drives | (reads - {"only_reads"}) == set(serial_profiles())
+    assert {"ascii", "frames"} == {load_profile(name).link.kind for name in drives}

@@ -4,8 +4,8 @@ import re
 
 from hilctl_drivers.emulator.answer import Answer
 from hilctl_drivers.emulator.ascii_templates import Template, in_style
-from hilctl_drivers.emulator.emulated import Wiring
 from hilctl_drivers.emulator.rig import Rig
+from hilctl_drivers.emulator.wiring import Wiring
 from hilctl_drivers.emulator.write_log import WriteLog
 from hilctl_drivers.profile_ascii import (
     AsciiInput,

@@ -10,9 +10,9 @@ from hilctl_drivers import board_protocol as board
 from hilctl_drivers.board_protocol import Status
 from hilctl_drivers.board_session import Values
 from hilctl_drivers.emulator.answer import Answer
-from hilctl_drivers.emulator.emulated import Wiring
 from hilctl_drivers.emulator.rig import Rig
 from hilctl_drivers.emulator.stream_player import StreamPlayer
+from hilctl_drivers.emulator.wiring import Wiring
 from hilctl_drivers.emulator.write_log import WriteLog
 from hilctl_drivers.profile_frames import FrameProfile, FrameStreaming
 
@@ -143,6 +143,8 @@ class EmulatedBoard:
 
     def _stream_reply(self, head: bytes, until: int, now_ns: int) -> bytes:
         self.tick(now_ns)
+        if self.tripped:
+            return board.STATUS_REPLY.pack(head[0] | board.REPLY_BIT, head[1], Status.TRIPPED)
         player = self.player
         if player.played < until:  # it was stopped meanwhile
             until = player.played

@@ -60,8 +60,8 @@ class SerialServer:
 
     def stop(self) -> None:
         """Make :meth:`run` end; from any thread or signal handler."""
+        self._wake.send(b"\0")  # first: once the flag is up, run() may close this at any time
         self._stopping = True
-        self._wake.send(b"\0")
 
     def _wait(self) -> None:
         pause_s = TICK_S

@@ -3,6 +3,7 @@
 import json
 import os
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,55 +13,9 @@ from hilctl_drivers.emulator.faults import parse_fault
 from hilctl_drivers.emulator.serial_server import SerialEmulation, emulated_serial
 from hilctl_drivers.profile import shipped_profiles
 from hilctl_drivers.serial_dac import SerialDac
-from hilctl_drivers.serial_setup import SerialOptions
+from hilctl_drivers.serial_options import SerialOptions
 
-DCON = """\
-vendor: nobody
-model: DCON module with an output and an input
-source: [this test]
-verified: "yes"
-link: {kind: ascii, baud: 115200, terminator: "\\r", reply_terminator: "\\r", checksum: dcon}
-address: 2
-exchange: none
-turnaround_s: 0.0
-max_rate_hz: 1000.0
-outputs:
-  AO0:
-    write: "#{address:02X}0{value:+07.3f}"
-    reply: {pattern: ">", example: ">"}
-    readback: {ask: "${address:02X}60", pattern: "![0-9A-F]{2}([+-][0-9]+\\\\.[0-9]+)",
-               example: "!02+05.000"}
-    unit: V
-    min: -10.0
-    max: 10.0
-    resolution: 1.0e-3
-inputs:
-  AI0: {ask: "#{address:02X}0", pattern: ">([+-][0-9]{2}\\\\.[0-9]{3})", example: ">+05.123",
-        unit: V, min: -10.0, max: 10.0}
-errors:
-  - {pattern: "\\\\?", example: "?", meaning: out of range}
-  - {pattern: "\\\\?[0-9A-F]{2}", example: "?02", meaning: invalid command}
-watchdog:
-  unit_s: 0.1
-  min_s: 0.1
-  max_s: 25.5
-  kick: strict
-  on_trip: safe
-  refuses_while_tripped: true
-  refusal: {pattern: "!", example: "!"}
-  tripped: {ask: "~{address:02X}0", pattern: "![0-9A-F]{3}[4-7C-F]", example: "!0204"}
-  arm:
-    - {kind: send, text: "~{address:02X}31{timeout:02X}",
-       reply: {pattern: "![0-9A-F]{2}", example: "!02"}}
-  disarm:
-    - {kind: send, text: "~{address:02X}30{timeout:02X}",
-       reply: {pattern: "![0-9A-F]{2}", example: "!02"}}
-  feed:
-    - {kind: send, text: "~**"}
-  clear:
-    - {kind: send, text: "~{address:02X}1", reply: {pattern: "![0-9A-F]{2}", example: "!02"}}
-selftest: {ask: "${address:02X}M", pattern: "![0-9A-F]{2}7.*", example: "!027024"}
-"""
+DCON = (Path(__file__).parents[2] / "profiles" / "dcon_module.yaml").read_text()
 KINDS = ["dcon", "scpi", "cobs", "length"]
 
 
@@ -193,16 +148,16 @@ FAULTS = {
 }
 
 
-def exchange_until_it_fails(bench):
+def exchange_until_it_fails(bench, command=2.0):
     for _ in range(40):
-        assert abs(bench.exchange(2.0)) < 30.0
+        assert abs(bench.exchange(command)) < 30.0
 
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_bad_answer_is_an_error_and_the_output_can_still_be_made_safe(rig, kind, fault):
     """No wrong reading is taken; the next request is not confused by what is left on the line."""
-    bench = rig(kind, faults=[f"{fault}:0.12@30" if fault == "delay" else f"{fault}@30"])
+    bench = rig(kind, faults=[f"{fault}:0.3@30" if fault == "delay" else f"{fault}@30"])
     bench.open()
     with pytest.raises(DeviceError, match=FAULTS[fault]) as caught:
         exchange_until_it_fails(bench)
@@ -293,6 +248,57 @@ def test_scpi_supply_is_set_up_and_checked(rig):
         bench.device.close()
 
 
+@pytest.mark.parametrize(("profile", "current_a"), [("kepco_bop", 2.5), ("tdk_lambda_gen", 3.0)])
+def test_the_output_is_measured_where_that_is_asked_for(rig, profile, current_a):
+    """What MEAS:CURR? or MC? says stands beside the command, and costs a part of the rate."""
+    quick = rig(profile, reader="agilent_34970a", own_line=True).device.info
+    bench = rig(profile, reader="agilent_34970a", own_line=True, measure="current")
+    info = bench.device.info
+    assert (quick.measures_command, info.measures_command) == (False, True)
+    assert "measuring current" in info.rate_note
+    assert info.max_rate_hz < quick.max_rate_hz
+    bench.device.open(10.0, 1)
+    displacement_um, measured = np.full(1, np.nan), np.full(1, np.nan)
+    bench.device.exchange(0, np.array([current_a]), displacement_um, measured)
+    assert measured[0] == pytest.approx(current_a, abs=1e-3)
+    assert np.isfinite(displacement_um).all()
+
+
+def test_a_reading_does_not_show_yet_what_the_command_does(rig):
+    """The sensor is asked first, however slow the line is."""
+    bench = rig("dcon")
+    bench.open()
+    bench.exchange(0.0)
+    bench.pass_s(0.5)
+    assert abs(bench.exchange(5.0)) < 1.0
+    bench.pass_s(0.5)
+    assert bench.exchange(5.0) > 20.0
+
+
+def test_a_reader_that_fails_is_named(rig):
+    """Which of the two devices did not answer is said."""
+    bench = rig("kepco_bop", reader="agilent_34970a", own_line=True)
+    bench.open()
+    bench.exchange(0.0)
+    bench.emulator.lines[1].devices = []
+    port = bench.emulator.lines[1].name
+    with pytest.raises(DeviceError, match=rf"reader Agilent 34970A .* at {port}: "):
+        exchange_until_it_fails(bench, 0.0)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("fault", ["silence", "corrupt", "duplicate", "wrong_id"])
+def test_making_safe_is_tried_twice(rig, kind, fault):
+    """A bad answer to the safe value itself does not end the attempt."""
+    message = {"dcon": 13, "scpi": 12, "cobs": 8, "length": 8}[kind]
+    bench = rig(kind, faults=[f"{fault}@{message}"])
+    bench.open()
+    for _ in range(5):
+        bench.exchange(2.0)
+    bench.device.make_safe(0.0)
+    assert bench.current_a() == pytest.approx(0.0, abs=2e-3)
+
+
 def test_another_device_is_noticed_at_open(rig, tmp_path):
     """A self-test that is answered by something else ends the opening."""
     path = tmp_path / "other.yaml"
@@ -335,6 +341,8 @@ def test_impossible_rates_and_blocks_are_refused(rig):
         ({"profile": "labjack_t7"}, "use modbus_dac"),
         ({"profile": "kepco_bop", "output": "current", "input": "current"}, "as reader"),
         ({"reader_address": 3}, "go with reader"),
+        ({"measure": "AI0"}, "measure must be an input of nobody .* measures its own output"),
+        ({"profile": "cobs_board", "output": "DAC", "input": "ADC", "measure": "ADC"}, "lines of"),
         ({"watchdog": {"timeout_s": 100.0}}, "timeout_s must be 0.1 to 25.5"),
         ({"watchdog": {"timeout_s": 1.0, "safe_command": 11.0}}, "safe_command must be -10 to 10"),
         ({"sensor": {"um_per_ma": 1.0}}, "the input is in V"),

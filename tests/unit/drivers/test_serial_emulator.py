@@ -18,31 +18,7 @@ from hilctl_drivers.framing import binary_framing
 
 MS = 1_000_000
 START_NS = 10_000_000_000
-DCON = """\
-vendor: nobody
-model: DCON module with an output and an input
-source: [this test]
-verified: "yes"
-link: {kind: ascii, baud: 115200, terminator: "\\r", reply_terminator: "\\r", checksum: dcon}
-address: 2
-exchange: none
-turnaround_s: 0.0
-max_rate_hz: 1000.0
-outputs:
-  AO0:
-    write: "#{address:02X}0{value:+07.3f}"
-    reply: {pattern: ">", example: ">"}
-    unit: V
-    min: -10.0
-    max: 10.0
-inputs:
-  AI0: {ask: "#{address:02X}0", pattern: ">([+-][0-9]{2}\\\\.[0-9]{3})", example: ">+05.123",
-        unit: V, min: -10.0, max: 10.0}
-errors:
-  - {pattern: "\\\\?", example: "?", meaning: out of range}
-  - {pattern: "\\\\?[0-9A-F]{2}", example: "?02", meaning: invalid command}
-watchdog: none
-"""
+DCON = (Path(__file__).parents[2] / "profiles" / "dcon_module.yaml").read_text()
 
 
 class Emulated:
@@ -293,13 +269,13 @@ class TestBoard:
             return b"\x11\x02" + struct.pack("<IH", first, n) + bytes(4 * n)
 
         assert board.ask(block(0)) == b"\x91\x02\x04"
-        board.ask(b"\x15\x01" + struct.pack("<fH", 10_000.0, 4096))
+        board.ask(b"\x15\x01" + struct.pack("<fH", 10_000.0, 8192))
         assert board.ask(block(0))[2] == 0
         assert board.ask(block(0)) == b"\x91\x02\x10"
         assert board.ask(block(1000)) == b"\x91\x02\x10"
-        for k in range(1, 8):
+        for k in range(1, 16):
             assert board.ask(block(500 * k))[2] == 0
-        assert board.ask(block(4000)) == b"\x91\x02\x08"
+        assert board.ask(block(8000)) == b"\x91\x02\x08"
 
     def test_underruns_are_counted_and_the_output_holds(self, emulate):
         """With nothing queued the last value stays, and each period is counted."""

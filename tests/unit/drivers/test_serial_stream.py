@@ -7,17 +7,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from hilctl.blocks import Batch
 from hilctl.compensator import Compensator
+from hilctl.delay_line import DelayLine
 from hilctl.errors import DeviceError
 from hilctl.flags import Flag
+from hilctl.interlocks import InterlockLimits, Interlocks
 from hilctl.limiter import CommandLimits, Limiter
-from hilctl.loop import Loop, Plan
+from hilctl.loop import Loop
 from hilctl.pacer import Pacer, SystemClock
+from hilctl.plan import Plan
 from hilctl_drivers.emulator.faults import parse_fault
 from hilctl_drivers.emulator.serial_server import SerialEmulation, emulated_serial
 from hilctl_drivers.profile import shipped_profiles
 from hilctl_drivers.serial_dac import SerialDac
-from hilctl_drivers.serial_setup import SerialOptions
+from hilctl_drivers.serial_options import SerialOptions
 from hilctl_drivers.terfenol import TerfenolActuator, TerfenolParameters
 
 RATE_HZ = 10_000.0
@@ -96,8 +100,8 @@ def test_says_that_it_streams(board):
     """Its FIFO and the exchanges until an answer are known before it is opened."""
     info = board().device.info
     assert info.buffered
-    assert (info.fifo_depth, info.latency_blocks) == (4096, FIFO_BLOCKS)
-    assert info.details["fifo_depth"] == "4096 samples"
+    assert (info.fifo_depth, info.latency_blocks) == (8192, FIFO_BLOCKS)
+    assert info.details["fifo_depth"] == "8192 samples"
     assert info.details["fifo_level"] == f"{FIFO_BLOCKS} blocks"
 
 
@@ -130,10 +134,10 @@ def test_the_board_keeps_the_pace(board):
 
 def test_a_stall_of_this_machine_costs_fifo_and_no_sample(board):
     """After a stall shorter than the FIFO holds, blocks go out in a burst and none is missing."""
-    bench = board()
+    bench = board(fifo_blocks=20)  # 200 ms, of which this machine may take some for itself
     bench.open()
-    bench.hold(1.0, 10)
-    bench.clock.extra_ns += 25 * MS
+    bench.hold(1.0, 25)
+    bench.clock.extra_ns += 100 * MS
     assert all(np.isfinite(each).all() for each in bench.hold(1.0, 20))
     assert bench.emulator.device.player.underruns == 0
     bench.device.close()
@@ -216,7 +220,7 @@ def test_samples_follow_one_another(board):
     ("rate_hz", "block", "options", "text"),
     [
         (RATE_HZ, 513, {}, "block must be 1 to 512 samples, got 513"),
-        (RATE_HZ, 500, {"fifo_blocks": 8}, "must fit into the FIFO, 4096 .*at most 7 with this"),
+        (RATE_HZ, 500, {"fifo_blocks": 16}, "must fit into the FIFO, 8192 .*at most 15 with this"),
         (50.0, 10, {}, "sample rate must be >= 100 Hz, got 50"),
         (200_000.0, 500, {}, r"sample rate must be in \(0, 100000\] Hz"),
         (RATE_HZ, 500, {"watchdog": {"timeout_s": 0.1}}, "3 exchanges must come within"),
@@ -254,21 +258,38 @@ class Sink:
         return True
 
 
+class Unwatched:
+    """Nobody who asks for anything."""
+
+    def beat(self, next_sample):
+        return ""
+
+    def tuning(self):
+        return None
+
+    def tell(self, event):
+        pass
+
+
 def run_loop(bench, n):
     """Run a sine of n samples through the real loop; return its outcome and what it recorded."""
     clock, sink = SystemClock(), Sink()
     limits = CommandLimits(low=-5.0, high=5.0, slew_per_s=1e5, safe=0.0, ramp_per_s=1e3)
     period_ns = 1e9 * BLOCK / RATE_HZ
     bench.open()
+    compensator = Compensator(None, RATE_HZ)
+    sent = Batch.empty(bench.device.info.latency_blocks + 1, BLOCK, compensator.state_size + 1)
     loop = Loop(
-        Plan(sine(n), False, BLOCK, (-100.0, 100.0), 1e9, bench.device.info.latency_blocks),
+        Plan(sine(n), False, BLOCK, 1e9),
         bench.device,
-        Compensator(None, RATE_HZ),
+        compensator,
         Limiter(limits, 1.0 / RATE_HZ),
+        Interlocks(InterlockLimits(stroke_um=(-100.0, 100.0)), RATE_HZ),
         Pacer(clock, period_ns, "follow", 0.5 * period_ns),
         clock,
+        DelayLine(sent),
         sink,
-        lambda: "",
+        Unwatched(),
     )
     return loop.run(clock.now_ns()), sink
 
@@ -298,8 +319,9 @@ def test_a_run_that_loses_the_board_leaves_by_the_one_way_out(board, fault):
     flags = np.concatenate(sink.flags)
     assert flags.size == outcome.ended_at
     unanswered = (flags & Flag.SENSOR_INVALID) != 0
-    assert unanswered.sum() == FIFO_BLOCKS * BLOCK
-    assert unanswered[-FIFO_BLOCKS * BLOCK :].all()
+    lost = (FIFO_BLOCKS + 1) * BLOCK  # those in the FIFO, and the one being sent
+    assert unanswered.sum() == lost
+    assert unanswered[-lost:].all()
     bench.clock.extra_ns += 400 * MS
     deadline = time.monotonic() + 5.0
     while bench.events()[-1]["event"] == "played" and time.monotonic() < deadline:

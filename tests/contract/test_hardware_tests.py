@@ -1,0 +1,126 @@
+"""What tests/hardware says it does to a real device, held against an emulated one."""
+
+import itertools
+import json
+import os
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from hilctl_drivers.emulator.faults import parse_fault
+from hilctl_drivers.emulator.modbus_bench import Emulator, EmulatorOptions, build
+
+ROOT = Path(__file__).parents[2]
+GIVE_UP_S = 120.0
+PEAK_A = 6.0
+TENTH_A = 0.1 * PEAK_A
+RAMP_S = 0.25
+RATE_HZ = 200.0
+EXPERIMENT = """\
+name: gentle
+device:
+  kind: modbus_dac
+  profile: labjack_t7
+  host: 127.0.0.1
+  port: {port}
+  output: DAC0
+  input: {sensor}
+  timeout_s: 2.0
+  amplifier: {{gain_a_per_v: 4.0, offset_a: -10.0}}
+  sensor: {{um_per_v: 12.5}}
+  watchdog: none
+sample_rate_hz: 200
+waveform: {{kind: sine, unit: A, amplitude: 1.0, frequency_hz: 1.0, duration_s: 1.0}}
+compensator: none
+limits: {{peak_current_a: 6.0, slew_a_per_s: 400.0, stroke_um: [-75.0, 60.0]}}
+safe: {{value: 0.0, ramp_s: 0.25}}
+"""
+
+
+class Bench:
+    """An emulated device and what the hardware tests make of it."""
+
+    def __init__(self, emulator: Emulator, folder: Path) -> None:
+        self._port = emulator.address.rpartition(":")[2]
+        self._folder = folder
+
+    def run(self, sensor: str = "AIN0", only: str = "test") -> subprocess.CompletedProcess:
+        """Run hardware tests in a process of their own."""
+        path = self._folder / "experiment.yaml"
+        path.write_text(EXPERIMENT.format(port=self._port, sensor=sensor), encoding="utf-8")
+        command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider"]
+        return subprocess.run(
+            [*command, "-k", only, "--device", str(path), str(ROOT / "tests" / "hardware")],
+            cwd=ROOT,
+            env={**os.environ, "PYTHONDONTWRITEBYTECODE": "1"},
+            capture_output=True,
+            text=True,
+            timeout=GIVE_UP_S,
+        )
+
+    def currents_a(self) -> list[float]:
+        """Return every current that was put out."""
+        lines = (self._folder / "writes.jsonl").read_text(encoding="utf-8").splitlines()
+        return [json.loads(line)["current_a"] for line in lines]
+
+
+@pytest.fixture
+def bench(tmp_path, request) -> Iterator[Bench]:
+    """An emulated device; the test's parameter is its fault."""
+    fault = getattr(request, "param", None)
+    faults = (parse_fault(fault),) if fault else ()
+    options = EmulatorOptions("labjack_t7", log=tmp_path / "writes.jsonl", faults=faults)
+    emulator = build(options)
+    thread = threading.Thread(target=emulator.server.run)
+    thread.start()
+    yield Bench(emulator, tmp_path)
+    emulator.server.stop()
+    thread.join()
+    emulator.log.close()
+
+
+def test_keeps_to_a_tenth_of_the_limits(bench):
+    """All pass, no current is beyond a tenth of the peak, but for one step ramps are slow."""
+    done = bench.run()
+    assert done.returncode == 0, done.stdout
+    assert "9 passed" in done.stdout
+    currents_a = bench.currents_a()
+    assert max(currents_a) == pytest.approx(TENTH_A, rel=1e-3)
+    assert min(currents_a) == 0.0
+    assert currents_a[-1] == 0.0
+    steps_a = sorted(abs(b - a) for a, b in itertools.pairwise(currents_a))
+    assert steps_a[-1] == pytest.approx(TENTH_A, rel=1e-3)  # the one that make_safe takes
+    assert steps_a[-2] <= PEAK_A / RAMP_S / RATE_HZ * 1.001
+
+
+@pytest.mark.parametrize("bench", ["exception@150"], indirect=True)
+def test_failure_ends_at_the_safe_value(bench):
+    """A device that refuses in the middle of a move fails its test and is made safe."""
+    done = bench.run(only="small_move")
+    assert done.returncode == 1
+    assert "refused with exception 4" in done.stdout
+    currents_a = bench.currents_a()
+    assert 0.0 < max(currents_a) <= TENTH_A * 1.001
+    assert currents_a[-1] == 0.0
+
+
+def test_sensor_that_shows_nothing_is_found(bench):
+    """With the sensor on another input the tests fail and say what to look at."""
+    done = bench.run(sensor="AIN1", only="small_move")
+    assert done.returncode == 1
+    assert "nothing moved: is the amplifier on, the sensor wired?" in done.stdout
+    assert bench.currents_a()[-1] == 0.0
+
+
+def test_without_a_device_nothing_is_run():
+    """Without --device the hardware tests are left out, and one line says how to run them."""
+    command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "tests/hardware"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=GIVE_UP_S)
+    assert done.returncode == pytest.ExitCode.NO_TESTS_COLLECTED
+    assert done.stdout.count("--device EXPERIMENT.yaml") == 1
+    assert "9 deselected" in done.stdout
+    assert "skipped" not in done.stdout

@@ -1,0 +1,184 @@
+"""Runs of hilctl and emulated devices for the tests of this folder, each in processes of its own.
+
+What a device says it put out is the judge: its own log, not what hilctl believes.
+"""
+
+import json
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from hilctl.recording.reader import read
+from hilctl.replay import replay
+
+PROFILES = Path(__file__).parents[1] / "profiles"
+EXPERIMENT = {
+    "name": "wire_fault",
+    "sample_rate_hz": 500,
+    "waveform": {
+        "kind": "sine",
+        "unit": "A",
+        "amplitude": 4.0,
+        "frequency_hz": 2.0,
+        "duration_s": 30.0,
+        "soft_start_s": 0.1,
+    },
+    "compensator": "none",
+    "limits": {"peak_current_a": 5.0, "slew_a_per_s": 500.0, "stroke_um": [-100.0, 100.0]},
+    "safe": {"value": 0.0, "ramp_s": 0.2},
+}
+
+
+class Log:
+    """What an emulated device says it put out."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def events(self, output: str) -> list[dict]:
+        lines = self.path.read_text(encoding="utf-8").splitlines()
+        return [each for each in map(json.loads, lines) if each.get("output") == output]
+
+    def writes(self, output: str) -> list[dict]:
+        return [each for each in self.events(output) if each["event"] == "write"]
+
+    def await_event(self, output: str, event: str) -> dict:
+        """Wait until the device reports an event."""
+        deadline = time.monotonic() + 30.0
+        while True:
+            found = [each for each in self.events(output) if each["event"] == event]
+            if found:
+                return found[-1]
+            assert time.monotonic() < deadline, f"no {event}"
+            time.sleep(0.02)
+
+    def await_events(self, output: str, count: int) -> None:
+        """Wait until so many events have come."""
+        deadline = time.monotonic() + 60.0
+        while len(self.events(output)) < count:
+            assert time.monotonic() < deadline
+            time.sleep(0.02)
+
+
+class Run:
+    """A ``hilctl run`` in a process of its own."""
+
+    def __init__(self, folder: Path, device: dict, **changes) -> None:
+        path = folder / "experiment.yaml"
+        experiment = {**EXPERIMENT, "device": device, **changes}
+        path.write_text(yaml.safe_dump(experiment), encoding="utf-8")
+        self.output = folder / "run.mcap"
+        command = [sys.executable, "-m", "hilctl.cli", "run", str(path)]
+        command += ["--output", str(self.output), "--json"]
+        self.process = subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
+
+    def loop_pid(self) -> int:
+        """Find the loop process among the run's children."""
+        children = Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children")
+        for child in children.read_text().split():
+            if b"hilctl.loop_process" in Path(f"/proc/{child}/cmdline").read_bytes():
+                return int(child)
+        raise AssertionError("the run has no loop process")
+
+    def kill_all(self, number: int) -> None:
+        """Send a signal to supervisor and loop at once."""
+        for pid in (self.process.pid, self.loop_pid()):
+            os.kill(pid, number)
+        self.process.communicate(timeout=60)
+
+    def end(self) -> dict:
+        """Wait for the end; return the JSON it printed."""
+        out, err = self.process.communicate(timeout=60)
+        assert "Traceback" not in err
+        assert self.process.returncode == 3, err
+        return json.loads(out)
+
+    def readable_samples(self) -> int:
+        """Return how many samples the recording gives, whole or cut short."""
+        return read(self.output).samples.index.size
+
+    def assert_recorded(self, at_least: int):
+        """The recording is whole, readable, and replays bit for bit; return it."""
+        recording = read(self.output)
+        assert recording.end["code"] == "fault"
+        assert recording.end["recorded_samples"] == str(recording.samples.index.size)
+        assert recording.samples.index.size > at_least
+        assert replay(recording).identical
+        return recording
+
+    def assert_put_out(self, writes: list[dict], tail: int, at_least: int = 100) -> None:
+        """Every command that the device put out is in the recording, but the last ``tail``.
+
+        The command of the tick that failed may have reached the device or not.
+        """
+        samples = self.assert_recorded(at_least).samples
+        put_out = np.array([each["current_a"] for each in writes[: len(writes) - tail]])
+        known = min(put_out.size, samples.index.size)
+        assert abs(put_out.size - samples.index.size) <= 1
+        assert put_out[:known] == pytest.approx(samples.command[:known], abs=2e-3)
+
+
+class Emulated:
+    """A ``hilctl emulate`` in a process of its own."""
+
+    def __init__(self, folder: Path, *words: str, lines: int = 1) -> None:
+        self.log = Log(folder / "writes.jsonl")
+        command = [sys.executable, "-m", "hilctl.cli", "emulate", *words]
+        command += ["--log", str(self.log.path)]
+        self.process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        assert self.process.stdout is not None
+        self.addresses = [self.process.stdout.readline().split()[-1] for _ in range(lines)]
+
+    @property
+    def address(self) -> str:
+        return self.addresses[0]
+
+    def end(self) -> None:
+        """Tell it to end; it must."""
+        self.process.terminate()
+        self.process.communicate(timeout=30)
+        assert self.process.returncode == 0
+
+
+@pytest.fixture
+def emulate(tmp_path):
+    """Return a function that starts ``hilctl emulate``; all must end when told to."""
+    started = []
+
+    def start(*words, lines=1):
+        started.append(Emulated(tmp_path, *words, lines=lines))
+        return started[-1]
+
+    yield start
+    for each in started:
+        each.end()
+
+
+@pytest.fixture
+def run(tmp_path):
+    """Return a function that starts ``hilctl run`` on a device section; none outlives its test."""
+    started = []
+
+    def start(device, **changes):
+        started.append(Run(tmp_path, device, **changes))
+        return started[-1]
+
+    yield start
+    for each in started:
+        if each.process.poll() is None:
+            each.process.kill()
+            each.process.communicate()
+
+
+@pytest.fixture
+def profile():
+    """Return a function that gives the path of a profile of ``tests/profiles``."""
+    return lambda name: str(PROFILES / f"{name}.yaml")
