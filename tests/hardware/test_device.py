@@ -1,0 +1,245 @@
+"""The contract of devices, held by a real one: ``pytest --device EXPERIMENT.yaml tests/hardware``.
+
+Look at the experiment's limits first; the tests do this to the coil or the piezo:
+
+- They open and close the experiment's device some fifteen times, at the experiment's sample rate.
+- They put out the safe value. The output should be there already, as before a run: if it is not, it
+  jumps.
+- Three times, they ramp from the safe value a tenth of the way to the limit that is further off,
+  hold that for a third of a second, and ramp back; once they step back, and twice where the device
+  can't be opened away from its safe value. Each command passes hilctl's own limiter, which is set
+  to this tenth and to the speed of the experiment's ramp to the safe value. The displacement must
+  stay within the experiment's stroke.
+- Once, they ask for commands that are no number or beyond the device's range. The driver must
+  refuse them before anything is sent, as it does in the other tests; this one comes last.
+- At the end of each test, failed or not, they ramp to the safe value and close the device; where
+  that fails, they put out the safe value at once.
+
+Nothing else may use the device meanwhile.
+"""
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from hilctl.devices import probe
+from hilctl.errors import DeviceError
+from hilctl.experiment import LoadedExperiment, load_experiment
+from hilctl.limiter import CommandLimits, Limiter
+from hilctl.pacer import SystemClock
+
+SHARE = 0.1
+HOLD_S = 0.3
+HOLD_SAMPLES = 20
+CLEARLY = 6.0
+
+
+class Bench:
+    """A device under gentle commands.
+
+    Args:
+        loaded: The experiment.
+    """
+
+    def __init__(self, loaded: LoadedExperiment) -> None:
+        config, self.device = loaded.config, loaded.device
+        info, limits = self.device.info, config.command_limits()
+        self.safe = limits.safe
+        low, high = max(limits.low, info.command_min), min(limits.high, info.command_max)
+        further = high if high - self.safe >= self.safe - low else low
+        self.target = self.safe + SHARE * (further - self.safe)
+        gentle = CommandLimits(
+            low=min(self.safe, self.target),
+            high=max(self.safe, self.target),
+            slew_per_s=limits.ramp_per_s,
+            safe=self.safe,
+            ramp_per_s=limits.ramp_per_s,
+        )
+        self.limiter = Limiter(gentle, 1.0 / config.sample_rate_hz)
+        self.stroke_um = config.limits.stroke_um
+        self._rate_hz, self._block = config.sample_rate_hz, config.block
+        self._period_ns = round(1e9 * config.block / config.sample_rate_hz)
+        self._clock = SystemClock()
+        self._due_ns = 0
+        self._sample = 0
+        self._open = False
+        self._was_open = False
+
+    def open(self) -> None:
+        """Open the device; the limiter goes on from the last command."""
+        self.device.open(self._rate_hz, self._block)
+        self._open = self._was_open = True
+        self._sample = 0
+
+    def close(self) -> None:
+        """Close the device and leave the output as it is."""
+        self._open = False
+        self.device.close()
+
+    def _exchange(self, command: np.ndarray) -> np.ndarray:
+        """Put out one block in its time; return the displacements that came, um."""
+        info = self.device.info
+        if not info.latency_blocks:  # else it waits for the device's clock by itself
+            self._clock.sleep_until_ns(self._due_ns)
+        # Never sooner than a period after the one before: a burst would be a steeper ramp.
+        self._due_ns = self._clock.now_ns() + self._period_ns
+        displacement_um, measured = np.full(command.size, np.nan), np.full(command.size, np.nan)
+        self.device.exchange(self._sample, command, displacement_um, measured)
+        answered = self._sample >= info.latency_blocks * self._block
+        self._sample += command.size
+        if not answered:
+            return displacement_um[:0]
+        low_um, high_um = self.stroke_um
+        assert ((displacement_um >= low_um) & (displacement_um <= high_um)).all(), displacement_um
+        assert np.isfinite(measured).all() == info.measures_command
+        return displacement_um
+
+    def make_safe(self) -> None:
+        """Put out the safe value at once; the limiter goes on from there."""
+        self.device.make_safe(self.safe)
+        self.limiter.last = self.safe
+
+    def ask(self, command: float) -> None:
+        """Ask for a command past the limiter, which must not pass the driver."""
+        block = np.full(self._block, command)
+        self.device.exchange(self._sample, block, np.empty(block.size), np.empty(block.size))
+
+    def go(self, wanted: float) -> np.ndarray:
+        """Ramp to a command and hold it; return the second half of what was seen meanwhile, um."""
+        held = max(HOLD_SAMPLES, round(HOLD_S * self._rate_hz))
+        held += self.device.info.latency_blocks * self._block
+        command, flags = np.empty(self._block), np.zeros(self._block, dtype=np.uint32)
+        seen: list[np.ndarray] = []
+        while sum(part.size for part in seen) < held:
+            self.limiter.limit(np.full(self._block, wanted), command, flags)
+            part = self._exchange(command)
+            if self.limiter.last == wanted:
+                seen.append(part)
+        return np.concatenate(seen)[held // 2 :]
+
+    def look(self) -> np.ndarray:
+        """Return the first displacement seen with the output where it was left: float64[1], um."""
+        command = np.full(self._block, self.limiter.last)
+        while True:
+            part = self._exchange(command)
+            if part.size:
+                return part[:1]
+
+    def end(self) -> None:
+        """Ramp to the safe value and close; put it out at once where that fails."""
+        if not self._was_open:
+            return
+        command, flags = np.empty(self._block), np.zeros(self._block, dtype=np.uint32)
+        try:
+            if not self._open:
+                self.open()
+            reached = False
+            while not reached:
+                reached = self.limiter.ramp(command, flags)
+                self._exchange(command)
+            self.close()
+        except (DeviceError, AssertionError):
+            self.make_safe()
+            raise
+
+
+@pytest.fixture
+def bench(request) -> Iterator[Bench]:
+    """The device of the experiment, not open."""
+    made = Bench(load_experiment(request.config.getoption("--device")))
+    yield made
+    made.end()
+
+
+def step_um(rest: np.ndarray, there: np.ndarray) -> float:
+    """Return how far the move went; fail where noise alone could explain it."""
+    noise_um = float(np.sqrt(rest.var() / rest.size + there.var() / there.size))
+    moved_um = float(abs(there.mean() - rest.mean()))
+    assert moved_um > CLEARLY * noise_um, "nothing moved: is the amplifier on, the sensor wired?"
+    return moved_um
+
+
+def distance_um(first: np.ndarray, second: np.ndarray) -> float:
+    """Return how far two stretches are apart."""
+    return float(abs(first.mean() - second.mean()))
+
+
+def test_answers_a_probe(request):
+    """What ``hilctl devices --probe`` does works, twice in a row."""
+    path = request.config.getoption("--device")
+    first, second = probe(path, []), probe(path, [])
+    assert first == second
+    assert first.max_rate_hz >= load_experiment(path).config.sample_rate_hz
+
+
+def test_small_move_is_seen_and_comes_back(bench):
+    """The displacement follows a tenth of the range beyond noise, and most of it comes back."""
+    bench.open()
+    rest = bench.go(bench.safe)
+    there = bench.go(bench.target)
+    back = bench.go(bench.safe)
+    assert distance_um(rest, back) < 0.5 * step_um(rest, there)
+
+
+def test_opening_and_closing_move_nothing(bench):
+    """The output stays where it was left while the device is closed, opened and probed."""
+    if bench.device.info.name.startswith("simulated_"):
+        pytest.skip("opening a simulated device puts it at rest")
+    bench.open()
+    rest = bench.go(bench.safe)
+    there = bench.go(bench.target)
+    bench.close()
+    try:
+        bench.open()
+    except DeviceError as refusal:
+        bench.make_safe()
+        pytest.skip(f"it is opened at its safe value only: {refusal}")
+    bench.close()
+    bench.open()
+    assert distance_um(bench.look(), there) < 0.5 * step_um(rest, there)
+
+
+def test_exchange_needs_an_open_device(bench):
+    """Commands before open and after close are refused; closing twice is fine."""
+    command = np.full(1, bench.safe)
+    with pytest.raises(DeviceError):
+        bench.device.exchange(0, command, np.empty(1), np.empty(1))
+    bench.open()
+    bench.go(bench.safe)
+    bench.close()
+    bench.device.close()
+    with pytest.raises(DeviceError):
+        bench.device.exchange(0, command, np.empty(1), np.empty(1))
+
+
+def test_make_safe_needs_no_open_device(bench):
+    """The last resort takes the output from a small command to the safe value."""
+    bench.open()
+    rest = bench.go(bench.safe)
+    there = bench.go(bench.target)
+    bench.close()
+    bench.make_safe()
+    bench.open()
+    back = bench.go(bench.safe)
+    assert distance_um(rest, back) < 0.5 * step_um(rest, there)
+
+
+@pytest.mark.parametrize("bad", ["not a number", "infinite", "above", "below"])
+def test_refuses_what_it_can_not_do(bench, bad):
+    """A command that is no number or out of range is refused before anything is sent."""
+    info = bench.device.info
+    beyond = 1e-3 * (info.command_max - info.command_min)
+    command = {
+        "not a number": np.nan,
+        "infinite": np.inf,
+        "above": info.command_max + beyond,
+        "below": info.command_min - beyond,
+    }[bad]
+    bench.open()
+    rest = bench.go(bench.safe)
+    with pytest.raises(DeviceError, match=info.name):
+        bench.ask(command)
+    after = bench.go(bench.safe)
+    spread_um = CLEARLY * (rest.std() + after.std()) + 1e-3 * np.ptp(bench.stroke_um)
+    assert distance_um(rest, after) < spread_um

@@ -1,0 +1,142 @@
+"""Finding, starting and stopping programs of other people.
+
+One that is not installed is skipped on a desk, and an error where CI is set: there it would go
+unnoticed that nothing was held against anything.
+"""
+
+import ctypes.util
+import importlib.util
+import os
+import select
+import shutil
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+import pytest
+
+HERE = Path(__file__).parent
+LIBMODBUS_SOURCE = HERE.parent / "benchmark" / "modbus_exchange.c"
+GIVE_UP_S = 60.0
+
+DEBIAN = "apt-get install {}"
+NPM = "npm ci --prefix tests/peers"
+PYTHON = "pip install -e '.[dev]'"
+
+
+def missing(what: str, remedy: str) -> None:
+    """Skip, or fail where CI is set."""
+    text = f"{what} is not installed: {remedy}"
+    if os.environ.get("CI"):
+        pytest.fail(text)
+    pytest.skip(text)
+
+
+def program(name: str, package: str = "") -> str:
+    """Return the path of a program."""
+    found = shutil.which(name)
+    if found is None:
+        missing(name, DEBIAN.format(package or name))
+    return str(found)
+
+
+class Programs:
+    """Where the programs of other people are; each method skips or fails where one is missing."""
+
+    program = staticmethod(program)
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+
+    def module(self, name: str) -> None:
+        """Check that a Python package is there, without importing it."""
+        if importlib.util.find_spec(name) is None:
+            missing(name, PYTHON)
+
+    def node_package(self, name: str) -> str:
+        """Return the path of node, after a look for an npm package."""
+        node = program("node", "nodejs")
+        if not (HERE / "node_modules" / name).is_dir():
+            missing(f"npm package {name}", NPM)
+        return node
+
+    def libmodbus(self) -> str:
+        """Return the name of libmodbus, the library."""
+        found = ctypes.util.find_library("modbus")
+        if found is None:
+            missing("libmodbus", DEBIAN.format("libmodbus-dev"))
+        return str(found)
+
+    def libmodbus_server(self) -> str:
+        """Return the path of a server that is built on libmodbus."""
+        self.libmodbus()
+        if not Path("/usr/include/modbus/modbus.h").exists():
+            missing("libmodbus's header", DEBIAN.format("libmodbus-dev"))
+        built = self._folder / "libmodbus_server"
+        if not built.exists():
+            command = [program("gcc"), "-o", str(built), str(LIBMODBUS_SOURCE), "-lmodbus"]
+            subprocess.run(command, check=True)
+        return str(built)
+
+
+@pytest.fixture(scope="session")
+def programs(tmp_path_factory) -> Programs:
+    """Where the programs of other people are."""
+    return Programs(tmp_path_factory.mktemp("programs"))
+
+
+def read_line(process: subprocess.Popen) -> str:
+    """Return the first line that a program prints."""
+    if not select.select([process.stdout], [], [], GIVE_UP_S)[0]:
+        raise AssertionError(f"{process.args} said nothing within {GIVE_UP_S:g} s")
+    line = process.stdout.readline().strip()
+    assert line, f"{process.args} ended at once"
+    return line
+
+
+@contextmanager
+def running(command: list[str], fds: tuple[int, ...] = ()) -> Iterator[subprocess.Popen]:
+    """Run a program until the end of the block."""
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, pass_fds=fds)
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.wait()
+        process.stdout.close()
+
+
+@contextmanager
+def serial_cable(folder: Path) -> Iterator[tuple[str, str]]:
+    """Connect two ptys, as a null modem does; yield the device files of both ends."""
+    ends = [str(folder / f"end{k}") for k in (0, 1)]
+    command = [program("socat"), *(f"pty,raw,echo=0,link={end}" for end in ends)]
+    with running(command) as process, ExitStack() as held:
+        deadline = time.monotonic() + GIVE_UP_S
+        while not all(Path(end).exists() for end in ends):
+            assert process.poll() is None, "socat ended at once"
+            assert time.monotonic() < deadline, "socat made no ptys"
+            time.sleep(0.005)
+        for end in ends:  # a pty that nobody holds hangs up, and socat ends
+            held.callback(os.close, os.open(end, os.O_RDWR | os.O_NOCTTY))
+        yield ends[0], ends[1]
+
+
+@pytest.fixture(scope="session")
+def run_program() -> Callable:
+    """Return the context manager that runs a program: (command, fds) to its process."""
+    return running
+
+
+@pytest.fixture(scope="session")
+def first_line() -> Callable[[subprocess.Popen], str]:
+    """Return the function that waits for the first line of a program."""
+    return read_line
+
+
+@pytest.fixture(scope="session")
+def cable() -> Callable:
+    """Return the context manager that connects two ptys: folder to both device files."""
+    return serial_cable

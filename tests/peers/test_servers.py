@@ -1,0 +1,347 @@
+"""The Modbus driver against servers of other people, over TCP and over a serial cable of ptys.
+
+What is written is read back, and what is to be read is written, by pymodbus's client: the driver
+and the server alone could agree on something wrong.
+"""
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hilctl.errors import DeviceError
+from hilctl_drivers.modbus_dac import ModbusDac
+from hilctl_drivers.modbus_options import ModbusOptions
+
+HERE = Path(__file__).parent
+BAUD = 115_200
+RATE_HZ = 10.0
+SHORT_S = 0.5
+HANG_S = 20.0
+PROFILE = """\
+vendor: somebody else
+model: a server with 16 holding registers
+source: [tests/peers]
+verified: "yes"
+link: {link}
+address_base: 0
+exchange: 23
+turnaround_s: 0.0
+max_rate_hz: 1000.0
+outputs:
+  FLOAT: {{address: 0, type: float32, unit: V, min: -10.0, max: 10.0}}
+  SWAPPED: {{address: 2, type: float32, order: CDAB, unit: V, min: -10.0, max: 10.0}}
+  INT:
+    {{address: 4, type: int16, scale: 0.0005, offset: 1.0, unit: V, min: -10.0, max: 10.0,
+      function: 6}}
+  GONE: {{address: 100, type: float32, unit: V, min: -10.0, max: 10.0}}
+inputs:
+  FLOAT: {{address: 8, type: float32, unit: V, min: -10.0, max: 10.0}}
+  SWAPPED: {{address: 10, type: float32, order: CDAB, unit: V, min: -10.0, max: 10.0}}
+  INT: {{address: 12, type: int16, scale: 0.0005, offset: 1.0, unit: V, min: -10.0, max: 10.0}}
+  ECHO: {{address: 0, type: float32, unit: V, min: -10.0, max: 10.0}}
+  GONE: {{address: 100, type: float32, unit: V, min: -10.0, max: 10.0}}
+watchdog: none
+"""
+OUTPUT_AT = {"FLOAT": 0, "SWAPPED": 2, "INT": 4}
+INPUT_AT = {"FLOAT": 8, "SWAPPED": 10, "INT": 12}
+
+
+@dataclass(frozen=True)
+class Server:
+    """A server of somebody else.
+
+    Attributes:
+        name: What it is built on.
+        link: tcp or rtu.
+        writes_and_reads: Whether it knows function 23.
+        reads_first: Whether its function 23 reads before it writes, which the standard has the
+            other way round (section 6.17).
+        no_such_register: How a read past its end looks.
+        timeout_s: Longest wait for one answer; those that never answer cost this.
+    """
+
+    name: str
+    link: str
+    writes_and_reads: bool = True
+    reads_first: bool = False
+    no_such_register: str = r"exception 2 \(illegal data address\)"
+    timeout_s: float = 2.0
+
+
+SERVERS = {
+    f"{server.name} {server.link}": server
+    for server in (
+        Server("libmodbus", "tcp"),
+        Server("libmodbus", "rtu"),
+        Server("pyModbusTCP", "tcp"),
+        Server("modbus-tk", "tcp", reads_first=True),
+        Server("modbus-tk", "rtu", reads_first=True),
+        Server("pymodbus", "tcp"),
+        Server("pymodbus", "rtu"),
+        Server("modbus-serial", "tcp", writes_and_reads=False),
+        Server(  # silent about function 23, deaf from then on, and sends a reply without data
+            "jsmodbus",
+            "tcp",
+            writes_and_reads=False,
+            no_such_register="reply must",
+            timeout_s=SHORT_S,
+        ),
+    )
+}
+MODULES = {"pyModbusTCP": "pyModbusTCP", "modbus-tk": "modbus_tk", "pymodbus": "pymodbus"}
+
+
+class Served:
+    """A server that runs.
+
+    Args:
+        server: What it is.
+        process: Its process.
+        where: How the driver finds it.
+        folder: For profiles.
+    """
+
+    def __init__(
+        self, server: Server, process: subprocess.Popen, where: dict, folder: Path
+    ) -> None:
+        self.server = server
+        self.process = process
+        self._where = where
+        self._profile = folder / "profile.yaml"
+        link = "{kind: tcp}" if server.link == "tcp" else f"{{kind: rtu, baud: {BAUD}}}"
+        self._profile.write_text(PROFILE.format(link=link), encoding="utf-8")
+
+    def device(self, output: str = "FLOAT", sensor: str = "FLOAT", **more) -> ModbusDac:
+        """Return a device on it: 2 A/V and 1 A at 0 V, 12.5 um/V and -4 um at 0 V."""
+        options = {
+            "profile": str(self._profile),
+            "output": output,
+            "input": sensor,
+            "timeout_s": self.server.timeout_s,
+            "amplifier": {"gain_a_per_v": 2.0, "offset_a": 1.0},
+            "sensor": {"um_per_v": 12.5, "offset_um": -4.0},
+            "watchdog": "none",
+            **self._where,
+            **more,
+        }
+        return ModbusDac(ModbusOptions.model_validate(options))
+
+    @contextmanager
+    def client(self):
+        """Give pymodbus's client; over a serial cable, the driver must be closed meanwhile."""
+        from pymodbus.client import ModbusSerialClient, ModbusTcpClient
+
+        if self.server.link == "tcp":
+            made = ModbusTcpClient(self._where["host"], port=self._where["port"])
+        else:
+            made = ModbusSerialClient(self._where["serial_port"], baudrate=BAUD)
+        assert made.connect()
+        try:
+            yield made
+        finally:
+            made.close()
+
+    def put(self, kind: str, volts: float) -> None:
+        """Make an input show this voltage."""
+        with self.client() as client:
+            if kind == "INT":
+                words = client.convert_to_registers(
+                    round((volts - 1.0) / 0.0005), client.DATATYPE.INT16
+                )
+            else:
+                words = client.convert_to_registers(volts, client.DATATYPE.FLOAT32, order(kind))
+            assert not client.write_registers(INPUT_AT[kind], words).isError()
+
+    def get(self, kind: str) -> float:
+        """Return the voltage that an output holds."""
+        with self.client() as client:
+            count = 1 if kind == "INT" else 2
+            reply = client.read_holding_registers(OUTPUT_AT[kind], count=count)
+            assert not reply.isError()
+            if kind == "INT":
+                raw = client.convert_from_registers(reply.registers, client.DATATYPE.INT16)
+                return raw * 0.0005 + 1.0
+            return client.convert_from_registers(
+                reply.registers, client.DATATYPE.FLOAT32, order(kind)
+            )
+
+
+def order(kind: str) -> str:
+    return "little" if kind == "SWAPPED" else "big"
+
+
+@pytest.fixture(scope="module")
+def start(programs, run_program, first_line, cable, tmp_path_factory) -> Callable:
+    """Return the context manager that runs a server."""
+
+    @contextmanager
+    def started(server: Server) -> Iterator[Served]:
+        folder = tmp_path_factory.mktemp(server.name)
+        with ExitStack() as stack:
+            fds: tuple[int, ...] = ()
+            where: dict = {}
+            words = [server.link]
+            if server.link == "rtu":
+                near, far = stack.enter_context(cable(folder))
+                where = {"serial_port": near}
+                words = [server.link, far]
+            if server.name == "libmodbus":
+                command = [programs.libmodbus_server()]
+                if server.link == "rtu":
+                    fds = (os.open(words[1], os.O_RDWR | os.O_NOCTTY),)
+                    stack.callback(os.close, fds[0])
+                    words = [server.link, str(fds[0])]
+            elif server.name in MODULES:
+                programs.module(MODULES[server.name])
+                command = [sys.executable, str(HERE / "servers.py"), server.name]
+            else:
+                node = programs.node_package(server.name)
+                command, words = [node, str(HERE / "servers.cjs"), server.name], []
+            process = stack.enter_context(run_program([*command, *words], fds))
+            said = first_line(process)
+            if server.link == "tcp":
+                where = {"host": "127.0.0.1", "port": int(said)}
+            yield Served(server, process, where, folder)
+
+    return started
+
+
+@pytest.fixture(scope="module", params=SERVERS)
+def served(request, start) -> Iterator[Served]:
+    """A server that runs, each of them in turn."""
+    with start(SERVERS[request.param]) as made:
+        yield made
+
+
+def exchange(device: ModbusDac, *commands: float) -> list[float]:
+    """Exchange one sample after the other; return what was measured, um."""
+    measured = []
+    for k, command in enumerate(commands):
+        displacement_um = np.full(1, np.nan)
+        device.exchange(k, np.array([command]), displacement_um, np.empty(1))
+        measured.append(displacement_um.item())
+    return measured
+
+
+@pytest.mark.parametrize("kind", ["FLOAT", "SWAPPED", "INT"])
+def test_values_come_back_right(served, kind):
+    """What the server holds is what was commanded, and what it shows is what is measured."""
+    device = served.device(kind, kind)
+    for volts, command in ((-7.5, 3.5), (4.125, -11.0), (9.9995, 20.5)):
+        served.put(kind, volts)
+        device.open(RATE_HZ, 1)
+        measured = exchange(device, 0.0, 7.0, command)
+        device.close()
+        assert measured == pytest.approx([12.5 * volts - 4.0] * 3, rel=1e-6)
+        assert served.get(kind) == pytest.approx((command - 1.0) / 2.0, rel=1e-6)
+
+
+def test_finds_out_whether_a_sample_is_one_transaction(served):
+    """Function 23 is used where the server knows it, and a write and a read where it doesn't."""
+    device = served.device()
+    device.open(RATE_HZ, 1)
+    device.close()
+    assert device.one_transaction == served.server.writes_and_reads
+
+
+def test_opening_does_not_move_the_output(served):
+    """Finding out what the server can do leaves the output as it was."""
+    device = served.device()
+    device.open(RATE_HZ, 1)
+    exchange(device, 8.0)
+    device.close()
+    device.open(RATE_HZ, 1)
+    device.close()
+    assert served.get("FLOAT") == 3.5
+
+
+def test_reads_after_it_writes(served):
+    """An input at the output's own address shows this sample's command."""
+    device = served.device("FLOAT", "ECHO")
+    device.open(RATE_HZ, 1)
+    commands = [1.0, 3.0, -5.0, 7.0]
+    volts = [(command - 1.0) / 2.0 for command in commands]
+    measured = exchange(device, *commands)
+    device.close()
+    shown = [(value + 4.0) / 12.5 for value in measured]
+    if served.server.reads_first:
+        assert shown[1:] == pytest.approx(volts[:-1])
+    else:
+        assert shown == pytest.approx(volts)
+
+
+@pytest.mark.parametrize(("output", "sensor"), [("GONE", "FLOAT"), ("FLOAT", "GONE")])
+def test_says_in_words_that_a_register_is_missing(served, output, sensor):
+    """A wrong address ends as an error that names the exception, at the first sample or before."""
+    device = served.device(output, sensor)
+
+    def use() -> None:
+        device.open(RATE_HZ, 1)
+        exchange(device, 0.0)
+
+    with pytest.raises(DeviceError, match=served.server.no_such_register):
+        use()
+    device.close()
+
+
+def test_make_safe_works_open_or_closed(served):
+    """The last resort puts the output where it is told to, with or without a connection."""
+    device = served.device("INT", "INT")
+    device.open(RATE_HZ, 1)
+    exchange(device, 9.0)
+    device.make_safe(1.0)
+    assert served.get("INT") == pytest.approx(0.0, abs=1e-12)
+    device.make_safe(3.0)
+    assert served.get("INT") == pytest.approx(1.0)
+
+
+def test_out_of_range_never_reaches_the_server(served):
+    """A command beyond the range is refused, and the output holds what it held."""
+    device = served.device()
+    device.open(RATE_HZ, 1)
+    exchange(device, 5.0)
+    for command in (21.01, -19.01, np.nan, np.inf):
+        with pytest.raises(DeviceError, match="nothing was sent"):
+            exchange(device, command)
+    device.close()
+    assert served.get("FLOAT") == 2.0
+
+
+@pytest.mark.parametrize("name", [name for name in SERVERS if name.endswith("rtu")])
+def test_only_its_own_unit_answers(start, name):
+    """Another unit on the line is not there; after its silence the right one still answers."""
+    with start(SERVERS[name]) as served:
+        with pytest.raises(DeviceError, match=r"no answer|exception"):
+            served.device(unit_id=9, timeout_s=SHORT_S).open(RATE_HZ, 1)
+        device = served.device()
+        device.open(RATE_HZ, 1)
+        exchange(device, 4.0)
+        device.close()
+        assert served.get("FLOAT") == 1.5
+
+
+@pytest.mark.parametrize("name", SERVERS)
+def test_death_of_the_server_is_an_error_within_the_time_out(start, name):
+    """A server that dies between two samples costs one time-out, not the machine."""
+    with start(SERVERS[name]) as served:
+        device = served.device(timeout_s=SHORT_S)
+        device.open(RATE_HZ, 1)
+        exchange(device, 3.0)
+        served.process.kill()
+        served.process.wait()
+        before_s = time.monotonic()
+        with pytest.raises(DeviceError, match=r"connection|no answer"):
+            exchange(device, 3.0)
+        with pytest.raises(DeviceError, match="not open"):
+            exchange(device, 3.0)
+        with pytest.raises(DeviceError, match="make safe"):
+            device.make_safe(0.0)
+        assert time.monotonic() - before_s < HANG_S
