@@ -1,11 +1,12 @@
-"""What it costs to feed a strict watchdog, which exchanges don't feed.
+"""How often a watchdog must be fed, and what it costs where exchanges don't feed it.
 
-It has feed steps of its own, sent three times in its time-out. The ticks in which that happens must
-fit in a sample period like all others.
+A strict one has feed steps of its own, sent three times in its time-out. The ticks in which that
+happens must fit in a sample period like all others.
 """
 
 from dataclasses import replace
 
+from hilctl.errors import DeviceError
 from hilctl_drivers.modbus_frames import coil_pdu, read_pdu, write_pdu, write_single_pdu
 from hilctl_drivers.profile_ascii import (
     AsciiProfile,
@@ -18,6 +19,23 @@ from hilctl_drivers.profile_modbus import ModbusProfile, ModbusWatchdog
 from hilctl_drivers.profile_parts import WaitStep
 from hilctl_drivers.profile_steps import EnsureStep, ExpectStep, ModbusStep
 from hilctl_drivers.wire_time import Line, Profile, WireTime, lines_time, requests_time
+
+_FEEDS_A_TIMEOUT = 3.0
+
+
+def check_feeds(timeout_s: float | None, ticks_per_s: float) -> int:
+    """Return how many ticks come in a third of the watchdog's timeout; 0 without a watchdog.
+
+    Raises:
+        DeviceError: Less than one.
+    """
+    if timeout_s is None:
+        return 0
+    ticks = timeout_s * ticks_per_s / _FEEDS_A_TIMEOUT
+    if ticks < 1.0:
+        rule = f"{_FEEDS_A_TIMEOUT:g} exchanges must come within the watchdog's timeout"
+        raise DeviceError(f"{rule}, {timeout_s:g} s, got {ticks_per_s:g} a second")
+    return int(ticks)
 
 
 def feed_time(profile: Profile) -> WireTime | None:

@@ -1,9 +1,9 @@
 """A DAC and an ADC on Modbus TCP or RTU as one device: ``modbus_dac``.
 
 The profile says what the registers mean, the experiment what they are wired to. A tick is one
-transaction where the device can write and read in one (function 23, or 76 on LabJack's), else a
-write and a read; the read may go to another device. Nothing is sent twice, and nothing before the
-last reply has come.
+transaction where the device can read and write in one (function 23, or 76 on LabJack's), else a
+read and then a write; the read may go to another device. Nothing is sent twice, and nothing before
+the last reply has come.
 """
 
 from typing import ClassVar
@@ -53,8 +53,8 @@ class ModbusDac:
     def open(self, sample_rate_hz: float, block: int) -> None:
         """Connect, check that it is the device of the profile, and set it up.
 
-        Self-test, init steps, watchdog; then whether it can write and read in one transaction,
-        which is tried by writing what the output holds already.
+        Self-test, init steps, one reading of the input; then whether it can read and write in one
+        transaction, which is tried by writing what the output holds already; the watchdog.
 
         Raises:
             DeviceError: It can't be reached, is another device, refuses a step, or can't keep this
@@ -166,7 +166,7 @@ class ModbusDac:
 
     def _check_rate(self, sample_rate_hz: float, highest_hz: float) -> None:
         if not 0.0 < sample_rate_hz <= highest_hz:
-            how = "one transaction" if self.one_transaction else "a write and a read"
+            how = "one transaction" if self.one_transaction else "a read and a write"
             note = self._setup.rate(self.one_transaction)[1]
             rule = f"sample rate must be in (0, {highest_hz:.6g}] Hz with {how} a sample ({note})"
             raise self._error("open", f"{rule}, got {sample_rate_hz:g}")

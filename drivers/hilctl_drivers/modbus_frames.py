@@ -113,15 +113,17 @@ def write_read_pdu(read_address: int, read_count: int, write_address: int, data:
 
 
 def feedback_pdu(write_address: int, data: bytes, read_address: int, read_count: int) -> bytes:
-    """Return a LabJack Modbus Feedback request: one write frame, then one read frame (76).
+    """Return a LabJack Modbus Feedback request: one read frame, then one write frame (76).
+
+    Frames are carried out in their order, so what is read does not show yet what is written.
 
     Arguments and errors are as for :func:`write_read_pdu`, with at most 122 registers to write and
     126 to read: what fits a PDU of 253 bytes.
     """
     count = _written(write_address, data, (PDU_MAX - 9) // 2)
     _check_span("register", read_address, read_count, (PDU_MAX - 1) // 2)
-    write = struct.pack(">BBHB", FEEDBACK, 1, write_address, count) + data
-    return write + struct.pack(">BHB", 0, read_address, read_count)
+    read = struct.pack(">BBHB", FEEDBACK, 0, read_address, read_count)
+    return read + struct.pack(">BHB", 1, write_address, count) + data
 
 
 def reply_layout(pdu: bytes) -> tuple[bytes, int]:
@@ -138,7 +140,7 @@ def reply_layout(pdu: bytes) -> tuple[bytes, int]:
     elif function in {WRITE_COIL, WRITE_REGISTER, WRITE_REGISTERS}:
         return pdu[:5], 0
     elif function == FEEDBACK:
-        return pdu[:1], 2 * pdu[-1]
+        return pdu[:1], 2 * pdu[4]
     else:
         raise BadRequest(f"function {function} is not one of those known here")
     return bytes((function, size)), size

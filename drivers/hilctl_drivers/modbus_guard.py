@@ -1,11 +1,9 @@
 """The host watchdog of a Modbus device during a run: cleared, armed, fed, disarmed."""
 
-from hilctl.errors import DeviceError
+from hilctl_drivers.feed_time import check_feeds
 from hilctl_drivers.modbus_session import ModbusSession
 from hilctl_drivers.modbus_setup import ModbusSetup
 from hilctl_drivers.profile_modbus import ModbusWatchdog
-
-_FEEDS_A_TIMEOUT = 3.0
 
 
 class ModbusGuard:
@@ -43,17 +41,14 @@ class ModbusGuard:
         self._ticks = self.feed_every = 0
         if wanted == "none" or watchdog == "none":
             return
-        ticks = wanted.timeout_s * sample_rate_hz / _FEEDS_A_TIMEOUT
-        if ticks < 1.0:
-            rule = f"{_FEEDS_A_TIMEOUT:g} samples must come within the watchdog's timeout"
-            raise DeviceError(f"{rule}, {wanted.timeout_s:g} s, got {sample_rate_hz:g} Hz")
+        ticks = check_feeds(wanted.timeout_s, sample_rate_hz)
         safe = watchdog.safe.get(self._setup.options.output, ())
         steps = self._setup.bound((*safe, *watchdog.arm))
         if session.would_change(steps):
             self._run(session, "unlock")
         session.run(steps)
         if watchdog.kick == "strict":
-            self.feed_every = int(ticks)
+            self.feed_every = ticks
 
     def disarm(self, session: ModbusSession) -> None:
         """Stop it, where the experiment wanted one.

@@ -17,7 +17,11 @@ from hilctl_drivers.modbus_setup import ModbusSetup
 from hilctl_drivers.wire_errors import Refused
 
 Swap: TypeAlias = Callable[[bytes], bytes]
-"""Write these register bytes to the output, return those of the input."""
+"""Write these register bytes to the output, return those of the input.
+
+The input is read first, so that it does not show yet what is written. Function 23 has an order of
+its own: the specification lets the device write first.
+"""
 
 
 class ModbusPair:
@@ -81,11 +85,15 @@ class ModbusPair:
     def find_swap(self) -> tuple[Swap, bool]:
         """Return how a sample is exchanged, and whether that is one transaction.
 
-        One transaction is tried by writing what the output holds already.
+        The input is read once before: an address that the device does not have must not show only
+        when the output has begun to move. One transaction is tried by writing what the output holds
+        already.
 
         Raises:
-            DeviceError: The output can't be read.
+            DeviceError: The input or the output can't be read.
         """
+        with self._reader_named():
+            self.reader.read_bytes(self._setup.input)
         swap = self._combined()
         readback = self._setup.output.readback_register
         if swap is None or readback is None:
@@ -120,15 +128,17 @@ class ModbusPair:
         read = reader.prepare(read_pdu(source.read_function, address, source.words))
 
         def pair(data: bytes) -> bytes:
+            found = reader.call(read)
             writer.call(write, data)
-            return reader.call(read)
+            return found
 
         def named_pair(data: bytes) -> bytes:
-            writer.call(write, data)
             try:
-                return reader.call(read)
+                found = reader.call(read)
             except DeviceError as error:
                 raise self._named(error) from None
+            writer.call(write, data)
+            return found
 
         return pair if self._one else named_pair
 
@@ -156,4 +166,5 @@ class ModbusPair:
             raise self._named(error) from None
 
     def _named(self, error: DeviceError) -> DeviceError:
-        return DeviceError(f"{self._setup.reader_title}: {error}")
+        """Return an error that says that the reader made it, where it is another device."""
+        return error if self._one else DeviceError(f"{self._setup.reader_title}: {error}")

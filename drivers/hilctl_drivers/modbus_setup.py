@@ -129,7 +129,7 @@ class ModbusSetup:
         if self.reads_elsewhere:
             write = exchange_time(self.profile, name, None)
             read = read_pdu(self.input.read_function, self.input_address(), self.input.words)
-            wire = write.then(requests_time(self.reader.profile, [read]))
+            wire = requests_time(self.reader.profile, [read]).then(write)
             if self.shares_link:
                 return wire
             # Of two lines, one is silent before its next request while the other is at work.
@@ -142,7 +142,7 @@ class ModbusSetup:
         """Return the highest sample rate, in Hz, and why it is that.
 
         Args:
-            one_transaction: Whether a sample is one transaction, not a write and a read.
+            one_transaction: Whether a sample is one transaction, not a read and a write.
         """
         wire = self.wire(one_transaction)
         if self.options.watchdog != "none":

@@ -84,7 +84,7 @@ def _data_span(pdu: bytes) -> tuple[int, int]:
     if function == WRITE_READ:
         return 10, len(pdu)
     if function == FEEDBACK:
-        return 5, len(pdu) - 4
+        return 9, len(pdu)
     return len(pdu), len(pdu)
 
 

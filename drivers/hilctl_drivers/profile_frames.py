@@ -51,7 +51,12 @@ class FrameStreaming(Part):
 
 
 class FrameWatchdog(Watchdog):
-    """The board's watchdog: armed, given its safe value and cleared by a WATCHDOG message."""
+    """The board's watchdog: armed, given its safe value and cleared by a WATCHDOG message.
+
+    It has no message that only feeds, so exchanges must.
+    """
+
+    kick: Literal["any", "write"] = Field(description="what feeds it: any request, or a write")
 
 
 class FrameProfile(BaseProfile):

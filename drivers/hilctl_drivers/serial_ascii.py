@@ -7,9 +7,9 @@ from hilctl.arrays import F64
 from hilctl.errors import DeviceError
 from hilctl_drivers.ascii_lines import parse_number
 from hilctl_drivers.ascii_session import AsciiSession
+from hilctl_drivers.feed_time import check_feeds
 from hilctl_drivers.links import LostError
 from hilctl_drivers.profile_ascii import AsciiInput, AsciiOutput, AsciiProfile
-from hilctl_drivers.serial_board import check_feeds
 from hilctl_drivers.serial_setup import SerialSetup
 from hilctl_drivers.wire_errors import WatchdogTripped
 

@@ -6,12 +6,11 @@ from hilctl.arrays import F64
 from hilctl.errors import DeviceError
 from hilctl_drivers import board_protocol as board
 from hilctl_drivers.board_session import BoardFacts, BoardSession
+from hilctl_drivers.feed_time import check_feeds
 from hilctl_drivers.links import Link, LostError
 from hilctl_drivers.profile_frames import FrameProfile
 from hilctl_drivers.serial_setup import SerialSetup
 from hilctl_drivers.wire_errors import WatchdogTripped
-
-_FEEDS_A_TIMEOUT = 3.0
 
 
 class Wire(Protocol):
@@ -54,21 +53,6 @@ class Wire(Protocol):
     def release(self) -> None:
         """Let go of the port and say nothing to the device."""
         ...
-
-
-def check_feeds(timeout_s: float | None, ticks_per_s: float) -> int:
-    """Return how many ticks come in a third of the watchdog's timeout; 0 without a watchdog.
-
-    Raises:
-        DeviceError: Less than one.
-    """
-    if timeout_s is None:
-        return 0
-    ticks = timeout_s * ticks_per_s / _FEEDS_A_TIMEOUT
-    if ticks < 1.0:
-        rule = f"{_FEEDS_A_TIMEOUT:g} exchanges must come within the watchdog's timeout"
-        raise DeviceError(f"{rule}, {timeout_s:g} s, got {ticks_per_s:g} a second")
-    return int(ticks)
 
 
 class BoardWire:

@@ -11,8 +11,9 @@ import numpy as np
 from hilctl.arrays import F64
 from hilctl.errors import DeviceError
 from hilctl_drivers.board_session import BoardFacts, Readings
+from hilctl_drivers.feed_time import check_feeds
 from hilctl_drivers.profile_frames import FrameProfile, FrameStreaming
-from hilctl_drivers.serial_board import BoardWire, check_feeds
+from hilctl_drivers.serial_board import BoardWire
 from hilctl_drivers.serial_setup import SerialSetup
 
 _FIRST_MAX = 2**32

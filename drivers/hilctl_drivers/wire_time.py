@@ -165,7 +165,7 @@ def _modbus_requests(
     write = write_single_pdu(at, data) if output.function == 6 else write_pdu(at, data)
     if sensor is None:
         return [write]
-    return [write, read_pdu(sensor.read_function, source, sensor.words)]
+    return [read_pdu(sensor.read_function, source, sensor.words), write]
 
 
 def lines_time(profile: AsciiProfile, lines: Sequence[Line]) -> WireTime:

@@ -264,7 +264,10 @@ def test_opening_does_not_move_the_output(served):
 
 
 def test_reads_after_it_writes(served):
-    """An input at the output's own address shows this sample's command."""
+    """An input at the output's own address shows this sample's command if function 23 writes first.
+
+    Where there is no function 23, hilctl reads first and then writes.
+    """
     device = served.device("FLOAT", "ECHO")
     device.open(RATE_HZ, 1)
     commands = [1.0, 3.0, -5.0, 7.0]
@@ -272,7 +275,7 @@ def test_reads_after_it_writes(served):
     measured = exchange(device, *commands)
     device.close()
     shown = [(value + 4.0) / 12.5 for value in measured]
-    if served.server.reads_first:
+    if served.server.reads_first or not served.server.writes_and_reads:
         assert shown[1:] == pytest.approx(volts[:-1])
     else:
         assert shown == pytest.approx(volts)

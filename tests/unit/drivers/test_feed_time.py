@@ -124,7 +124,7 @@ def test_a_tick_that_feeds_must_fit():
     assert both.total_s == pytest.approx(exchange.total_s + requests_s(WRITE))
     assert (both.gaps, both.samples) == (6, 1)
     assert str(both).startswith(
-        "FC16+FC03 at 9600 8N1, then FC06 at 9600 8N1 to feed the watchdog: request "
+        "FC03+FC16 at 9600 8N1, then FC06 at 9600 8N1 to feed the watchdog: request "
     )
 
 

@@ -15,7 +15,7 @@ from hilctl_drivers.emulator.faults import parse_fault
 from hilctl_drivers.emulator.modbus_bench import Emulator, EmulatorOptions, build
 from hilctl_drivers.modbus_dac import ModbusDac
 from hilctl_drivers.modbus_options import ModbusOptions
-from hilctl_drivers.profile import load_profile
+from hilctl_drivers.profile import load_profile, shipped_profiles
 
 T7 = {
     "profile": "labjack_t7",
@@ -239,7 +239,7 @@ class TestExchange:
         ],
     )
     def test_one_transaction_is_found_out_without_moving(self, serve, options, without, one):
-        """Refusal and silence both lead to a write and a read; the output stays where it was."""
+        """Refusal and silence both lead to a read and a write; the output stays where it was."""
         served = serve(options["profile"], **without)
         device = served.device(options, timeout_s=0.5)
         device.open(10.0, 1)
@@ -251,12 +251,47 @@ class TestExchange:
         assert served.events()[-1]["current_a"] == pytest.approx(3.0, abs=1e-3)
         device.close()
 
+    @pytest.mark.parametrize("without", [{}, {"lacking": frozenset({76})}])
+    def test_input_is_read_before_the_output_is_written(self, serve, without):
+        """In one message or in two: the reading shows nothing yet of the command."""
+        served = serve("labjack_t7", **without)
+        device = served.device(T7)
+        device.open(10.0, 1)
+        emulated, order = served.emulator.device, []
+        read, write = emulated.read, emulated.write
+
+        def reading(areas: tuple[str, ...], address: int, count: int) -> list[int]:
+            order.append(("read", address))
+            return read(areas, address, count)
+
+        def writing(area: str, address: int, values: list[int]) -> None:
+            order.append(("write", address))
+            write(area, address, values)
+
+        emulated.read, emulated.write = reading, writing
+        exchange(device, 1.0)
+        assert order == [("read", 0), ("write", 1000)]
+        device.close()
+
+    @pytest.mark.parametrize("kind", ["23", "none"])
+    def test_wrong_input_is_found_out_at_opening(self, serve, tmp_path, kind):
+        """An address that the device does not have is refused before anything is written."""
+        served = serve("generic_float32")
+        text = shipped_profiles()["generic_float32"].read_text(encoding="utf-8")
+        wrong = tmp_path / "wrong.yaml"
+        text = text.replace("exchange: 23", f"exchange: {kind}")
+        wrong.write_text(text.replace("IN: {address: 2,", "IN: {address: 50,"), encoding="utf-8")
+        device = served.device({**RTU, "profile": str(wrong)})
+        with pytest.raises(DeviceError, match=r"exception 2 .* \(to open\)"):
+            device.open(10.0, 1)
+        assert served.events() == []
+
     def test_slower_way_may_be_too_slow(self, serve):
         """A rate that only one transaction could keep is refused where the device lacks it."""
         served = serve("labjack_t7", lacking=frozenset({76}))
         device = served.device(T7)
         device.open(500.0, 1)
-        with pytest.raises(DeviceError, match=r"\(0, 500\] Hz with a write and a read a sample"):
+        with pytest.raises(DeviceError, match=r"\(0, 500\] Hz with a read and a write a sample"):
             device.open(501.0, 1)
 
     def test_output_that_can_not_be_read_is_not_tried(self, serve):
@@ -306,6 +341,49 @@ class TestExchange:
         device.open(100.0, 1)
         exchange(device, 0.0)
         device.close()
+
+    @pytest.mark.parametrize(
+        ("fault", "said"),
+        [
+            ("silence", "no answer within 0.2 s"),
+            ("corrupt", "not a Modbus TCP header"),
+            ("cut", "only 6 bytes, 3 short, within 0.2 s"),
+            ("duplicate", "bytes behind the end of the reply"),
+            ("wrong_id", "transaction must be"),
+            ("reset", "connection lost: connection reset by peer"),
+        ],
+    )
+    def test_bad_answer_over_tcp_is_told(self, serve, fault, said):
+        """In words, with what was asked; the safe value gets there by a new connection."""
+        served = serve("labjack_t7", faults=(parse_fault(f"{fault}@1s"),))
+        device = served.device(T7, timeout_s=0.2)
+        self.assert_told(served, device, said)
+
+    @pytest.mark.parametrize(
+        ("fault", "said"),
+        [
+            ("silence", "no answer within 0.2 s"),
+            ("corrupt", "CRC of 9 bytes is wrong"),
+            ("cut", "short, within 0.2 s"),
+            ("duplicate", "CRC of 18 bytes is wrong"),
+            ("wrong_id", "unit must be 1, got 2"),
+        ],
+    )
+    def test_bad_answer_over_rtu_is_told(self, serve, module, fault, said):
+        """The same on a serial line."""
+        served = serve(module, faults=(parse_fault(f"{fault}@1s"),))
+        device = served.device({**RTU, "profile": module}, timeout_s=0.2)
+        self.assert_told(served, device, said)
+
+    @staticmethod
+    def assert_told(served: Served, device: ModbusDac, said: str) -> None:
+        device.open(100.0, 1)
+        exchange(device, 1.0)
+        served.clock.pass_s(2.0)
+        with pytest.raises(DeviceError, match=said):
+            exchange(device, 1.0)
+        device.make_safe(0.0)
+        assert served.events()[-1]["current_a"] == pytest.approx(0.0, abs=1e-5)
 
     def test_nobody_there(self):
         """A refused connection names the device, where it should be, and what was tried."""
@@ -424,7 +502,9 @@ class TestWatchdog:
         """Fewer than three samples in its time-out are refused at open."""
         served = serve("labjack_t7")
         device = served.device(T7, watchdog={"timeout_s": 1.0})
-        with pytest.raises(DeviceError, match="3 samples must come within the watchdog's timeout"):
+        with pytest.raises(
+            DeviceError, match="3 exchanges must come within the watchdog's timeout"
+        ):
             device.open(2.0, 1)
 
 

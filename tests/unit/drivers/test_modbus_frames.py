@@ -74,14 +74,14 @@ EXAMPLES = [
     # LabJack's frames: write "01 addr16 nregs data", read "00 addr16 nregs"; the reply is data.
     pytest.param(
         feedback_pdu(1000, H("40200000"), 0, 2),
-        "4C 01 03E8 02 40200000 00 0000 02",
+        "4C 00 0000 02 01 03E8 02 40200000",
         "4C 3F800000",
         "3F800000",
         id="LabJack MBFB",
     ),
     pytest.param(
         feedback_pdu(3, H("12345678"), 1, 1),
-        "4C 01 0003 02 12345678 00 0001 01",
+        "4C 00 0001 01 01 0003 02 12345678",
         "4C 9ABC",
         "9ABC",
         id="LabJack MBFB, other sizes",

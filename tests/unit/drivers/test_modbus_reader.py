@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from hilctl.errors import DeviceError, InputError
+from hilctl_drivers.emulator.faults import parse_fault
 from hilctl_drivers.emulator.modbus_bench import Emulator, EmulatorOptions, build
 from hilctl_drivers.modbus_dac import ModbusDac
 from hilctl_drivers.modbus_options import ModbusOptions
@@ -144,17 +145,17 @@ class TestPlaces:
         assert served.events()[-1]["current_a"] == pytest.approx(0.0, abs=5e-3)
 
     def test_rate_counts_both(self):
-        """One write and one read at 9600 8N1: 31 characters, 4 gaps and two turnarounds."""
+        """One read and one write at 9600 8N1: 31 characters, 4 gaps and two turnarounds."""
         info = made().info
         total_s = 31 * 10 / 9600 + 4 * 3.5 * 10 / 9600 + 2 * 0.002
         assert info.max_rate_hz == pytest.approx(1.0 / total_s)
-        assert "FC06 at 9600 8N1, then FC04 at 9600 8N1" in info.rate_note
+        assert "FC04 at 9600 8N1, then FC06 at 9600 8N1" in info.rate_note
 
     def test_baud_of_a_shared_line_is_that_of_both(self):
         """The reader's own profile has another; a faster line leaves the slower device's limit."""
         info = made(baud=115200).info
         assert info.max_rate_hz == 60.0
-        assert info.rate_note.startswith("profile icp_m7017 says so; the wire alone: FC06 at 1152")
+        assert info.rate_note.startswith("profile icp_m7017 says so; the wire alone: FC04 at 1152")
 
     def test_two_lines_are_silent_at_the_same_time(self):
         """With a line each, only the silence before the two replies counts."""
@@ -162,7 +163,7 @@ class TestPlaces:
         total_s = 31 * 10 / 9600 + 2 * 3.5 * 10 / 9600 + 2 * 0.002
         assert info.max_rate_hz == pytest.approx(1.0 / total_s)
         faster = made(reader_serial_port="/dev/y", reader_baud=115200).info
-        assert "then FC04 at 115200 8N1" in faster.rate_note
+        assert faster.rate_note.startswith("FC04 at 115200 8N1, then FC06 at 9600 8N1")
 
     def test_a_place_named_twice_is_one_line(self, tmp_path):
         """Two names of one port are one port; a reader there needs a unit id of its own."""
@@ -227,14 +228,26 @@ class TestReader:
         ("fault", "said"),
         [({"mute": frozenset({4})}, "no answer"), ({"lacking": frozenset({4})}, "exception 1")],
     )
-    def test_errors_name_the_reader(self, serve, fault, said):
-        """The message says which device, where, and what was being done."""
+    def test_input_that_can_not_be_read_moves_nothing(self, serve, fault, said):
+        """It is read once at opening, before the first write."""
         served = serve("icp_m7024", "icp_m7017", **fault)
+        with pytest.raises(DeviceError, match=rf": reader icp_m7017, .*{said}.* \(to open\)"):
+            served.device(timeout_s=0.2).open(5.0, 1)
+        assert served.events() == []
+
+    @pytest.mark.parametrize(
+        ("fault", "said"), [("silence@1s", "no answer"), ("exception@1s", "exception 4")]
+    )
+    def test_errors_name_the_reader(self, serve, fault, said):
+        """The message says which device, where, and what was being done; nothing was written."""
+        served = serve("icp_m7024", "icp_m7017", faults=(parse_fault(fault),))
         device = served.device(timeout_s=0.2)
         device.open(5.0, 1)
+        served.clock.pass_s(2.0)
         named = rf"modbus_dac icp_m7024 at .*: reader icp_m7017, unit 2 at .*: .*{said}.* \(to wri"
         with pytest.raises(DeviceError, match=named):
             exchange(device, 1.0)
+        assert served.events() == []
         with pytest.raises(DeviceError, match="not open"):
             exchange(device, 1.0)
         device.make_safe(0.0)
@@ -251,11 +264,13 @@ class TestReader:
 
     def test_both_lines_are_let_go_of(self, serve):
         """After an error in the one, neither port is kept."""
-        served = serve("icp_m7024", "icp_m7017", reader_line="own", mute=frozenset({4}))
+        faults = (parse_fault("silence@1s"),)
+        served = serve("icp_m7024", "icp_m7017", reader_line="own", faults=faults)
         device, other = served.device(timeout_s=0.2), served.device(timeout_s=0.2)
         device.open(5.0, 1)
         with pytest.raises(DeviceError, match="can't be opened"):
             other.open(5.0, 1)
+        served.clock.pass_s(2.0)
         with pytest.raises(DeviceError, match="reader icp_m7017"):
             exchange(device, 1.0)
         other.open(5.0, 1)

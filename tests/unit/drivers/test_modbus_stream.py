@@ -406,7 +406,7 @@ def test_samples_follow_one_another(bench):
         (50_001.0, 580, {}, r"sample rate must be in \[100, 50000\] Hz with blocks of 580"),
         (40_000.0, 58, {}, r"in \[100, 29000\] Hz .*58 samples in 2 messages.*turnaround 2.00 ms"),
         (7_000.0, 100, {}, "scan rate was set to 7000 Hz, the device makes 6997.9"),
-        (100.0, 100, {"watchdog": {"timeout_s": 2.0}}, "3 samples must come within"),
+        (100.0, 100, {"watchdog": {"timeout_s": 2.0}}, "3 exchanges must come within"),
     ],
 )
 def test_what_the_device_can_not_do_is_refused_at_open(bench, rate_hz, block, changes, text):

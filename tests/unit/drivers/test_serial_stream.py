@@ -264,6 +264,9 @@ class Unwatched:
     def beat(self, next_sample):
         return ""
 
+    def closing(self):
+        pass
+
     def tuning(self):
         return None
 

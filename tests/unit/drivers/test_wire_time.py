@@ -94,7 +94,7 @@ class TestRtu:
         two = exchange_time(rtu(), "AO", "AI", one_transaction=False)
         assert (one.gaps, two.gaps) == (2, 4)
         assert one.turnaround_s == profile.turnaround_s
-        assert str(two).startswith("FC16+FC03 at 115200 8N1: request ")
+        assert str(two).startswith("FC03+FC16 at 115200 8N1: request ")
 
     def test_real_frames(self) -> None:
         """The bytes counted are those of the frames that are sent."""
