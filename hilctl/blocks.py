@@ -7,8 +7,10 @@ import numpy as np
 
 from hilctl.arrays import F64, I64, U32
 
-COLUMNS = ("reference", "wanted", "command", "displacement_um", "measured")
-"""Rows of a block's columns."""
+COLUMNS = ("reference", "wanted", "command", "displacement_um", "measured", "input_um")
+"""Rows of a block's columns; ``input_um`` is of no meaning where the reference is the input."""
+ANSWERS = slice(COLUMNS.index("displacement_um"), COLUMNS.index("measured") + 1)
+"""Those that the device fills."""
 
 
 class Head(IntEnum):
@@ -31,7 +33,7 @@ class Batch:
         heads: int64[k, len(Head)].
         states: float64[k, s]: the compensator's memory before each block, then the command
             before it.
-        columns: float64[k, 5, B], see :data:`COLUMNS`.
+        columns: float64[k, 6, B], see :data:`COLUMNS`.
         flags: uint32[k, B].
     """
 

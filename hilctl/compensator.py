@@ -17,13 +17,37 @@ class Compensator:
 
     def __init__(self, model: HysteresisModel | None, sample_rate_hz: float) -> None:
         self._operator: Operator | None = model.inverse(sample_rate_hz) if model else None
+        self.preview = self._operator.preview if self._operator else 0
+        """Samples by which its input must run ahead of the commands."""
 
-    def process(self, reference: F64, wanted: F64) -> None:
-        """Fill ``wanted`` (float64[n], command unit) from ``reference`` (float64[n])."""
+    def ahead(self, reference: F64) -> F64:
+        """Return what to feed for a reference (float64[n]): itself, ``preview`` samples ahead.
+
+        The last value stands for those that come after it.
+        """
+        if not self.preview:
+            return reference
+        after = np.full(min(self.preview, reference.size), reference[-1])
+        return np.concatenate((reference[self.preview :], after))
+
+    def begin(self, reference: F64) -> None:
+        """Run through what comes before the first command: ``preview`` samples of the reference.
+
+        So the first command belongs to a reference that has stood at its first value until then.
+        """
+        if self.preview:
+            first = reference[: self.preview].copy()
+            self.process(first, np.empty_like(first))
+
+    def process(self, input_um: F64, wanted: F64) -> None:
+        """Fill ``wanted`` (float64[n], command unit) from ``input_um`` (float64[n]).
+
+        Where there is no model, the input is in the command's unit.
+        """
         if self._operator is None:
-            wanted[:] = reference
+            wanted[:] = input_um
         else:
-            self._operator.process(reference, wanted)
+            self._operator.process(input_um, wanted)
 
     def warm_up(self) -> None:
         """Run once and forget it, so that nothing is compiled or loaded during a run."""

@@ -5,6 +5,7 @@ from typing import Annotated, Any, Literal, Self, TypeVar
 from pydantic import BeforeValidator, Field, model_validator
 
 from hilctl.config_parts import Interval, Name, Part, Realtime, RecordingConfig, Timing
+from hilctl.feedback_keys import FeedbackConfig
 from hilctl.interlock_keys import InterlockKeys
 from hilctl.limiter import CommandLimits
 from hilctl.ports import CommandUnit
@@ -88,9 +89,16 @@ class CompensatorConfig(Part):
 
     Attributes:
         model: Model file, relative to the experiment file's folder.
+        correction: File of what ``hilctl learn`` has found for this waveform, relative to the same
+            folder; None where nothing is added to the reference.
+        initial_state: Recording of the run before this one, relative to the same folder, so that
+            the compensator begins with what that run left in the actuator, and reaches the
+            reference from there within ``safe.ramp_s``; None for an actuator at rest.
     """
 
     model: str
+    correction: str | None = None
+    initial_state: str | None = None
 
 
 class Experiment(Part):
@@ -104,6 +112,7 @@ class Experiment(Part):
         block: Samples exchanged in one tick; more than 1 needs a device with a FIFO.
         waveform: What to run.
         compensator: ``none``, read as None, or the model to invert.
+        feedback: A controller around the compensator; None where there is none.
         limits: What the run is held to.
         safe: Where the output goes on the way out.
         timing: What happens to late ticks.
@@ -123,6 +132,7 @@ class Experiment(Part):
             _none_or_mapping, json_schema_input_type=Literal["none"] | CompensatorConfig
         ),
     ]
+    feedback: FeedbackConfig | None = None
     limits: Limits
     safe: Safe = Field(default_factory=Safe)
     timing: Timing = Field(default_factory=Timing)

@@ -62,6 +62,7 @@ class Phase(IntEnum):
     ENDED = 3
     FAILED = 4
     REFUSED = 5
+    CLOSING = 6
 
 
 @dataclass(frozen=True, slots=True)

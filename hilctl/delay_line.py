@@ -20,7 +20,7 @@ class SentBlock:
 
     Attributes:
         head: int64[len(Head)], what others see of it while it is on its way.
-        columns: float64[5, B], see :data:`hilctl.blocks.COLUMNS`; its rows are the arrays below.
+        columns: float64[6, B], see :data:`hilctl.blocks.COLUMNS`; its rows are the arrays below.
         flags: uint32[B].
         state: float64[s], the memory before the block.
         first_sample: Its first sample.
@@ -42,12 +42,13 @@ class SentBlock:
     command: F64 = field(init=False)
     displacement_um: F64 = field(init=False)
     measured: F64 = field(init=False)
+    input_um: F64 = field(init=False)
     memory: F64 = field(init=False)
     numbers: "memoryview[int]" = field(init=False)
 
     def __post_init__(self) -> None:
         self.reference, self.wanted, self.command = self.columns[:3]
-        self.displacement_um, self.measured = self.columns[3:]
+        self.displacement_um, self.measured, self.input_um = self.columns[3:]
         self.memory = self.state[:-1]
         self.numbers = self.head.data.cast("B").cast("q")
 

@@ -9,6 +9,7 @@ import yaml
 
 from hilctl.config import Experiment
 from hilctl.errors import ConfigError, InputError, Problem
+from hilctl.learning.correction import Correction, load_correction
 from hilctl.models.base import HysteresisModel
 from hilctl.models.files import ModelFile
 from hilctl.ports import Device
@@ -29,6 +30,7 @@ class LoadedExperiment:
         folder: Folder that file names in it are relative to.
         yaml_text: The experiment as it will run, command-line settings included.
         document: The file, which knows where each value stands.
+        correction: What is added to the reference before the compensator, or None.
     """
 
     config: Experiment
@@ -37,6 +39,7 @@ class LoadedExperiment:
     folder: Path
     yaml_text: str
     document: Document
+    correction: Correction | None = None
 
 
 def load_experiment(path: Path, settings: Sequence[str] = ()) -> LoadedExperiment:
@@ -57,12 +60,13 @@ def resolve(document: Document, folder: Path, settings: Sequence[str] = ()) -> L
     config = _collect(problems, lambda: document.validate(Experiment))
     device = _collect(problems, lambda: _make_device(document))
     model = _collect(problems, lambda: _load_model(document, folder))
+    correction = _collect(problems, lambda: _load_correction(document, folder))
     if config is not None:
         problems += _joint_problems(config, document)
     if problems or config is None or device is None:
         raise ConfigError(problems)
     yaml_text = yaml.safe_dump(_plain(document.data), sort_keys=False, width=100)
-    return LoadedExperiment(config, device, model, folder, yaml_text, document)
+    return LoadedExperiment(config, device, model, folder, yaml_text, document, correction)
 
 
 def _joint_problems(config: Experiment, document: Document) -> list[Problem]:
@@ -119,17 +123,30 @@ def _make_device(document: Document) -> Device | None:
 
 
 def _load_model(document: Document, folder: Path) -> HysteresisModel | None:
+    return _load_file(document, folder, "model", _model_of)
+
+
+def _model_of(path: Path) -> HysteresisModel:
+    return load_document(path).validate(ModelFile).model
+
+
+def _load_correction(document: Document, folder: Path) -> Correction | None:
+    return _load_file(document, folder, "correction", load_correction)
+
+
+def _load_file(document: Document, folder: Path, key: str, load: Callable[[Path], T]) -> T | None:
+    """Load the file that a key of the compensator names, if any."""
     compensator = document.data.get("compensator")
-    name = compensator.get("model") if isinstance(compensator, dict) else None
+    name = compensator.get(key) if isinstance(compensator, dict) else None
     if not isinstance(name, str):
         return None
     try:
-        return load_document(folder / name).validate(ModelFile).model
+        return load(folder / name)
     except ConfigError:
         raise
     except InputError as error:
-        where = document.where(("compensator", "model"))
-        raise ConfigError([Problem(where, "compensator.model", str(error))]) from None
+        where = document.where(("compensator", key))
+        raise ConfigError([Problem(where, f"compensator.{key}", str(error))]) from None
 
 
 def _plain(value: Any) -> Any:

@@ -98,6 +98,8 @@ def columns(recording: Recording, t0: float | None = None, t1: float | None = No
     }
     if samples.measured.size:
         table[measured] = samples.measured
+    if samples.input_um.size:
+        table["input_um"] = samples.input_um
     return table
 
 

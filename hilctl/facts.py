@@ -47,6 +47,7 @@ def run_facts(checked: Checked, started: str) -> dict[str, str]:
         "waveform_unit": str(config.waveform.unit),
         "waveform_samples": str(checked.forecast.samples),
         "compensator": getattr(loaded.model, "kind", "none"),
+        "initial_state_run_id": checked.memory.run_id if checked.memory else "",
         "experiment_sha256": hashlib.sha256(loaded.yaml_text.encode()).hexdigest(),
         "model_sha256": hashlib.sha256(model_text.encode()).hexdigest() if model_text else "",
         "limits": config.limits.model_dump_json(exclude_none=True),
@@ -55,6 +56,7 @@ def run_facts(checked: Checked, started: str) -> dict[str, str]:
             {
                 "t_rel": "s",
                 "reference_um": "um",
+                "input_um": "um",
                 "displacement_um": "um",
                 "wanted_a, current_a, measured_a": "A",
                 "wanted_v, drive_v, measured_v": "V",

@@ -16,13 +16,14 @@ from hilctl.compensator import Compensator
 from hilctl.control_page import LoopEvent
 from hilctl.delay_line import DelayLine, SentBlock
 from hilctl.errors import DeviceError
+from hilctl.feedback import Feedback
 from hilctl.flags import Flag
 from hilctl.interlocks import Interlocks
 from hilctl.limiter import Limiter
 from hilctl.pacer import Pacer
 from hilctl.plan import Code, Outcome, Oversight, Plan, SampleSink
 from hilctl.ports import Clock, Device
-from hilctl.tuner import Tuner
+from hilctl.tuner import TUNED, Tuner, tuning_text
 
 
 class Loop:
@@ -39,6 +40,7 @@ class Loop:
         line: Where blocks wait for their answer.
         sink: Where blocks go.
         oversight: Whom it answers to.
+        feedback: Corrects the compensator's input; None where nothing does.
     """
 
     def __init__(
@@ -53,6 +55,7 @@ class Loop:
         line: DelayLine,
         sink: SampleSink,
         oversight: Oversight,
+        feedback: Feedback | None = None,
     ) -> None:
         self._plan = plan
         self._device = device
@@ -64,7 +67,9 @@ class Loop:
         self._line = line
         self._sink = sink
         self._oversight = oversight
+        self._feedback = feedback
         self._tuner = Tuner()
+        self._input_tuner = Tuner()
         self._start_ns = 0
         self._next_sample = 0
         self._ended_at = 0
@@ -125,26 +130,15 @@ class Loop:
         order = self._oversight.beat(self._next_sample)
         if self._ramping:
             return
-        if late := self._too_late():
+        if late := self._plan.too_late(self._pacer):
             self._leave("fault", "late", late)
         elif order:
             self._leave("stopped", "stopped", order)
         elif tuning := self._oversight.tuning():
             self._tuner.move(tuning)
-            text = f"reference gain to {tuning.gain:g}, offset to {tuning.offset:g}"
-            text += f", over {tuning.samples} samples"
-            self._oversight.tell(LoopEvent(self._next_sample, "info", "tuned", text))
-
-    def _too_late(self) -> str:
-        pacer, plan = self._pacer, self._plan
-        if pacer.tick < plan.grace_ticks:
-            return ""
-        if pacer.late_ns > plan.max_late_ns:
-            late_s = pacer.late_ns * 1e-9
-            return f"tick {pacer.tick} woke {late_s:.3f} s late, more than the limit"
-        if 0 < plan.max_consecutive_late <= pacer.late_run:
-            return f"{pacer.late_run} ticks in a row woke late, up to tick {pacer.tick}"
-        return ""
+            self._input_tuner.move(tuning)
+            text = tuning_text(tuning)
+            self._oversight.tell(LoopEvent(self._next_sample, "info", TUNED, text))
 
     def _leave(self, code: Code, event: str, reason: str, sample: int | None = None) -> None:
         """Take the way out from the next block on."""
@@ -166,22 +160,28 @@ class Loop:
         n = 0 if self._ramping else reference.size
         self._first_invalid = -1
         if n == plan.block:
-            self._work_out(reference, block.reference, block.wanted, block.command, block.flags)
+            whole = (block.reference, block.input_um, block.wanted, block.command, block.flags)
+            self._work_out(reference, *whole)
             return False
-        block.reference[n:] = np.nan
+        block.reference[n:] = block.input_um[n:] = np.nan
         block.wanted[n:] = self._limiter.limits.safe
         if n:
-            parts = (block.reference[:n], block.wanted[:n], block.command[:n], block.flags[:n])
-            self._work_out(reference, *parts)
+            parts = (block.reference[:n], block.input_um[:n], block.wanted[:n])
+            self._work_out(reference, *parts, block.command[:n], block.flags[:n])
         return self._limiter.ramp(block.command[n:], block.flags[n:])
 
     def _work_out(
-        self, reference: F64, tuned_um: F64, wanted: F64, command: F64, flags: U32
+        self, reference: F64, tuned_um: F64, input_um: F64, wanted: F64, command: F64, flags: U32
     ) -> None:
         """Fill what comes of the reference: tuned, through the compensator, through the limiter."""
-        tuned = tuned_um if self._plan.in_um else wanted
-        self._tuner.apply(reference, tuned)
-        self._compensator.process(tuned, wanted)
+        fed = tuned_um if self._plan.in_um else wanted
+        self._tuner.apply(reference, fed)
+        if (ahead := self._plan.ahead) is not None:
+            start, fed = self._next_sample, input_um
+            self._input_tuner.apply(ahead[start : start + fed.size], fed)
+            if self._feedback is not None:
+                self._feedback.follow(self._line.newest)
+        self._compensator.process(fed, wanted)
         self._first_invalid = self._limiter.limit(wanted, command, flags)
         if not self._plan.in_um:
             tuned_um.fill(np.nan)
@@ -241,6 +241,7 @@ class Loop:
     def _lost_device(self, error: DeviceError) -> Outcome:
         text = str(error) if self._code == "completed" else f"{self._reason}; then {error}"
         self._oversight.tell(LoopEvent(self._next_sample, "error", "device_lost", str(error)))
+        self._oversight.closing()
         safe = True
         try:
             self._device.make_safe(self._limiter.limits.safe)

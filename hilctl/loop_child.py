@@ -8,6 +8,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from typing import Any
 
 import numpy as np
 
@@ -42,7 +43,7 @@ class LoopChild:
     ) -> None:
         self._ring = ring
         np.save(folder.reference, checked.reference.values)
-        job = {
+        job: dict[str, Any] = {
             "experiment": checked.loaded.yaml_text,
             "folder": str(checked.loaded.folder.resolve()),
             "ring": str(folder.ring),
@@ -50,6 +51,11 @@ class LoopChild:
             "supervisor": os.getpid(),
             "silence_s": silence_s,
         }
+        if checked.ahead is not None:
+            np.save(folder.ahead, checked.ahead)
+            job["ahead"] = str(folder.ahead)
+        if checked.state is not None:
+            job["state"] = checked.state.tolist()
         self._process = subprocess.Popen(
             [sys.executable, "-m", "hilctl.loop_process"],
             stdin=subprocess.PIPE,

@@ -16,12 +16,14 @@ from typing import Any
 
 import numpy as np
 
+from hilctl.arrays import F64
 from hilctl.compensator import Compensator
 from hilctl.config import Experiment
 from hilctl.control_page import Field, LoopEvent, Phase
 from hilctl.delay_line import DelayLine
 from hilctl.errors import DeviceError, HilctlError, InputError
 from hilctl.experiment import LoadedExperiment, resolve
+from hilctl.feedback_setup import make_feedback
 from hilctl.interlock_setup import interlock_limits
 from hilctl.interlocks import Interlocks
 from hilctl.limiter import Limiter
@@ -90,6 +92,11 @@ class Supervision:
             return f"stopped because the supervisor was silent for {self._silence_ns * 1e-9:g} s"
         return ""
 
+    def closing(self) -> None:
+        """Say that the loop is over, and that the device may take its time."""
+        self._control[Field.LOOP_BEAT_NS] = self._clock.now_ns()
+        self._control[Field.PHASE] = Phase.CLOSING
+
     def tuning(self) -> Tuning | None:
         """Return a change of the reference that is wanted and new."""
         control, ring = self._control, self._ring
@@ -144,6 +151,8 @@ def _run(job: dict[str, Any], ring: SampleRing, loaded: LoadedExperiment) -> Out
     supervision = Supervision(ring, pacer, clock, job["supervisor"], job["silence_s"])
     compensator = Compensator(loaded.model, config.sample_rate_hz)
     compensator.warm_up()
+    if "state" in job:
+        compensator.restore(np.array(job["state"]))
     limits = interlock_limits(config, device.info)
     loop = Loop(
         _plan(job, config),
@@ -156,6 +165,7 @@ def _run(job: dict[str, Any], ring: SampleRing, loaded: LoadedExperiment) -> Out
         DelayLine(ring.sent),
         ring,
         supervision,
+        make_feedback(config, compensator),
     )
     steps = prepare(config.realtime)
     if config.realtime.require:
@@ -167,6 +177,7 @@ def _run(job: dict[str, Any], ring: SampleRing, loaded: LoadedExperiment) -> Out
         _await_go(ring, supervision)
         ring.put(Field.PHASE, Phase.RUNNING)
         outcome = loop.run(ring.get(Field.START_NS))
+        supervision.closing()
     except BaseException:
         device.make_safe(config.safe.value)
         raise
@@ -180,7 +191,8 @@ def _plan(job: dict[str, Any], config: Experiment) -> Plan:
     timing = config.timing
     late = timing.max_consecutive_late
     return Plan(
-        reference=np.load(job["reference"], mmap_mode="r").view(np.ndarray),  # quicker to slice
+        reference=_mapped(job["reference"]),
+        ahead=_mapped(job["ahead"]) if "ahead" in job else None,
         in_um=config.waveform.unit == "um",
         block=config.block,
         max_late_ns=timing.max_late_s * 1e9,
@@ -188,6 +200,11 @@ def _plan(job: dict[str, Any], config: Experiment) -> Plan:
         grace_ticks=int(timing.grace_s / config.tick_s),
         keep_all=config.recording.on_failure == "stop",
     )
+
+
+def _mapped(path: str) -> F64:
+    values: F64 = np.load(path, mmap_mode="r").view(np.ndarray)  # quicker to slice
+    return values
 
 
 def _late_policy(config: Experiment, info: DeviceInfo) -> LatePolicy:

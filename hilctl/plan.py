@@ -5,6 +5,7 @@ from typing import Literal, Protocol, TypeAlias
 
 from hilctl.arrays import F64, U32
 from hilctl.control_page import LoopEvent
+from hilctl.pacer import Pacer
 
 Code: TypeAlias = Literal["completed", "stopped", "fault"]
 
@@ -39,6 +40,10 @@ class Oversight(Protocol):
 
     def beat(self, next_sample: int) -> str:
         """Take a sign of life, once a tick; return why the run should end, or an empty text."""
+        ...
+
+    def closing(self) -> None:
+        """Hear that no more samples will be exchanged: what comes now has a device's own times."""
         ...
 
     def tuning(self) -> Tuning | None:
@@ -81,6 +86,8 @@ class Plan:
         max_consecutive_late: Late ticks, one after the other, that end the run; 0 for any number.
         grace_ticks: Ticks at the start that no lateness ends the run in.
         keep_all: Whether a block that finds no room in the ring ends the run.
+        ahead: float64[n], in um, what the compensator is fed: the reference as far ahead as it
+            previews, and whatever is added to it. None where that is the reference itself.
     """
 
     reference: F64
@@ -90,3 +97,15 @@ class Plan:
     max_consecutive_late: int = 0
     grace_ticks: int = 0
     keep_all: bool = True
+    ahead: F64 | None = None
+
+    def too_late(self, pacer: Pacer) -> str:
+        """Return why the ticks come too late to go on, or an empty text."""
+        if pacer.tick < self.grace_ticks:
+            return ""
+        if pacer.late_ns > self.max_late_ns:
+            late_s = pacer.late_ns * 1e-9
+            return f"tick {pacer.tick} woke {late_s:.3f} s late, more than the limit"
+        if 0 < self.max_consecutive_late <= pacer.late_run:
+            return f"{pacer.late_run} ticks in a row woke late, up to tick {pacer.tick}"
+        return ""

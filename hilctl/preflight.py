@@ -5,57 +5,19 @@ by the same compensator that will run, and held against the limits.
 """
 
 import math
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
+from hilctl.arrays import F64
 from hilctl.compensator import Compensator
-from hilctl.errors import ConfigError, InputError, ModelError, Problem
+from hilctl.errors import ConfigError, DataError, InputError, ModelError, Problem
 from hilctl.experiment import LoadedExperiment
+from hilctl.feedback_setup import feedback_problems
+from hilctl.forecast import Forecast, forecast_of
 from hilctl.interlock_setup import HeatForecast, interlock_problems
+from hilctl.memory import Memory, memory_after
 from hilctl.waveforms.build import Reference, build
-
-_CHUNK = 1_000_000
-_BYTES_A_SAMPLE = 45.0
-
-
-@dataclass(frozen=True, slots=True)
-class Forecast:
-    """What a run will do.
-
-    Attributes:
-        samples: Samples of the waveform.
-        duration_s: Its length.
-        reference_min: Lowest reference, in the waveform's unit.
-        reference_max: Highest reference.
-        command_unit: ``A`` or ``V``.
-        command_min: Lowest command.
-        command_max: Highest command.
-        slew_per_s: Fastest change of the command.
-        heating_rms_a: Highest running rms of the coil current, as the thermal budget has it; None
-            where there is no budget.
-        recording_mb: About how large the recording will be.
-        highest_rate_hz: Highest sample rate that the device can keep.
-        rate_note: Why that is so; empty where there is no more to say.
-    """
-
-    samples: int
-    duration_s: float
-    reference_min: float
-    reference_max: float
-    command_unit: str
-    command_min: float
-    command_max: float
-    slew_per_s: float
-    heating_rms_a: float | None
-    recording_mb: float
-    highest_rate_hz: float
-    rate_note: str
-
-    def to_mapping(self) -> dict[str, Any]:
-        """Return the fields as plain values."""
-        return asdict(self)
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,11 +28,22 @@ class Checked:
         loaded: The experiment.
         reference: Every sample of its waveform.
         forecast: What it will do.
+        ahead: float64[n], what the compensator is fed; None where that is the reference itself.
+        state: The compensator's memory before the first sample; None where it is at rest.
+        memory: What a run before left in the actuator; None where it is at rest.
     """
 
     loaded: LoadedExperiment
     reference: Reference
     forecast: Forecast
+    ahead: F64 | None = None
+    state: F64 | None = None
+    memory: Memory | None = None
+
+    @property
+    def fed(self) -> F64:
+        """What the compensator is fed: float64[n]."""
+        return self.reference.values if self.ahead is None else self.ahead
 
 
 def check(loaded: LoadedExperiment) -> Checked:
@@ -92,14 +65,60 @@ def check(loaded: LoadedExperiment) -> Checked:
     problems += _reference_problems(loaded, reference)
     heat = HeatForecast(config)
     try:
-        forecast = _forecast(loaded, reference, heat)
+        compensator = Compensator(loaded.model, config.sample_rate_hz)
+        problems += feedback_problems(loaded, compensator.preview)
+        corrected = _corrected(loaded, reference, problems)
+        memory = _memory(loaded, problems)
+        ahead, state = _feed(loaded, corrected, compensator, memory)
+        own = ahead is not reference.values or config.feedback is not None
+        forecast = forecast_of(loaded, reference, ahead, heat, state)
     except ModelError as error:
         problems.append(_problem(loaded, "compensator.model", str(error)))
         raise ConfigError(problems) from None
     problems += _command_problems(loaded, forecast) + heat.problems(loaded)
     if problems:
         raise ConfigError(problems)
-    return Checked(loaded, reference, forecast)
+    return Checked(loaded, reference, forecast, ahead if own else None, state, memory)
+
+
+def _feed(
+    loaded: LoadedExperiment, values: F64, compensator: Compensator, memory: Memory | None
+) -> tuple[F64, F64 | None]:
+    """Return what the compensator is fed, and its memory before that where it is not at rest."""
+    config = loaded.config
+    if memory is not None:
+        compensator.restore(memory.state)
+        values = memory.lead_in(values, max(1, round(config.safe.ramp_s * config.sample_rate_hz)))
+    compensator.begin(values)
+    at_rest = memory is None and not compensator.preview
+    return compensator.ahead(values), None if at_rest else compensator.state()
+
+
+def _memory(loaded: LoadedExperiment, problems: list[Problem]) -> Memory | None:
+    """Return what the run before left in the actuator, where one is named."""
+    config = loaded.config
+    if config.compensator is None or config.compensator.initial_state is None:
+        return None
+    assert loaded.model is not None
+    path = loaded.folder / config.compensator.initial_state
+    try:
+        return memory_after(path, loaded.model, config.sample_rate_hz)
+    except DataError as error:
+        problems.append(_problem(loaded, "compensator.initial_state", str(error)))
+        return None
+
+
+def _corrected(loaded: LoadedExperiment, reference: Reference, problems: list[Problem]) -> F64:
+    """Return the reference with what has been learned: float64[n]; itself where nothing has."""
+    correction = loaded.correction
+    if correction is None:
+        return reference.values
+    try:
+        return reference.values + correction.samples(reference, loaded.model)
+    except InputError as error:
+        hint = "learn again with 'hilctl learn', or take it out"
+        problems.append(_problem(loaded, "compensator.correction", str(error), hint=hint))
+        return reference.values
 
 
 def check_tuned(
@@ -117,15 +136,14 @@ def check_tuned(
         ConfigError: It would leave device, model or limits; the error says by how much.
     """
     loaded, plain = checked.loaded, checked.reference
-    values = plain.values * wanted[0] + wanted[1]
-    lead_in = np.linspace(0.0, values[0], samples + 1)[:-1]
     change = abs(wanted[0] - now[0]) * np.abs(plain.values).max() + abs(wanted[1] - now[1])
-    tuned = Reference(
-        np.concatenate((lead_in, values)), plain.unit, plain.sample_rate_hz, plain.segments
-    )
+    values = _led_in(plain.values * wanted[0] + wanted[1], samples)
+    fed = _led_in(checked.fed * wanted[0] + wanted[1], samples)
+    tuned = Reference(values, plain.unit, plain.sample_rate_hz, plain.segments)
     heat = HeatForecast(loaded.config)
     problems = _reference_problems(loaded, tuned)
-    problems += _command_problems(loaded, _forecast(loaded, tuned, heat)) + heat.problems(loaded)
+    problems += _command_problems(loaded, forecast_of(loaded, tuned, fed, heat))
+    problems += heat.problems(loaded)
     if loaded.model is None:
         fastest = change / samples * plain.sample_rate_hz + checked.forecast.slew_per_s
         if fastest > loaded.config.limits.slew_per_s:
@@ -133,6 +151,11 @@ def check_tuned(
             problems.append(_problem(loaded, "limits", rule, f"{fastest:.4g}/s"))
     if problems:
         raise ConfigError(problems)
+
+
+def _led_in(values: F64, samples: int) -> F64:
+    """Return values with that many samples before them, from 0 to the first."""
+    return np.concatenate((np.linspace(0.0, values[0], samples + 1)[:-1], values))
 
 
 def _problem(
@@ -197,40 +220,6 @@ def _reference_problems(loaded: LoadedExperiment, reference: Reference) -> list[
             hint = f"{excess:.3g} um too far: change the waveform's amplitude or offset"
             found.append(_problem(loaded, "waveform", rule, value, hint))
     return found
-
-
-def _forecast(loaded: LoadedExperiment, reference: Reference, heat: HeatForecast) -> Forecast:
-    config = loaded.config
-    compensator = Compensator(loaded.model, config.sample_rate_hz)
-    last = config.safe.value
-    low, high, step = last, last, 0.0
-    values = reference.values
-    wanted = np.empty(min(_CHUNK, values.size))
-    for start in range(0, values.size, _CHUNK):
-        part = values[start : start + _CHUNK]
-        out = wanted[: part.size]
-        compensator.process(part, out)
-        with np.errstate(over="ignore", invalid="ignore"):  # what comes of it is refused
-            steps = np.abs(np.diff(out, prepend=last))
-        low = float(np.minimum(low, out.min()))  # keeps a NaN, where min() would lose it
-        high = float(np.maximum(high, out.max()))
-        step = float(np.maximum(step, steps.max()))
-        last = float(out[-1])
-        heat.add(out)
-    return Forecast(
-        samples=values.size,
-        duration_s=values.size / config.sample_rate_hz,
-        reference_min=float(values.min()),
-        reference_max=float(values.max()),
-        command_unit=loaded.device.info.command_unit,
-        command_min=low,
-        command_max=high,
-        slew_per_s=step * config.sample_rate_hz,
-        heating_rms_a=heat.rms_a,
-        recording_mb=values.size * _BYTES_A_SAMPLE / 1e6,
-        highest_rate_hz=loaded.device.info.max_rate_hz,
-        rate_note=loaded.device.info.rate_note,
-    )
 
 
 def _command_problems(loaded: LoadedExperiment, forecast: Forecast) -> list[Problem]:

@@ -1,4 +1,4 @@
-"""Recompute a recording's commands from its recorded reference, by the code that made them."""
+"""Recompute a recording's commands from what was fed, by the code that made them."""
 
 from dataclasses import asdict, dataclass
 from itertools import pairwise
@@ -62,8 +62,8 @@ def replay(recording: Recording, model: HysteresisModel | None = None) -> Replay
 
     Args:
         recording: What was recorded.
-        model: Another model to invert instead of the recorded one; it starts from rest, and the
-            limits stay as recorded.
+        model: Another model to invert instead of the recorded one; it starts from rest, is fed the
+            reference by its own preview, and the limits stay as recorded.
 
     Raises:
         DataError: The recording holds no samples or not what a replay needs, or ``model`` does not
@@ -88,8 +88,11 @@ def replay(recording: Recording, model: HysteresisModel | None = None) -> Replay
         limiter.last = start.previous_command
         if model is None:
             compensator.restore(start.state)
+        elif rows.start == 0:
+            compensator.begin(samples.reference_um[rows])
         for part in _alike(samples.flags, rows):
-            _recompute(samples, part, compensator, limiter, (wanted, command, flags))
+            fed = _fed(samples, part, compensator, as_recorded=model is None)
+            _recompute(samples, part, fed, compensator, limiter, (wanted, command, flags))
     return _compare(recording, known, (wanted, command, flags))
 
 
@@ -123,9 +126,20 @@ def _alike(flags: U32, rows: slice) -> list[slice]:
     return [slice(a, b) for a, b in pairwise(bounds) if b > a]
 
 
+def _fed(samples: Samples, rows: slice, compensator: Compensator, *, as_recorded: bool) -> F64:
+    """Return what the compensator is fed; another one than the recorded has its own preview."""
+    reference = samples.reference_um[rows]
+    if bool(np.isnan(reference).all()):
+        return samples.wanted[rows]
+    if not as_recorded:
+        return compensator.ahead(reference)
+    return samples.input_um[rows] if samples.input_um.size else reference
+
+
 def _recompute(
     samples: Samples,
     rows: slice,
+    fed: F64,
     compensator: Compensator,
     limiter: Limiter,
     out: tuple[F64, F64, U32],
@@ -135,9 +149,7 @@ def _recompute(
         wanted[:] = limiter.limits.safe
         limiter.ramp(command, flags)
         return
-    reference = samples.reference_um[rows]
-    without = bool(np.isnan(reference).all())
-    compensator.process(samples.wanted[rows] if without else reference, wanted)
+    compensator.process(fed, wanted)
     limiter.limit(wanted, command, flags)
 
 

@@ -19,7 +19,7 @@ from typing import Any, Self
 import numpy as np
 
 from hilctl.arrays import F64, U32
-from hilctl.blocks import COLUMNS, Batch, Head
+from hilctl.blocks import ANSWERS, COLUMNS, Batch, Head
 from hilctl.control_page import SIZE as _PAGE_SIZE
 from hilctl.control_page import ControlPage, Field
 from hilctl.flags import Flag
@@ -29,8 +29,7 @@ _HEAD, _TAIL = int(Field.HEAD), int(Field.TAIL)
 _HEAD_NUMBERS = len(Head)
 _HEAD_BYTES = 8 * _HEAD_NUMBERS
 _HEAD_BUT_SEQUENCE = Struct(f"{len(Head) - 1}q")
-_MAGIC = 0x48494C43_52494E47
-_DISPLACEMENT = COLUMNS.index("displacement_um")
+_MAGIC = 0x48494C43_52494E48
 
 
 class SampleRing(ControlPage):
@@ -127,7 +126,7 @@ class SampleRing(ControlPage):
         Args:
             head: Numbers of :class:`~hilctl.blocks.Head` after the sequence.
             state: float64[s], see :class:`~hilctl.blocks.Batch`.
-            columns: float64[5, B], see :class:`~hilctl.blocks.Batch`.
+            columns: float64[6, B], see :class:`~hilctl.blocks.Batch`.
             flags: uint32[B].
 
         Returns:
@@ -207,7 +206,7 @@ class SampleRing(ControlPage):
         batch = self.sent.rows(order[(numbers[order] > 0) & (firsts >= next_sample)])
         if not batch.heads.shape[0]:
             return None
-        batch.columns[:, _DISPLACEMENT:] = np.nan
+        batch.columns[:, ANSWERS] = np.nan
         batch.flags[:] |= np.uint32((Flag.SENSOR_INVALID | Flag.UNANSWERED).value)
         ends = [next_sample, *(batch.heads[:-1, Head.FIRST_SAMPLE] + self.block).tolist()]
         batch.heads[:, Head.DROPPED_BEFORE] = batch.heads[:, Head.FIRST_SAMPLE] - ends

@@ -64,6 +64,11 @@ class RunFolder:
         return self.path / "reference.npy"
 
     @property
+    def ahead(self) -> Path:
+        """File of what the compensator is fed, where it is not the reference."""
+        return self.path / "ahead.npy"
+
+    @property
     def socket(self) -> Path:
         """Socket that the supervisor answers at."""
         return self.path / "socket"

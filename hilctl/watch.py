@@ -4,6 +4,7 @@ from hilctl.control_page import Field, Phase
 from hilctl.ring import SampleRing
 
 _POLLS = 5
+_CLOSING_S = 30.0
 
 
 class HangWatch:
@@ -31,9 +32,13 @@ class HangWatch:
             now_ns: Monotonic time.
         """
         beat_ns = self._ring.get(Field.LOOP_BEAT_NS)
-        running = self._ring.get(Field.PHASE) == Phase.RUNNING
-        if beat_ns != self._beat_ns or not running or beat_ns == 0:
+        phase = self._ring.get(Field.PHASE)
+        watched = phase in {Phase.RUNNING, Phase.CLOSING}
+        if beat_ns != self._beat_ns or not watched or beat_ns == 0:
             self._beat_ns, self._seen_ns, self._polls = beat_ns, now_ns, 0
             return False
         self._polls += 1
-        return self._polls > _POLLS and now_ns - self._seen_ns > self._limit_ns
+        limit_ns = self._limit_ns
+        if phase == Phase.CLOSING:  # a device that is lost may use up its time-outs
+            limit_ns += _CLOSING_S * 1e9
+        return self._polls > _POLLS and now_ns - self._seen_ns > limit_ns

@@ -39,8 +39,11 @@ class Operator:
         input_offset: float = 0.0,
         output_offset: float = 0.0,
     ) -> None:
+        self.preview = 0
+        """Samples by which the input must run ahead of the output; more for some inverses."""
         self._kernel = kernel
-        self._memory = rest_memory(operators)
+        self._rest = rest_memory(operators)
+        self._memory = self._rest.copy()
         self._input_offset = input_offset
         self._output_offset = output_offset
 
@@ -85,9 +88,14 @@ class Operator:
             )
         self._memory[:] = state
 
+    def keep_in(self, memory: F64) -> None:
+        """Keep the memory, as it is now, in a given place from now on."""
+        memory[:] = self._memory
+        self._memory = memory
+
     def reset(self, first_input: float | None = None) -> None:
         """Start from rest; where ``first_input`` is given, as if the signal had begun there."""
-        self._memory[:] = rest_memory(self._memory.size - 1)
+        self._memory[:] = self._rest
         if first_input is not None:
             self.process(np.array([first_input]))
 

@@ -7,13 +7,43 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field
 
 from hilctl.models.base import HysteresisModel
+from hilctl.models.bouc_wen import BoucWenModel
+from hilctl.models.butterfly import ButterflyModel
+from hilctl.models.duhem import DuhemModel
+from hilctl.models.generalised import GeneralisedModel
 from hilctl.models.integrated import IntegratedModel
+from hilctl.models.kp import KrasnoselskiiPokrovskiiModel
 from hilctl.models.ppi import PpiModel
+from hilctl.models.preisach import PreisachModel
 from hilctl.models.rdpi import RdpiModel
+from hilctl.models.staged import StagedModel
 from hilctl.yamlio import Document, load_document
 
-AnyModel: TypeAlias = Annotated[PpiModel | RdpiModel | IntegratedModel, Field(discriminator="kind")]
-KINDS: tuple[str, ...] = ("ppi", "rdpi", "integrated")
+AnyModel: TypeAlias = Annotated[
+    PpiModel
+    | RdpiModel
+    | IntegratedModel
+    | StagedModel
+    | ButterflyModel
+    | GeneralisedModel
+    | PreisachModel
+    | KrasnoselskiiPokrovskiiModel
+    | BoucWenModel
+    | DuhemModel,
+    Field(discriminator="kind"),
+]
+KINDS: tuple[str, ...] = (
+    "ppi",
+    "rdpi",
+    "integrated",
+    "staged",
+    "butterfly",
+    "generalised",
+    "preisach",
+    "krasnoselskii_pokrovskii",
+    "bouc_wen",
+    "duhem",
+)
 
 
 class ModelFile(BaseModel):

@@ -1,7 +1,7 @@
 """A recording in memory: arrays and facts, however they were stored."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +23,8 @@ class Samples:
         measured: float64[n], command as the device measured it; empty where it does not.
         displacement_um: float64[n], sampled when ``command`` was put out.
         flags: uint32[n], bits of :class:`hilctl.flags.Flag`.
+        input_um: float64[n], what the compensator was fed: the reference ahead of its time, with
+            what is added to it; NaN on the ramp, empty where the reference itself was fed.
     """
 
     index: I64
@@ -32,6 +34,7 @@ class Samples:
     measured: F64
     displacement_um: F64
     flags: U32
+    input_um: F64 = field(default_factory=lambda: np.empty(0))
 
     def part(self, start: int, stop: int) -> "Samples":
         """Return the rows whose sample index lies in [start, stop)."""
@@ -45,6 +48,7 @@ class Samples:
             self.measured[rows],
             self.displacement_um[rows],
             self.flags[rows],
+            self.input_um[rows],
         )
 
 
@@ -120,6 +124,7 @@ class Recording:
         experiment_yaml: The experiment as it was run.
         model_yaml: The compensator's model, or empty.
         starts: Where a replay can begin.
+        correction_yaml: What had been learned and was added to the reference, or empty.
     """
 
     path: Path
@@ -136,3 +141,4 @@ class Recording:
     experiment_yaml: str
     model_yaml: str
     starts: tuple[Start, ...] = ()
+    correction_yaml: str = ""

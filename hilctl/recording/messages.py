@@ -8,7 +8,7 @@ import numpy as np
 from mcap.writer import Writer
 
 from hilctl.arrays import F64, U32
-from hilctl.blocks import Batch, Head
+from hilctl.blocks import COLUMNS, Batch, Head
 from hilctl.errors import DataError
 from hilctl.ports import CommandUnit
 from hilctl.recording import schema
@@ -39,6 +39,7 @@ class Layout:
         measures_command: Whether the device measures its command.
         scope_rate_hz: Highest rate of ``/scope``.
         start_unix_ns: Unix time of sample 0 in ns.
+        records_input: Whether the compensator's input is other than the reference.
     """
 
     sample_rate_hz: float
@@ -46,6 +47,7 @@ class Layout:
     measures_command: bool
     scope_rate_hz: float
     start_unix_ns: int
+    records_input: bool = False
 
     def to_facts(self) -> dict[str, str]:
         """Return the fields as text, for a recording's metadata."""
@@ -53,6 +55,7 @@ class Layout:
             "sample_rate_hz": repr(self.sample_rate_hz),
             "command_unit": self.command_unit,
             "measures_command": str(self.measures_command).lower(),
+            "records_input": str(self.records_input).lower(),
             "scope_rate_hz": repr(self.scope_rate_hz),
             "start_unix_ns": str(self.start_unix_ns),
         }
@@ -69,6 +72,7 @@ class Layout:
                 sample_rate_hz=float(facts["sample_rate_hz"]),
                 command_unit="V" if facts["command_unit"] == "V" else "A",
                 measures_command=facts["measures_command"] == "true",
+                records_input=facts.get("records_input") == "true",  # older recordings have none
                 scope_rate_hz=float(facts["scope_rate_hz"]),
                 start_unix_ns=int(facts["start_unix_ns"]),
             )
@@ -133,7 +137,7 @@ class MessageMaker:
         rows = slice(row, stop)
         first = int(batch.heads[row, Head.FIRST_SAMPLE])
         flags = batch.flags[rows].ravel()
-        columns = batch.columns[rows].transpose(1, 0, 2).reshape(5, -1)
+        columns = batch.columns[rows].transpose(1, 0, 2).reshape(len(COLUMNS), -1)
         dropped = int(batch.heads[row, Head.DROPPED_BEFORE])
         t_rel = (first + np.arange(flags.size)) / self._layout.sample_rate_hz
         wanted, command, measured = _COLUMNS[self._layout.command_unit]
@@ -147,6 +151,8 @@ class MessageMaker:
         out.displacement_um.extend(columns[3].tolist())
         if self._layout.measures_command:
             getattr(out, measured).extend(columns[4].tolist())
+        if self._layout.records_input:
+            out.input_um.extend(columns[5].tolist())
         if self.samples == 0 or dropped:
             out.state.extend(batch.states[row, :-1].tolist())
             out.previous_command.append(float(batch.states[row, -1]))

@@ -140,6 +140,7 @@ class _Contents:
             events=tuple(self._events),
             experiment_yaml=self._texts.get("experiment.yaml", ""),
             model_yaml=self._texts.get("model.yaml", ""),
+            correction_yaml=self._texts.get("correction.yaml", ""),
             starts=tuple(
                 Start(block.tick0, np.array(block.state), block.previous_command[0])
                 for block in self._blocks
@@ -165,6 +166,7 @@ class _Contents:
             measured=self._column(f"measured_{small}"),
             displacement_um=self._column("displacement_um"),
             flags=self._column("flags").astype(np.uint32),
+            input_um=self._column("input_um"),
         )
 
     def _column(self, name: str) -> F64:

@@ -46,6 +46,7 @@ _MESSAGES: dict[str, dict[str, tuple[int, Any, bool]]] = {
         # command before it, so that it can be replayed by itself.
         "state": (14, _DOUBLE, True),
         "previous_command": (15, _DOUBLE, True),
+        "input_um": (16, _DOUBLE, True),  # what the compensator was fed, where not the reference
     },
     "TickBlock": {
         "first_sample": (1, _UINT64, True),

@@ -41,7 +41,7 @@ class Tail:
         rows = slice(max(0, stop - self._samples), stop)
         if stop == 0:
             return None
-        reference, wanted, command, displacement_um, _ = self._columns[:, rows]
+        reference, wanted, command, displacement_um = self._columns[:4, rows]
         return Samples(
             self._index[rows],
             reference,

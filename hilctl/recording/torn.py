@@ -16,12 +16,12 @@ _CHUNK = struct.Struct("<QQQII")
 _LENGTH = struct.Struct("<Q")
 _WINDOW_BYTES = 4 * 2**20
 _IN_CHUNKS = {Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE}
-_COLUMNS = {"t_rel", "reference_um", "displacement_um", "flags"}
+_COLUMNS = {"t_rel", "reference_um", "displacement_um", "flags", "input_um"}
 # Lengths are little-endian and far below 2**40, so their three highest bytes are 0.
 _LIKELY = re.compile(
     rb"\x06.{5}\0{3}.{16}.{5}\0{3}.{4}(?:\x04\0{3}zstd|\x03\0{3}lz4|\0{4}).{5}\0{3}"
     rb"|\x0c.{5}\0{3}.\0{3}hilctl\."
-    rb"|\x09.{5}\0{3}.{16}.\0{3}(?:experiment|model)\.yaml"
+    rb"|\x09.{5}\0{3}.{16}.\0{3}(?:experiment|model|correction)\.yaml"
     rb"|\x0f\x04\0{7}.{4}[\x02\x03\x04\x0b]",
     re.DOTALL,
 )

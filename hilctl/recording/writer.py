@@ -38,6 +38,8 @@ class RunFacts:
         command_unit: ``A`` or ``V``.
         measures_command: Whether the device measures its command.
         scope_rate_hz: Highest rate of ``/scope``.
+        records_input: Whether the compensator's input is other than the reference.
+        correction_yaml: What had been learned and was added to the reference, or empty.
     """
 
     facts: Mapping[str, str]
@@ -48,6 +50,8 @@ class RunFacts:
     command_unit: CommandUnit
     measures_command: bool
     scope_rate_hz: float
+    records_input: bool = False
+    correction_yaml: str = ""
 
     def layout(self, start_unix_ns: int) -> Layout:
         """Return what the run's messages are made by."""
@@ -55,6 +59,7 @@ class RunFacts:
             sample_rate_hz=self.sample_rate_hz,
             command_unit=self.command_unit,
             measures_command=self.measures_command,
+            records_input=self.records_input,
             scope_rate_hz=self.scope_rate_hz,
             start_unix_ns=start_unix_ns,
         )
@@ -86,6 +91,8 @@ class RecordingWriter:
         self._attach("experiment.yaml", run.experiment_yaml, layout.start_unix_ns)
         if run.model_yaml:
             self._attach("model.yaml", run.model_yaml, layout.start_unix_ns)
+        if run.correction_yaml:
+            self._attach("correction.yaml", run.correction_yaml, layout.start_unix_ns)
         self._topics.register()
         self._writer.flush()
 

@@ -71,14 +71,22 @@ def experiment(options: argparse.Namespace) -> LoadedExperiment:
         "waveform.frequency_hz": 1.0,
         "waveform.duration_s": options.ticks / options.rate,
     }
+    if options.model:
+        settings["compensator.model"] = options.model.resolve()
     return load_experiment(EXPERIMENT, [f"{key}={value}" for key, value in settings.items()])
 
 
 def job(folder: Path, loaded: LoadedExperiment) -> dict[str, Any]:
     """Return what the supervisor hands to the loop process, with nobody to be silent."""
-    reference = folder / "reference.npy"
-    np.save(reference, build(loaded.config.waveform, loaded.config.sample_rate_hz, folder).values)
-    return {"reference": str(reference), "supervisor": os.getppid(), "silence_s": 1e9}
+    rate_hz = loaded.config.sample_rate_hz
+    values = build(loaded.config.waveform, rate_hz, folder).values
+    ahead = Compensator(loaded.model, rate_hz).ahead(values)
+    work = {"reference": str(folder / "reference.npy"), "supervisor": os.getppid()}
+    np.save(work["reference"], values)
+    if ahead is not values:
+        work["ahead"] = str(folder / "ahead.npy")
+        np.save(work["ahead"], ahead)
+    return {**work, "silence_s": 1e9}
 
 
 def ticks_us(options: argparse.Namespace) -> tuple[np.ndarray, np.ndarray]:
@@ -147,6 +155,7 @@ def main() -> int:
     parser.add_argument("--ticks", type=int, default=10_000)
     parser.add_argument("--rate", type=float, default=1000.0, help="ticks a second")
     parser.add_argument("--priority", type=int, default=80)
+    parser.add_argument("--model", type=Path, help="another model than the experiment's")
     parser.add_argument("--max-us", type=float, default=25.0)
     options = parser.parse_args()
     tick_us, exchange_us = ticks_us(options)

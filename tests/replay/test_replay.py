@@ -7,10 +7,13 @@ import numpy as np
 import pytest
 import yaml
 
+from hilctl.compensator import Compensator
 from hilctl.errors import DataError
+from hilctl.memory import memory_after
 from hilctl.models.base import HysteresisModel
 from hilctl.models.files import dump_model
 from hilctl.models.published import terfenol_rdpi
+from hilctl.models.staged import FieldLag, StagedModel, Structure
 from hilctl.recording.data import Recording
 from hilctl.recording.reader import read
 from hilctl.replay import replay
@@ -19,11 +22,19 @@ from hilctl.start import start_run
 GOLDEN = sorted((Path(__file__).parents[2] / "recordings" / "golden").glob("*.mcap"))
 
 
-@pytest.fixture(scope="module")
-def recording(tmp_path_factory) -> Recording:
-    """A short compensated run that is stopped by its end, limits untouched."""
-    folder = tmp_path_factory.mktemp("replay")
-    (folder / "model.yaml").write_text(dump_model(terfenol_rdpi()))
+STAGED = StagedModel.around(
+    terfenol_rdpi(),
+    lag=FieldLag(tau_s=1e-4, growth_per_unit=0.3),
+    structure=Structure(natural_hz=2200.0, damping_ratio=0.12),
+    delay_s=3e-5,
+)
+
+
+def record(
+    folder: Path, model: HysteresisModel, duration_s: float, after: Path | None = None
+) -> Recording:
+    """Run a compensated sine to its end, perhaps after another run."""
+    (folder / "model.yaml").write_text(dump_model(model))
     experiment = {
         "name": "replayed",
         "device": {"kind": "simulated_terfenol"},
@@ -34,10 +45,10 @@ def recording(tmp_path_factory) -> Recording:
             "unit": "um",
             "amplitude": 10.0,
             "frequency_hz": 40.0,
-            "duration_s": 0.4,
+            "duration_s": duration_s,
             "soft_start_s": 0.05,
         },
-        "compensator": {"model": "model.yaml"},
+        "compensator": {"model": "model.yaml"} | ({"initial_state": str(after)} if after else {}),
         "limits": {"peak_current_a": 4.0, "slew_a_per_s": 4000.0, "stroke_um": [-40.0, 40.0]},
     }
     path = folder / "experiment.yaml"
@@ -47,12 +58,62 @@ def recording(tmp_path_factory) -> Recording:
     return read(result.path)
 
 
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory) -> Recording:
+    """A short compensated run that is stopped by its end, limits untouched."""
+    return record(tmp_path_factory.mktemp("replay"), terfenol_rdpi(), 0.4)
+
+
+@pytest.fixture(scope="module")
+def ahead(tmp_path_factory) -> Recording:
+    """A run whose compensator looks ahead."""
+    return record(tmp_path_factory.mktemp("ahead"), STAGED, 0.2)
+
+
 def test_own_recording_is_identical(recording):
     """Every wanted command, command and flag comes out bit for bit, the ramp included."""
     result = replay(recording)
     assert result.identical
     assert result.samples == recording.samples.index.size > 8000
     assert result.first_difference is None
+
+
+def test_run_that_looks_ahead_is_identical(ahead):
+    """What was fed is recorded, the reference ahead of its time, and gives the bits again."""
+    preview = STAGED.inverse(ahead.sample_rate_hz).preview
+    samples = ahead.samples
+    assert preview == 7
+    assert (
+        samples.reference_um[preview:4000].tolist() == samples.input_um[: 4000 - preview].tolist()
+    )
+    assert set(samples.input_um[4000 - preview : 4000]) == {samples.reference_um[3999]}
+    assert np.isnan(samples.input_um[4000:]).all()
+    assert replay(ahead).identical
+
+
+def test_another_model_is_fed_by_its_own_preview(ahead, recording):
+    """A recording replayed with another model is fed as far ahead as that one looks."""
+    assert recording.samples.input_um.size == 0
+    assert replay(ahead, STAGED).identical
+    samples = replace(ahead.samples, input_um=np.empty(0))
+    assert replay(replace(ahead, samples=samples), STAGED).identical
+    plain = replay(ahead, terfenol_rdpi())
+    command = terfenol_rdpi().inverse(20e3).process(ahead.samples.reference_um[:4000].copy())
+    assert plain.command_max == pytest.approx(command.max(), abs=1e-12)
+
+
+def test_run_that_goes_on_after_another_is_identical(ahead, tmp_path):
+    """Begun with what a run before left, a run records that memory, and replays from it."""
+    memory = memory_after(ahead.path, STAGED, ahead.sample_rate_hz)
+    after = record(tmp_path, STAGED, 0.1, ahead.path)
+    begun = Compensator(STAGED, ahead.sample_rate_hz)
+    begun.restore(memory.state)
+    begun.begin(memory.lead_in(after.samples.reference_um[:7], 4000))
+    assert after.starts[0].state.tolist() == begun.state().tolist()
+    assert after.samples.input_um[0] == pytest.approx(memory.stands_um, rel=1e-3)
+    assert after.run["initial_state_run_id"] == ahead.run["run_id"] != ""
+    assert ahead.run["initial_state_run_id"] == ""
+    assert replay(after).identical
 
 
 @pytest.mark.parametrize("row", [0, 777, 7999])

@@ -214,6 +214,15 @@ def test_measured_is_cut_like_the_rest() -> None:
     assert {c.size for c in without.values()} == {500}
 
 
+def test_what_the_compensator_was_fed_is_there_where_it_was_recorded() -> None:
+    """Fed other than the reference, a run has one more column; other runs don't."""
+    plain = recording()
+    fed = replace(plain.samples, input_um=plain.samples.reference_um + 1.0)
+    table = columns(replace(plain, samples=fed), 0.01, 0.02)
+    np.testing.assert_array_equal(table["input_um"], fed.input_um[500:1000])
+    assert "input_um" not in columns(plain)
+
+
 @pytest.mark.parametrize(("t0", "t1"), [(0.02, 0.01), (0.021, 0.029), (5.0, None), (np.nan, None)])
 def test_no_samples_between_the_times_is_an_error(tmp_path: Path, t0, t1) -> None:
     """Nothing is written; a stretch that was lost counts as nothing."""

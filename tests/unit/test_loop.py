@@ -17,6 +17,7 @@ from hilctl.loop import Loop
 from hilctl.models.published import terfenol_rdpi
 from hilctl.pacer import Pacer
 from hilctl.plan import Plan, Tuning
+from hilctl.tuner import tuning_samples
 
 RATE_HZ = 1000.0
 LIMITS = CommandLimits(low=-5.0, high=5.0, slew_per_s=2000.0, safe=0.0, ramp_per_s=100.0)
@@ -129,10 +130,14 @@ class Oversight:
     tunings: dict[int, Tuning] = field(default_factory=dict)
     events: list[LoopEvent] = field(default_factory=list)
     beats: list[int] = field(default_factory=list)
+    closed: bool = False
 
     def beat(self, next_sample):
         self.beats.append(next_sample)
         return self.stop()
+
+    def closing(self):
+        self.closed = True
 
     def tuning(self):
         return self.tunings.pop(self.beats[-1], None)
@@ -156,7 +161,8 @@ class Bench:
         self.pacer = Pacer(self.clock, period_ns, policy, 0.5 * period_ns)
         stroke_um = options.get("stroke_um", (-60.0, 60.0))
         rules = {"max_late_ns": 1e9, "keep_all": False, **options.get("rules", {})}
-        plan = Plan(reference, model is not None, block, **rules)
+        ahead = options.get("ahead")
+        plan = Plan(reference, model is not None, block, ahead=ahead, **rules)
         self.oversight = options.get("oversight") or Oversight(options.get("stop", lambda: ""))
         latency, states = getattr(self.device, "latency", 0), self.compensator.state_size + 1
         self.sent = Batch.empty(latency + 1, block, states)
@@ -231,6 +237,33 @@ def test_state_before_a_block_is_recorded():
     assert bench.sink.states[6][-1] == bench.sink.columns[5][2][-1]
 
 
+@pytest.mark.parametrize("block", [1, 7, 50])
+def test_what_is_fed_ahead_is_recorded_beside_the_reference(block):
+    """The compensator gets what was prepared for it; the reference is recorded as it was."""
+    reference, model = 10.0 * sine(230), terfenol_rdpi()
+    ahead = np.concatenate((reference[4:], np.full(4, reference[-1]))) + 0.25
+    bench = Bench(reference, block=block, model=model, ahead=ahead)
+    assert bench.run().code == "completed"
+    assert bench.sink.column(0)[:230].tolist() == reference.tolist()
+    assert bench.sink.column(5)[:230].tolist() == ahead.tolist()
+    assert np.isnan(bench.sink.column(5)[230:]).all()
+    wanted = model.inverse(RATE_HZ).process(ahead.copy())
+    assert bench.sink.column(1)[:230].tolist() == wanted.tolist()
+
+
+def test_tuning_moves_reference_and_what_is_fed_alike():
+    """Gain and offset, and the way to them, are the same for both."""
+    reference = 10.0 * sine(200)
+    ahead = np.concatenate((reference[4:], np.full(4, reference[-1])))
+    oversight = Oversight(tunings={40: Tuning(0.5, 0.1, 20)})
+    bench = Bench(reference, block=10, model=terfenol_rdpi(), ahead=ahead, oversight=oversight)
+    bench.run()
+    ramp = np.clip((np.arange(200) - 39) / 20, 0.0, 1.0)
+    gains, offsets = 1.0 - 0.5 * ramp, 0.1 * ramp
+    np.testing.assert_allclose(bench.sink.column(0)[:200], gains * reference + offsets)
+    np.testing.assert_allclose(bench.sink.column(5)[:200], gains * ahead + offsets)
+
+
 def test_current_runs_record_no_reference():
     """Without a compensator there is no displacement wanted, and none is pretended."""
     bench = Bench(sine(50))
@@ -294,6 +327,7 @@ def test_lost_device_is_made_safe():
     assert bench.device.made_safe == [0.0]
     assert outcome.ended_at == 61
     assert [event.code for event in bench.oversight.events] == ["device_lost"]
+    assert bench.oversight.closed
 
 
 def test_sample_that_the_device_did_not_answer_is_recorded():
@@ -487,7 +521,8 @@ def test_reference_is_tuned_without_a_bump():
     assert (reference[:40] == 2.0).all()
     assert reference[59:] == pytest.approx(1.1)
     assert np.diff(reference[39:60]) == pytest.approx(-0.9 / 20)
-    assert [(event.sample, event.code) for event in oversight.events] == [(40, "tuned")]
+    (event,) = oversight.events
+    assert (event.sample, event.code, tuning_samples(event.text)) == (40, "tuned", 20)
 
 
 def test_many_late_ticks_in_a_row_end_the_run():

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from pydantic import ConfigDict
 
-from hilctl import preflight
 from hilctl.arrays import F64
 from hilctl.errors import ConfigError
 from hilctl.experiment import LoadedExperiment, resolve
 from hilctl.models.base import HysteresisModel, Operator
 from hilctl.models.published import piezo_ppi, terfenol_rdpi
 from hilctl.models.rdpi import RdpiModel
+from hilctl.models.staged import FieldLag, StagedModel
 from hilctl.ports import DeviceInfo, DeviceOptions
-from hilctl.preflight import Checked, check
+from hilctl.preflight import Checked, check, check_tuned
 from hilctl.yamlio import Document
 
 CURRENT = """\
@@ -41,6 +41,7 @@ waveform:
 compensator: {model: model.yaml}
 limits: {peak_current_a: 7.0, slew_a_per_s: 20000.0, stroke_um: [-75.0, 60.0]}
 """
+MODEL = Path(__file__).parents[2] / "configs" / "models" / "terfenol_rdpi.yaml"
 INFO = DeviceInfo(
     name="fake",
     description="a device that does nothing",
@@ -188,17 +189,50 @@ class TestForecast:
         """However the reference is cut, the forecast is the same, bit for bit."""
         model = terfenol_rdpi()
         whole = checked(DISPLACEMENT, model=model).forecast
-        monkeypatch.setattr(preflight, "_CHUNK", chunk)
+        monkeypatch.setattr("hilctl.forecast._CHUNK", chunk)
         assert checked(DISPLACEMENT, model=model).forecast == whole
 
     def test_longer_than_a_chunk(self, monkeypatch: pytest.MonkeyPatch) -> None:
         """A run of more than a million samples is forecast as if in one piece."""
         settings = ("waveform.duration_s=120.0", "waveform.frequency_hz=0.37")
-        assert preflight._CHUNK == 1_000_000
         forecast = checked(DISPLACEMENT, *settings, model=terfenol_rdpi()).forecast
         assert forecast.samples == 1_200_000
-        monkeypatch.setattr(preflight, "_CHUNK", 2_000_000)
+        monkeypatch.setattr("hilctl.forecast._CHUNK", 2_000_000)
         assert checked(DISPLACEMENT, *settings, model=terfenol_rdpi()).forecast == forecast
+
+    def test_what_is_fed_ahead_is_what_is_forecast(self) -> None:
+        """A compensator that looks ahead is fed the reference shifted, and held at its end."""
+        model = StagedModel.around(terfenol_rdpi(), lag=FieldLag(tau_s=2e-4), delay_s=3e-4)
+        result = checked(DISPLACEMENT, model=model)
+        values = result.reference.values
+        assert result.ahead is not None
+        assert result.fed is result.ahead
+        assert result.ahead.tolist() == [*values[4:].tolist(), *[values[-1]] * 4]
+        inverse = model.inverse(10e3)
+        inverse.process(values[:4].copy())
+        command = inverse.process(result.ahead.copy())
+        assert result.forecast.command_max == command.max()
+        plain = checked(DISPLACEMENT, model=terfenol_rdpi())
+        assert plain.ahead is None
+        assert plain.state is None
+        assert plain.fed is plain.reference.values
+        assert result.forecast.recording_mb > plain.forecast.recording_mb
+
+    def test_tuned_run_that_looks_ahead_is_worked_out_on_what_is_fed(self) -> None:
+        """A gain is refused by the current it would take with all of the compensator in it."""
+        model = StagedModel.around(terfenol_rdpi(), lag=FieldLag(tau_s=2e-3))
+        result = checked(DISPLACEMENT, model=model)
+        highest = result.forecast.command_max
+        check_tuned(result, (1.0, 0.0), (0.99 * 7.0 / highest, 0.0), 1000)
+        with pytest.raises(ConfigError, match="must stay within -7 to 7 A"):
+            check_tuned(result, (1.0, 0.0), (1.2 * 7.0 / highest, 0.0), 1000)
+
+    def test_run_before_that_can_t_be_read_is_refused(self) -> None:
+        """A recording that is not there is named with its key."""
+        text = DISPLACEMENT.replace("{model: model.yaml}", "{model: m, initial_state: gone.mcap}")
+        made = resolve(Document("x.yaml", text.replace("model: m,", f"model: {MODEL},")), Path())
+        with pytest.raises(ConfigError, match=r"initial_state: gone\.mcap: no such"):
+            check(replace(made, device=FakeDevice(INFO)))
 
     def test_to_mapping(self) -> None:
         """A forecast can be printed as JSON."""
@@ -319,7 +353,7 @@ class TestCommand:
     @pytest.mark.parametrize("at", [0, 1, 1500])
     def test_not_a_number(self, monkeypatch: pytest.MonkeyPatch, bad: float, at: int) -> None:
         """A command that is not finite is refused, wherever and in whichever chunk it stands."""
-        monkeypatch.setattr(preflight, "_CHUNK", 1000)
+        monkeypatch.setattr("hilctl.forecast._CHUNK", 1000)
         found = refusals(DISPLACEMENT, model=BrokenModel(bad=bad, at=at))
         assert len(found) == 1
         assert found[0].startswith(

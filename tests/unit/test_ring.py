@@ -18,7 +18,7 @@ def make(tmp_path, slots=4):
 
 
 def push(ring, number, dropped=0):
-    columns = np.full((5, BLOCK), float(number))
+    columns = np.full((6, BLOCK), float(number))
     head = (number * BLOCK, BLOCK, dropped, number, number, number)
     return ring.push(head, np.full(STATE, -number), columns, np.full(BLOCK, number, np.uint32))
 
@@ -31,7 +31,7 @@ def test_blocks_come_out_as_they_went_in(tmp_path):
     assert push(ring, 2)
     batch = other.pop()
     assert batch.heads[:, Head.FIRST_SAMPLE].tolist() == [3, 6]
-    assert batch.columns[1].tolist() == [[2.0] * BLOCK] * 5
+    assert batch.columns[1].tolist() == [[2.0] * BLOCK] * 6
     assert batch.states.tolist() == [[-1.0, -1.0], [-2.0, -2.0]]
     assert batch.flags.tolist() == [[1] * BLOCK, [2] * BLOCK]
     assert other.pop() is None
@@ -124,7 +124,8 @@ def test_blocks_that_were_sent_outlive_their_loop(tmp_path):
     batch = other.unanswered(5)
     assert batch.heads[:, Head.FIRST_SAMPLE].tolist() == [6, 9]
     assert batch.heads[:, Head.DROPPED_BEFORE].tolist() == [1, 0]
-    assert np.isnan(batch.columns[:, 3:]).all()
+    assert np.isnan(batch.columns[:, 3:5]).all()
+    assert (batch.columns[:, 5] == batch.columns[:, 2]).all()
     assert (batch.columns[:, 2] == [[6.0] * BLOCK, [9.0] * BLOCK]).all()
     assert (batch.flags & Flag.UNANSWERED).all()
     assert (batch.flags & Flag.SLEW_LIMITED).all()

@@ -45,3 +45,11 @@ def test_loop_that_does_not_run_yet_or_any_more_does_not_hang(tmp_path):
     for phase in (Phase.STARTING, Phase.READY, Phase.ENDED, Phase.FAILED):
         ring.put(Field.PHASE, phase)
         assert not any(look(watch, [0.5 * k for k in range(20)]))
+
+
+def test_closing_a_device_has_more_time(tmp_path):
+    """A device that is lost may use up its time-outs, but not for ever."""
+    ring, watch = watched(tmp_path)
+    ring.put(Field.PHASE, Phase.CLOSING)
+    assert not any(look(watch, [float(k) for k in range(31)]))
+    assert look(watch, [32.0]) == [True]

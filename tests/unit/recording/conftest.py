@@ -29,12 +29,12 @@ def batch(first, blocks, *, dropped=0, seed=0):
     return Batch(
         heads,
         rng.normal(size=(blocks, 4)),
-        rng.normal(size=(blocks, 5, BLOCK)),
+        rng.normal(size=(blocks, 6, BLOCK)),
         rng.integers(0, 31, (blocks, BLOCK)).astype(np.uint32),
     )
 
 
-def write(stream, batches, *, unit="A", measures=True, finish=True, ended_at=0):
+def write(stream, batches, *, unit="A", measures=True, own_input=True, finish=True, ended_at=0):
     """Write a recording, a chunk a batch."""
     facts = RunFacts(
         facts={"command_unit": unit, "sample_rate_hz": repr(RATE_HZ), "compensator": "rdpi"},
@@ -45,6 +45,7 @@ def write(stream, batches, *, unit="A", measures=True, finish=True, ended_at=0):
         command_unit=unit,
         measures_command=measures,
         scope_rate_hz=1000.0,
+        records_input=own_input,
     )
     writer = RecordingWriter(stream, facts, START_NS)
     for each in batches:

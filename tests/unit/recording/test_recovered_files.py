@@ -190,8 +190,9 @@ def test_ring_batches_fill_the_end(torn, batches):
     assert recovered.missing_samples == 0
     back = read(torn)
     assert back.samples.index.tolist() == list(range(5000))
-    expected = np.concatenate([b.columns.transpose(1, 0, 2).reshape(5, -1) for b in batches], 1)
+    expected = np.concatenate([b.columns.transpose(1, 0, 2).reshape(6, -1) for b in batches], 1)
     assert np.array_equal(back.samples.measured, expected[4])
+    assert np.array_equal(back.samples.input_um, expected[5])
     assert np.array_equal(back.samples.flags, np.concatenate([b.flags.ravel() for b in batches]))
     assert back.ticks.late_ns.tolist() == np.concatenate([b.heads[:, 5] for b in batches]).tolist()
     assert (back.end["code"], back.end["reason"]) == ("fault", "killed")

@@ -30,10 +30,10 @@ def test_everything_comes_back(recorded, make):
     """Samples, ticks, events, facts, segments and attachments are read back as written."""
     path, batches = recorded
     back = read(path)
-    expected = np.concatenate([b.columns.transpose(1, 0, 2).reshape(5, -1) for b in batches], 1)
+    expected = np.concatenate([b.columns.transpose(1, 0, 2).reshape(6, -1) for b in batches], 1)
     samples = back.samples
     columns = [samples.reference_um, samples.wanted, samples.command]
-    columns += [samples.displacement_um, samples.measured]
+    columns += [samples.displacement_um, samples.measured, samples.input_um]
     for column, values in zip(columns, expected, strict=True):
         assert np.array_equal(column, values)
     assert samples.flags.tolist() == np.concatenate([b.flags.ravel() for b in batches]).tolist()
@@ -103,7 +103,7 @@ def test_voltage_devices_have_voltage_fields(tmp_path, make):
     path = tmp_path / "run.mcap"
     one = make.batch(0, 2)
     with path.open("wb") as stream:
-        make.write(stream, [one], unit="V", measures=False)
+        make.write(stream, [one], unit="V", measures=False, own_input=False)
     with path.open("rb") as stream:
         reader = make_reader(stream, decoder_factories=[DecoderFactory()])
         decoded = next(d for *_, d in reader.iter_decoded_messages(topics=["/samples"]))
@@ -112,7 +112,7 @@ def test_voltage_devices_have_voltage_fields(tmp_path, make):
     back = read(path)
     assert back.command_unit == "V"
     assert np.array_equal(back.samples.command, one.columns[:, 2].ravel())
-    assert back.samples.measured.size == 0
+    assert back.samples.measured.size == back.samples.input_um.size == 0
 
 
 def test_cut_short_file_gives_what_it_holds(tmp_path, make):

@@ -31,7 +31,7 @@ def record(path: Path, firsts: list[int], columns: F64) -> None:
     batch = Batch(
         heads=heads,
         states=np.zeros((blocks, 1)),
-        columns=np.ascontiguousarray(columns.reshape(5, blocks, BLOCK).transpose(1, 0, 2)),
+        columns=np.ascontiguousarray(columns.reshape(6, blocks, BLOCK).transpose(1, 0, 2)),
         flags=np.zeros((blocks, BLOCK), dtype=np.uint32),
     )
     facts = RunFacts(
@@ -54,7 +54,7 @@ def record(path: Path, firsts: list[int], columns: F64) -> None:
 def recording(tmp_path: Path) -> Path:
     """A recording of 100 samples at 1 kHz."""
     path = tmp_path / "run.mcap"
-    record(path, [0, 20, 40, 60, 80], np.array([column(k) for k in range(5)]))
+    record(path, [0, 20, 40, 60, 80], np.array([column(k) for k in range(6)]))
     return path
 
 
@@ -92,7 +92,7 @@ def test_column_is_needed(made: Made, recording: Path) -> None:
 
 def test_not_a_number(made: Made, tmp_path: Path) -> None:
     """A recorded value that is not a number is refused with its row."""
-    columns = np.array([column(k) for k in range(5)])
+    columns = np.array([column(k) for k in range(6)])
     columns[0, 30:] = np.nan
     record(tmp_path / "run.mcap", [0, 20, 40, 60, 80], columns)
     keys = {"kind": "file", "path": "run.mcap", "column": "reference_um"}
@@ -105,7 +105,7 @@ def test_not_a_number(made: Made, tmp_path: Path) -> None:
 
 def test_gap(made: Made, tmp_path: Path) -> None:
     """A recording that lacks samples is refused: closing the gap would make a step."""
-    columns = np.array([column(k) for k in range(5)])
+    columns = np.array([column(k) for k in range(6)])
     record(tmp_path / "run.mcap", [0, 20, 60, 80, 100], columns)
     with pytest.raises(InputError, match="samples are missing in it"):
         made(RATE_HZ, tmp_path, kind="file", path="run.mcap", column="command")

@@ -1,0 +1,188 @@
+"""Field lag, structure and transport delay between samples, forwards and backwards.
+
+Memory of every kernel ends with the previous input; NaN means that there is none yet, and then the
+signal counts as having stood at its first value for ever. It is updated in place, so any cut of a
+signal into blocks gives the same bits as one call. ``out`` may be the input array itself.
+"""
+
+import math
+
+from hilctl.arrays import F64
+from hilctl.kernels.jit import kernel
+
+# Share of the fastest change the lag allows that its inverse asks for; towards 1 the command that
+# takes grows beyond all bounds.
+_REACH = 0.8
+_NEWTON_STEPS = 60
+_SMALL = 1e-17  # a growth that rounding hides
+
+
+@kernel("float64(float64, float64, float64)")
+def _left_behind(behind: float, growth: float, periods: float) -> float:
+    """Return what is left of ``behind`` > 0 after a sample in which the command is held.
+
+    With e the distance, tau de/dt = -e / (1 + b e), so ln e + b e falls by T / tau. Newton's
+    method for ln(b e) comes down to the root from above, because the function is convex.
+    """
+    wide = growth * behind
+    if wide < _SMALL:
+        return behind * math.exp(-periods)
+    log = math.log(wide)
+    end = log + wide - periods
+    change = 1.0
+    steps = 0
+    while abs(change) > 1e-8 and steps < _NEWTON_STEPS:
+        wide = math.exp(log)
+        change = (log + wide - end) / (1.0 + wide)
+        log -= change
+        steps += 1
+    return math.exp(log) / growth
+
+
+@kernel("void(float64[::1], float64, float64, float64[::1], float64[::1])")
+def lag_block(v: F64, periods: float, growth: float, memory: F64, out: F64) -> None:
+    """Let a first-order lag follow a command that is held from sample to sample.
+
+    tau (1 + b |v - x|) dx/dt = v - x, integrated exactly. ``out[k]`` is x when ``v[k]`` is put
+    out, so it shows the commands up to ``v[k - 1]``.
+
+    Args:
+        v: float64[n], command.
+        periods: T / tau, > 0.
+        growth: b, one over the unit of ``v``, >= 0.
+        memory: float64[2]: x, the previous command.
+        out: float64[n], filled with x.
+    """
+    for k in range(v.size):
+        now, held, x = v[k], memory[1], memory[0]
+        behind = abs(held - x)
+        if not abs(held) >= 0.0:
+            x = now
+        elif behind > 0.0:
+            x = held - math.copysign(_left_behind(behind, growth, periods), held - x)
+        memory[0] = x
+        memory[1] = now
+        out[k] = x
+
+
+@kernel("void(float64[::1], float64, float64, float64[::1], float64[::1])")
+def lead_block(x: F64, periods: float, growth: float, memory: F64, out: F64) -> None:
+    """Find the commands that bring the lag of :func:`lag_block` to wanted values.
+
+    ``out[k]`` brings it to ``x[k]`` when ``out[k + 1]`` is put out. To go by D within a sample the
+    command must be ahead by D / (1 - exp(b D - T / tau)), which asks for b D < T / tau: no lag of
+    this kind moves faster than 1 / (tau b). D is held below 0.8 of that, and what is missing is
+    made good at the samples after it.
+
+    Args:
+        x: float64[n], wanted output of the lag.
+        periods: T / tau, > 0.
+        growth: b, one over the unit of ``x``, >= 0.
+        memory: float64[2]: the lag's output, the previous command.
+        out: float64[n], filled with commands.
+    """
+    furthest = _REACH * periods / growth if growth > 0.0 else math.inf
+    for k in range(x.size):
+        wanted, there = x[k], memory[0]
+        if not abs(memory[1]) >= 0.0:
+            there = wanted
+        way = wanted - there
+        size = min(abs(way), furthest)
+        way = math.copysign(size, way)
+        command = there - way / math.expm1(growth * size - periods)
+        if not abs(wanted) < math.inf:  # must not come out as a number
+            command = way = math.nan
+        memory[0] = there + way
+        memory[1] = command
+        out[k] = command
+
+
+@kernel("void(float64[::1], float64[:, ::1], float64[::1], float64[::1])")
+def structure_block(x: F64, motion: F64, memory: F64, out: F64) -> None:
+    """Let a mass on a damped spring follow ``x``, which changes linearly between samples.
+
+    Args:
+        x: float64[n], where it would rest.
+        motion: float64[2, 4]: position and velocity after a sample, from those before it and
+            from ``x`` before and after it.
+        memory: float64[3]: position, velocity, the previous ``x``.
+        out: float64[n], filled with positions.
+    """
+    for k in range(x.size):
+        now, before = x[k], memory[2]
+        position, velocity = memory[0], memory[1]
+        if abs(before) >= 0.0:
+            p = motion[0, 0] * position + motion[0, 1] * velocity
+            q = motion[1, 0] * position + motion[1, 1] * velocity
+            position = p + motion[0, 2] * before + motion[0, 3] * now
+            velocity = q + motion[1, 2] * before + motion[1, 3] * now
+        else:
+            position = now
+            velocity = 0.0
+        memory[0] = position
+        memory[1] = velocity
+        memory[2] = now
+        out[k] = position
+
+
+@kernel("float64(float64[::1], float64)", inline=True)
+def _oldest(memory: F64, now: float) -> float:
+    """Put ``now`` into a row of values, oldest first, and return the one that leaves it."""
+    last = memory.size - 1
+    if not abs(memory[last]) >= 0.0:
+        for i in range(last):
+            memory[i] = now
+    left = memory[0] if last else now
+    for i in range(last - 1):
+        memory[i] = memory[i + 1]
+    memory[max(last - 1, 0)] = now
+    memory[last] = now
+    return left
+
+
+@kernel("void(float64[::1], float64[::1], float64[::1], float64[::1])")
+def weigh_block(x: F64, weights: F64, memory: F64, out: F64) -> None:
+    """Sum a signal's last values, each with its weight.
+
+    Args:
+        x: float64[k].
+        weights: float64[n], n >= 2, of the oldest value first.
+        memory: float64[n]: the last n - 1 values, the previous one.
+        out: float64[k], filled.
+    """
+    for k in range(x.size):
+        total = weights[0] * _oldest(memory, x[k])
+        for i in range(1, weights.size):
+            total += weights[i] * memory[i - 1]
+        out[k] = total
+
+
+@kernel("void(float64[::1], float64[::1], float64[::1])")
+def delay_block(x: F64, memory: F64, out: F64) -> None:
+    """Hold a signal back by n samples.
+
+    Args:
+        x: float64[k].
+        memory: float64[n + 1]: the last n values, the previous one.
+        out: float64[k], filled.
+    """
+    for k in range(x.size):
+        out[k] = _oldest(memory, x[k])
+
+
+@kernel("void(float64[::1], float64, float64[::1], float64[::1])")
+def between_block(x: F64, part: float, memory: F64, out: F64) -> None:
+    """Take a signal between its samples: ``part`` of the way from the one before to each.
+
+    Args:
+        x: float64[n].
+        part: 0 to 1.
+        memory: float64[1]: the previous value.
+        out: float64[n], filled.
+    """
+    for k in range(x.size):
+        now, before = x[k], memory[0]
+        if not abs(before) >= 0.0:
+            before = now
+        memory[0] = now
+        out[k] = before + part * (now - before)

@@ -1,0 +1,244 @@
+"""Hysteresis between the stages that carry it: field lag, structure, transport delay.
+
+Command -> field lag -> hysteresis -> structure -> transport delay -> displacement. A displacement
+is sampled when a command is put out and can't yet show it, as :mod:`hilctl.ports` has it. So the
+forward operator answers one sample later than its input, whatever its stages; ``delay_s`` is what
+comes on top of that.
+
+The inverse goes the other way round, and its input must run ahead of its output by
+:attr:`~hilctl.models.base.Operator.preview` samples: one for the loop, then the delay, then what
+the smoothing reaches ahead. ``inverse.process(reference[k + preview])`` is the command of sample k.
+It is finite for every finite reference: the lag's inverse is held within what the lag can follow,
+and the structure's is one of a displacement smoothed over a radian of its natural frequency.
+"""
+
+import math
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from hilctl.arrays import F64
+from hilctl.kernels.dynamics import (
+    lag_block,
+    lead_block,
+    structure_block,
+    weigh_block,
+)
+from hilctl.models.base import HysteresisModel, Operator, Provenance, refuse
+from hilctl.models.chain import Chain, between, delayed
+from hilctl.models.integrated import IntegratedModel
+from hilctl.models.ppi import PpiModel
+from hilctl.models.preisach import PreisachModel
+from hilctl.models.rdpi import RdpiModel
+from hilctl.models.smoothing import smoothing_weights
+
+AnyHysteresis = Annotated[
+    PpiModel | RdpiModel | IntegratedModel | PreisachModel, Field(discriminator="kind")
+]
+_WHOLE = 1e-6
+
+
+class _Stage(BaseModel):
+    model_config = ConfigDict(frozen=True, strict=True, extra="forbid", allow_inf_nan=False)
+
+
+class FieldLag(_Stage):
+    """tau (1 + b |v - x|) dx/dt = v - x: the field x follows the command v.
+
+    Attributes:
+        tau_s: Time constant tau for small changes, in s.
+        growth_per_unit: b, growth of tau with the distance, per unit of the command; the lag moves
+            no faster than 1 / (tau b).
+    """
+
+    tau_s: float = Field(gt=0.0, le=1.0)
+    growth_per_unit: float = Field(default=0.0, ge=0.0)
+
+    def forward(self, sample_rate_hz: float) -> Operator:
+        """Return the lag, exact for commands that are held; it answers a sample later."""
+        periods, growth = 1.0 / (sample_rate_hz * self.tau_s), self.growth_per_unit
+
+        def run(v: F64, memory: F64, out: F64) -> None:
+            lag_block(v, periods, growth, memory, out)
+
+        return Operator(run, 1)
+
+    def inverse(self, sample_rate_hz: float) -> Operator:
+        """Return the lead, exact where the lag can follow; with a preview of one sample."""
+        periods, growth = 1.0 / (sample_rate_hz * self.tau_s), self.growth_per_unit
+
+        def run(x: F64, memory: F64, out: F64) -> None:
+            lead_block(x, periods, growth, memory, out)
+
+        lead = Operator(run, 1)
+        lead.preview = 1
+        return lead
+
+
+class Structure(_Stage):
+    """y'' / w^2 + 2 zeta y' / w + y = x: the mass of the actuator and its load on its stiffness.
+
+    Attributes:
+        natural_hz: w / (2 pi), in Hz.
+        damping_ratio: zeta.
+    """
+
+    natural_hz: float = Field(gt=0.0)
+    damping_ratio: float = Field(gt=0.0, le=10.0)
+
+    def forward(self, sample_rate_hz: float) -> Operator:
+        """Return the structure, exact for an x that changes linearly between samples."""
+        motion = self._motion(1.0 / sample_rate_hz)
+
+        def run(x: F64, memory: F64, out: F64) -> None:
+            structure_block(x, motion, memory, out)
+
+        return Operator(run, 2)
+
+    @property
+    def radian_s(self) -> float:
+        """1 / w, in s."""
+        return 0.5 / (math.pi * self.natural_hz)
+
+    def _motion(self, step_s: float) -> F64:
+        """Return float64[2, 4], see :func:`~hilctl.kernels.dynamics.structure_block`.
+
+        Velocity is in um per radian of the natural frequency, so that the matrix is well scaled.
+        """
+        from scipy.linalg import expm
+
+        rates = np.zeros((4, 4))  # position, velocity, x, its change over the step
+        rates[0, 1] = 1.0
+        rates[1, :3] = (-1.0, -2.0 * self.damping_ratio, 1.0)
+        rates[2, 3] = 1.0 / (2.0 * math.pi * self.natural_hz * step_s)
+        motion: F64 = np.ascontiguousarray(expm(rates / rates[2, 3])[:2])
+        motion[:, 2] -= motion[:, 3]
+        return motion
+
+
+class StagedModel(HysteresisModel):
+    """A model of hysteresis with the linear stages around it.
+
+    Attributes:
+        hysteresis: Model of the hysteresis; the unit and the ranges are the staged model's.
+        lag: Lag of the field behind the command; None where there is none.
+        structure: What the displacement goes through; None where it is rigid.
+        delay_s: Transport delay beyond the one sample that every loop has, in s.
+        smoothing_s: Standard deviation of the smoothing in the inverse, in s, not less than 1 / w
+            where there is a structure. Corners of a reference are rounded within about twice that;
+            a lead makes steps of the command out of corners that are not.
+    """
+
+    kind: Literal["staged"] = "staged"
+    hysteresis: AnyHysteresis
+    lag: FieldLag | None = None
+    structure: Structure | None = None
+    delay_s: float = Field(default=0.0, ge=0.0, le=1.0)
+    smoothing_s: float = Field(default=0.0, ge=0.0, le=0.1)
+
+    @classmethod
+    def around(
+        cls,
+        hysteresis: PpiModel | RdpiModel | IntegratedModel | PreisachModel,
+        *,
+        lag: FieldLag | None = None,
+        structure: Structure | None = None,
+        delay_s: float = 0.0,
+        smoothing_s: float = 0.0,
+    ) -> Self:
+        """Put stages around a model, whose unit, ranges and provenance become theirs."""
+        shared = {name: getattr(hysteresis, name) for name in _SHARED}
+        bare = {"input_range": None, "output_range_um": None, "provenance": Provenance()}
+        inner = hysteresis.model_copy(update=bare)
+        return cls(
+            hysteresis=inner,
+            lag=lag,
+            structure=structure,
+            delay_s=delay_s,
+            smoothing_s=smoothing_s,
+            **shared,
+        )
+
+    @model_validator(mode="after")
+    def _check_one_truth(self) -> Self:
+        inner = self.hysteresis
+        problems = [
+            f"hysteresis.{name} must be left out: give it beside hysteresis"
+            for name in ("input_range", "output_range_um")
+            if getattr(inner, name) is not None
+        ]
+        if inner.input_unit != self.input_unit:
+            problems.append(f"hysteresis.input_unit must be {self.input_unit}, as beside it")
+        refuse(problems)
+        return self
+
+    @property
+    def operators(self) -> int:
+        """Number of operators with memory in the hysteresis."""
+        return self.hysteresis.operators
+
+    def forward(self, sample_rate_hz: float) -> Chain:
+        """Return the operator from command to displacement in um, at rest in its first input."""
+        whole, part = self._delay(sample_rate_hz)
+        stages = [delayed(1) if self.lag is None else self.lag.forward(sample_rate_hz)]
+        stages.append(self.hysteresis.forward(sample_rate_hz))
+        if self.structure is not None:
+            stages.append(self.structure.forward(sample_rate_hz))
+        if whole:
+            stages.append(delayed(whole))
+        if part:
+            stages.append(between(1.0 - part))
+        return Chain(stages, output_offset=self.output_offset_um)
+
+    def inverse(self, sample_rate_hz: float) -> Chain:
+        """Return the operator from displacement in um, ``preview`` samples ahead, to command.
+
+        Raises:
+            ModelError: The numbers of the hysteresis' inverse are not finite.
+        """
+        whole, part = self._delay(sample_rate_hz)
+        preview = 1 + whole + (1 if part else 0)
+        stages = [between(part)] if part else []
+        if self.structure is not None or self.smoothing_s > 0.0:
+            stages.append(self._unstructure(sample_rate_hz))
+            preview += stages[-1].preview
+        stages.append(self.hysteresis.inverse(sample_rate_hz))
+        if self.lag is not None:
+            stages.append(self.lag.inverse(sample_rate_hz))
+        return Chain(stages, preview=preview, input_offset=-self.output_offset_um)
+
+    def _unstructure(self, sample_rate_hz: float) -> Operator:
+        """Return what a smoothed displacement takes before the structure, by its derivatives.
+
+        The exact inverse of the sampled structure would ring for ever: its zero lies near -1.
+        """
+        radian_s, damping = 0.0, 0.0
+        if self.structure is not None:
+            radian_s, damping = self.structure.radian_s, self.structure.damping_ratio
+        radian = radian_s * sample_rate_hz
+        width = max(self.smoothing_s * sample_rate_hz, radian)
+        weights, ahead = smoothing_weights(width, 2.0 * damping * radian, radian**2)
+
+        def run(y: F64, memory: F64, out: F64) -> None:
+            weigh_block(y, weights, memory, out)
+
+        inverse = Operator(run, weights.size - 1)
+        inverse.preview = ahead
+        return inverse
+
+    def _delay(self, sample_rate_hz: float) -> tuple[int, float]:
+        """Return the delay's whole samples, and the part of a sample beyond them."""
+        samples = self.delay_s * sample_rate_hz
+        whole = math.floor(samples + _WHOLE)
+        part = samples - whole
+        return whole, part if part > _WHOLE else 0.0
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return the parameters as plain mappings, lists and numbers, defaults left out."""
+        mapping = super().to_mapping()
+        kind = self.hysteresis.kind
+        return mapping | {"hysteresis": {"kind": kind, **self.hysteresis.to_mapping()}}
+
+
+_SHARED = ("input_unit", "input_range", "output_range_um", "provenance")

@@ -1,0 +1,153 @@
+"""Lag, structure and delay: against independent solvers, bit for bit, block by block, in place."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.signal import StateSpace, lsim
+
+from hilctl.kernels import dynamics
+from hilctl.kernels.hysteresis import rest_memory
+from hilctl.models.smoothing import smoothing_weights
+from hilctl.models.staged import FieldLag, Structure
+
+RATE_HZ = 20_000.0
+SIGNAL = 2.0 * np.sin(np.arange(400) / 9.0) + 0.6 * np.cos(np.arange(400) / 2.3)
+MOTION = Structure(natural_hz=1500.0, damping_ratio=0.1)._motion(1.0 / RATE_HZ)
+STREAMING = {
+    "lag": (dynamics.lag_block, (0.3, 0.4), 1),
+    "linear lag": (dynamics.lag_block, (0.3, 0.0), 1),
+    "lead": (dynamics.lead_block, (0.3, 0.4), 1),
+    "linear lead": (dynamics.lead_block, (0.3, 0.0), 1),
+    "structure": (dynamics.structure_block, (MOTION,), 2),
+    "weigh": (dynamics.weigh_block, (smoothing_weights(1.5, 0.3, 5.0)[0],), 10),
+    "delay": (dynamics.delay_block, (), 4),
+    "between": (dynamics.between_block, (0.3,), 0),
+}
+
+
+def stream(name, signal, memory=None, *, plain=False, out=None):
+    kernel, parameters, size = STREAMING[name]
+    memory = rest_memory(size) if memory is None else memory
+    out = np.empty_like(signal) if out is None else out
+    (kernel.py_func if plain else kernel)(signal, *parameters, memory, out)
+    return out, memory
+
+
+@pytest.mark.parametrize("name", STREAMING)
+def test_compiled_and_python_agree_bit_for_bit(name):
+    """The function as written, run by Python, gives the same bits as its compiled form."""
+    out, memory = stream(name, SIGNAL)
+    plain, plain_memory = stream(name, SIGNAL, plain=True)
+    np.testing.assert_array_equal(out, plain)
+    np.testing.assert_array_equal(memory, plain_memory)
+
+
+@pytest.mark.parametrize("name", STREAMING)
+def test_any_cut_and_the_input_itself_as_output(name):
+    """Blocks of any size, each written over its input, give the bits of one call."""
+    whole, end = stream(name, SIGNAL)
+    memory = None
+    parts = []
+    for part in np.split(SIGNAL.copy(), [1, 2, 9, 10, 250]):
+        out, memory = stream(name, part, memory, out=part)
+        parts.append(out)
+    np.testing.assert_array_equal(np.concatenate(parts), whole)
+    np.testing.assert_array_equal(memory, end)
+
+
+@pytest.mark.parametrize("name", STREAMING)
+def test_a_constant_passes_from_the_first_sample(name):
+    """A signal counts as having stood at its first value before."""
+    out, _ = stream(name, np.full(50, -3.7))
+    np.testing.assert_allclose(out, -3.7, rtol=1e-14)
+
+
+@pytest.mark.parametrize(("periods", "growth"), [(0.2, 0.0), (0.2, 0.3), (3.0, 2.0), (0.01, 50.0)])
+def test_lag_solves_its_equation(periods, growth):
+    """For held commands the lag is what a general solver makes of its equation."""
+    v = np.array([0.0, 1.0, 1.0, -2.0, 0.5, 0.5, 4.0, 0.0])
+    out = np.empty_like(v)
+    dynamics.lag_block(v, periods, growth, rest_memory(1), out)
+    x = 0.0
+    for k in range(1, v.size):
+        solved = solve_ivp(
+            lambda t, y, held=v[k - 1]: (held - y) / (1.0 + growth * abs(held - y)),
+            (0.0, periods), [x], rtol=1e-10, atol=1e-12,
+        )  # fmt: skip
+        x = solved.y[0, -1]
+        assert out[k] == pytest.approx(x, abs=1e-8)
+
+
+@pytest.mark.parametrize("periods", [1e-9, 0.2, 30.0, 1e4, 1e300])
+@pytest.mark.parametrize("growth", [0.0, 1e-300, 1e-9, 0.3, 1e3, 1e9])
+@pytest.mark.parametrize("behind", [5e-324, 1e-9, 1.0, 1e9])
+def test_lag_is_never_past_its_command(periods, growth, behind):
+    """Whatever the numbers, a held command is approached and not passed."""
+    out = np.empty(4)
+    dynamics.lag_block(np.array([0.0, *[behind] * 3]), periods, growth, rest_memory(1), out)
+    assert np.all(np.diff(out) >= 0.0)
+    assert np.all((out >= 0.0) & (out <= behind))
+
+
+def test_lead_brings_the_lag_to_wanted_values():
+    """What the lead asks for makes the lag be there a sample later."""
+    wanted = 2.0 * np.sin(np.arange(400) / 30.0)
+    command, out = np.empty(400), np.empty(400)
+    dynamics.lead_block(wanted, 0.2, 0.4, rest_memory(1), command)
+    dynamics.lag_block(command, 0.2, 0.4, rest_memory(1), out)
+    np.testing.assert_allclose(out[1:], wanted[:-1], atol=1e-13)
+    assert np.abs(command).max() > np.abs(wanted).max()
+
+
+def test_lead_of_a_jump_stays_below_the_lag_s_limit_and_catches_up():
+    """A jump no lag could follow is followed as fast as 0.8 of its limit, and then held."""
+    wanted = np.where(np.arange(80) < 5, 0.0, 6.0)
+    command, out = np.empty(80), np.empty(80)
+    dynamics.lead_block(wanted, 0.2, 0.4, rest_memory(1), command)
+    dynamics.lag_block(command, 0.2, 0.4, rest_memory(1), out)
+    step = 0.8 * 0.2 / 0.4
+    assert np.diff(out).max() == pytest.approx(step)
+    np.testing.assert_allclose(out[25:], 6.0, atol=1e-12)
+    assert command.max() <= 6.0 + step / -math.expm1(0.4 * step - 0.2)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("growth", [0.0, 0.4])
+def test_lead_shows_what_is_not_a_number_and_goes_on(bad, growth):
+    """A wish that is not finite gives none, and the next ones give numbers again."""
+    wanted = np.array([1.0, 1.1, bad, 1.2, 1.3])
+    command = np.empty(5)
+    dynamics.lead_block(wanted, 0.2, growth, rest_memory(1), command)
+    assert np.isfinite(command).tolist() == [True, True, False, True, True]
+
+
+def test_structure_is_the_exact_solution():
+    """For an input of straight pieces the structure is what scipy makes of its equation."""
+    omega = 2.0 * math.pi * 1500.0
+    system = StateSpace([[0.0, 1.0], [-(omega**2), -0.2 * omega]], [[0.0], [omega**2]],
+                        [[1.0, 0.0]], [[0.0]])  # fmt: skip
+    signal = SIGNAL - SIGNAL[0]
+    _, expected, _ = lsim(system, signal, np.arange(signal.size) / RATE_HZ)
+    out = np.empty_like(signal)
+    dynamics.structure_block(signal, MOTION, rest_memory(2), out)
+    np.testing.assert_allclose(out, expected, atol=1e-9)
+
+
+def test_delay_holds_back_whole_samples_and_parts():
+    """Four samples back is four samples back; a part lies on the line between two."""
+    ramp = np.arange(20.0)
+    delayed, _ = stream("delay", ramp)
+    assert delayed.tolist() == [0.0] * 4 + ramp[:-4].tolist()
+    between, _ = stream("between", ramp)
+    np.testing.assert_allclose(between[1:], ramp[1:] - 0.7)
+
+
+def test_lag_refuses_other_types():
+    """A float32 signal is refused at once."""
+    with pytest.raises(TypeError):
+        dynamics.lag_block(
+            np.zeros(3, np.float32), 0.2, FieldLag(tau_s=1e-4).growth_per_unit, rest_memory(1),
+            np.zeros(3),
+        )  # fmt: skip

@@ -1,0 +1,172 @@
+"""The staged model: files, conditions, preview, and that the inverse undoes the model."""
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from hilctl.errors import ModelError
+from hilctl.models.base import Provenance
+from hilctl.models.files import dump_model, parse_model
+from hilctl.models.published import exponential_integrated, piezo_ppi, terfenol_rdpi
+from hilctl.models.smoothing import smoothing_weights
+from hilctl.models.staged import FieldLag, StagedModel, Structure
+
+RATE_HZ = 50_000.0
+LAG = FieldLag(tau_s=1e-4, growth_per_unit=0.28)
+STRUCTURE = Structure(natural_hz=2200.0, damping_ratio=0.12)
+OMEGA = exponential_integrated(
+    alpha=0.3, gamma_s=0.0, a_0=1.0, alpha_0=0.2, beta_0=0.3, g_0=6.0, alpha_1=0.3, beta_1=0.1,
+    d_p=0.8, alpha_2=0.4, beta_2=0.1, d_n=0.8, plays=6, deadbands_a_side=2,
+)  # fmt: skip
+STAGES = {
+    "bare": {},
+    "lag": {"lag": LAG},
+    "linear lag": {"lag": FieldLag(tau_s=1e-4)},
+    "delay": {"delay_s": 3 / RATE_HZ},
+    "part of a sample": {"delay_s": 2.35 / RATE_HZ},
+    "structure": {"structure": STRUCTURE},
+    "smoothing": {"lag": LAG, "smoothing_s": 1.0 / (2.0 * np.pi * 2200.0)},
+    "all": {"lag": LAG, "structure": STRUCTURE, "delay_s": 2.7e-5},
+}
+PREVIEW = {"bare": 1, "lag": 1, "linear lag": 1, "delay": 4, "part of a sample": 4, "structure": 12,
+           "all": 14, "smoothing": 12}  # fmt: skip
+
+
+def sine(frequency_hz, n=12_000):
+    """A sine whose amplitude rises over 0.05 s and falls over 0.05 s at its end."""
+    t = np.arange(n) / RATE_HZ
+    size = np.minimum(np.minimum(1.0, t / 0.05), (t[-1] - t) / 0.05)
+    return size * (20.0 * np.sin(2.0 * np.pi * frequency_hz * t) - 3.0)
+
+
+def ahead(reference, preview):
+    return np.concatenate((reference[preview:], np.full(preview, reference[-1])))
+
+
+@pytest.mark.parametrize("name", STAGES)
+def test_round_trip_gives_the_same_model(name):
+    """Dumped and read back, a staged model is equal to itself, its stages' kinds included."""
+    for hysteresis in (OMEGA, piezo_ppi(), terfenol_rdpi()):
+        model = StagedModel.around(hysteresis, **STAGES[name])
+        assert parse_model("text", dump_model(model)) == model
+
+
+def test_around_takes_over_unit_ranges_and_provenance():
+    """What the hysteresis said of itself is said of the whole, and in one place only."""
+    source = Provenance(source=("run.mcap",))
+    inner = piezo_ppi().model_copy(
+        update={"input_range": (0.0, 5.0), "output_range_um": (-1.0, 9.0), "provenance": source}
+    )
+    model = StagedModel.around(inner, lag=LAG)
+    assert (model.input_unit, model.input_range, model.output_range_um) == ("V", (0, 5), (-1, 9))
+    assert model.provenance == source
+    assert model.hysteresis.input_range is None
+    assert model.hysteresis.provenance == Provenance()
+    assert model.operators == inner.operators
+
+
+@pytest.mark.parametrize(("change", "message"), [
+    ({"hysteresis": piezo_ppi()}, "hysteresis.input_unit must be A, as beside it"),
+    ({"hysteresis": OMEGA.model_copy(update={"input_range": (0.0, 1.0)})},
+     "hysteresis.input_range must be left out"),
+    ({"lag": {"tau_s": 0.0}}, "greater than 0"),
+    ({"lag": {"tau_s": 1e-4, "growth_per_unit": -0.1}}, "greater than or equal to 0"),
+    ({"structure": {"natural_hz": 0.0, "damping_ratio": 0.1}}, "greater than 0"),
+    ({"structure": {"natural_hz": 100.0, "damping_ratio": 0.0}}, "greater than 0"),
+    ({"delay_s": -1e-6}, "greater than or equal to 0"),
+    ({"delay_s": float("nan")}, "finite number"),
+])  # fmt: skip
+def test_conditions_are_named(change, message):
+    """Every broken condition is refused with its name."""
+    with pytest.raises(ValidationError, match=message):
+        StagedModel.model_validate({"hysteresis": OMEGA, **change})
+
+
+@pytest.mark.parametrize("name", STAGES)
+@pytest.mark.parametrize("frequency_hz", [10.0, 250.0])
+def test_inverse_undoes_the_model(name, frequency_hz):
+    """Fed ahead of its time, the inverse brings the model to the reference: within 0.02 %."""
+    model = StagedModel.around(OMEGA, **STAGES[name])
+    reference = sine(frequency_hz)
+    inverse = model.inverse(RATE_HZ)
+    assert inverse.preview == PREVIEW[name]
+    command = inverse.process(ahead(reference, inverse.preview))
+    came = model.forward(RATE_HZ).process(command)
+    error = (came - reference)[2 * inverse.preview :]  # before it, the model stands where it began
+    assert np.abs(error).max() < 2e-4 * np.ptp(reference)
+    if name not in {"structure", "smoothing", "all", "part of a sample"}:
+        np.testing.assert_allclose(error, 0.0, atol=1e-11)
+
+
+def test_model_answers_later_than_its_input():
+    """No command shows in the displacement sampled when it is put out, nor before the delay."""
+    step = np.zeros(40)
+    step[10:] = 2.0
+    for name, first in (("bare", 11), ("lag", 11), ("structure", 11), ("delay", 14)):
+        came = StagedModel.around(OMEGA, **STAGES[name]).forward(RATE_HZ).process(step)
+        assert np.flatnonzero(came != came[0])[0] == first, name
+
+
+def test_offsets_of_hysteresis_and_whole_add_up():
+    """Both offsets are undone, and a constant reference is met from the start."""
+    inner = OMEGA.model_copy(update={"output_offset_um": 4.0})
+    model = StagedModel.around(inner, **STAGES["all"]).model_copy(update={"output_offset_um": -1.5})
+    command = model.inverse(RATE_HZ).process(np.full(60, 2.5))
+    np.testing.assert_allclose(command, 0.0, atol=1e-12)
+    np.testing.assert_allclose(model.forward(RATE_HZ).process(command), 2.5, atol=1e-12)
+
+
+@pytest.mark.parametrize("rate_hz", [20e3, 50e3, 200e3])
+def test_corners_of_a_triangle_are_rounded_and_take_no_jolt(rate_hz):
+    """A full triangle at 100 Hz: within 1 % of it, by commands no faster than a sine's."""
+    model = StagedModel.around(OMEGA, lag=LAG, structure=STRUCTURE)
+    t = np.arange(int(0.04 * rate_hz)) / rate_hz
+    triangle = 24.0 * np.arcsin(np.sin(2.0 * np.pi * 100.0 * t)) / np.pi
+    inverse = model.inverse(rate_hz)
+    command = inverse.process(ahead(triangle, inverse.preview))[: -inverse.preview]
+    came = model.forward(rate_hz).process(command)
+    error = np.abs(came - triangle[: came.size])[int(0.01 * rate_hz) :]
+    assert error.max() < 0.01 * np.ptp(triangle)
+    slew = np.abs(np.diff(command[int(0.01 * rate_hz) :])).max() * rate_hz
+    assert slew < 2.0 * np.pi * 250.0 * np.abs(command).max()
+
+
+def test_weights_add_up_and_follow_slope_and_bend():
+    """Constant, ramp and parabola come out as their derivatives say, whatever the width."""
+    k = np.arange(400.0)
+    for width in (0.0, 0.4, 3.6, 30.0, 1e6):
+        weights, m = smoothing_weights(width, 2.0, 5.0)
+        assert weights.size == 2 * m + 1 <= 255
+        for y, expected in (
+            (np.ones(400), np.ones(400)),
+            (k, k + 2.0),
+            (k**2, k**2 + 2.0 * 2.0 * k + 5.0 * 2.0),
+        ):
+            out = np.convolve(y, weights[::-1], "valid")
+            np.testing.assert_allclose(out, expected[m : 400 - m], rtol=1e-10)
+
+
+def test_structure_s_inverse_asks_for_little_more_than_it_is_given():
+    """The largest gain of any reference is near 1 at every rate that can resolve the structure."""
+    radian_s = STRUCTURE.radian_s
+    for rate_hz in (30e3, 50e3, 200e3, 500e3):
+        radian = radian_s * rate_hz
+        weights, _ = smoothing_weights(radian, 2.0 * STRUCTURE.damping_ratio * radian, radian**2)
+        assert np.abs(weights).sum() < 1.1
+
+
+def test_state_goes_back_and_another_model_s_is_refused():
+    """The chain's memory is one array: copied, given back, and checked for its size."""
+    operator = StagedModel.around(OMEGA, **STAGES["all"]).inverse(RATE_HZ)
+    reference = sine(250.0, 400)
+    operator.process(reference[:150])
+    state = operator.state()
+    rest = operator.process(reference[150:])
+    operator.restore(state)
+    np.testing.assert_array_equal(operator.process(reference[150:]), rest)
+    operator.reset()
+    first = operator.process(reference)
+    operator.reset()
+    np.testing.assert_array_equal(operator.process(reference), first)
+    with pytest.raises(ModelError, match="state must have"):
+        operator.restore(state[:-1])
