@@ -1,0 +1,233 @@
+"""Learning, run by run: the same experiment over and over, each time with the next correction."""
+
+import signal
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TypeAlias
+
+from hilctl import __version__
+from hilctl.errors import ConfigError, HilctlError, InputError, RunError
+from hilctl.learning.correction import (
+    C128,
+    Correction,
+    LearnedCycle,
+    dump_correction,
+    model_sha256,
+    signature,
+)
+from hilctl.learning.cycle import cycle_error
+from hilctl.learning.repeating import beginning, repeating
+from hilctl.learning.results import Learned, Row, row_of
+from hilctl.learning.unpaced import run_unpaced
+from hilctl.learning.update import learn, refused
+from hilctl.recording.reader import read
+from hilctl.run_result import RunResult
+from hilctl.segments import Segment
+from hilctl.start import checked_experiment, start_run
+
+Runner: TypeAlias = Callable[[Path, Sequence[str], Path], RunResult]
+"""Runs an experiment file with settings into a recording."""
+
+
+def paced(path: Path, settings: Sequence[str], output: Path) -> RunResult:
+    """Run as ``hilctl run`` does."""
+    return start_run(path, settings, output, overwrite=True, on_progress=lambda progress: None)
+
+
+def unpaced(path: Path, settings: Sequence[str], output: Path) -> RunResult:
+    """Run a simulated device as fast as it goes."""
+    return run_unpaced(checked_experiment(path, settings), output, overwrite=True)
+
+
+class _StoppedError(Exception):
+    """Somebody stopped a run; what has been learned before stands."""
+
+    def __init__(self, text: str, number: int) -> None:
+        super().__init__(text)
+        self.signal = number
+
+
+class Session:
+    """Learns the correction of every waveform of an experiment that repeats.
+
+    Args:
+        experiment: Experiment file; where it has a correction already, learning goes on from it.
+        settings: ``key=value`` texts over it.
+        folder: Where each run's recording and correction go.
+        run: How an experiment is run.
+
+    Raises:
+        InputError: It has no compensator, or no waveform with enough whole steady cycles.
+    """
+
+    def __init__(
+        self, experiment: Path, settings: Sequence[str], folder: Path, run: Runner = paced
+    ) -> None:
+        self._experiment = experiment
+        self._settings = list(settings)
+        self._folder = folder
+        self._run = run
+        self._checked = checked_experiment(experiment, settings)
+        self._segments = repeating(self._checked)
+        self._learning = [beginning(self._checked, each) for each in self._segments]
+        self._rows: list[Row] = []
+        self._refusals: list[str] = []
+
+    def learn(self, cycles: int, on_rows: Callable[[Sequence[Row]], None]) -> Learned:
+        """Run, learn, and run again, until nothing is left to learn.
+
+        Args:
+            cycles: Most runs after the first.
+            on_rows: Called after each run.
+
+        Raises:
+            InputError: The first run is refused; nothing has moved.
+            RunError: The first run ended by a fault.
+        """
+        self._make_folder()
+        reason, stop_signal, fault = "", 0, False
+        check: tuple[Row, ...] = ()
+        try:
+            reason = self._runs_until_done(cycles, on_rows)
+            check = self._check()
+        except (_StoppedError, KeyboardInterrupt, HilctlError) as error:
+            if not self._rows:
+                raise
+            fault = isinstance(error, HilctlError)
+            stop_signal = 0 if fault else getattr(error, "signal", signal.SIGINT)
+            reason = "; ".join(filter(None, (reason, str(error) or "stopped by Ctrl-C")))
+        if self._refusals:
+            reason += f"; {len(self._refusals)} corrections were refused: {self._refusals[-1]}"
+        return Learned(self._best(), tuple(self._rows), check, reason, stop_signal, fault)
+
+    def _runs_until_done(self, cycles: int, on_rows: Callable[[Sequence[Row]], None]) -> str:
+        """Run and learn; return why that ended."""
+        for number in range(cycles + 1):
+            try:
+                path = self._next_run(number, [each.next_um for each in self._learning])
+            except ConfigError as error:
+                if not self._rows:
+                    raise
+                self._refusals.append(str(error))
+                self._learning = [refused(each) for each in self._learning]
+                continue
+            on_rows(self._take(number, path))
+            if all(each.done for each in self._learning):
+                return "; ".join(sorted({each.done for each in self._learning}))
+        return f"{cycles} learning cycles are done"
+
+    def _make_folder(self) -> None:
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(f"{self._folder}: can't be made: {error.strerror}") from None
+
+    def _next_run(self, number: int, coefficients: Sequence[C128]) -> Path:
+        """Run with a correction, which is kept beside the recording; return that."""
+        name = f"run-{number:02d}"
+        file = self._folder / f"{name}.yaml"
+        cycles = [
+            self._cycle(segment, each)
+            for segment, each in zip(self._segments, coefficients, strict=True)
+        ]
+        _write(file, self._whole(cycles))
+        settings = [*self._settings, f"compensator.correction={file.resolve()}"]
+        settings += self._other_noise(number)
+        result = self._run(self._experiment, settings, self._folder / f"{name}.mcap")
+        if result.stop_signal and self._rows:
+            raise _StoppedError(f"run {number}: {result.reason}", result.stop_signal)
+        if result.code != "completed":
+            raise RunError(f"run {number}: {result.reason}")
+        return result.path
+
+    def _other_noise(self, number: int) -> list[str]:
+        """Give each run of a simulated device noise of its own: it must not be learned."""
+        device = self._checked.loaded.device
+        field = device.Options.model_fields.get("seed")
+        if field is None:
+            return []
+        first = self._checked.loaded.config.device.get("seed", field.default)
+        return [f"device.seed={first + number}"]
+
+    def _take(self, number: int, path: Path) -> list[Row]:
+        rows = self._judge(number, path, learning=True)
+        self._rows += rows
+        return rows
+
+    def _judge(self, number: int, path: Path, *, learning: bool) -> list[Row]:
+        recording = read(path)
+        rows = []
+        for i, segment in enumerate(self._segments):
+            state = self._learning[i]
+            error = cycle_error(recording, segment, state.highest_hz)
+            reach_hz = state.reach_hz
+            if learning and not state.done:
+                state = learn(state, error)
+                if state.done:  # it stays as it is while others go on
+                    state = replace(state, next_um=state.best.correction_um)
+                self._learning[i] = state
+            rows.append(row_of(number, segment, error, state, reach_hz, path))
+        return rows
+
+    def _check(self) -> tuple[Row, ...]:
+        """Run once more with the best corrections, under noise that they have not seen."""
+        number = self._rows[-1].run + 1
+        path = self._next_run(number, [each.best.correction_um for each in self._learning])
+        return tuple(self._judge(number, path, learning=False))
+
+    def _best(self) -> Correction:
+        cycles = []
+        for segment, state in zip(self._segments, self._learning, strict=True):
+            figures = {
+                "start_percent": state.trials[0].error.percent,
+                "error_percent": state.best.error.percent,
+            }
+            cycles.append(self._cycle(segment, state.best.correction_um, **figures))
+        return self._whole(cycles)
+
+    def _cycle(self, segment: Segment, coefficients: C128, **figures: float) -> LearnedCycle:
+        wanted = signature(self._checked.reference.values, segment)
+        assert wanted is not None
+        return LearnedCycle.from_coefficients(
+            segment.label, segment.period, wanted, coefficients, **figures
+        )
+
+    def _whole(self, cycles: Sequence[LearnedCycle]) -> Correction:
+        rate_hz = self._checked.reference.sample_rate_hz
+        provenance = {
+            "experiment": self._checked.loaded.config.name,
+            "device": self._checked.loaded.device.info.name,
+            "hilctl": __version__,
+            "created": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+            "runs": str(len(self._rows) // len(self._segments)),
+        }
+        for segment, state in zip(self._segments, self._learning, strict=True):
+            if state.trials:
+                delay = state.response.delay_s * rate_hz
+                provenance[f"delay_samples: {segment.label}"] = f"{delay:.2f}"
+        return Correction(
+            sample_rate_hz=rate_hz,
+            model_sha256=model_sha256(self._checked.loaded.model),
+            cycles=tuple(cycles),
+            provenance=provenance,
+        )
+
+
+def write_correction(path: Path, correction: Correction, *, overwrite: bool) -> None:
+    """Write a correction file.
+
+    Raises:
+        InputError: It exists, or can't be written.
+    """
+    if path.exists() and not overwrite:
+        raise InputError(f"{path}: exists already: give another --output, or --overwrite")
+    _write(path, correction)
+
+
+def _write(path: Path, correction: Correction) -> None:
+    try:
+        path.write_text(dump_correction(correction), encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{path}: can't be written: {error.strerror}") from None
