@@ -53,7 +53,15 @@ def write_html(recording: Recording, report: RunReport, path: Path) -> None:
     Raises:
         InputError: It can't be written.
     """
-    text = page(recording, report)
+    write_page(page(recording, report), path)
+
+
+def write_page(text: str, path: Path) -> None:
+    """Write a page; one of that name is replaced.
+
+    Raises:
+        InputError: It can't be written.
+    """
     beside = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
         try:
@@ -82,6 +90,11 @@ def page(recording: Recording, report: RunReport) -> str:
         *_details("Experiment", recording.experiment_yaml),
         *_details("Model", recording.model_yaml),
     ]
+    return document(title, body)
+
+
+def document(title: str, body: Iterable[str]) -> str:
+    """Return a whole page; title and body are HTML."""
     return "\n".join((_HEAD.format(title=title, css=_CSS), *body, "</body></html>\n"))
 
 
@@ -102,7 +115,8 @@ def _rows(heading: str, rows: Sequence[tuple[str, str]]) -> str:
     return f"<section><h2>{heading}</h2><table>{cells}</table></section>"
 
 
-def _table(headings: Iterable[str], rows: Iterable[Iterable[str]], css: str = "") -> str:
+def grid(headings: Iterable[str], rows: Iterable[Iterable[str]], css: str = "") -> str:
+    """Return a table of plain texts."""
     head = "".join(f"<th>{html.escape(heading)}</th>" for heading in headings)
     body = "\n".join(
         f"<tr>{''.join(f'<td>{html.escape(cell)}</td>' for cell in row)}</tr>" for row in rows
@@ -115,7 +129,7 @@ def _segments(report: RunReport) -> list[str]:
         return []
     note = "<p>The figures above are the worst of these.</p>"
     headings, rows = table.segment_table(report)
-    return ["<h2>By segment</h2>", note, _table(headings, rows, "numbers")]
+    return ["<h2>By segment</h2>", note, grid(headings, rows, "numbers")]
 
 
 def _figures(recording: Recording, report: RunReport) -> list[str]:
@@ -130,11 +144,12 @@ def _figures(recording: Recording, report: RunReport) -> list[str]:
     parts = []
     for heading, figure, otherwise in drawn:
         parts.append(f"<h2>{heading}</h2>")
-        parts.append(f"<p>{otherwise}</p>" if figure is None else _image(heading, figure))
+        parts.append(f"<p>{otherwise}</p>" if figure is None else image(heading, figure))
     return parts
 
 
-def _image(alternative: str, figure: Figure) -> str:
+def image(alternative: str, figure: Figure) -> str:
+    """Return a figure as a PNG within the page."""
     data = base64.b64encode(canvas.png(figure)).decode("ascii")
     return f'<img alt="{alternative}" src="data:image/png;base64,{data}">'
 
@@ -145,7 +160,7 @@ def _events(events: Sequence[Event]) -> list[str]:
     rows = [(str(e.sample), e.level, e.code, e.text) for e in events[-_MOST_EVENTS:]]
     left_out = len(events) - len(rows)
     note = [f"<p>The first {left_out} are left out.</p>"] if left_out else []
-    return ["<h2>Events</h2>", *note, _table(("sample", "level", "code", "text"), rows)]
+    return ["<h2>Events</h2>", *note, grid(("sample", "level", "code", "text"), rows)]
 
 
 def _details(heading: str, text: str) -> list[str]:

@@ -14,7 +14,7 @@ from typing import Annotated, NoReturn
 import typer
 
 from hilctl import __version__
-from hilctl.cli import machine, recordings, running
+from hilctl.cli import comparing, learning, machine, recordings, running
 from hilctl.cli.options import app, devices_app, print_json
 from hilctl.errors import ConfigError, HilctlError, InputError
 
@@ -31,6 +31,8 @@ _COMMANDS = (
     recordings.export,
     recordings.recover,
     recordings.identify,
+    comparing.compare,
+    learning.learn,
     machine.doctor,
     machine.emulate,
     machine.schema,

@@ -1,0 +1,193 @@
+"""Each inverse before a simulated device, in this process: what a run would come to.
+
+The device is made by its registered name and driven through :class:`hilctl.ports.Device`, with
+compensator and limiter as a run has them; feedback is left out. Nothing is recorded, and nothing
+keeps the pace: that is for devices whose time is the sample count, so any other is refused.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from hilctl.analysis.metrics import fold, peak, peak_hysteresis_percent, peak_to_peak, percent, rms
+from hilctl.arrays import F64, U32
+from hilctl.comparison.data import Loops
+from hilctl.compensator import Compensator
+from hilctl.errors import InputError
+from hilctl.experiment import LoadedExperiment
+from hilctl.flags import Flag
+from hilctl.limiter import Limiter
+from hilctl.models.base import HysteresisModel
+from hilctl.waveforms.build import Reference, build
+from hilctl.waveforms.spec import AnyWaveform, Sine, Triangle
+
+CYCLES = 4
+"""Cycles of each trial at full amplitude; the first is not judged."""
+
+STROKE = 0.98
+"""Part of the measured stroke that a trial covers where no experiment says otherwise."""
+
+SIMULATED = "simulated_"
+"""What the names of devices begin with whose time is the sample count."""
+
+_SOFT_S = 0.2
+_LIMITED = int(Flag.RANGE_LIMITED | Flag.SLEW_LIMITED | Flag.INVALID)
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """What came of one model's inverse before the device, on the average steady cycle.
+
+    Attributes:
+        label: The waveform.
+        frequency_hz: Of its cycle.
+        peak_hysteresis_percent: See :class:`hilctl.analysis.figures.Figures`.
+        peak_error_percent: The same.
+        rms_error_percent: The same.
+        limited_samples: Judged samples whose command the limiter changed.
+    """
+
+    label: str
+    frequency_hz: float
+    peak_hysteresis_percent: float | None
+    peak_error_percent: float | None
+    rms_error_percent: float | None
+    limited_samples: int
+
+
+def waveforms_of(
+    waveform: AnyWaveform, frequencies_hz: Sequence[float] | None
+) -> list[AnyWaveform]:
+    """Return an experiment's waveform at each frequency, no longer than it takes.
+
+    Args:
+        waveform: A sine or a triangle; anything else is run as it is.
+        frequencies_hz: Frequencies wanted; None for the waveform as it is.
+
+    Raises:
+        InputError: Frequencies are wanted of another waveform, or one is not > 0.
+    """
+    if frequencies_hz is None:
+        return [waveform]
+    if not isinstance(waveform, Sine | Triangle):
+        raise InputError(
+            f"--frequencies must be left out for a waveform of the kind {waveform.kind}"
+        )
+    if not all(0.0 < f < float("inf") for f in frequencies_hz):
+        raise InputError(f"--frequencies must be > 0: {list(frequencies_hz)}")
+    soft_s = waveform.soft_start_s + waveform.soft_end_s
+    return [
+        waveform.model_copy(update={"frequency_hz": f, "duration_s": soft_s + CYCLES / f})
+        for f in frequencies_hz
+    ]
+
+
+def full_stroke(loops: Loops) -> Sine:
+    """Return a sine in um that covers nearly the stroke of the widest loop."""
+    widest = max(loops, key=lambda loop: float(np.ptp(loop.displacement_um)))
+    low, high = float(widest.displacement_um.min()), float(widest.displacement_um.max())
+    return Sine(
+        kind="sine",
+        unit="um",
+        amplitude=STROKE * 0.5 * (high - low),
+        offset=0.5 * (high + low),
+        frequency_hz=widest.frequency_hz,
+        duration_s=2.0 * _SOFT_S + CYCLES / widest.frequency_hz,
+        soft_start_s=_SOFT_S,
+        soft_end_s=_SOFT_S,
+    )
+
+
+class Bench:
+    """A simulated device and the limits of its experiment, for one trial after another.
+
+    Args:
+        loaded: Gives device, limits, sample rate and block.
+        waveforms: What each model is tried on.
+        folder: Folder that file names in them are relative to.
+
+    Raises:
+        InputError: The device is not simulated, or a waveform can't be built or doesn't repeat.
+    """
+
+    def __init__(
+        self, loaded: LoadedExperiment, waveforms: Sequence[AnyWaveform], folder: Path
+    ) -> None:
+        name = loaded.device.info.name
+        if not name.startswith(SIMULATED):
+            raise InputError(
+                f"inverses are tried on simulated devices only, not on {name}: run each one with "
+                "'hilctl run'"
+            )
+        self._device = loaded.device
+        self._config = loaded.config
+        rate_hz = loaded.config.sample_rate_hz
+        self.references = tuple(build(waveform, rate_hz, folder) for waveform in waveforms)
+        for reference in self.references:
+            if reference.unit != "um" or reference.segments[0].period <= 0.0:
+                label = reference.segments[0].label
+                raise InputError(f"a trial needs a waveform in um that repeats: {label}")
+
+    @property
+    def device(self) -> str:
+        """The device, for people."""
+        return self._device.info.description
+
+    @property
+    def sample_rate_hz(self) -> float:
+        """Samples a second."""
+        return self._config.sample_rate_hz
+
+    def try_out(self, model: HysteresisModel, reference: Reference) -> list[Trial]:
+        """Run one model's inverse before the device from rest, and judge each segment.
+
+        Raises:
+            ModelError: The model can't be inverted.
+            DeviceError: The device refuses something.
+        """
+        rate_hz = self.sample_rate_hz
+        compensator = Compensator(model, rate_hz)
+        wanted = np.empty(reference.values.size)
+        compensator.process(compensator.ahead(reference.values), wanted)
+        limiter = Limiter(self._config.command_limits(), 1.0 / rate_hz)
+        command, flags = np.empty_like(wanted), np.zeros(wanted.size, dtype=np.uint32)
+        limiter.limit(wanted, command, flags)
+        displacement_um = self._drive(command)
+        return _judged(reference, displacement_um, flags)
+
+    def _drive(self, command: F64) -> F64:
+        block = self._config.block
+        displacement_um, measured = np.empty_like(command), np.empty_like(command)
+        self._device.open(self.sample_rate_hz, block)
+        try:
+            for start in range(0, command.size, block):
+                part = slice(start, start + block)
+                self._device.exchange(start, command[part], displacement_um[part], measured[part])
+        finally:
+            self._device.close()
+        return displacement_um
+
+
+def _judged(reference: Reference, displacement_um: F64, flags: U32) -> list[Trial]:
+    trials = []
+    for segment in reference.segments:
+        start, stop, cycles = segment.steady_cycles()
+        if cycles == 0:
+            raise InputError(f"{segment.label}: no steady cycle: give the waveform more time")
+        signals = (reference.values[start:stop], displacement_um[start:stop])
+        cycle = fold(np.arange(start, stop) - segment.start, segment.period, signals)
+        wanted, moved = cycle.signals
+        swing = peak_to_peak(moved)
+        trials.append(
+            Trial(
+                label=segment.label,
+                frequency_hz=reference.sample_rate_hz / segment.period,
+                peak_hysteresis_percent=peak_hysteresis_percent(wanted, moved),
+                peak_error_percent=percent(peak(moved - wanted), swing),
+                rms_error_percent=percent(rms(moved - wanted), swing),
+                limited_samples=int(np.count_nonzero(flags[start:stop] & _LIMITED)),
+            )
+        )
+    return trials

@@ -1,0 +1,151 @@
+"""The generalised Prandtl-Ishlinskii model: plays with envelope functions, and its inverse.
+
+A generalised play holds ``max(gamma_l(v) - r, min(gamma_r(v) + r, held))`` (1.17). Where
+``gamma_l <= gamma_r``, all of them are ordinary plays of one signal z, the generalised play of
+threshold 0: so the model is a sum of plays behind z, and its inverse is the inverse sum of plays
+before the inverse envelopes. Each envelope is ``c tanh(k v + s) + o``; where the falling one would
+lie below the rising one, it follows the rising one.
+
+Memory, float64[m + 2]: m play outputs, z, then the previous command (NaN: none yet, which is 0).
+It is updated in place, so any cut of a signal into blocks gives the same bits.
+
+Source: section 2.2.6 of "Modeling and Compensation of Rate-Dependent Asymmetric Hysteresis
+Nonlinearities of Magnetostrictive Actuators", Concordia; equation numbers are that dissertation's.
+"""
+
+import math
+
+from hilctl.arrays import F64
+from hilctl.kernels.jit import kernel
+
+_SATURATED = 1.0 - 1e-12
+
+
+@kernel("float64(float64, float64[::1])", inline=True)
+def _envelope(v: float, shape: F64) -> float:
+    return float(shape[0] * math.tanh(shape[1] * v + shape[2]) + shape[3])
+
+
+@kernel("float64(float64, float64[::1])", inline=True)
+def _inverse_envelope(z: float, shape: F64) -> float:
+    level = (z - shape[3]) / shape[0]
+    level = min(max(level, -_SATURATED), _SATURATED)
+    return float((math.atanh(level) - shape[2]) / shape[1])
+
+
+@kernel("float64(float64, float64, float64[::1], float64[::1])", inline=True)
+def _hold(v: float, held: float, rising: F64, falling: F64) -> float:
+    low = _envelope(v, rising)
+    high = max(low, _envelope(v, falling))
+    return max(low, min(high, held))
+
+
+@kernel("float64(float64, float64, float64[::1], float64[::1], float64[::1])", inline=True)
+def _sum_of_plays(z: float, direct: float, thresholds: F64, weights: F64, memory: F64) -> float:
+    total = direct * z
+    for i in range(thresholds.size):
+        memory[i] = max(min(memory[i], z + thresholds[i]), z - thresholds[i])
+        total += weights[i] * memory[i]
+    return total
+
+
+@kernel(
+    "void(float64[::1], float64[::1], float64[::1], float64, float64[::1], float64[::1],"
+    " float64[::1], float64[::1])"
+)
+def envelope_forward(
+    v: F64,
+    rising: F64,
+    falling: F64,
+    direct: float,
+    thresholds: F64,
+    weights: F64,
+    memory: F64,
+    out: F64,
+) -> None:
+    """Run the generalised model (1.20).
+
+    Args:
+        v: float64[n], command.
+        rising: float64[4], c, k, s and o of gamma_l; c and k are > 0.
+        falling: float64[4], those of gamma_r.
+        direct: p_0, weight of the play of threshold 0.
+        thresholds: float64[m], rising, in the unit of the envelopes.
+        weights: float64[m].
+        memory: float64[m + 2], see the module's docstring.
+        out: float64[n], filled.
+    """
+    m = thresholds.size
+    for k in range(v.size):
+        now = v[k]
+        z = _hold(now, memory[m], rising, falling)
+        out[k] = _sum_of_plays(z, direct, thresholds, weights, memory)
+        memory[m] = z
+        memory[m + 1] = now
+
+
+@kernel(
+    "void(float64[::1], float64[::1], float64[::1], float64[::1], float64[::1], float64[:, ::1])"
+)
+def envelope_outputs(
+    v: F64, rising: F64, falling: F64, thresholds: F64, memory: F64, out: F64
+) -> None:
+    """Record z and each play's output by itself, as regressors for identification.
+
+    Args as for :func:`envelope_forward`; ``out`` is float64[n, m + 1], z first.
+    """
+    m = thresholds.size
+    for k in range(v.size):
+        z = _hold(v[k], memory[m], rising, falling)
+        memory[m] = z
+        memory[m + 1] = v[k]
+        out[k, 0] = z
+        for i in range(m):
+            memory[i] = max(min(memory[i], z + thresholds[i]), z - thresholds[i])
+            out[k, i + 1] = memory[i]
+
+
+@kernel(
+    "void(float64[::1], float64[::1], float64[::1], float64, float64, float64, float64[::1],"
+    " float64[::1], float64[::1], float64[::1])"
+)
+def envelope_inverse(
+    y: F64,
+    rising: F64,
+    falling: F64,
+    low: float,
+    high: float,
+    direct: float,
+    thresholds: F64,
+    weights: F64,
+    memory: F64,
+    out: F64,
+) -> None:
+    """Run the inverse: the inverse sum of plays, then the inverse envelopes.
+
+    While z rises the command follows the inverse of gamma_l, while it falls that of gamma_r, and
+    where it turns the command jumps from one to the other; where z rests, so does the command.
+
+    Args:
+        y: float64[n], displacement in um.
+        rising: float64[4], see :func:`envelope_forward`.
+        falling: float64[4].
+        low: Lowest command given out.
+        high: Highest command given out.
+        direct: Direct weight of the inverse sum of plays.
+        thresholds: float64[m], its thresholds in um.
+        weights: float64[m], its weights.
+        memory: float64[m + 2], see the module's docstring.
+        out: float64[n], filled.
+    """
+    m = thresholds.size
+    for k in range(y.size):
+        z = _sum_of_plays(y[k], direct, thresholds, weights, memory)
+        upper = _inverse_envelope(z, rising)
+        lower = min(upper, _inverse_envelope(z, falling))
+        held = memory[m + 1] if abs(memory[m + 1]) >= 0.0 else 0.0
+        held = upper if z > memory[m] else (lower if z < memory[m] else held)
+        now = max(low, min(high, max(lower, min(upper, held))))
+        memory[m] = z
+        memory[m + 1] = now
+        out[k] = now

@@ -1,0 +1,173 @@
+"""The comparison as a whole, on the tracked recordings."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from hilctl.cli.comparing import _numbers
+from hilctl.cli.comparing import compare as command
+from hilctl.comparison.catalogue import CATALOGUE, entry
+from hilctl.comparison.compare import Request, compare
+from hilctl.comparison.figure import comparison_figure
+from hilctl.comparison.page import comparison_page
+from hilctl.comparison.render import headings, notes, render, table_rows
+from hilctl.comparison.saving import save_models
+from hilctl.errors import InputError
+from hilctl.models.files import load_model
+from hilctl.recording.reader import read
+
+ROOT = Path(__file__).parents[3]
+GOLDEN = ROOT / "recordings" / "golden" / "terfenol_uncompensated.mcap"
+OMEGA = ROOT / "configs" / "models" / "terfenol_omega.yaml"
+
+
+class Clock:
+    """Time that goes on by 1 ms whenever it is looked at."""
+
+    def __init__(self):
+        self.now = 0.0
+
+    def __call__(self):
+        self.now += 1e-3
+        return self.now
+
+
+def ignore(done, text):
+    """Take a progress report."""
+
+
+@pytest.fixture(scope="module")
+def comparison():
+    """Two models of the catalogue and one of a file, tried at 100 Hz."""
+    request = Request([GOLDEN], ["duhem", "straight", str(OMEGA)], frequencies_hz=[100.0])
+    return compare(request, Clock(), ignore)
+
+
+def test_rows_come_as_asked_for(comparison):
+    """One row a model, in that order; a model file was not identified here."""
+    assert [row.name for row in comparison.rows] == ["duhem", "straight", "terfenol_omega.yaml"]
+    assert [row.parameters for row in comparison.rows] == [4, 2, None]
+    assert comparison.rows[2].identify_s is None
+    assert comparison.rows[0].identify_s == pytest.approx(1e-3)
+
+
+def test_better_models_compensate_better(comparison):
+    """On its loop: Omega before Duhem before a straight line, modelled and compensated."""
+    duhem, straight, omega = comparison.rows
+    assert omega.error.peak_percent < duhem.error.peak_percent < straight.error.peak_percent
+    assert omega.compensated_percent < duhem.compensated_percent < straight.compensated_percent
+
+
+def test_everything_goes_into_json(comparison):
+    """The mapping is plain, and holds every loop and trial."""
+    mapping = json.loads(json.dumps(comparison.to_mapping(), allow_nan=False))
+    first = mapping["models"][0]
+    assert first["model"]["kind"] == "duhem"
+    assert [loop["label"] for loop in first["loops"]] == mapping["loops"]
+    assert first["compensated"][0]["frequency_hz"] == pytest.approx(100.0)
+    assert "simulated" in mapping["device"]
+
+
+def test_the_table_has_a_column_a_trial(comparison):
+    """Each row has as many texts as there are columns."""
+    rows = list(table_rows(comparison))
+    assert headings(comparison)[-1] == "100 Hz"
+    assert {len(row) for row in rows} == {len(headings(comparison))}
+    assert rows[2][1:3] == ["-", "-"]
+    assert render(comparison) is not None
+    assert any("simulated" in note for note in notes(comparison))
+
+
+def test_the_page_holds_table_and_figure(comparison):
+    """Self-contained, with every model by name."""
+    page = comparison_page(comparison)
+    assert page.count("data:image/png") == 1
+    assert "http://" not in page
+    assert "https://" not in page
+    for row in comparison.rows:
+        assert row.name in page
+
+
+def test_the_figure_draws_each_model_once(comparison):
+    """A line a model in each error panel, a panel a model below."""
+    upper, lower = comparison_figure(comparison).subfigs
+    assert [len(axes.lines) for axes in upper.axes] == [3, 3]
+    assert sum(bool(axes.lines) for axes in lower.axes) == 3
+
+
+@pytest.mark.parametrize("text", ["", "device: {kind: serial_dac, port: /dev/ttyUSB9}"])
+def test_loops_of_a_real_device_are_judged_without_trials(monkeypatch, text):
+    """No device is made, and table, figure and page do without compensated errors."""
+    recording = replace(read(GOLDEN), experiment_yaml=text)
+    monkeypatch.setattr("hilctl.comparison.compare.read", lambda path: recording)
+    judged = compare(Request([GOLDEN], ["straight"]), Clock(), ignore)
+    assert judged.rows[0].trials == ()
+    assert judged.rows[0].compensated_percent is None
+    assert judged.to_mapping()["device"] is None
+    assert any("not a simulated one" in note for note in notes(judged))
+    assert "straight" in comparison_page(judged)
+
+
+def test_a_compensated_recording_gives_device_and_limits():
+    """Its own waveform and compensator, whose file may be elsewhere, are not needed."""
+    path = GOLDEN.with_name("terfenol_compensated.mcap")
+    judged = compare(Request([path], ["straight"], frequencies_hz=[200.0]), Clock(), ignore)
+    assert judged.rows[0].trials[0].frequency_hz == pytest.approx(200.0)
+
+
+def test_progress_rises_to_the_end():
+    """Whoever waits is told what is being done, and how far it is."""
+    told = []
+    request = Request([GOLDEN], ["straight"], frequencies_hz=[100.0])
+    compare(request, Clock(), lambda done, text: told.append((done, text)))
+    parts = [done for done, _ in told]
+    assert parts == sorted(parts)
+    assert parts[-1] == 1.0
+    assert any("straight: " in text for _, text in told)
+
+
+def test_unknown_models_are_refused_at_once():
+    """A misspelt name is refused before any file is read, with the nearest one."""
+    with pytest.raises(InputError, match="did you mean 'preisach'"):
+        compare(Request([Path("nowhere.mcap")], ["presach"]), Clock(), ignore)
+    for name in CATALOGUE:
+        assert entry(name).title
+
+
+def test_a_model_of_another_unit_is_refused():
+    """A stage's model in V can't stand beside loops in A."""
+    model = ROOT / "configs" / "models" / "piezo_ppi.yaml"
+    with pytest.raises(InputError, match="commands in A"):
+        compare(Request([GOLDEN], [str(model)]), Clock(), ignore)
+
+
+def test_frequencies_are_numbers():
+    """The command line's list of frequencies."""
+    assert _numbers(None) is None
+    assert _numbers("1, 2.5,1e2") == [1.0, 2.5, 100.0]
+    with pytest.raises(InputError, match="numbers with commas"):
+        _numbers("ten")
+
+
+def test_saved_models_are_model_files(comparison, tmp_path):
+    """What was found is written with its provenance; what came from a file is not."""
+    paths = save_models(comparison, tmp_path / "models", created="2026-01-01", overwrite=False)
+    assert [path.name for path in paths] == ["duhem.yaml", "straight.yaml"]
+    for path, row in zip(paths, comparison.rows, strict=False):
+        saved = load_model(path)
+        assert saved.model_copy(update={"provenance": row.model.provenance}) == row.model
+        assert saved.provenance.source == (GOLDEN.name,)
+        assert saved.provenance.errors_percent["peak"] == row.error.peak_percent
+    with pytest.raises(InputError, match="--overwrite"):
+        save_models(comparison, tmp_path / "models", created="2026-01-01", overwrite=False)
+
+
+def test_an_existing_page_is_kept(tmp_path):
+    """Unless asked to, the command replaces no file; it says so before anything is read."""
+    page = tmp_path / "models.html"
+    page.write_text("mine")
+    with pytest.raises(InputError, match="--overwrite"):
+        command([Path("nowhere.mcap")], html=page)
+    assert page.read_text() == "mine"
