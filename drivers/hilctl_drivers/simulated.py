@@ -1,7 +1,7 @@
 """The simulated rigs as devices: ``simulated_terfenol`` and ``simulated_piezo``."""
 
 from dataclasses import asdict, replace
-from typing import Any, ClassVar, Self
+from typing import Annotated, Any, ClassVar, Self, TypeAlias
 
 from pydantic import Field, model_validator
 
@@ -16,11 +16,46 @@ from hilctl_drivers.simulated_device import (
 )
 from hilctl_drivers.terfenol import TerfenolActuator, TerfenolParameters
 
+Factor: TypeAlias = Annotated[float, Field(ge=0.5, le=2.0)]
+
+
+class Variation(DeviceOptions):
+    """Factors on the rated actuator, to try what a model found on another one is still good for."""
+
+    lag: Factor = Field(default=1.0, description="time constant of the field")
+    pinning: Factor = Field(default=1.0, description="pinning fields, the width of the loops")
+    strain: Factor = Field(default=1.0, description="displacement, the gain of the rig")
+    resonance: Factor = Field(default=1.0, description="natural frequency, by the stiffness")
+    damping: Factor = Field(default=1.0, description="damping ratio")
+
+    def of(self, rated: TerfenolParameters) -> TerfenolParameters:
+        """Return an actuator that differs from ``rated`` by these factors."""
+        return replace(
+            rated,
+            lag_s=rated.lag_s * self.lag,
+            pinning_max_a_per_m=rated.pinning_max_a_per_m * self.pinning,
+            strain_um=rated.strain_um * self.strain,
+            stiffness_n_per_m=rated.stiffness_n_per_m * self.resonance**2,
+            damping_ratio=rated.damping_ratio * self.damping,
+        )
+
+
+class Drift(DeviceOptions):
+    """Slow growth of the displacement, as of rods that warm up: ``um * (1 - exp(-t / tau_s))``."""
+
+    um: float = Field(ge=-50.0, le=50.0, description="displacement that it comes to, um")
+    tau_s: float = Field(gt=0.0, description="its time constant, s")
+
 
 class TerfenolOptions(SimulatedOptions):
     """Options of ``simulated_terfenol``."""
 
     load_kg: float = Field(default=0.0, ge=0.0, le=100.0, description="mass on the actuator, kg")
+    magnet: bool = Field(
+        default=True,
+        description="whether permanent magnets bias the rods; without them and without bias_a the"
+        " displacement is even in the current, and its loops are butterflies",
+    )
     bias_a: float = Field(
         default=0.0,
         ge=-8.0,
@@ -28,8 +63,42 @@ class TerfenolOptions(SimulatedOptions):
         description="constant current beside the command, A; displacement is zero there",
     )
     current_max_a: float = Field(
-        default=10.0, gt=0.0, le=10.0, description="largest current accepted either way, A"
+        default=10.0,
+        gt=0.0,
+        le=10.0,
+        description="largest current accepted either way, bias and command together, A",
     )
+    vary: Variation = Field(
+        default=Variation(), description="factors on the rated actuator, for tests of robustness"
+    )
+    drift: Drift | None = Field(default=None, description="slow growth of the displacement")
+
+    @model_validator(mode="after")
+    def _room(self) -> Self:
+        if not abs(self.bias_a) < self.current_max_a:
+            raise ValueError(
+                f"bias_a must leave room for a command within current_max_a, "
+                f"{self.current_max_a:g} A: {self.bias_a:g}"
+            )
+        return self
+
+    @property
+    def command_range_a(self) -> tuple[float, float]:
+        """Lowest and highest command: with the bias it must stay within ``current_max_a``."""
+        dac_a = TerfenolParameters().dac_range_a
+        low, high = -self.current_max_a - self.bias_a, self.current_max_a - self.bias_a
+        return max(-dac_a, low), min(dac_a, high)
+
+    def parameters(self) -> TerfenolParameters:
+        """Return the actuator that the options describe."""
+        parameters = self.vary.of(TerfenolParameters())
+        if not self.noise:
+            parameters = replace(parameters, sensor_noise_um=0.0)
+        if not self.magnet:
+            parameters = replace(parameters, magnet_field_a_per_m=0.0)
+        if self.drift is not None:
+            parameters = replace(parameters, drift_um=self.drift.um, drift_s=self.drift.tau_s)
+        return parameters
 
 
 class PiezoStage(DeviceOptions):
@@ -77,16 +146,17 @@ class SimulatedTerfenol(SimulatedDevice):
     def __init__(self, options: TerfenolOptions) -> None:
         """Describe the device; nothing is simulated before :meth:`open`."""
         self._options = options
-        rated = TerfenolParameters()
-        self._parameters = rated if options.noise else replace(rated, sensor_noise_um=0.0)
+        self._parameters = options.parameters()
+        range_um = self._parameters.sensor_range_um
+        command_min, command_max = options.command_range_a
         info = DeviceInfo(
             name="simulated_terfenol",
             description="simulated Terfenol-D actuator, linear amplifier and capacitive sensor",
             command_unit="A",
-            command_min=-options.current_max_a,
-            command_max=options.current_max_a,
-            sensor_min_um=-rated.sensor_range_um,
-            sensor_max_um=rated.sensor_range_um,
+            command_min=command_min,
+            command_max=command_max,
+            sensor_min_um=-range_um,
+            sensor_max_um=range_um,
             max_rate_hz=MAX_RATE_HZ,
             buffered=True,
             fifo_depth=FIFO_DEPTH,

@@ -36,7 +36,8 @@ class TerfenolParameters:
         dac_codes: Codes on either side of zero (DAC and ADCs).
         amplifier_bandwidth_hz: Corner of the first-order current loop.
         coil_factor_per_m: Field of one ampere, k_o in H = k_o I + H_PM.
-        magnet_field_a_per_m: Field of the permanent magnets, H_PM.
+        magnet_field_a_per_m: Field of the permanent magnets, H_PM; 0 where there are none: the
+            displacement is then even in the current.
         lag_s: Time constant of the field inside the rods, for small changes.
         lag_growth_m_per_a: Relative growth of that time constant per A/m the field is behind.
         langevin_field_a_per_m: Field scale of the anhysteretic curve.
@@ -53,6 +54,8 @@ class TerfenolParameters:
         sensor_bandwidth_hz: Corner of the first-order sensor.
         sensor_noise_um: Noise of each reading, rms.
         sensor_range_um: Reading at either end of the sensor's range.
+        drift_um: Displacement that slow growth of the rods comes to, beside all the rest.
+        drift_s: Time constant of that growth.
         step_max_s: Longest internal time step.
     """
 
@@ -76,6 +79,8 @@ class TerfenolParameters:
     sensor_bandwidth_hz: float = 15e3
     sensor_noise_um: float = 0.03553
     sensor_range_um: float = 125.0
+    drift_um: float = 0.0
+    drift_s: float = 1.0
     step_max_s: float = 10e-6
 
 
@@ -156,6 +161,8 @@ class TerfenolActuator(Plant):
             parameters.sensor_range_um / parameters.dac_codes,
             parameters.sensor_range_um,
         )
+        self._drift = (parameters.drift_um, 1.0 / (parameters.drift_s * sample_rate_hz))
+        self._samples = 0
         self._motion = _motion(parameters, load_kg, step_s)
         self._cells = _cells(parameters)
         self._state = np.zeros(7)
@@ -166,8 +173,14 @@ class TerfenolActuator(Plant):
         self._state[1] = self._bias
         self._cells[2] = self._bias
         self._rest_um = free_displacement(self._cells, self._bias, self._curve)
+        self._samples = 0
 
     def _advance(self, command: F64, noise_um: F64, displacement_um: F64, measured: F64) -> None:
+        whole, per_sample = self._drift
+        if whole:
+            past = np.arange(self._samples, self._samples + command.size)
+            noise_um -= whole * np.expm1(-past * per_sample)  # the sensor takes no notice of it
+        self._samples += command.size
         run(
             command,
             noise_um,
