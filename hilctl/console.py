@@ -9,6 +9,7 @@ from typing import Any, Self
 
 import numpy as np
 from rich.console import Console, RenderableType
+from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
@@ -21,7 +22,6 @@ from hilctl.run_result import Progress as RunProgress
 from hilctl.run_result import RunResult
 
 _REFRESH_S = 0.1
-_COUNTS = ("recorded_samples", "missing_samples", "late_ticks")
 _LARGEST_REPORTED = 5_000_000
 
 
@@ -90,7 +90,7 @@ def measuring(seconds: float, *, quiet: bool) -> Iterator[Callable[[float], None
 
 
 def _live_text(progress: RunProgress) -> str:
-    reference, _, command, displacement_um, _ = progress.batch.columns[-1]
+    reference, _, command, displacement_um = progress.batch.columns[-1][:4]
     error_um = displacement_um - reference
     error = f"error {error_um[-1]:+7.2f} um  " if np.isfinite(error_um[-1]) else ""
     return (
@@ -104,6 +104,8 @@ def run_mapping(result: RunResult) -> dict[str, Any]:
     summary = summarize(read(result.path)).to_mapping()
     return {
         **summary,
+        "recorded_samples": result.samples,
+        "dropped": result.missing,  # a recording that was cut short can't say it
         "output": str(result.path),
         "code": result.code,
         "reason": result.reason,
@@ -188,17 +190,33 @@ def print_forecast(checked: Checked) -> None:
 
 
 def print_status(found: list[dict[str, Any]]) -> None:
-    """Print which runs are going on."""
+    """Print which runs are going on, a block of lines each."""
+    console = Console()
     if not found:
-        Console().print("no run is going on")
-        return
-    table = Table("run", "state", "at", "recorded", "missing", "late", "recording")
+        console.print("no run is going on")
     for run in found:
-        total, rate_hz = run.get("total_samples", 0), run.get("sample_rate_hz", 1.0)
-        at = f"{run['sample'] / rate_hz:.1f} of {total / rate_hz:.1f} s" if total else ""
-        counts = [f"{run[key]:,}" if key in run else "" for key in _COUNTS]
-        table.add_row(run["name"], run["state"], at, *counts, run["recording"])
-    Console().print(table)
+        console.print(f"[bold]{escape(run['name'])}[/]  {run['state']}", highlight=False)
+        for name, text in _status_lines(run).items():
+            # A path is left whole, wherever the line ends, so that it can be copied.
+            line = f"  {name:10} {text}"
+            console.print(line, highlight=False, markup=False, soft_wrap=True)
+
+
+def _status_lines(run: dict[str, Any]) -> dict[str, str]:
+    """Return what there is to say of a run, by name; little where nobody answers for it."""
+    lines = {}
+    if total := run.get("total_samples", 0):
+        at_s, total_s = run["sample"] / run["sample_rate_hz"], total / run["sample_rate_hz"]
+        lines["at"] = f"{at_s:.1f} of {total_s:.1f} s"
+        lines["samples"] = (
+            f"{run['recorded_samples']:,} recorded, {run['missing_samples']:,} missing"
+        )
+        lines["late ticks"] = f"{run['late_ticks']:,}"
+        lines["reference"] = f"gain {run['gain']:g}, offset {run['offset']:g}"
+    lines["recording"] = run["recording"]
+    if trouble := run.get("recording_error") or run.get("error"):
+        lines["trouble"] = trouble
+    return lines
 
 
 def print_replay(result: ReplayResult, *, other: Path | None) -> None:

@@ -1,15 +1,17 @@
 """The recording side of a run: claims the file, writes batches, survives a full disk."""
 
+import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 
-from hilctl.blocks import Batch
+from hilctl.blocks import Batch, Head
 from hilctl.control_page import LoopEvent
 from hilctl.errors import InputError
 from hilctl.facts import run_facts
+from hilctl.learning.correction import dump_correction
 from hilctl.models.files import dump_model
 from hilctl.preflight import Checked
 from hilctl.recording.data import Event
@@ -36,10 +38,12 @@ class Recorder:
     def __init__(self, checked: Checked, path: Path, *, overwrite: bool) -> None:
         self.path = path
         self.error = ""
-        self.lost = 0
+        self._next_sample = 0
+        self._flushed = 0
         self._checked = checked
         self._writer: RecordingWriter | None = None
         self._start_unix_ns = 0
+        self._unix_ns = steady_unix_ns()
         self._tail = Tail(_SAMPLES_BEFORE)
         try:
             self._file = OutputFile(path, overwrite=overwrite)
@@ -64,6 +68,7 @@ class Recorder:
             InputError: The file can't be written.
         """
         self._start_unix_ns = start_unix_ns
+        self._unix_ns = steady_unix_ns()
         try:
             self._writer = RecordingWriter(
                 self._file.begin(), self._facts(start_unix_ns, set_up), start_unix_ns
@@ -77,8 +82,7 @@ class Recorder:
 
     def batch(self, batch: Batch) -> None:
         """Write a batch, or count it as lost where the file can't be written any more."""
-        if self.error:
-            self.lost += batch.flags.size
+        self._next_sample = int(batch.heads[-1, Head.FIRST_SAMPLE]) + batch.flags.shape[1]
         self._tail.add(batch)
         self._write(partial(self._begun.batch, batch))
 
@@ -93,6 +97,8 @@ class Recorder:
     def flush(self) -> None:
         """Hand all that was written to the kernel."""
         self._write(self._begun.flush)
+        if not self.error:
+            self._flushed = self._begun.samples
 
     def finish(self, end: Mapping[str, str], ended_at: int) -> None:
         """Write how the run ended, and close the file.
@@ -101,7 +107,8 @@ class Recorder:
             end: Facts of the end, with ``code`` and ``reason``.
             ended_at: Index after the last sample.
         """
-        now_ns = int(datetime.now(UTC).timestamp() * 1e9)
+        self._next_sample = max(self._next_sample, ended_at)
+        now_ns = self._unix_ns()
         level = "info" if end["code"] == "completed" else "error"
         event = Event(now_ns, max(0, ended_at - 1), level, "run_ended", end["reason"])
         self._write(partial(self._begun.event, event))
@@ -113,18 +120,18 @@ class Recorder:
 
     @property
     def samples(self) -> int:
-        """Samples written."""
-        return self._begun.samples
+        """Samples written; where the file could not be written to its end, those flushed before."""
+        return self._flushed if self.error else self._begun.samples
 
     @property
     def next_sample(self) -> int:
         """Index after the last sample written or lost."""
-        return self.samples + self.missing
+        return self._next_sample
 
     @property
     def missing(self) -> int:
-        """Samples known to be missing: counted in the recording, or lost after it ended."""
-        return self._begun.missing + self.lost
+        """Samples known to be missing: counted in the recording, or lost because it was cut."""
+        return self._next_sample - self._flushed if self.error else self._begun.missing
 
     @property
     def _begun(self) -> RecordingWriter:
@@ -147,11 +154,19 @@ class Recorder:
             segments=self._checked.reference.segments,
             experiment_yaml=loaded.yaml_text,
             model_yaml=dump_model(loaded.model) if loaded.model else "",
+            correction_yaml=dump_correction(loaded.correction) if loaded.correction else "",
             sample_rate_hz=config.sample_rate_hz,
             command_unit=info.command_unit,
             measures_command=info.measures_command,
+            records_input=self._checked.ahead is not None,
             scope_rate_hz=config.recording.scope_rate_hz,
         )
+
+
+def steady_unix_ns() -> Callable[[], int]:
+    """Return a clock of Unix time in ns that goes on from now, whatever the machine's is set to."""
+    offset_ns = time.time_ns() - time.monotonic_ns()
+    return lambda: time.monotonic_ns() + offset_ns
 
 
 def iso_time(unix_ns: int) -> str:

@@ -132,13 +132,17 @@ class Supervisor:
         config, info = self._config, self._checked.loaded.device.info
         slots = max(16, int(config.recording.ring_s / config.tick_s))
         state = Compensator(self._checked.loaded.model, config.sample_rate_hz).state_size + 1
-        return SampleRing.create(
-            folder.ring,
-            slots=slots,
-            block=config.block,
-            state_size=state,
-            in_flight=info.latency_blocks + 1,
-        )
+        try:
+            return SampleRing.create(
+                folder.ring,
+                slots=slots,
+                block=config.block,
+                state_size=state,
+                in_flight=info.latency_blocks + 1,
+            )
+        except OSError as error:
+            hint = "less recording.ring_s needs less of it"
+            raise RunError(f"{folder.ring}: no memory: {error.strerror}; {hint}") from None
 
     def _drain_while_alive(
         self,
@@ -215,7 +219,7 @@ class Supervisor:
         self, outcome: Outcome, ring: SampleRing, recorder: Recorder, *, ordered: bool
     ) -> RunResult:
         stop_signal = self._stop_signal or (signal.SIGTERM if ordered else 0)
-        cut = f"; the recording is cut short: {recorder.error}" if recorder.error else ""
+        cut = f"; {recorder.missing} samples are lost: {recorder.error}" if recorder.error else ""
         fault = recorder.error or (outcome.code == "stopped" and not stop_signal)
         code = "fault" if fault else outcome.code
         return RunResult(

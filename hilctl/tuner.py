@@ -1,9 +1,34 @@
 """Gain and offset of a running reference, moved without a bump."""
 
+import re
+
 import numpy as np
 
 from hilctl.arrays import F64
 from hilctl.plan import Tuning
+
+TUNED = "tuned"
+"""Code of the event that tells of a change, at the first sample that it moves."""
+_OVER = re.compile(r", over (\d+) samples$")
+
+
+def tuning_text(tuning: Tuning) -> str:
+    """Return what a recording says of a change; :func:`tuning_samples` reads it."""
+    moved = f"reference gain to {tuning.gain:g}, offset to {tuning.offset:g}"
+    return f"{moved}, over {tuning.samples} samples"
+
+
+def tuning_samples(text: str) -> int:
+    """Return how many samples a change took by what a recording says of it.
+
+    Args:
+        text: As :func:`tuning_text` makes it.
+
+    Returns:
+        Samples; 0 where the text does not say.
+    """
+    found = _OVER.search(text)
+    return int(found[1]) if found else 0
 
 
 class Tuner:

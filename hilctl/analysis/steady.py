@@ -9,6 +9,7 @@ from hilctl.arrays import F64
 from hilctl.flags import Flag
 from hilctl.recording.data import Recording, Samples
 from hilctl.segments import Segment
+from hilctl.tuner import TUNED, tuning_samples
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,13 +40,27 @@ def waveform_end(samples: Samples) -> int:
 def steady_samples(recording: Recording, segment: Segment) -> tuple[Samples, int]:
     """Return the samples to judge of a segment, and how many whole cycles they are.
 
-    Of a segment cut short, these are the last whole cycles it got to. Samples whose displacement
-    the run did not trust are left out.
+    Of a segment cut short, these are the last whole cycles it got to; of one that was tuned while
+    it ran, they lie behind the last change. Samples whose displacement the run did not trust are
+    left out.
     """
+    begin = max(segment.steady_start, _tuned_until(recording, segment))
     end = min(segment.steady_stop, waveform_end(recording.samples))
-    known = replace(segment, steady_stop=max(end, segment.steady_start))
+    known = replace(segment, steady_start=begin, steady_stop=max(end, begin))
     start, stop, cycles = known.steady_cycles()
     return _trusted(recording.samples.part(start, stop)), cycles
+
+
+def _tuned_until(recording: Recording, segment: Segment) -> int:
+    """Return the index after the last change of the reference that reaches a segment; 0 if none.
+
+    A change ends the one before it, wherever that stands.
+    """
+    until = 0
+    for event in recording.events:
+        if event.code == TUNED and event.sample < segment.steady_stop:
+            until = event.sample + tuning_samples(event.text)
+    return until
 
 
 def _trusted(samples: Samples) -> Samples:
@@ -60,6 +75,7 @@ def _trusted(samples: Samples) -> Samples:
         measured=samples.measured[keep] if samples.measured.size else samples.measured,
         displacement_um=samples.displacement_um[keep],
         flags=samples.flags[keep],
+        input_um=samples.input_um[keep] if samples.input_um.size else samples.input_um,
     )
 
 

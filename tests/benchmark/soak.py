@@ -10,6 +10,7 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from statistics import median
 
 ROOT = Path(__file__).parents[2]
 EXPERIMENT = ROOT / "configs" / "terfenol_sine_6a.yaml"
@@ -77,9 +78,16 @@ def main() -> int:
     return 0 if ok and all(each < 1024 for each in growth.values()) else 1
 
 
-def _growth_kib(noted: list[tuple[float, int]]) -> int:
-    later = [kib for at, kib in noted if at >= 60.0]
-    return max(later) - later[0] if later else 0
+def _growth_kib(noted: list[tuple[float, int]]) -> float:
+    """Return by how much the median of a minute rose above that of the second minute.
+
+    Medians, because the recorder's chunk fills and empties by some MB every two seconds.
+    """
+    minutes: dict[int, list[int]] = {}
+    for at, kib in noted:
+        minutes.setdefault(int(at // 60), []).append(kib)
+    medians = [median(minutes[minute]) for minute in sorted(minutes) if minute]
+    return max(medians) - medians[0] if medians else 0.0
 
 
 if __name__ == "__main__":

@@ -5,6 +5,7 @@ What a device says it put out is the judge: its own log, not what hilctl believe
 
 import json
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -32,6 +33,7 @@ EXPERIMENT = {
     "compensator": "none",
     "limits": {"peak_current_a": 5.0, "slew_a_per_s": 500.0, "stroke_um": [-100.0, 100.0]},
     "safe": {"value": 0.0, "ramp_s": 0.2},
+    "recording": {"flush_s": 0.1},
 }
 
 
@@ -69,11 +71,11 @@ class Log:
 class Run:
     """A ``hilctl run`` in a process of its own."""
 
-    def __init__(self, folder: Path, device: dict, **changes) -> None:
-        path = folder / "experiment.yaml"
+    def __init__(self, folder: Path, device: dict, name: str = "run", **changes) -> None:
+        path = folder / f"{name}.yaml"
         experiment = {**EXPERIMENT, "device": device, **changes}
         path.write_text(yaml.safe_dump(experiment), encoding="utf-8")
-        self.output = folder / "run.mcap"
+        self.output = folder / f"{name}.mcap"
         command = [sys.executable, "-m", "hilctl.cli", "run", str(path)]
         command += ["--output", str(self.output), "--json"]
         self.process = subprocess.Popen(
@@ -99,6 +101,20 @@ class Run:
         out, err = self.process.communicate(timeout=60)
         assert "Traceback" not in err
         assert self.process.returncode == 3, err
+        return json.loads(out)
+
+    def refused(self) -> str:
+        """Wait until it is refused; return what it said, and see that it left no file."""
+        _, err = self.process.communicate(timeout=60)
+        assert self.process.returncode == 2, err
+        assert not self.output.exists()
+        return err
+
+    def interrupt(self) -> dict:
+        """Press Ctrl-C; return the JSON it printed."""
+        self.process.send_signal(signal.SIGINT)
+        out, err = self.process.communicate(timeout=60)
+        assert self.process.returncode == 130, err
         return json.loads(out)
 
     def readable_samples(self) -> int:

@@ -1,6 +1,7 @@
 """Runs in the background: status, set and stop from outside, and what they may not do."""
 
 import json
+import random
 import signal
 import socket
 import subprocess
@@ -46,16 +47,45 @@ def hilctl(*words, code=0):
     return json.loads(done.stdout) if code == 0 else done.stderr
 
 
-@pytest.fixture
-def background(tmp_path):
-    """A run in the background; the test may end it, or leave that to the fixture."""
-    path = tmp_path / "experiment.yaml"
+def start(folder):
+    """Start a run in the background; return its recording."""
+    path = folder / "experiment.yaml"
     path.write_text(yaml.safe_dump(EXPERIMENT), encoding="utf-8")
-    started = hilctl("run", path, "--output", tmp_path / "run.mcap", "--detach")
-    yield Path(started["recording"])
+    started = hilctl("run", path, "--output", folder / "run.mcap", "--detach")
+    return Path(started["recording"])
+
+
+def stop_all():
     for run in runs():
         if run.supervised:
             hilctl("stop", "--run", run.card.name)
+
+
+@pytest.fixture
+def background(tmp_path):
+    """A run in the background; the test may end it, or leave that to the fixture."""
+    yield start(tmp_path)
+    stop_all()
+
+
+@pytest.fixture(scope="module")
+def long_run(memory, tmp_path_factory):
+    """A run in the background for all tests that must leave it undisturbed, and its place."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("HILCTL_RUNS", str(memory / "long_run"))
+        recording = start(tmp_path_factory.mktemp("long_run"))
+        await_state("running")
+    yield recording
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("HILCTL_RUNS", str(memory / "long_run"))
+        stop_all()
+
+
+@pytest.fixture
+def going(long_run, memory, monkeypatch):
+    """The recording of the long run, which commands of this test find."""
+    monkeypatch.setenv("HILCTL_RUNS", str(memory / "long_run"))
+    return long_run
 
 
 def await_state(state, timeout_s=60.0):
@@ -92,9 +122,8 @@ def test_background_run_is_seen_changed_and_stopped(background):
     assert np.abs(np.diff(samples.command[at - 1000 : at + 4000])).max() <= steepest
 
 
-def test_bad_messages_change_nothing(background):
+def test_bad_messages_change_nothing(going):
     """Garbage, unknown orders and wrong types are refused in words, and the run goes on."""
-    await_state("running")
     (run,) = runs()
     for raw, words in {
         b"not json\n": "Invalid JSON",
@@ -119,10 +148,61 @@ def test_bad_messages_change_nothing(background):
     assert (status["gain"], status["offset"], status["missing_samples"]) == (1.0, 0.0, 0)
 
 
-def test_second_run_into_the_same_recording_is_refused(background, tmp_path):
+SEEDS = (
+    b'{"command": "status"}',
+    b'{"command": "set", "gain": 9e9, "over_s": 2.0}',
+    b'{"command": "explode", "why": [1, {"a": null}, "\xc3\xa4"]}',
+)
+
+
+def mangled(chance):
+    """Return a message: noise, or an order with a few bytes changed, taken out or put in."""
+    if chance.random() < 0.2:
+        return chance.randbytes(chance.randrange(1, 6000))
+    raw = bytearray(chance.choice(SEEDS))
+    for _ in range(chance.randrange(6)):
+        at = chance.randrange(len(raw))
+        raw[at : at + chance.randrange(3)] = chance.randbytes(chance.randrange(3))
+        raw = raw or bytearray(b"?")
+    return bytes(raw) + chance.choice([b"\n", b"", b"\n\n{", b"\0\n"])
+
+
+def say(socket_path, raw):
+    """Say something to a run; return its answer, empty where it cut us off."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as client:
+        client.settimeout(10.0)
+        client.connect(str(socket_path))
+        try:
+            client.sendall(raw)
+            client.shutdown(socket.SHUT_WR)
+            return client.recv(65536)
+        except (BrokenPipeError, ConnectionResetError):
+            return b""
+
+
+def test_hundreds_of_mangled_messages_do_not_disturb_a_run(going):
+    """Each is answered or cut off, silent clients too; samples come on time all the while."""
+    (run,) = runs()
+    before, chance = hilctl("status")["runs"][0], random.Random(7)
+    answers = [say(run.socket, mangled(chance)) for _ in range(400)]
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as silent:
+        silent.connect(str(run.socket))
+        silent.settimeout(10.0)
+        assert silent.recv(1) == b""
+    said = [json.loads(answer) for answer in answers if answer]
+    assert len(said) > 300
+    assert {answer["ok"] for answer in said} == {True, False}
+    after = await_state("running")
+    assert after["missing_samples"] == 0
+    ticks = (after["sample"] - before["sample"]) / EXPERIMENT["block"]
+    assert ticks > 100
+    assert after["late_ticks"] - before["late_ticks"] < 0.1 * ticks
+
+
+def test_second_run_into_the_same_recording_is_refused(going):
     """The recording of a run that goes on can't be taken by another."""
-    path = tmp_path / "experiment.yaml"
-    text = hilctl("run", path, "--output", background, "--overwrite", code=2)
+    path = going.parent / "experiment.yaml"
+    text = hilctl("run", path, "--output", going, "--overwrite", code=2)
     assert "another hilctl is recording to it" in text
 
 
@@ -142,15 +222,24 @@ def test_without_a_run_there_is_nothing_to_stop():
 
 
 @pytest.mark.parametrize("stopped_s", [0.01, 0.3])
-def test_short_stop_of_the_supervisor_loses_nothing(background, stopped_s):
+def test_short_stop_of_the_supervisor_loses_nothing(going, stopped_s):
     """The ring takes what comes meanwhile."""
     status = await_state("running")
     (run,) = runs()
     for number, wait_s in ((signal.SIGSTOP, stopped_s), (signal.SIGCONT, 0.2)):
         subprocess.run(["kill", f"-{number.value}", str(run.card.supervisor)], check=True)
         time.sleep(wait_s)
+    after = await_state("running")
+    assert after["recorded_samples"] > status["sample"]
+    assert after["missing_samples"] == 0
+
+
+def test_run_that_was_left_in_peace_is_whole(going):
+    """After all that, it ends by its way out, and every sample is there and replays."""
+    await_state("running")
     assert hilctl("stop")["ended"]
-    recording = read(background)
-    assert recording.samples.index.size > status["sample"]
+    recording = read(going)
     assert recording.dropped == 0
+    assert np.array_equal(recording.samples.index, np.arange(recording.samples.index.size))
+    assert recording.end["reason"] == "stopped by hilctl stop"
     assert replay(recording).identical

@@ -10,7 +10,7 @@ from hilctl.flags import Flag
 
 TIMEOUT_S = 0.5
 WATCHDOG_S = 2.0
-FAULT_AT = 150
+FAULT_AT = 120
 BLOCK = 200
 FIFO_BLOCKS = 12
 STREAM = {"sample_rate_hz": 5000, "block": BLOCK}
@@ -29,7 +29,6 @@ FAULTS = {
     "silence": "no answer within 0.5 s",
     "exception": "function 76 refused with exception 4 (device failure)",
     "corrupt": "not a Modbus TCP header",
-    "cut": "short, within 0.5 s",
     "reset": "connection lost: connection reset by peer",
 }
 

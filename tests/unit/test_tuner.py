@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hilctl.plan import Tuning
-from hilctl.tuner import Tuner
+from hilctl.tuner import Tuner, tuning_samples, tuning_text
 
 
 def run(tuner, reference, block, moves):
@@ -57,3 +57,18 @@ def test_block_cuts_make_no_difference(block, start, samples):
         cut.apply(reference[at:stop], out[at:stop])
         at = stop
     assert out == pytest.approx(expected, abs=1e-15)
+
+
+@given(
+    st.floats(-1e3, 1e3),
+    st.floats(-1e3, 1e3),
+    st.integers(min_value=1, max_value=10**9),
+)
+def test_length_of_a_change_can_be_read_again(gain, offset, samples):
+    """What a recording says of a change gives the samples it took, whatever the values."""
+    assert tuning_samples(tuning_text(Tuning(gain, offset, samples))) == samples
+
+
+def test_other_texts_tell_no_length():
+    """A recording of another make has nothing to say."""
+    assert tuning_samples("reference gain to 2, over all") == 0

@@ -1,0 +1,56 @@
+"""What a reader that others wrote makes of a recording: ``@mcap/core``, where it is installed."""
+
+import json
+import shutil
+import subprocess
+from collections import Counter
+from pathlib import Path
+
+from mcap.reader import make_reader
+
+PEERS = Path(__file__).parents[1] / "peers"
+NOT_INSTALLED = "not installed"
+
+
+def verdict(path: Path, samples: int) -> str:
+    """Return where ``@mcap/core`` differs from what we read.
+
+    It reads the file twice, by its index and as a stream, and checks every checksum.
+
+    Args:
+        path: A recording that is closed and whole.
+        samples: What our own reader found in it; ``/scope`` must have that many messages, so the
+            recording's scope rate must not be below its sample rate.
+
+    Returns:
+        Empty where it agrees; otherwise what is wrong, or :data:`NOT_INSTALLED`.
+    """
+    node = shutil.which("node")
+    if node is None or not (PEERS / "node_modules" / "@mcap" / "core").is_dir():
+        return NOT_INSTALLED
+    command = [node, str(PEERS / "read_mcap.mjs"), str(path)]
+    ran = subprocess.run(command, capture_output=True, text=True, check=True, timeout=120)
+    found = json.loads(ran.stdout)[str(path)]
+    if "error" in found:
+        return str(found["error"])
+    ours = counts(path)
+    if ours.get("/scope", 0) != samples:
+        return f"{ours.get('/scope', 0)} messages in /scope, {samples} samples"
+    return _difference(found, ours)
+
+
+def counts(path: Path) -> dict[str, int]:
+    """Return how many messages there are of each topic, as Python's mcap reads them."""
+    with path.open("rb") as stream:
+        return Counter(channel.topic for _, channel, _ in make_reader(stream).iter_messages())
+
+
+def _difference(found: dict, ours: dict[str, int]) -> str:
+    for way in ("indexed", "streamed"):
+        if found[way]["counts"] != ours:
+            return f"{way}: {found[way]['counts']}, ours {dict(ours)}"
+    if not found["streamed"]["done"] or found["streamed"]["left"]:
+        return f"streamed: {found['streamed']['left']} bytes left"
+    if "hilctl.end" not in found["indexed"]["metadata"]:
+        return "no hilctl.end"
+    return ""
