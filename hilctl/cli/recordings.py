@@ -14,11 +14,13 @@ from hilctl.cli.options import (
 )
 from hilctl.errors import InputError
 
-Kind: TypeAlias = Literal["integrated", "rdpi", "ppi"]
+Kind: TypeAlias = Literal["integrated", "rdpi", "ppi", "staged"]
 Weights: TypeAlias = Literal["exponential", "free"]
 Layout: TypeAlias = Literal["even", "midpoint"]
 WeightBy: TypeAlias = Literal["equal", "hysteresis"]
 Unit: TypeAlias = Literal["A", "V"]
+Core: TypeAlias = Literal["integrated", "preisach"]
+Lag: TypeAlias = Literal["growth", "plain", "none"]
 
 
 def report(
@@ -94,7 +96,9 @@ def identify(
     files: Annotated[list[Path], typer.Argument(help="Recordings (MCAP) or text tables.")],
     model: Annotated[Kind, typer.Option(help="Model to find.")] = "integrated",
     output: Annotated[Path | None, typer.Option(help="Model file to write.")] = None,
-    plays: Annotated[int | None, typer.Option(help="Play operators; else as published.")] = None,
+    plays: Annotated[
+        str | None, typer.Option(help="Play operators, or auto: by loops held out.")
+    ] = None,
     deadbands: Annotated[int | None, typer.Option(help="Deadbands on each side of 0.")] = None,
     weights: Annotated[Weights | None, typer.Option(help="Else as published.")] = None,
     layout: Annotated[
@@ -102,6 +106,20 @@ def identify(
     ] = "even",
     weight_by: Annotated[WeightBy | None, typer.Option(help="Weight of each loop.")] = None,
     offset: Annotated[bool, typer.Option(help="Find a constant displacement too.")] = False,
+    creep: Annotated[
+        bool, typer.Option(help="A constant and creep of each file beside ppi and rdpi.")
+    ] = False,
+    hysteresis: Annotated[
+        Core | None, typer.Option(help="Of a staged model; else plays and deadbands.")
+    ] = None,
+    lines: Annotated[int | None, typer.Option(help="Lines of a Preisach triangle.")] = None,
+    lag: Annotated[Lag | None, typer.Option(help="Field lag of a staged model.")] = None,
+    structure: Annotated[
+        bool | None, typer.Option(help="Structure of a staged model.", show_default=False)
+    ] = None,
+    delay: Annotated[
+        bool | None, typer.Option(help="Transport delay of a staged model.", show_default=False)
+    ] = None,
     starts: Annotated[int | None, typer.Option(help="Starts of the search.")] = None,
     peak_goal_percent: Annotated[
         float | None, typer.Option(help="Go on reweighting until no error is larger.")
@@ -116,10 +134,14 @@ def identify(
     rows: Annotated[str, typer.Option(help="FIRST:LAST data rows of a table, from 1.")] = ":",
     ignore: Annotated[int, typer.Option(help="Rows at the start run but not judged.")] = 0,
     whole: Annotated[bool, typer.Option(help="Judge whole histories, not steady cycles.")] = False,
-    lag_samples: Annotated[int, typer.Option(help="Lag of a table's displacement.")] = 0,
+    lag_samples: Annotated[str, typer.Option(help="Lag of a table's displacement, or auto.")] = "0",
     validate: Annotated[
         list[Path] | None, typer.Option(help="Files to judge the model on; may be repeated.")
     ] = None,
+    scheduler: Annotated[
+        str, typer.Option(help="none, threads, processes, or a Dask scheduler's address.")
+    ] = "none",
+    html: Annotated[Path | None, typer.Option(help="Page of model against data to write.")] = None,
     overwrite: Overwrite = False,
     as_json: AsJson = False,
 ) -> None:
@@ -127,17 +149,25 @@ def identify(
     from hilctl.finding import Request, find, print_finding
 
     finish_orphans()
+    if html is not None and html.exists() and not overwrite:
+        raise InputError(f"{html}: exists already: give another name, or --overwrite")
     first_row, last_row = _rows(rows)
     request = Request(
         kind=model,
         points=points,
         seed=seed,
-        plays=plays,
+        plays=None if plays is None else _count("--plays", plays),
         deadbands=deadbands,
         weights=weights,
         layout=layout,
         weight_by=weight_by,
         offset=offset,
+        creep=creep,
+        hysteresis=hysteresis,
+        lines=lines,
+        lag=lag,
+        structure=structure,
+        delay=delay,
         starts=starts,
         peak_goal_percent=peak_goal_percent,
         unit=unit,
@@ -149,11 +179,16 @@ def identify(
         last_row=last_row,
         ignore=ignore,
         whole=whole,
-        lag_samples=lag_samples,
+        lag_samples=_count("--lag-samples", lag_samples),
+        scheduler=scheduler,
     )
     finding = find(
         files, request, output, validate=validate or [], overwrite=overwrite, quiet=as_json
     )
+    if html is not None:
+        from hilctl.finding.page import write_finding
+
+        write_finding(finding, html)
     if as_json:
         print_json({"output": str(output) if output else None, **finding.to_mapping()})
     else:
@@ -165,6 +200,14 @@ def _rows(text: str) -> tuple[int, int | None]:
     if colon and (first or "1").isdecimal() and (last or "1").isdecimal() and first != "0":
         return int(first or 1), int(last) if last else None
     raise InputError(f"--rows must be FIRST:LAST, counted from 1, either may be left out: {text!r}")
+
+
+def _count(option: str, text: str) -> int | Literal["auto"]:
+    if text == "auto":
+        return "auto"
+    if text.isdecimal():
+        return int(text)
+    raise InputError(f"{option} must be a whole number or auto: {text!r}")
 
 
 def _column(text: str) -> str | int:

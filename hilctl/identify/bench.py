@@ -6,10 +6,12 @@ import numpy as np
 
 from hilctl.arrays import F64
 from hilctl.errors import DataError
-from hilctl.identify.data import Records
+from hilctl.identify.data import History, Loop, Records
 from hilctl.kernels.hysteresis import play_outputs, play_sum_shared, rest_memory
 from hilctl.models.integrated import IntegratedModel
 from hilctl.models.plays import PlayModel
+
+CREEP_S = 0.1  # time that creep is counted from
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,6 +22,7 @@ class _Run:
     speed: F64
     judged: slice
     place: slice
+    loop: bool
 
 
 class Bench:
@@ -34,6 +37,8 @@ class Bench:
         stroke_um: Largest peak-to-peak displacement of a record.
         input_range: Lowest and highest command.
         output_range_um: Lowest and highest judged displacement.
+        creep: float64[N, f], what each record may have of its own beside a model: a constant, and
+            for a whole history ln(1 + t / 0.1 s) as well, the usual law of creep.
     """
 
     def __init__(self, data: Records) -> None:
@@ -53,7 +58,7 @@ class Bench:
             judged = slice(ignored, command.size)
             place = slice(end, end + command.size - ignored)
             end = place.stop
-            self._runs.append(_Run(command, np.abs(rate), judged, place))
+            self._runs.append(_Run(command, np.abs(rate), judged, place, isinstance(record, Loop)))
         self.target_um = np.concatenate(targets)
         self.places = tuple(run.place for run in self._runs)
         self.reach = max(0.5 * float(np.ptp(run.command)) for run in self._runs)
@@ -63,7 +68,25 @@ class Bench:
             min(float(run.command.min()) for run in self._runs),
             max(float(run.command.max()) for run in self._runs),
         )
+        self.creep = self._creep(data)
         self.output_range_um = (float(self.target_um.min()), float(self.target_um.max()))
+
+    def _creep(self, data: Records) -> F64:
+        columns: list[F64] = []
+        for record, place in zip(data, self.places, strict=True):
+            part = np.ones((place.stop - place.start, 1))
+            if isinstance(record, History):
+                time_s = np.arange(record.command.size)[record.ignore :] / record.sample_rate_hz
+                part = np.column_stack([part, np.log1p(time_s / CREEP_S)])
+            column = np.zeros((self.target_um.size, part.shape[1]))
+            column[place] = part
+            columns.append(column)
+        return np.hstack(columns)
+
+    @property
+    def speeds(self) -> list[F64]:
+        """|rate| of each record's judged samples, command units a second; whole of a history."""
+        return [run.speed[run.judged] if run.loop else run.speed for run in self._runs]
 
     @property
     def gain(self) -> float:

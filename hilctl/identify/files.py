@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from hilctl.ports import CommandUnit
 from hilctl.recording.data import Recording
 from hilctl.recording.reader import read
 
-PUBLISHED_POINTS: dict[Kind, int] = {"ppi": 300, "rdpi": 400, "integrated": 300}
+PUBLISHED_POINTS: dict[Kind, int] = {"ppi": 300, "rdpi": 400, "integrated": 300, "staged": 300}
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +35,8 @@ class TableOptions:
         last_row: Last data row used; None for all.
         ignore: Rows at the start that are run but not judged.
         whole: Judge the whole history instead of its steady cycle.
-        lag_samples: Samples by which the displacement is taken to lag.
+        lag_samples: Samples by which the displacement is taken to lag, or ``auto`` for those that
+            leave the least error.
     """
 
     command_column: Column = "current_a"
@@ -45,11 +47,11 @@ class TableOptions:
     last_row: int | None = None
     ignore: int = 0
     whole: bool = False
-    lag_samples: int = 0
+    lag_samples: int | Literal["auto"] = 0
 
 
 def load_records(
-    paths: Sequence[Path], points: int, table: TableOptions
+    paths: Sequence[Path], points: int, table: TableOptions, lag_samples: int
 ) -> tuple[list[Record], CommandUnit | None]:
     """Read everything that a model is to be found from.
 
@@ -57,6 +59,7 @@ def load_records(
         paths: Recordings (``.mcap``) and text tables.
         points: Points a loop.
         table: How text tables are read.
+        lag_samples: Samples by which tables' displacements are taken to lag.
 
     Returns:
         The loops and histories, and the recordings' command unit (None where there are only
@@ -77,7 +80,7 @@ def load_records(
             else:
                 records += loops_from_recording(recording, points)
         else:
-            records.append(_from_table(path, points, table))
+            records.append(_from_table(path, points, table, lag_samples))
     if len(units) > 1:
         raise InputError("recordings of devices driven in A and in V can't be fitted together")
     return records, next(iter(units), None)
@@ -102,7 +105,7 @@ def history_from_recording(recording: Recording) -> History:
     return History(recording.path.name, command, displacement_um, recording.sample_rate_hz)
 
 
-def _from_table(path: Path, points: int, table: TableOptions) -> Record:
+def _from_table(path: Path, points: int, table: TableOptions, lag_samples: int) -> Record:
     history = read_table(
         path,
         table.command_column,
@@ -111,7 +114,7 @@ def _from_table(path: Path, points: int, table: TableOptions) -> Record:
         rate_hz=table.rate_hz,
         rows=(table.first_row - 1, table.last_row),
         ignore=table.ignore,
-    ).without_lag(table.lag_samples)
+    ).without_lag(lag_samples)
     return history if table.whole else find_cycles(history, points)
 
 

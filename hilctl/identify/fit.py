@@ -1,6 +1,6 @@
 """What an identification found, and how well it describes the data."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -10,7 +10,11 @@ from hilctl.identify.bench import Bench
 from hilctl.identify.data import Loop, Record, Records
 from hilctl.identify.geometry import loop_area
 from hilctl.identify.search import StartOutcome
+from hilctl.identify.staged_bench import StagedBench
+from hilctl.identify.staged_model import response_um
+from hilctl.models.base import HysteresisModel
 from hilctl.models.plays import PlayModel
+from hilctl.models.staged import StagedModel
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,9 +68,10 @@ class Fit:
         starts: What became of each start of the search.
         parameters: Fitted parameters under their published names, in command units, um and s.
         elapsed_s: How long it took.
+        standard_errors: Of the parameters, by the same names; empty where a fit has none.
     """
 
-    model: PlayModel
+    model: PlayModel | StagedModel
     errors: tuple[LoopError, ...]
     peak_percent: float
     rms_percent: float
@@ -74,6 +79,7 @@ class Fit:
     starts: tuple[StartOutcome, ...]
     parameters: dict[str, float]
     elapsed_s: float
+    standard_errors: dict[str, float] = field(default_factory=dict)
 
     def to_mapping(self) -> dict[str, Any]:
         """Return all of it as plain mappings, lists and numbers, for JSON."""
@@ -85,23 +91,40 @@ class Fit:
             "own_peak_percent": self.own_peak_percent,
             "starts": [asdict(start) for start in self.starts],
             "parameters": dict(self.parameters),
+            "standard_errors": dict(self.standard_errors),
             "elapsed_s": self.elapsed_s,
         }
 
 
-def judge(model: PlayModel, data: Records) -> Judgement:
+def judge(
+    model: PlayModel | StagedModel,
+    data: Records,
+    *,
+    creep: bool = False,
+    bench: Bench | None = None,
+) -> Judgement:
     """Work out a model's errors on records, those it was fitted to or others.
 
     Loops are compared in their periodic steady state, with the rate as :meth:`Loop.rate` has it.
 
+    Args:
+        model: The model.
+        data: The records.
+        bench: The same data, where they have been prepared already.
+        creep: Whether each record has a constant displacement of its own, and a whole history
+            creep of its own as well; what is judged is the rest.
+
     Raises:
         DataError: There are no records.
     """
-    bench = Bench(data)
-    response_um = bench.response_um(model)
-    errors_um = response_um - bench.target_um
+    bench = Bench(data) if bench is None else bench
+    responses_um = modelled_um(model, data, bench)
+    if creep:
+        own = np.linalg.lstsq(bench.creep, bench.target_um - responses_um, rcond=None)[0]
+        responses_um = responses_um + bench.creep @ own
+    errors_um = responses_um - bench.target_um
     errors = tuple(
-        _loop_error(record, response_um[place], bench.target_um[place])
+        _loop_error(record, responses_um[place], bench.target_um[place])
         for record, place in zip(data, bench.places, strict=True)
     )
     to_percent = 100.0 / bench.stroke_um
@@ -111,6 +134,23 @@ def judge(model: PlayModel, data: Records) -> Judgement:
         rms_percent=float(np.sqrt(np.mean(errors_um**2))) * to_percent,
         own_peak_percent=max(error.peak_percent for error in errors),
     )
+
+
+def modelled_um(model: HysteresisModel, data: Records, bench: Bench) -> F64:
+    """Return a model's displacement of all judged samples: float64[N]."""
+    if isinstance(model, PlayModel):
+        return bench.response_um(model)
+    parts: list[F64] = []
+    for record, speed in zip(data, bench.speeds, strict=True):
+        if isinstance(model, StagedModel) and isinstance(record, Loop):
+            parts.append(response_um(model, StagedBench([record], [speed])))
+        elif isinstance(record, Loop):
+            points, rate_hz = record.command.size, record.command.size * record.frequency_hz
+            parts.append(model.forward(rate_hz).process(record.run()[0])[points:])
+        else:
+            command, _, ignored = record.run()
+            parts.append(model.forward(record.sample_rate_hz).process(command)[ignored:])
+    return np.concatenate(parts)
 
 
 def _loop_error(record: Record, response_um: F64, target_um: F64) -> LoopError:

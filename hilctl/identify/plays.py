@@ -4,7 +4,7 @@ import numpy as np
 
 from hilctl.arrays import F64
 from hilctl.identify.bench import Bench
-from hilctl.identify.linear import bounded_weights
+from hilctl.identify.linear import bounded_and_free
 from hilctl.identify.search import Space
 from hilctl.identify.settings import Settings
 from hilctl.models.plays import PlayModel
@@ -55,6 +55,10 @@ class PlaysProblem:
             low, high, guess = [*low, 0.0], [*high, 1.0], [*guess, 0.1]
         if self._exponential:
             low, high, guess = [*low, 0.0], [*high, 40.0], [*guess, 1.5]
+        size = bench.target_um.size
+        self._free = np.ones((size, 1)) if settings.output_offset else np.empty((size, 0))
+        if settings.creep:
+            self._free = bench.creep
         self._space = Space(np.array(low), np.array(high), np.array(guess))
 
     @property
@@ -65,19 +69,20 @@ class PlaysProblem:
     def error_um(self, x: F64, scale: F64) -> F64:
         """Return modelled minus measured displacement, see :class:`search.Problem`."""
         columns = self._columns(x)
-        weights, offset = self._solve(columns, scale)
-        return np.asarray(columns @ weights + (offset - self._bench.target_um), dtype=np.float64)
+        weights, free = self._solve(columns, scale)
+        beside = self._free @ free
+        return np.asarray(columns @ weights + (beside - self._bench.target_um), dtype=np.float64)
 
     def build(self, x: F64, scale: F64) -> PlayModel:
         """Return the model at a point of the space."""
-        found, offset = self._solve(self._columns(x), scale)
+        found, free = self._solve(self._columns(x), scale)
         weights = found[1] * self._decay(x) if self._exponential else found[1:]
         thresholds = self._spacing(x) * numbered(self._settings)
         model = PpiModel(
             direct=float(found[0]),
             weights=tuple(weights.tolist()),
             thresholds=tuple(thresholds.tolist()),
-            output_offset_um=offset,
+            output_offset_um=self._offset_um(free),
             input_unit=self._settings.input_unit,
             input_range=self._bench.input_range,
             output_range_um=self._bench.output_range_um,
@@ -89,7 +94,7 @@ class PlaysProblem:
 
     def parameters(self, x: F64, scale: F64) -> dict[str, float]:
         """Return the fitted parameters under their published names."""
-        found, offset = self._solve(self._columns(x), scale)
+        found, free = self._solve(self._columns(x), scale)
         alpha, beta, a = (
             ("alpha", "beta_0", "a") if self._rate_dependent else ("sigma", "beta", "p")
         )
@@ -101,14 +106,16 @@ class PlaysProblem:
             out[beta] = self._beta(x)
         else:
             out |= {f"{a}_{i}": float(weight) for i, weight in enumerate(found[1:], start=1)}
-        return out | ({"output_offset_um": offset} if self._settings.output_offset else {})
+        return out | ({"output_offset_um": self._offset_um(free)} if free.size else {})
 
-    def _solve(self, columns: F64, scale: F64) -> tuple[F64, float]:
+    def _solve(self, columns: F64, scale: F64) -> tuple[F64, F64]:
         least = np.zeros(columns.shape[1])
         least[0] = self._settings.least_slope * self._bench.gain
-        return bounded_weights(
-            columns, self._bench.target_um, scale, least, offset=self._settings.output_offset
-        )
+        return bounded_and_free(columns, self._free, self._bench.target_um, scale, least)
+
+    def _offset_um(self, free: F64) -> float:
+        """Return the constant displacement; with creep, its mean over all samples."""
+        return float(np.mean(self._free @ free)) if free.size else 0.0
 
     def _columns(self, x: F64) -> F64:
         thresholds = self._spacing(x) * numbered(self._settings)

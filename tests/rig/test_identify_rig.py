@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from hilctl.analysis.metrics import fold, peak_hysteresis_percent
 from hilctl.arrays import F64
 from hilctl.identify.cycles import average_cycle
 from hilctl.identify.data import Loop
@@ -27,11 +28,11 @@ Tone = tuple[float, float]
 """Amplitude in A, frequency in Hz."""
 
 
-def drive(command_a: Callable[[F64], F64], seconds: float) -> tuple[F64, F64]:
+def drive(command_a: Callable[[F64], F64], seconds: float, seed: int = 3) -> tuple[F64, F64]:
     """Return a current and the displacement that the rig gives."""
     command = np.ascontiguousarray(command_a(np.arange(round(seconds * RATE_HZ)) / RATE_HZ))
     displacement_um, current_a = np.empty_like(command), np.empty_like(command)
-    actuator = TerfenolActuator(TerfenolParameters(), RATE_HZ, seed=3)
+    actuator = TerfenolActuator(TerfenolParameters(), RATE_HZ, seed=seed)
     actuator.step(command, displacement_um, current_a)
     return command, displacement_um
 
@@ -118,7 +119,51 @@ def test_free_weights_and_more_plays_are_better() -> None:
     more = fit("integrated", data, plays=36, starts=3)
     free = fit("integrated", data, weights="free", starts=2)
     assert more.peak_percent < published_omega().peak_percent
-    assert free.peak_percent <= 2.2
+    assert free.peak_percent <= 1.9
+
+
+@cache
+def staged() -> Fit:
+    """Return the staged model of a short campaign."""
+    tones = [(3.0, 1.0), (3.0, 250.0), (5.0, 100.0), (6.6, 1.0), (6.6, 50.0), (6.6, 100.0)]
+    data = [measured_loop(tone) for tone in (*tones, (6.6, 150.0), (6.6, 250.0), (6.0, 400.0))]
+    return fit("staged", data)
+
+
+def test_staged_model_finds_lag_and_resonance() -> None:
+    """From loops alone, lag and resonance come within 10 % of what the rig was built with."""
+    rig, found = TerfenolParameters(), staged()
+    assert found.parameters["tau_s"] == pytest.approx(rig.lag_s, rel=0.1)
+    growth = rig.lag_growth_m_per_a * rig.coil_factor_per_m
+    assert found.parameters["growth_per_unit"] == pytest.approx(growth, rel=0.1)
+    assert found.parameters["natural_hz"] == pytest.approx(2292.0, rel=0.1)
+    assert found.peak_percent <= 0.8
+
+
+def compensated(frequency_hz: float) -> tuple[float, float]:
+    """Return peak hysteresis and peak error in percent, the full stroke through the inverse."""
+    period = RATE_HZ / frequency_hz
+    time = np.arange(round(8 * period)) / RATE_HZ
+    swell = 0.5 - 0.5 * np.cos(np.pi * np.clip(time * frequency_hz / 3.0, 0.0, 1.0))
+    reference_um = swell * (40.8 * np.sin(2.0 * np.pi * frequency_hz * time) - 6.9)
+    inverse = staged().model.inverse(RATE_HZ)
+    ahead = np.append(reference_um[inverse.preview :], np.full(inverse.preview, reference_um[-1]))
+    command = inverse.process(ahead)
+    _, displacement_um = drive(lambda _: command, time.size / RATE_HZ, seed=11)
+    index = np.arange(time.size)[-round(4 * period) :]
+    cycle = fold(index, period, (reference_um[index], displacement_um[index]))
+    error = np.max(np.abs(cycle.signals[1] - cycle.signals[0]))
+    hysteresis = peak_hysteresis_percent(*cycle.signals)
+    assert hysteresis is not None
+    return hysteresis, 100.0 * float(error) / float(np.ptp(cycle.signals[1]))
+
+
+@pytest.mark.parametrize("frequency_hz", [5.0, 50.0, 100.0, 200.0, 250.0])
+def test_staged_inverse_straightens_the_rig(frequency_hz: float) -> None:
+    """At full stroke, noise not seen before, hysteresis is at most 1 % (published: up to 3.7 %)."""
+    hysteresis, error = compensated(frequency_hz)
+    assert hysteresis <= 1.0
+    assert error <= 1.0
 
 
 def test_without_rate_or_deadbands_the_model_is_far_off() -> None:

@@ -1,0 +1,84 @@
+"""Independent fits at the same time: here, over threads or processes, or on a Dask cluster."""
+
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
+from contextlib import contextmanager
+from multiprocessing import get_context
+from typing import Any, Protocol, TypeVar
+
+from hilctl.errors import InputError
+
+Task = TypeVar("Task")
+Result = TypeVar("Result")
+SCHEDULERS = ("none", "threads", "processes")
+
+
+class Map(Protocol):
+    """Runs a function on each task and returns the results in the tasks' order."""
+
+    def __call__(
+        self, function: Callable[[Task], Result], tasks: Sequence[Task], /
+    ) -> list[Result]:
+        """Return ``[function(task) for task in tasks]``; the first error is raised."""
+        ...
+
+
+def one_by_one(function: Callable[[Task], Result], tasks: Sequence[Task], /) -> list[Result]:
+    """Run tasks one after the other."""
+    return [function(task) for task in tasks]
+
+
+@contextmanager
+def workers(scheduler: str = "none") -> Iterator[Map]:
+    """Give a :class:`Map`; results do not depend on which.
+
+    Args:
+        scheduler: ``none`` for one after the other, ``threads`` or ``processes`` on this machine,
+            or the address of a Dask scheduler, such as ``tcp://host:8786``. Its workers need the
+            same hilctl.
+
+    Raises:
+        InputError: The scheduler is unknown, can't be reached, or Dask is not installed.
+    """
+    if scheduler == "none":
+        yield one_by_one
+    elif scheduler in SCHEDULERS:
+        with _local(scheduler) as executor:
+
+            def run(function: Callable[[Any], Any], tasks: Sequence[Any], /) -> list[Any]:
+                return list(executor.map(function, tasks))
+
+            yield run
+    elif "://" in scheduler:
+        with _dask(scheduler) as distributed:
+            yield distributed
+    else:
+        known = ", ".join(SCHEDULERS)
+        raise InputError(f"scheduler must be {known} or an address such as tcp://host:8786: "
+                         f"{scheduler!r}")  # fmt: skip
+
+
+def _local(scheduler: str) -> Executor:
+    if scheduler == "threads":
+        return ThreadPoolExecutor()
+    return ProcessPoolExecutor(mp_context=get_context("spawn"))  # fork would copy BLAS's threads
+
+
+@contextmanager
+def _dask(address: str) -> Iterator[Map]:
+    try:
+        from distributed import Client
+    except ImportError:
+        raise InputError(
+            f"--scheduler {address} needs Dask: install it with pip install 'hilctl[scale]'"
+        ) from None
+    try:
+        client = Client(address, timeout="10s")
+    except (OSError, ValueError) as error:
+        raise InputError(f"no Dask scheduler answers at {address}: {error}") from None
+    with client:
+
+        def run(function: Callable[[Any], Any], tasks: Sequence[Any], /) -> list[Any]:
+            return list(client.gather(client.map(function, list(tasks), pure=False)))
+
+        yield run
