@@ -26,7 +26,7 @@ class SentBlock:
         first_sample: Its first sample.
         skipped: Samples skipped just before it.
         times_ns: Deadline, lateness and exchange of the tick that sent it.
-        ramping: Whether all of it is on the way out.
+        following: Whether it begins with samples of the waveform.
     """
 
     head: I64
@@ -36,7 +36,7 @@ class SentBlock:
     first_sample: int = 0
     skipped: int = 0
     times_ns: tuple[int, int, int] = (0, 0, 0)
-    ramping: bool = False
+    following: bool = True
     reference: F64 = field(init=False)
     wanted: F64 = field(init=False)
     command: F64 = field(init=False)

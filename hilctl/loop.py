@@ -9,6 +9,8 @@ for theirs before they are recorded, and after the ramp the loop goes on at the 
 the last of them has come.
 """
 
+from enum import Enum
+
 import numpy as np
 
 from hilctl.arrays import F64, U32
@@ -24,6 +26,12 @@ from hilctl.pacer import Pacer
 from hilctl.plan import Code, Outcome, Oversight, Plan, SampleSink
 from hilctl.ports import Clock, Device
 from hilctl.tuner import TUNED, Tuner, tuning_text
+
+
+class _Phase(Enum):
+    FOLLOWING = "follows the reference"
+    LEAVING = "ramps to the safe value"
+    HOLDING = "holds the safe value until the last answer has come"
 
 
 class Loop:
@@ -77,7 +85,7 @@ class Loop:
         self._dropped = 0
         self._code: Code = "completed"
         self._reason = "waveform completed"
-        self._ramping = False
+        self._phase = _Phase.FOLLOWING
         self._first_invalid = -1
 
     def run(self, start_ns: int) -> Outcome:
@@ -91,6 +99,7 @@ class Loop:
         try:
             while not self._tick():
                 pass
+            self._phase = _Phase.HOLDING
             while self._line.waiting:
                 self._hold()
         except DeviceError as error:
@@ -103,8 +112,7 @@ class Loop:
         self._attend()
         done = self._fill(block)
         self._exchange(block, recorded=True)
-        if not self._ramping:
-            self._judge(block)
+        self._judge(block)
         return done
 
     def _hold(self) -> None:
@@ -128,7 +136,9 @@ class Loop:
     def _attend(self) -> None:
         """Give a sign of life, and follow what is wanted of the run."""
         order = self._oversight.beat(self._next_sample)
-        if self._ramping:
+        if self._next_sample >= self._plan.reference.size:
+            self._leave("completed", "completed", "waveform completed")
+        if self._phase is not _Phase.FOLLOWING:
             return
         if late := self._plan.too_late(self._pacer):
             self._leave("fault", "late", late)
@@ -141,8 +151,15 @@ class Loop:
             self._oversight.tell(LoopEvent(self._next_sample, "info", TUNED, text))
 
     def _leave(self, code: Code, event: str, reason: str, sample: int | None = None) -> None:
-        """Take the way out from the next block on."""
-        self._code, self._reason, self._ramping = code, reason, True
+        """Ramp to the safe value from the next block on.
+
+        Leaving twice is ignored, but for a fault of the waveform that shows after its end.
+        """
+        if self._phase is _Phase.FOLLOWING:
+            self._phase = _Phase.LEAVING
+        elif self._code != "completed" or code != "fault":
+            return
+        self._code, self._reason = code, reason
         if code == "fault":
             at = self._next_sample if sample is None else sample
             self._oversight.tell(LoopEvent(at, "error", event, reason))
@@ -154,10 +171,10 @@ class Loop:
         block.state[-1] = self._limiter.last
         block.flags.fill(0)
         block.measured.fill(np.nan)
-        block.ramping = self._ramping
+        block.following = self._phase is _Phase.FOLLOWING
         start = self._next_sample
         reference = plan.reference[start : start + plan.block]
-        n = 0 if self._ramping else reference.size
+        n = reference.size if block.following else 0
         self._first_invalid = -1
         if n == plan.block:
             whole = (block.reference, block.input_um, block.wanted, block.command, block.flags)
@@ -216,7 +233,7 @@ class Loop:
             block.flags,
         )
         self._push(block)
-        if trip is not None and not block.ramping and self._code == "completed":
+        if trip is not None and block.following:
             self._leave("fault", trip.code, trip.reason, trip.sample)
 
     def _judge(self, block: SentBlock) -> None:
@@ -234,7 +251,7 @@ class Loop:
             return
         self._missing = missing + self._plan.block
         self._dropped += self._plan.block
-        if self._plan.keep_all and not self._ramping:
+        if self._plan.keep_all:
             reason = f"no room for sample {block.first_sample}: the recorder does not keep up"
             self._leave("fault", "dropped", reason)
 

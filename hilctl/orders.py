@@ -110,6 +110,10 @@ class Orders:
         ring = self._ring
         if order.gain is None and order.offset is None:
             raise InputError("set: gain or offset is required")
+        if self.stop or ring.get(page.Field.STOP):
+            raise InputError("set: the run is on its way to the safe value")
+        if ring.get(page.Field.NEXT_SAMPLE) >= self._checked.forecast.samples:
+            raise InputError("set: the waveform is over; the run is on its way to the safe value")
         if ring.get(page.Field.TUNE_WANTED) != ring.get(page.Field.TUNE_TAKEN):
             raise InputError("set: the change before has not been taken yet: try again")
         gain = self._tuning[0] if order.gain is None else order.gain

@@ -512,6 +512,35 @@ def test_loop_gives_a_sign_of_life_in_every_tick():
     assert oversight.beats == list(range(outcome.ended_at))
 
 
+@pytest.mark.parametrize("block", [1, 8])
+def test_stop_in_the_ramp_after_the_waveform_changes_nothing(block):
+    """A completed waveform stays completed, whatever is asked for on the way to the safe value."""
+    n = 4 * block + 3
+    oversight = Oversight(lambda: "stopped by a test" if oversight.beats[-1] >= n else "")
+    bench = Bench(np.full(n, 2.0), block=block, oversight=oversight)
+    outcome = bench.run()
+    assert outcome.ended_at > n + block
+    assert (outcome.code, outcome.reason) == ("completed", "waveform completed")
+
+
+def test_tuning_in_the_ramp_after_the_waveform_is_not_taken():
+    """What moves nothing is not recorded as a change."""
+    oversight = Oversight(tunings={12: Tuning(0.5, 0.0, 1)})
+    bench = Bench(np.full(10, 2.0), oversight=oversight)
+    assert bench.run().ended_at > 12
+    assert oversight.tunings
+    assert not oversight.events
+
+
+def test_invalid_wish_in_the_last_block_is_a_fault():
+    """The end of the waveform in the same block does not hide it."""
+    reference = np.full(11, 2.0)
+    reference[-1] = np.nan
+    outcome = Bench(reference, block=8).run()
+    assert outcome.code == "fault"
+    assert "sample 10" in outcome.reason
+
+
 def test_reference_is_tuned_without_a_bump():
     """A new gain is reached over its ramp, recorded with the reference, and told once."""
     oversight = Oversight(tunings={40: Tuning(0.5, 0.1, 20)})
