@@ -1,7 +1,7 @@
 """From an experiment file to the experiment with all that the file refers to."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -9,9 +9,10 @@ import yaml
 
 from hilctl.config import Experiment
 from hilctl.errors import ConfigError, InputError, Problem
+from hilctl.files import TextFiles
 from hilctl.learning.correction import Correction, load_correction
 from hilctl.models.base import HysteresisModel
-from hilctl.models.files import ModelFile
+from hilctl.models.files import load_model
 from hilctl.ports import Device
 from hilctl.registry import device_class, known_devices
 from hilctl.yamlio import Document, load_document
@@ -31,6 +32,7 @@ class LoadedExperiment:
         yaml_text: The experiment as it will run, command-line settings included.
         document: The file, which knows where each value stands.
         correction: What is added to the reference before the compensator, or None.
+        files: The files that it refers to, as they were read.
     """
 
     config: Experiment
@@ -40,6 +42,7 @@ class LoadedExperiment:
     yaml_text: str
     document: Document
     correction: Correction | None = None
+    files: TextFiles = field(default_factory=TextFiles)
 
 
 def load_experiment(path: Path, settings: Sequence[str] = ()) -> LoadedExperiment:
@@ -52,21 +55,35 @@ def load_experiment(path: Path, settings: Sequence[str] = ()) -> LoadedExperimen
     return resolve(load_document(path), path.parent, settings)
 
 
-def resolve(document: Document, folder: Path, settings: Sequence[str] = ()) -> LoadedExperiment:
-    """Build an experiment from a YAML document, see :func:`load_experiment`."""
+def resolve(
+    document: Document,
+    folder: Path,
+    settings: Sequence[str] = (),
+    files: TextFiles | None = None,
+) -> LoadedExperiment:
+    """Build an experiment from a YAML document, see :func:`load_experiment`.
+
+    Args:
+        document: The experiment.
+        folder: What file names in it are relative to.
+        settings: ``key=value`` texts over it.
+        files: Where those files are read from; the disk where None.
+    """
+    files = TextFiles() if files is None else files
     for setting in settings:
         document.set(setting)
     problems: list[Problem] = []
     config = _collect(problems, lambda: document.validate(Experiment))
     device = _collect(problems, lambda: _make_device(document))
-    model = _collect(problems, lambda: _load_model(document, folder))
-    correction = _collect(problems, lambda: _load_correction(document, folder))
+    named = _NamedFiles(document, folder, files)
+    model = _collect(problems, lambda: named.load("model", load_model))
+    correction = _collect(problems, lambda: named.load("correction", load_correction))
     if config is not None:
         problems += _joint_problems(config, document)
     if problems or config is None or device is None:
         raise ConfigError(problems)
     yaml_text = yaml.safe_dump(_plain(document.data), sort_keys=False, width=100)
-    return LoadedExperiment(config, device, model, folder, yaml_text, document, correction)
+    return LoadedExperiment(config, device, model, folder, yaml_text, document, correction, files)
 
 
 def _joint_problems(config: Experiment, document: Document) -> list[Problem]:
@@ -122,31 +139,27 @@ def _make_device(document: Document) -> Device | None:
         raise ConfigError([Problem(document.where(("device",)), "device", str(error))]) from None
 
 
-def _load_model(document: Document, folder: Path) -> HysteresisModel | None:
-    return _load_file(document, folder, "model", _model_of)
+@dataclass(frozen=True, slots=True)
+class _NamedFiles:
+    """Files that keys of the compensator name."""
 
+    document: Document
+    folder: Path
+    files: TextFiles
 
-def _model_of(path: Path) -> HysteresisModel:
-    return load_document(path).validate(ModelFile).model
-
-
-def _load_correction(document: Document, folder: Path) -> Correction | None:
-    return _load_file(document, folder, "correction", load_correction)
-
-
-def _load_file(document: Document, folder: Path, key: str, load: Callable[[Path], T]) -> T | None:
-    """Load the file that a key of the compensator names, if any."""
-    compensator = document.data.get("compensator")
-    name = compensator.get(key) if isinstance(compensator, dict) else None
-    if not isinstance(name, str):
-        return None
-    try:
-        return load(folder / name)
-    except ConfigError:
-        raise
-    except InputError as error:
-        where = document.where(("compensator", key))
-        raise ConfigError([Problem(where, f"compensator.{key}", str(error))]) from None
+    def load(self, key: str, load: Callable[[Path, TextFiles], T]) -> T | None:
+        """Return what the file that ``key`` names holds; None where it names none."""
+        compensator = self.document.data.get("compensator")
+        name = compensator.get(key) if isinstance(compensator, dict) else None
+        if not isinstance(name, str):
+            return None
+        try:
+            return load(self.folder / name, self.files)
+        except ConfigError:
+            raise
+        except InputError as error:
+            where = self.document.where(("compensator", key))
+            raise ConfigError([Problem(where, f"compensator.{key}", str(error))]) from None
 
 
 def _plain(value: Any) -> Any:

@@ -46,6 +46,7 @@ class LoopChild:
         job: dict[str, Any] = {
             "experiment": checked.loaded.yaml_text,
             "folder": str(checked.loaded.folder.resolve()),
+            "files": checked.loaded.files.texts,
             "ring": str(folder.ring),
             "reference": str(folder.reference),
             "supervisor": os.getpid(),

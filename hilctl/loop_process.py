@@ -24,6 +24,7 @@ from hilctl.delay_line import DelayLine
 from hilctl.errors import DeviceError, HilctlError, InputError
 from hilctl.experiment import LoadedExperiment, resolve
 from hilctl.feedback_setup import make_feedback
+from hilctl.files import TextFiles
 from hilctl.interlock_setup import interlock_limits
 from hilctl.interlocks import Interlocks
 from hilctl.limiter import Limiter
@@ -123,7 +124,8 @@ def main() -> int:
     job = json.load(sys.stdin)
     ring = SampleRing.attach(Path(job["ring"]))
     try:
-        loaded = resolve(Document("experiment", job["experiment"]), Path(job["folder"]))
+        document = Document("experiment", job["experiment"])
+        loaded = resolve(document, Path(job["folder"]), files=TextFiles(job["files"]))
         outcome = _run(job, ring, loaded)
     except InputError as error:  # before the device was opened
         return _failed(ring, str(error), Phase.REFUSED)

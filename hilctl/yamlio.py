@@ -14,7 +14,8 @@ import yaml
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-from hilctl.errors import ConfigError, InputError, Problem
+from hilctl.errors import ConfigError, Problem
+from hilctl.files import TextFiles
 from hilctl.plainyaml import MAX_DEPTH, compose, scalar
 from hilctl.wording import hint_of, rule_of, value_of
 
@@ -140,25 +141,18 @@ class Document:
         return Problem(self.where(loc), dotted(loc), rule_of(detail), value_of(detail), hint)
 
 
-def load_document(path: Path) -> Document:
+def load_document(path: Path, files: TextFiles | None = None) -> Document:
     """Read a YAML file.
+
+    Args:
+        path: The file.
+        files: Where it is read from; the disk where None.
 
     Raises:
         InputError: The file can't be read.
         ConfigError: See :class:`Document`.
     """
-    try:
-        if path.exists() and not path.is_file():
-            raise InputError(f"{path}: is not a file")
-        text = path.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
-    except UnicodeDecodeError:
-        raise InputError(f"{path}: is not UTF-8 text") from None
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise InputError(f"{path}: can't be read: {reason}") from None
-    return Document(str(path), text)
+    return Document(str(path), (files or TextFiles()).read(path))
 
 
 def dotted(loc: Loc) -> str:

@@ -17,6 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from hilctl.arrays import F64
 from hilctl.errors import InputError
+from hilctl.files import TextFiles
 from hilctl.models.base import HysteresisModel
 from hilctl.models.files import dump_model
 from hilctl.segments import Segment
@@ -209,14 +210,18 @@ def model_sha256(model: HysteresisModel | None) -> str:
     return hashlib.sha256(dump_model(model).encode()).hexdigest() if model else ""
 
 
-def load_correction(path: Path) -> Correction:
+def load_correction(path: Path, files: TextFiles | None = None) -> Correction:
     """Read a correction file.
+
+    Args:
+        path: The file.
+        files: Where it is read from; the disk where None.
 
     Raises:
         InputError: The file can't be read.
         ConfigError: It breaks a rule; all problems are listed.
     """
-    return load_document(path).validate(CorrectionFile).correction
+    return load_document(path, files).validate(CorrectionFile).correction
 
 
 def parse_correction(name: str, text: str) -> Correction:

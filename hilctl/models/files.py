@@ -6,6 +6,7 @@ from typing import Annotated, TypeAlias
 import yaml
 from pydantic import BaseModel, ConfigDict, Field
 
+from hilctl.files import TextFiles
 from hilctl.models.base import HysteresisModel
 from hilctl.models.bouc_wen import BoucWenModel
 from hilctl.models.butterfly import ButterflyModel
@@ -54,14 +55,18 @@ class ModelFile(BaseModel):
     model: AnyModel
 
 
-def load_model(path: Path) -> HysteresisModel:
+def load_model(path: Path, files: TextFiles | None = None) -> HysteresisModel:
     """Read a model file.
+
+    Args:
+        path: The file.
+        files: Where it is read from; the disk where None.
 
     Raises:
         InputError: The file can't be read.
         ConfigError: It breaks a rule, or the model can't be inverted; all problems are listed.
     """
-    return load_document(path).validate(ModelFile).model
+    return load_document(path, files).validate(ModelFile).model
 
 
 def parse_model(name: str, text: str) -> HysteresisModel:

@@ -17,6 +17,10 @@ from hilctl.orphans import recover_orphans
 from hilctl.recording.reader import read
 from hilctl.replay import replay
 from hilctl.runs import base_folder
+from hilctl.start import checked_experiment
+from hilctl.supervisor import Supervisor
+
+MODELS = Path(__file__).parents[2] / "configs" / "models"
 
 EXPERIMENT = {
     "name": "fault_test",
@@ -217,3 +221,19 @@ def test_nothing_stays_in_memory(tmp_path):
     assert run.end()[0] == 0
     assert list(base_folder().iterdir()) == []
     assert_good_way_out(run)
+
+
+def test_model_exchanged_after_the_check_changes_nothing(tmp_path):
+    """What was checked is what runs, and what the recording names."""
+    model = tmp_path / "model.yaml"
+    model.write_text((MODELS / "terfenol_omega.yaml").read_text())
+    waveform = {"kind": "sine", "unit": "um", "amplitude": 8.0, "frequency_hz": 20.0}
+    waveform |= {"duration_s": 0.1, "soft_start_s": 0.05}
+    compensator = {"model": model.name}
+    path = experiment(tmp_path, waveform=waveform, compensator=compensator)
+    checked = checked_experiment(path, ())
+    model.write_text((MODELS / "terfenol_rdpi.yaml").read_text())
+    output = tmp_path / "run.mcap"
+    result = Supervisor(checked, output, overwrite=False, on_progress=lambda _: None).run()
+    assert (result.code, result.missing) == ("completed", 0)
+    assert replay(read(output)).identical
