@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-from hilctl.ring import memory_folder
+from hilctl.run.ring import memory_folder
 
 HARDWARE = Path(__file__).parent / "hardware"
 

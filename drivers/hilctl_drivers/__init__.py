@@ -1,7 +1,7 @@
 """Devices that hilctl can drive: simulated rigs, and DACs on a serial line or Modbus.
 
 ``hilctl`` never imports this package; its registry loads a device by name. Modules here see only
-``hilctl.ports``, ``hilctl.errors``, ``hilctl.arrays`` and ``hilctl.kernels``.
+``hilctl.base.device``, ``hilctl.base.errors``, ``hilctl.base.arrays`` and ``hilctl.kernels``.
 
     terfenol*, piezo, plant             physics of the simulated actuators
     simulated*                          they as devices

@@ -6,18 +6,18 @@ happens must fit in a sample period like all others.
 
 from dataclasses import replace
 
-from hilctl.errors import DeviceError
-from hilctl_drivers.modbus_frames import coil_pdu, read_pdu, write_pdu, write_single_pdu
-from hilctl_drivers.profile_ascii import (
+from hilctl.base.errors import DeviceError
+from hilctl_drivers.modbus.pdu import coil_pdu, read_pdu, write_pdu, write_single_pdu
+from hilctl_drivers.modbus.profile import ModbusProfile, ModbusWatchdog
+from hilctl_drivers.modbus.steps import EnsureStep, ExpectStep, ModbusStep
+from hilctl_drivers.profile_parts import WaitStep
+from hilctl_drivers.text.profile import (
     AsciiProfile,
     AsciiStep,
     AsciiWatchdog,
     AskStep,
     NumberStep,
 )
-from hilctl_drivers.profile_modbus import ModbusProfile, ModbusWatchdog
-from hilctl_drivers.profile_parts import WaitStep
-from hilctl_drivers.profile_steps import EnsureStep, ExpectStep, ModbusStep
 from hilctl_drivers.wire_time import Line, Profile, WireTime, lines_time, requests_time
 
 _FEEDS_A_TIMEOUT = 3.0

@@ -12,11 +12,11 @@ import yaml
 from pydantic import ValidationError
 from pydantic.json_schema import models_json_schema
 
-from hilctl.errors import ConfigError, InputError, Problem
-from hilctl_drivers.profile_ascii import AsciiProfile
-from hilctl_drivers.profile_frames import FrameProfile
-from hilctl_drivers.profile_modbus import ModbusProfile
+from hilctl.base.errors import ConfigError, InputError, Problem
+from hilctl_drivers.board.profile import FrameProfile
+from hilctl_drivers.modbus.profile import ModbusProfile
 from hilctl_drivers.profile_problems import read_yaml, rules_broken, value_at
+from hilctl_drivers.text.profile import AsciiProfile
 
 Profile: TypeAlias = ModbusProfile | AsciiProfile | FrameProfile
 """A device's profile; which one follows from ``link.kind``."""

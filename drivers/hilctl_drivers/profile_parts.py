@@ -6,10 +6,10 @@ from typing import Annotated, Literal, Self, TypeAlias
 
 from pydantic import BeforeValidator, Field, StringConstraints, model_validator
 
-from hilctl.errors import InputError
-from hilctl.ports import DeviceOptions
-from hilctl_drivers.registers import RegisterFormat
-from hilctl_drivers.wire_errors import BadRequest
+from hilctl.base.device import DeviceOptions
+from hilctl.base.errors import InputError
+from hilctl_drivers.modbus.registers import RegisterFormat
+from hilctl_drivers.wire.errors import BadRequest
 
 RegisterType: TypeAlias = Literal["bit", "int16", "uint16", "int32", "uint32", "float32", "float64"]
 Area: TypeAlias = Literal["coil", "discrete", "input", "holding"]

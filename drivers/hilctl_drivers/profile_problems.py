@@ -9,7 +9,7 @@ import yaml
 from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
-from hilctl.errors import Problem
+from hilctl.base.errors import Problem
 
 _RULES = {
     "missing": "is required",

@@ -9,9 +9,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
 
-from hilctl_drivers.board_protocol import exchange_sizes
-from hilctl_drivers.framing import binary_framing
-from hilctl_drivers.modbus_frames import (
+from hilctl_drivers.board.frames import exchange_sizes
+from hilctl_drivers.board.profile import FrameProfile
+from hilctl_drivers.modbus.pdu import (
     feedback_pdu,
     read_pdu,
     reply_size,
@@ -20,10 +20,10 @@ from hilctl_drivers.modbus_frames import (
     write_read_pdu,
     write_single_pdu,
 )
-from hilctl_drivers.profile_ascii import AsciiProfile
-from hilctl_drivers.profile_frames import FrameProfile
-from hilctl_drivers.profile_links import FramesLink, RtuLink
-from hilctl_drivers.profile_modbus import ModbusInput, ModbusOutput, ModbusProfile
+from hilctl_drivers.modbus.profile import ModbusInput, ModbusOutput, ModbusProfile
+from hilctl_drivers.text.profile import AsciiProfile
+from hilctl_drivers.wire.framing import binary_framing
+from hilctl_drivers.wire.line_settings import FramesLink, RtuLink
 
 Profile: TypeAlias = ModbusProfile | AsciiProfile | FrameProfile
 Line: TypeAlias = tuple[str, str | None]

@@ -12,4 +12,6 @@ canvas.py   what all plots share: style, colours, signals over time, PNG
 plots.py    plots over time: history, error, lateness
 loops.py    the hysteresis loop
 html.py     one self-contained page
+replay.py   the same commands again
+export.py   CSV, Parquet, NPZ, MAT
 """

@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from hilctl.analysis import traces
-from hilctl.arrays import F64
+from hilctl.base.arrays import F64
 from hilctl.recording.data import Recording
 
 REFERENCE = "#000000"

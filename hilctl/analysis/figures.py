@@ -8,7 +8,7 @@ import math
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from hilctl.ports import CommandUnit
+from hilctl.base.device import CommandUnit
 
 
 @dataclass(frozen=True, slots=True)

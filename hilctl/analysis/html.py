@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from hilctl.analysis import canvas, loops, plots, table
 from hilctl.analysis.report import RunReport, worst_segment
-from hilctl.errors import InputError
+from hilctl.base.errors import InputError
 from hilctl.recording.data import Event, Recording
 
 _MOST_EVENTS = 200

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from hilctl.analysis import metrics
 from hilctl.analysis.canvas import DISPLACEMENT, MARK, REFERENCE, STYLE
 from hilctl.analysis.steady import SteadyPart, steady_part
-from hilctl.arrays import F64
+from hilctl.base.arrays import F64
 from hilctl.recording.data import Recording
 
 _LONGEST_PATH = 200_000

@@ -5,7 +5,7 @@ import math
 import numpy as np
 from scipy.special import erf
 
-from hilctl.arrays import F64, I64
+from hilctl.base.arrays import F64, I64
 
 SHORTEST_PERIOD = 16.0
 """Shortest period, in samples, at which the signal still passes for smooth beside the noise."""

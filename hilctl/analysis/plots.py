@@ -23,9 +23,9 @@ from hilctl.analysis.canvas import (
     legend,
 )
 from hilctl.analysis.steady import SteadyPart, steady_part, steady_samples
-from hilctl.arrays import F64, I64
+from hilctl.base.arrays import F64, I64
+from hilctl.base.segments import Segment
 from hilctl.recording.data import Recording, Samples
-from hilctl.segments import Segment
 
 _ZOOM_CYCLES = 2
 _MOST_DOTS = 10_000

@@ -9,11 +9,11 @@ from hilctl.analysis import metrics, noise, timing
 from hilctl.analysis.figures import RunReport, SegmentReport
 from hilctl.analysis.steady import SteadyPart, error_um, steady_part, waveform_end
 from hilctl.analysis.table import render
-from hilctl.arrays import F64
-from hilctl.errors import DataError
-from hilctl.flags import Flag
+from hilctl.base.arrays import F64
+from hilctl.base.errors import DataError
+from hilctl.base.flags import Flag
+from hilctl.base.segments import Segment
 from hilctl.recording.data import Recording
-from hilctl.segments import Segment
 
 __all__ = ["RunReport", "SegmentReport", "judge", "render", "summarize", "worst_segment"]
 

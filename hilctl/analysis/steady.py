@@ -5,11 +5,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hilctl.analysis.metrics import Fold, fold
-from hilctl.arrays import F64
-from hilctl.flags import Flag
+from hilctl.base.arrays import F64
+from hilctl.base.flags import Flag
+from hilctl.base.segments import Segment
+from hilctl.loop.tuning import TUNED, tuning_samples
 from hilctl.recording.data import Recording, Samples
-from hilctl.segments import Segment
-from hilctl.tuner import TUNED, tuning_samples
 
 
 @dataclass(frozen=True, slots=True)

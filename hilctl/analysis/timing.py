@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from hilctl.arrays import I64
+from hilctl.base.arrays import I64
 from hilctl.recording.data import Ticks
 
 _MINUTE_NS = 60_000_000_000

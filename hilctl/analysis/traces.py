@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from hilctl.arrays import F64, I64
+from hilctl.base.arrays import F64, I64
 
 MAX_POINTS = 4000
 """Most points of one line."""

@@ -14,9 +14,9 @@ from typing import Annotated, NoReturn
 import typer
 
 from hilctl import __version__
+from hilctl.base.errors import ConfigError, HilctlError, InputError
 from hilctl.cli import comparing, learning, machine, recordings, running
 from hilctl.cli.options import app, devices_app, print_json
-from hilctl.errors import ConfigError, HilctlError, InputError
 
 __all__ = ["app", "main"]
 

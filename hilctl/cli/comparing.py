@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from hilctl.base.errors import InputError
 from hilctl.cli.options import AsJson, Overwrite, Settings, finish_orphans, print_json
-from hilctl.errors import InputError
 
 if TYPE_CHECKING:
     from hilctl.comparison.compare import Comparison
@@ -37,12 +37,12 @@ def compare(
     as_json: AsJson = False,
 ) -> None:
     """Find models of the literature on the same loops, and hold them against one another."""
+    from hilctl.cli.compare_view import render, shown_progress
+    from hilctl.cli.console import print_rich
     from hilctl.comparison.catalogue import CATALOGUE
     from hilctl.comparison.compare import Request
     from hilctl.comparison.compare import compare as hold
-    from hilctl.comparison.render import render, shown_progress
     from hilctl.comparison.saving import check_free
-    from hilctl.console import print_rich
 
     if html is not None and html.exists() and not overwrite:
         raise InputError(f"{html}: exists already: give another name, or --overwrite")

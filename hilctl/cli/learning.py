@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from hilctl.base.errors import InputError
 from hilctl.cli.options import (
     AsJson,
     ExperimentFile,
@@ -14,7 +15,6 @@ from hilctl.cli.options import (
     finish_orphans,
     print_json,
 )
-from hilctl.errors import InputError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

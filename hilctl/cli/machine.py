@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from hilctl.base.errors import InputError
 from hilctl.cli.options import (
     AsJson,
     ExperimentFile,
@@ -12,7 +13,6 @@ from hilctl.cli.options import (
     devices_app,
     print_json,
 )
-from hilctl.errors import InputError
 
 
 def doctor(
@@ -27,12 +27,19 @@ def doctor(
     as_json: AsJson = False,
 ) -> None:
     """Say what keeps this machine from real time, and measure whether it keeps a rate."""
-    from hilctl.console import measuring, print_rich
-    from hilctl.doctor.diagnosis import diagnose
-    from hilctl.doctor.report import render
+    from hilctl.cli.console import measuring, print_rich
+    from hilctl.cli.machine_view import render
+    from hilctl.experiment.load import load_experiment
+    from hilctl.machine.diagnosis import DEFAULT_RATE_HZ, diagnose
+    from hilctl.machine.settings import Realtime
 
+    settings, folder, rate_hz = Realtime(), Path("recordings"), DEFAULT_RATE_HZ
+    if experiment is not None:
+        config = load_experiment(experiment).config
+        settings, folder = config.realtime, Path(config.recording.folder)
+        rate_hz = 1.0 / config.tick_s
     with measuring(seconds, quiet=as_json) as on_progress:
-        diagnosis = diagnose(experiment, rate, seconds, on_progress)
+        diagnosis = diagnose(rate or rate_hz, settings, folder, seconds, on_progress)
     if as_json:
         print_json(diagnosis.to_mapping())
     else:
@@ -46,7 +53,7 @@ def schema(
     as_json: AsJson = False,
 ) -> None:
     """Print the JSON schema of experiment files, for editors."""
-    from hilctl.schema import schema_text
+    from hilctl.experiment.schema import schema_text
 
     del as_json  # it is JSON either way
     if output is None:
@@ -63,8 +70,8 @@ def devices(context: typer.Context, as_json: AsJson = False) -> None:
     """List devices, shipped profiles and the serial ports of this machine; nothing is opened."""
     if context.invoked_subcommand is not None:
         return
-    from hilctl.console import print_inventory
-    from hilctl.devices import inventory
+    from hilctl.cli.console import print_inventory
+    from hilctl.experiment.inventory import inventory
 
     found = inventory()
     if as_json:
@@ -76,8 +83,8 @@ def devices(context: typer.Context, as_json: AsJson = False) -> None:
 @devices_app.command()
 def probe(experiment: ExperimentFile, settings: Settings = None, as_json: AsJson = False) -> None:
     """Open an experiment's device and run its self-test; the output does not move."""
-    from hilctl.console import print_probed
-    from hilctl.devices import probe as open_and_close
+    from hilctl.cli.console import print_probed
+    from hilctl.experiment.inventory import probe as open_and_close
 
     answered = open_and_close(experiment, settings or [])
     if as_json:
@@ -109,7 +116,7 @@ def emulate(
     ] = 0,
 ) -> None:
     """Serve the simulated rig as a real device would, until Ctrl-C."""
-    from hilctl.emulate import emulate as serve
+    from hilctl.cli.emulate import emulate as serve
 
     serve(
         profile,

@@ -36,7 +36,7 @@ def print_json(value: dict[str, Any]) -> None:
 
 def finish_orphans() -> None:
     """Recover what runs whose processes have died left in memory, and say so."""
-    from hilctl.orphans import recover_orphans
+    from hilctl.run.orphans import recover_orphans
 
     for orphan in recover_orphans():
         print(f"hilctl: {orphan.name} had died: {orphan.text}", file=sys.stderr)

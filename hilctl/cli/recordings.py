@@ -5,6 +5,7 @@ from typing import Annotated, Literal, TypeAlias
 
 import typer
 
+from hilctl.base.errors import InputError
 from hilctl.cli.options import (
     AsJson,
     Overwrite,
@@ -12,7 +13,6 @@ from hilctl.cli.options import (
     finish_orphans,
     print_json,
 )
-from hilctl.errors import InputError
 
 Kind: TypeAlias = Literal["integrated", "rdpi", "ppi", "staged"]
 Weights: TypeAlias = Literal["exponential", "free"]
@@ -31,7 +31,7 @@ def report(
 ) -> None:
     """Judge a recording: hysteresis, error, noise, lateness."""
     from hilctl.analysis.report import render, summarize
-    from hilctl.console import print_rich
+    from hilctl.cli.console import print_rich
     from hilctl.recording.reader import read
 
     finish_orphans()
@@ -77,10 +77,10 @@ def replay(
     as_json: AsJson = False,
 ) -> None:
     """Recompute the commands from the recorded reference and compare them bit for bit."""
-    from hilctl.console import print_replay
+    from hilctl.analysis.replay import replay as recompute
+    from hilctl.cli.console import print_replay
     from hilctl.models.files import load_model
     from hilctl.recording.reader import read
-    from hilctl.replay import replay as recompute
 
     finish_orphans()
     result = recompute(read(recording), load_model(model) if model else None)
@@ -146,7 +146,9 @@ def identify(
     as_json: AsJson = False,
 ) -> None:
     """Find a model's parameters from recordings or measured tables."""
-    from hilctl.finding import Request, find, print_finding
+    from hilctl.cli.identify_view import print_finding
+    from hilctl.identify.command import find
+    from hilctl.identify.request import Request
 
     finish_orphans()
     if html is not None and html.exists() and not overwrite:
@@ -186,7 +188,7 @@ def identify(
         files, request, output, validate=validate or [], overwrite=overwrite, quiet=as_json
     )
     if html is not None:
-        from hilctl.finding.page import write_finding
+        from hilctl.identify.page import write_finding
 
         write_finding(finding, html)
     if as_json:
@@ -223,7 +225,7 @@ def export(
     as_json: AsJson = False,
 ) -> None:
     """Write a recording's samples as CSV, NumPy, Parquet or MATLAB file."""
-    from hilctl.export import export as write
+    from hilctl.analysis.export import export as write
     from hilctl.recording.reader import read
 
     finish_orphans()

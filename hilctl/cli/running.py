@@ -35,8 +35,8 @@ def run(
     if detach:
         _detach(experiment, output, settings or [], overwrite=overwrite, as_json=as_json)
         return
-    from hilctl.console import LiveView, print_run, run_mapping
-    from hilctl.start import start_run
+    from hilctl.cli.console import LiveView, print_run, run_mapping
+    from hilctl.run.start import start_run
 
     finish_orphans()
     with LiveView(quiet=as_json) as view:
@@ -56,8 +56,8 @@ def run(
 def _detach(
     experiment: Path, output: Path | None, settings: list[str], *, overwrite: bool, as_json: bool
 ) -> None:
-    from hilctl.daemon import start_detached
-    from hilctl.runs import facts_of
+    from hilctl.run.client import start_detached
+    from hilctl.run.run_folder import facts_of
 
     flags = ["--overwrite"] if overwrite else []
     started = start_detached(experiment, settings, output, flags)
@@ -70,9 +70,9 @@ def _detach(
 
 def status(as_json: AsJson = False) -> None:
     """Say which runs are going on, and where each stands."""
-    from hilctl.console import print_status
-    from hilctl.daemon import status_of
-    from hilctl.runs import runs
+    from hilctl.cli.console import print_status
+    from hilctl.run.client import status_of
+    from hilctl.run.run_folder import runs
 
     finish_orphans()
     found = [status_of(each) for each in runs()]
@@ -93,7 +93,7 @@ def stop(
     as_json: AsJson = False,
 ) -> None:
     """End a run by its way out: ramp to the safe value, close, record why."""
-    from hilctl.daemon import find_run, stop_run
+    from hilctl.run.client import find_run, stop_run
 
     chosen = find_run(name)
     answer = stop_run(chosen, wait_s)
@@ -116,7 +116,7 @@ def set_(
     as_json: AsJson = False,
 ) -> None:
     """Move the reference of a run without a bump: gain * reference + offset."""
-    from hilctl.daemon import find_run, set_run
+    from hilctl.run.client import find_run, set_run
 
     chosen = find_run(name)
     answer = set_run(chosen, assignments, over_s)
@@ -129,8 +129,8 @@ def set_(
 
 def check(experiment: ExperimentFile, settings: Settings = None, as_json: AsJson = False) -> None:
     """Check an experiment and say what it would do; nothing moves."""
-    from hilctl.console import print_forecast
-    from hilctl.start import checked_experiment
+    from hilctl.cli.console import print_forecast
+    from hilctl.run.start import checked_experiment
 
     checked = checked_experiment(experiment, settings or [])
     if as_json:

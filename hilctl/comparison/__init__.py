@@ -9,7 +9,7 @@ differential.py  fits of Bouc-Wen and Duhem
 judging.py       model error loop by loop; time a sample
 trials.py        each inverse before a simulated device, in this process
 compare.py       all of it together
-render.py        the table
+summary.py       the table's texts
 figure.py        the figure
 page.py          both as one page
 saving.py        each model as a file, ready to run

@@ -8,7 +8,7 @@ there.
 import numpy as np
 from scipy.optimize import least_squares, nnls
 
-from hilctl.arrays import F64
+from hilctl.base.arrays import F64
 from hilctl.comparison.data import LEAST_SLOPE, Fitted, Frame
 from hilctl.comparison.operators import plays_of
 from hilctl.kernels.hysteresis import deadband_block

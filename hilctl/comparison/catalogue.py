@@ -6,15 +6,15 @@ from typing import Any
 
 import numpy as np
 
+from hilctl.base.errors import InputError
+from hilctl.base.yaml.messages import did_you_mean
 from hilctl.comparison.asymmetric import fit_asymmetric
 from hilctl.comparison.data import Fitted, Frame
 from hilctl.comparison.differential import fit_bouc_wen, fit_duhem
 from hilctl.comparison.envelopes import fit_generalised
 from hilctl.comparison.operators import fit_kp, fit_preisach, fit_straight
-from hilctl.errors import InputError
-from hilctl.identify.fitting import identify
+from hilctl.identify.identify import identify
 from hilctl.identify.settings import Kind, Settings
-from hilctl.wording import did_you_mean
 
 OMEGA = "omega"
 """The model that the others are held against."""
@@ -36,7 +36,7 @@ class Entry:
 
 
 def _identified(kind: Kind, choices: Mapping[str, Any]) -> Callable[[Frame], Fitted]:
-    """Return a fit by :func:`hilctl.identify.fitting.identify`."""
+    """Return a fit by :func:`hilctl.identify.identify.identify`."""
 
     def fit(frame: Frame) -> Fitted:
         settings = replace(Settings.published(kind), input_unit=frame.unit, **choices)

@@ -5,18 +5,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
 
+from hilctl.base.errors import InputError
+from hilctl.base.yaml.document import Document
 from hilctl.comparison.catalogue import CATALOGUE, entry
 from hilctl.comparison.data import Fitted, Frame, read_loops
 from hilctl.comparison.judging import ModelError, inverse_ns, model_error
 from hilctl.comparison.trials import SIMULATED, Bench, Trial, full_stroke, waveforms_of
-from hilctl.errors import InputError
-from hilctl.experiment import LoadedExperiment, load_experiment, resolve
+from hilctl.experiment.load import LoadedExperiment, load_experiment, resolve
 from hilctl.identify.data import Loop
 from hilctl.models.base import HysteresisModel
 from hilctl.models.files import load_model
 from hilctl.recording.data import Recording
 from hilctl.recording.reader import read
-from hilctl.yamlio import Document
 
 Progress: TypeAlias = Callable[[float, str], None]
 """Called with the part that is done (0 to 1) and what is being done."""

@@ -6,13 +6,13 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from hilctl.arrays import F64
-from hilctl.errors import DataError, InputError
+from hilctl.base.arrays import F64
+from hilctl.base.device import CommandUnit
+from hilctl.base.errors import DataError, InputError
 from hilctl.identify.cycles import loops_from_recording
 from hilctl.identify.data import Loop
 from hilctl.identify.linear import bounded_weights
 from hilctl.models.base import HysteresisModel
-from hilctl.ports import CommandUnit
 from hilctl.recording.data import Recording
 
 Loops: TypeAlias = Sequence[Loop]

@@ -8,7 +8,7 @@ import math
 import numpy as np
 from scipy.optimize import least_squares
 
-from hilctl.arrays import F64
+from hilctl.base.arrays import F64
 from hilctl.comparison.data import Fitted, Frame
 from hilctl.kernels.hysteresis import rest_memory
 from hilctl.kernels.implicit import BOUC_WEN, implicit_forward

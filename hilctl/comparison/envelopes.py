@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.optimize import least_squares
 
-from hilctl.arrays import F64
+from hilctl.base.arrays import F64
 from hilctl.comparison.data import Fitted, Frame
 from hilctl.kernels.envelope import envelope_outputs
 from hilctl.kernels.hysteresis import rest_memory

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 
 from hilctl.analysis.canvas import DISPLACEMENT, QUIET, REFERENCE, STYLE
-from hilctl.arrays import F64
+from hilctl.base.arrays import F64
 from hilctl.comparison.compare import Comparison, Row
 from hilctl.identify.data import Loop
 

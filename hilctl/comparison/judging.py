@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from hilctl.arrays import F64
+from hilctl.base.arrays import F64
 from hilctl.comparison.data import PERIODS, Loops
 from hilctl.identify.data import Loop
 from hilctl.models.base import HysteresisModel

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from hilctl.arrays import F64
+from hilctl.base.arrays import F64
 from hilctl.comparison.data import Fitted, Frame
 from hilctl.kernels.hysteresis import play_outputs, rest_memory
 from hilctl.models.kp import KrasnoselskiiPokrovskiiModel

@@ -6,7 +6,7 @@ from pathlib import Path
 from hilctl.analysis.html import document, grid, image, write_page
 from hilctl.comparison.compare import Comparison
 from hilctl.comparison.figure import comparison_figure
-from hilctl.comparison.render import headings, notes, table_rows, titles
+from hilctl.comparison.summary import headings, notes, table_rows, titles
 
 
 def write_comparison(comparison: Comparison, path: Path) -> None:

@@ -6,8 +6,8 @@ import numpy as np
 import scipy
 
 import hilctl
+from hilctl.base.errors import InputError
 from hilctl.comparison.compare import Comparison, Row
-from hilctl.errors import InputError
 from hilctl.models.base import Provenance
 from hilctl.models.files import dump_model
 

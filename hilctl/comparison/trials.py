@@ -1,7 +1,7 @@
 """Each inverse before a simulated device, in this process: what a run would come to.
 
-The device is made by its registered name and driven through :class:`hilctl.ports.Device`, with
-compensator and limiter as a run has them; feedback is left out. Nothing is recorded, and nothing
+The device is made by its registered name and driven through :class:`hilctl.base.device.Device`,
+with compensator and limiter as a run has them; feedback is left out. Nothing is recorded, nothing
 keeps the pace: that is for devices whose time is the sample count, so any other is refused.
 """
 
@@ -12,13 +12,13 @@ from pathlib import Path
 import numpy as np
 
 from hilctl.analysis.metrics import fold, peak, peak_hysteresis_percent, peak_to_peak, percent, rms
-from hilctl.arrays import F64, U32
+from hilctl.base.arrays import F64, U32
+from hilctl.base.errors import InputError
+from hilctl.base.flags import Flag
 from hilctl.comparison.data import Loops
-from hilctl.compensator import Compensator
-from hilctl.errors import InputError
-from hilctl.experiment import LoadedExperiment
-from hilctl.flags import Flag
-from hilctl.limiter import Limiter
+from hilctl.experiment.load import LoadedExperiment
+from hilctl.loop.compensator import Compensator
+from hilctl.loop.limiter import Limiter
 from hilctl.models.base import HysteresisModel
 from hilctl.waveforms.build import Reference, build
 from hilctl.waveforms.spec import AnyWaveform, Sine, Triangle

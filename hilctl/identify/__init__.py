@@ -1,15 +1,16 @@
 """Measured data in, model parameters out.
 
+command.py       the command: request.py asks for it, summary.py and page.py show it
 files.py         recordings and tables in, model files out
 data.py          steady loops and whole time histories
 cycles.py        loops from recordings and from histories that repeat
 period.py        the period of a command, and where it is steady
 tables.py        histories from text tables
 settings.py      choices of a fit; the published ones
-fitting.py       identify a model
+identify.py      identify a model
 fit.py           what was found, and how far a model is from data
 describe.py      what a model file says of how its model was found
-orders.py        number of plays by loops held out; lag of a table
+model_size.py      number of plays by loops held out; lag of a table
 workers.py       independent fits over threads, processes or a Dask cluster
 geometry.py      area and peak hysteresis of loops; weights by hysteresis
 

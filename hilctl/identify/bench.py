@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hilctl.arrays import F64
-from hilctl.errors import DataError
+from hilctl.base.arrays import F64
+from hilctl.base.errors import DataError
 from hilctl.identify.data import History, Loop, Records
 from hilctl.kernels.hysteresis import play_outputs, play_sum_shared, rest_memory
 from hilctl.models.integrated import IntegratedModel

@@ -12,14 +12,14 @@ import numpy as np
 from scipy.optimize import lsq_linear, minimize
 from scipy.signal import find_peaks
 
-from hilctl.arrays import F64
-from hilctl.errors import DataError
+from hilctl.base.arrays import F64
+from hilctl.base.device import CommandUnit
+from hilctl.base.errors import DataError
 from hilctl.identify.bench import Bench
 from hilctl.identify.data import Loop
 from hilctl.models.base import Provenance
 from hilctl.models.butterfly import ButterflyModel
 from hilctl.models.deadband import DeadbandFunction
-from hilctl.ports import CommandUnit
 
 _NEAR = 0.1  # of the stroke: so near to the turning point a loop may change from wing to wing
 _DEEP = 0.01  # of the stroke: what goes up and down by less is noise

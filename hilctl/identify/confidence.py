@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from hilctl.arrays import F64
+from hilctl.base.arrays import F64
 from hilctl.identify.layered import DYNAMIC, Layers
 from hilctl.identify.sensitivity import GAMMA_S, GROWTH, LAG_S, SPACING
 from hilctl.identify.staged import StagedFound

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hilctl.arrays import F64
+from hilctl.base.arrays import F64
 from hilctl.identify.layered import STEEPEST, Layers, Point, segments
 from hilctl.identify.linear import bounded_weights
 from hilctl.identify.staged_bench import Linear, StagedBench

@@ -5,12 +5,12 @@ from collections.abc import Collection
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from hilctl.arrays import F64
-from hilctl.errors import DataError
+from hilctl.base.arrays import F64
+from hilctl.base.errors import DataError
+from hilctl.base.segments import Segment
 from hilctl.identify.data import FEWEST_POINTS, History, Loop
 from hilctl.identify.period import steady_part
 from hilctl.recording.data import Recording
-from hilctl.segments import Segment
 
 
 def average_cycle(label: str, phase: F64, values: F64, period: float, points: int) -> F64:

@@ -7,15 +7,15 @@ from typing import Literal
 
 import numpy as np
 
-from hilctl.errors import DataError, InputError
-from hilctl.flags import Flag
+from hilctl.base.device import CommandUnit
+from hilctl.base.errors import DataError, InputError
+from hilctl.base.flags import Flag
 from hilctl.identify.cycles import find_cycles, loops_from_recording
 from hilctl.identify.data import History, Record
 from hilctl.identify.fit import Fit
 from hilctl.identify.settings import Kind
 from hilctl.identify.tables import Column, read_table
 from hilctl.models.files import dump_model
-from hilctl.ports import CommandUnit
 from hilctl.recording.data import Recording
 from hilctl.recording.reader import read
 

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from hilctl.arrays import F64
+from hilctl.base.arrays import F64
 from hilctl.identify.bench import Bench
 from hilctl.identify.data import Loop, Record, Records
 from hilctl.identify.geometry import loop_area

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from hilctl.arrays import F64
-from hilctl.errors import DataError
+from hilctl.base.arrays import F64
+from hilctl.base.errors import DataError
 from hilctl.identify.data import Loop, Records
 
 REVERSAL = 1e-3  # change against the branch's direction that is still noise, of the peak-to-peak

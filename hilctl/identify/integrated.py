@@ -5,7 +5,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from hilctl.arrays import F64
+from hilctl.base.arrays import F64
 from hilctl.identify.bench import Bench
 from hilctl.identify.plays import numbered, spacing_limit
 from hilctl.identify.search import Space

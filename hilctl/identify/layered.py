@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hilctl.arrays import F64
+from hilctl.base.arrays import F64
 from hilctl.identify.sensitivity import PARAMETERS
 from hilctl.identify.staged_bench import Linear, StagedBench
 

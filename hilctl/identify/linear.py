@@ -4,7 +4,7 @@ import numpy as np
 from scipy.linalg import qr
 from scipy.optimize import nnls
 
-from hilctl.arrays import F64
+from hilctl.base.arrays import F64
 
 
 def bounded_weights(

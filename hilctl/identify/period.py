@@ -6,8 +6,8 @@ import numpy as np
 from scipy.fft import irfft, next_fast_len, rfft
 from scipy.optimize import minimize_scalar
 
-from hilctl.arrays import F64, I64
-from hilctl.errors import DataError
+from hilctl.base.arrays import F64, I64
+from hilctl.base.errors import DataError
 from hilctl.identify.data import FEWEST_POINTS
 
 LIKELY = 0.3  # least similarity worth a closer look; a decay lowers it

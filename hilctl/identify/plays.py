@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from hilctl.arrays import F64
+from hilctl.base.arrays import F64
 from hilctl.identify.bench import Bench
 from hilctl.identify.linear import bounded_and_free
 from hilctl.identify.search import Space

@@ -7,7 +7,7 @@ from typing import Protocol, TypeAlias
 import numpy as np
 from scipy.optimize import least_squares
 
-from hilctl.arrays import F64
+from hilctl.base.arrays import F64
 from hilctl.models.plays import PlayModel
 
 Progress: TypeAlias = Callable[[float, str], None]

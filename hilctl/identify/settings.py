@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
-from hilctl.errors import InputError
-from hilctl.ports import CommandUnit
+from hilctl.base.device import CommandUnit
+from hilctl.base.errors import InputError
 
 Kind: TypeAlias = Literal["ppi", "rdpi", "integrated", "staged"]
 Weights: TypeAlias = Literal["exponential", "free"]

@@ -6,8 +6,8 @@ from itertools import product
 
 import numpy as np
 
-from hilctl.arrays import F64
-from hilctl.errors import DataError
+from hilctl.base.arrays import F64
+from hilctl.base.errors import DataError
 from hilctl.identify.convex import Start, convex_start
 from hilctl.identify.descend import ErrorAndSlopes, descend
 from hilctl.identify.layered import RADIAN, Layers, Point, bounds, error_and_slopes

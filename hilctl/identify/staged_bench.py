@@ -14,8 +14,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.fft import irfft, rfft
 
-from hilctl.arrays import F64
-from hilctl.errors import DataError
+from hilctl.base.arrays import F64
+from hilctl.base.errors import DataError
 from hilctl.identify.data import Loop, Record, Records
 from hilctl.identify.sensitivity import PARAMETERS, lagged, plays_and_slopes
 from hilctl.models.base import Operator

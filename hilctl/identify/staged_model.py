@@ -4,14 +4,14 @@ import math
 
 import numpy as np
 
-from hilctl.arrays import F64
+from hilctl.base.arrays import F64
+from hilctl.base.device import CommandUnit
 from hilctl.identify.layered import Layers, Point
 from hilctl.identify.staged_bench import Linear, StagedBench
 from hilctl.models.deadband import DeadbandFunction
 from hilctl.models.integrated import IntegratedModel
 from hilctl.models.plays import PlayModel
 from hilctl.models.staged import FieldLag, StagedModel, Structure
-from hilctl.ports import CommandUnit
 
 STAGE_PARAMETERS = ("tau_s", "growth_per_unit", "natural_hz", "damping_ratio", "delay_s")
 

@@ -10,7 +10,7 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from hilctl.arrays import F64
+from hilctl.base.arrays import F64
 from hilctl.identify.linear import bounded_and_free
 from hilctl.identify.staged_bench import StagedBench
 from hilctl.identify.staged_model import stages_of

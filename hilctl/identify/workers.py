@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from multiprocessing import get_context
 from typing import Any, Protocol, TypeVar
 
-from hilctl.errors import InputError
+from hilctl.base.errors import InputError
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")

@@ -7,7 +7,7 @@ signal into blocks gives the same bits as one call. ``out`` may be the input arr
 
 import math
 
-from hilctl.arrays import F64
+from hilctl.base.arrays import F64
 from hilctl.kernels.jit import kernel
 
 # Share of the fastest change the lag allows that its inverse asks for; towards 1 the command that

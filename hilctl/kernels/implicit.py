@@ -20,7 +20,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from hilctl.arrays import F64
+from hilctl.base.arrays import F64
 from hilctl.kernels.jit import kernel
 
 Arrays: TypeAlias = tuple[F64, F64, F64]

@@ -1,12 +1,12 @@
 """Interlocks on the samples of a run: all of them in one pass, with memory from block to block.
 
 Settings and memory are arrays with a named place for each number, so that one call a block does it
-all; see :class:`hilctl.interlocks.Interlocks` for what they mean. A time is a whole number of
+all; see :class:`hilctl.loop.interlocks.Interlocks` for what they mean. A time is a whole number of
 samples; one that is infinite switches its interlock off.
 """
 
-from hilctl.arrays import F64, U32
-from hilctl.flags import Flag
+from hilctl.base.arrays import F64, U32
+from hilctl.base.flags import Flag
 from hilctl.kernels.jit import kernel
 
 (

@@ -9,11 +9,11 @@ import numpy as np
 from hilctl.analysis import metrics
 from hilctl.analysis.noise import SHORTEST_PERIOD, expected_maximum, sensor_noise_um
 from hilctl.analysis.steady import SteadyPart, steady_part
-from hilctl.arrays import F64, I64
-from hilctl.errors import DataError
-from hilctl.learning.correction import C128
+from hilctl.base.arrays import F64, I64
+from hilctl.base.errors import DataError
+from hilctl.base.segments import Segment
+from hilctl.experiment.correction import C128
 from hilctl.recording.data import Recording
-from hilctl.segments import Segment
 
 MAX_HARMONICS = 2000
 """Most harmonics that are looked at; a bin of the fold is then a quarter of the shortest."""

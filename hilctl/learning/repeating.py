@@ -2,12 +2,12 @@
 
 import numpy as np
 
-from hilctl.errors import ConfigError, Problem
-from hilctl.learning.correction import C128, LearnedCycle, fits, signature
+from hilctl.base.errors import ConfigError, Problem
+from hilctl.base.segments import Segment
+from hilctl.experiment.check import Checked
+from hilctl.experiment.correction import C128, LearnedCycle, fits, signature
 from hilctl.learning.cycle import harmonic_count
 from hilctl.learning.update import Learning, begin
-from hilctl.preflight import Checked
-from hilctl.segments import Segment
 
 HIGHEST_PART = 0.125
 """Highest frequency that a correction reaches, as a part of the sample rate."""

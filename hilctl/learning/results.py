@@ -4,10 +4,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from hilctl.learning.correction import Correction
+from hilctl.base.segments import Segment
+from hilctl.experiment.correction import Correction
 from hilctl.learning.cycle import CycleError
 from hilctl.learning.update import Learning
-from hilctl.segments import Segment
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import TypeAlias
 
 from hilctl import __version__
-from hilctl.errors import ConfigError, HilctlError, InputError, RunError
-from hilctl.learning.correction import (
+from hilctl.base.errors import ConfigError, HilctlError, InputError, RunError
+from hilctl.base.segments import Segment
+from hilctl.experiment.correction import (
     C128,
     Correction,
     LearnedCycle,
@@ -20,12 +21,11 @@ from hilctl.learning.correction import (
 from hilctl.learning.cycle import cycle_error
 from hilctl.learning.repeating import beginning, repeating
 from hilctl.learning.results import Learned, Row, row_of
-from hilctl.learning.unpaced import run_unpaced
 from hilctl.learning.update import learn, refused
 from hilctl.recording.reader import read
-from hilctl.run_result import RunResult
-from hilctl.segments import Segment
-from hilctl.start import checked_experiment, start_run
+from hilctl.run.result import RunResult
+from hilctl.run.start import checked_experiment, start_run
+from hilctl.run.unpaced import run_unpaced
 
 Runner: TypeAlias = Callable[[Path, Sequence[str], Path], RunResult]
 """Runs an experiment file with settings into a recording."""

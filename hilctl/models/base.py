@@ -5,12 +5,13 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Annotated, Any, TypeAlias
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import Field, field_validator
 
-from hilctl.arrays import F64
-from hilctl.errors import ModelError
+from hilctl.base.arrays import F64
+from hilctl.base.device import CommandUnit
+from hilctl.base.errors import ModelError
+from hilctl.base.strict import Strict
 from hilctl.kernels.hysteresis import rest_memory
-from hilctl.ports import CommandUnit
 
 BlockKernel: TypeAlias = Callable[[F64, F64, F64], None]
 """A kernel with its parameters bound: (input[n], memory, output[n])."""
@@ -100,7 +101,7 @@ class Operator:
             self.process(np.array([first_input]))
 
 
-class Provenance(BaseModel):
+class Provenance(Strict):
     """Where a model's parameters come from.
 
     Attributes:
@@ -113,8 +114,6 @@ class Provenance(BaseModel):
         created: Date and time in ISO 8601, UTC.
     """
 
-    model_config = ConfigDict(frozen=True, strict=True, extra="forbid")
-
     source: tuple[str, ...] = ()
     method: str = ""
     grid: tuple[str, ...] = ()
@@ -124,7 +123,7 @@ class Provenance(BaseModel):
     created: str = ""
 
 
-class HysteresisModel(BaseModel, ABC):
+class HysteresisModel(Strict, ABC):
     """Parameters of a model from command to displacement, and of its inverse.
 
     Attributes:
@@ -135,8 +134,6 @@ class HysteresisModel(BaseModel, ABC):
         output_offset_um: Displacement where the operators' output is 0.
         provenance: Where the parameters come from.
     """
-
-    model_config = ConfigDict(frozen=True, strict=True, extra="forbid", allow_inf_nan=False)
 
     input_unit: CommandUnit = "A"
     input_range: tuple[float, float] | None = None

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from hilctl.arrays import F64
+from hilctl.base.arrays import F64
 from hilctl.kernels.dynamics import between_block, delay_block
 from hilctl.models.base import Operator
 

@@ -4,15 +4,16 @@ from collections.abc import Iterator
 from typing import Self
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
+from pydantic import ValidationError, model_validator
 
-from hilctl.arrays import F64
-from hilctl.errors import ModelError
+from hilctl.base.arrays import F64
+from hilctl.base.errors import ModelError
+from hilctl.base.strict import Strict
 from hilctl.kernels.hysteresis import deadband_block
 from hilctl.models.base import Thresholds, Weights, length_problems, refuse, threshold_problems
 
 
-class DeadbandFunction(BaseModel):
+class DeadbandFunction(Strict):
     """Lambda(x) = g_0 x + sum g_j J_j(x): piecewise linear, for asymmetry and saturation.
 
     It can be inverted while each cumulative slope, g_0 plus the weights from 0 outwards on one
@@ -25,8 +26,6 @@ class DeadbandFunction(BaseModel):
         down_thresholds: d_-1 to d_-l, < 0, falling.
         down_weights: g_-1 to g_-l, changes of slope below each threshold.
     """
-
-    model_config = ConfigDict(frozen=True, strict=True, extra="forbid", allow_inf_nan=False)
 
     slope: float = 1.0
     up_thresholds: Thresholds = ()

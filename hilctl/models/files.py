@@ -4,9 +4,11 @@ from pathlib import Path
 from typing import Annotated, TypeAlias
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
-from hilctl.files import TextFiles
+from hilctl.base.files import TextFiles
+from hilctl.base.strict import Strict
+from hilctl.base.yaml.document import Document, load_document
 from hilctl.models.base import HysteresisModel
 from hilctl.models.bouc_wen import BoucWenModel
 from hilctl.models.butterfly import ButterflyModel
@@ -18,7 +20,6 @@ from hilctl.models.ppi import PpiModel
 from hilctl.models.preisach import PreisachModel
 from hilctl.models.rdpi import RdpiModel
 from hilctl.models.staged import StagedModel
-from hilctl.yamlio import Document, load_document
 
 AnyModel: TypeAlias = Annotated[
     PpiModel
@@ -47,10 +48,8 @@ KINDS: tuple[str, ...] = (
 )
 
 
-class ModelFile(BaseModel):
+class ModelFile(Strict):
     """A model file: one model under the key ``model``."""
-
-    model_config = ConfigDict(frozen=True, strict=True, extra="forbid")
 
     model: AnyModel
 

@@ -4,9 +4,10 @@ from collections.abc import Iterator
 from typing import Literal, Self
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, model_validator
+from pydantic import model_validator
 
-from hilctl.arrays import F64
+from hilctl.base.arrays import F64
+from hilctl.base.strict import Strict
 from hilctl.kernels.envelope import envelope_forward, envelope_inverse
 from hilctl.models.base import (
     Operator,
@@ -21,7 +22,7 @@ from hilctl.models.numeric_inverse import SpannedModel
 from hilctl.models.plays import inverse_plays
 
 
-class Envelope(BaseModel):
+class Envelope(Strict):
     """``height tanh(slope v + shift) + level``, as in Al Janaideh's generalised plays.
 
     Attributes:
@@ -30,8 +31,6 @@ class Envelope(BaseModel):
         shift: Where it is steepest, times -slope.
         level: Middle between both saturated ends.
     """
-
-    model_config = ConfigDict(frozen=True, strict=True, extra="forbid", allow_inf_nan=False)
 
     height: float = 1.0
     slope: float

@@ -5,7 +5,7 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
-from hilctl.arrays import F64
+from hilctl.base.arrays import F64
 from hilctl.kernels.hysteresis import integrated_forward, integrated_inverse
 from hilctl.models.base import Operator
 from hilctl.models.deadband import DeadbandFunction

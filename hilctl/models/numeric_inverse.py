@@ -7,7 +7,7 @@ from typing import Self
 import numpy as np
 from pydantic import model_validator
 
-from hilctl.arrays import F64
+from hilctl.base.arrays import F64
 from hilctl.kernels.implicit import implicit_forward, implicit_inverse
 from hilctl.models.base import HysteresisModel, Operator
 

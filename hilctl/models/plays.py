@@ -5,8 +5,8 @@ from typing import Self
 import numpy as np
 from pydantic import model_validator
 
-from hilctl.arrays import F64
-from hilctl.errors import ModelError
+from hilctl.base.arrays import F64
+from hilctl.base.errors import ModelError
 from hilctl.kernels.hysteresis import play_sum
 from hilctl.models.base import (
     HysteresisModel,

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from hilctl.arrays import F64
+from hilctl.base.arrays import F64
 from hilctl.models.base import Provenance
 from hilctl.models.deadband import DeadbandFunction
 from hilctl.models.integrated import IntegratedModel

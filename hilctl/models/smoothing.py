@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from hilctl.arrays import F64
+from hilctl.base.arrays import F64
 
 _WIDEST = 64
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hilctl.arrays import F64
+from hilctl.base.arrays import F64
 from hilctl.kernels.hysteresis import stop_sum
 from hilctl.models.base import Operator
 from hilctl.models.ppi import PpiModel

@@ -1,9 +1,9 @@
 """Hysteresis between the stages that carry it: field lag, structure, transport delay.
 
 Command -> field lag -> hysteresis -> structure -> transport delay -> displacement. A displacement
-is sampled when a command is put out and can't yet show it, as :mod:`hilctl.ports` has it. So the
-forward operator answers one sample later than its input, whatever its stages; ``delay_s`` is what
-comes on top of that.
+is sampled when a command is put out and can't yet show it, as :mod:`hilctl.base.device` has it. So
+the forward operator answers one sample later than its input, whatever its stages; ``delay_s`` is
+what comes on top of that.
 
 The inverse goes the other way round, and its input must run ahead of its output by
 :attr:`~hilctl.models.base.Operator.preview` samples: one for the loop, then the delay, then what
@@ -16,9 +16,10 @@ import math
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
-from hilctl.arrays import F64
+from hilctl.base.arrays import F64
+from hilctl.base.strict import Strict
 from hilctl.kernels.dynamics import (
     lag_block,
     lead_block,
@@ -39,11 +40,7 @@ AnyHysteresis = Annotated[
 _WHOLE = 1e-6
 
 
-class _Stage(BaseModel):
-    model_config = ConfigDict(frozen=True, strict=True, extra="forbid", allow_inf_nan=False)
-
-
-class FieldLag(_Stage):
+class FieldLag(Strict):
     """tau (1 + b |v - x|) dx/dt = v - x: the field x follows the command v.
 
     Attributes:
@@ -76,7 +73,7 @@ class FieldLag(_Stage):
         return lead
 
 
-class Structure(_Stage):
+class Structure(Strict):
     """y'' / w^2 + 2 zeta y' / w + y = x: the mass of the actuator and its load on its stiffness.
 
     Attributes:

@@ -7,10 +7,10 @@ from typing import NamedTuple, Self
 import numpy as np
 from mcap.writer import Writer
 
-from hilctl.arrays import F64, U32
-from hilctl.blocks import COLUMNS, Batch, Head
-from hilctl.errors import DataError
-from hilctl.ports import CommandUnit
+from hilctl.base.arrays import F64, U32
+from hilctl.base.blocks import COLUMNS, Batch, Head
+from hilctl.base.device import CommandUnit
+from hilctl.base.errors import DataError
 from hilctl.recording import schema
 from hilctl.recording.data import Event
 

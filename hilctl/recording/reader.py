@@ -9,13 +9,13 @@ import numpy as np
 from google.protobuf.message import DecodeError
 from mcap.records import Attachment, Channel, Message, Metadata
 
-from hilctl.arrays import F64
-from hilctl.errors import DataError
+from hilctl.base.arrays import F64
+from hilctl.base.errors import DataError
+from hilctl.base.segments import Segment
 from hilctl.recording import schema
 from hilctl.recording.data import Event, Recording, Samples, Start, Ticks
 from hilctl.recording.salvage import Salvage
 from hilctl.recording.writer import is_being_recorded
-from hilctl.segments import Segment
 
 _log = logging.getLogger(__name__)
 

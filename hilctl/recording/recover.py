@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 from google.protobuf.message import DecodeError
 
-from hilctl.blocks import Batch, Head
-from hilctl.control_page import LoopEvent
-from hilctl.errors import DataError, InputError
-from hilctl.recording.keep import Replacement
+from hilctl.base.blocks import Batch, Head
+from hilctl.base.errors import DataError, InputError
+from hilctl.base.events import LoopEvent
 from hilctl.recording.messages import Layout
-from hilctl.recording.resave import Resaved, Survey
+from hilctl.recording.replace import Replacement
+from hilctl.recording.rewrite import Resaved, Survey
 from hilctl.recording.salvage import Damage, Salvage
 from hilctl.recording.writer import lock
 

@@ -16,11 +16,11 @@ from typing import BinaryIO
 from mcap.writer import CompressionType, Writer
 
 from hilctl import __version__
-from hilctl.blocks import Batch
-from hilctl.ports import CommandUnit
+from hilctl.base.blocks import Batch
+from hilctl.base.device import CommandUnit
+from hilctl.base.segments import Segment
 from hilctl.recording.data import Event
 from hilctl.recording.messages import Layout, MessageMaker, Topics
-from hilctl.segments import Segment
 
 _CHUNK_BYTES = 8 << 20  # each chunk's index stays in memory until the end of the run
 

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from hilctl.arrays import F64
-from hilctl.errors import InputError
-from hilctl.segments import Segment
+from hilctl.base.arrays import F64
+from hilctl.base.errors import InputError
+from hilctl.base.segments import Segment
 from hilctl.waveforms import shapes, spec
 from hilctl.waveforms.table import read_samples
 

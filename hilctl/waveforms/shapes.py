@@ -5,8 +5,8 @@ from fractions import Fraction
 
 import numpy as np
 
-from hilctl.arrays import F64
-from hilctl.errors import InputError
+from hilctl.base.arrays import F64
+from hilctl.base.errors import InputError
 from hilctl.waveforms import spec
 
 MAX_SAMPLES = 100_000_000

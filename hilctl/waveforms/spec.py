@@ -8,12 +8,12 @@ from typing import Annotated, Any, Literal, TypeAlias
 
 from pydantic import (
     AfterValidator,
-    BaseModel,
-    ConfigDict,
     Field,
     ValidationInfo,
     field_validator,
 )
+
+from hilctl.base.strict import Strict
 
 WaveformUnit: TypeAlias = Literal["um", "A", "V"]
 Positive: TypeAlias = Annotated[float, Field(gt=0.0)]
@@ -33,11 +33,7 @@ NotEmpty = AfterValidator(_not_empty)
 AtLeastOne = Field(json_schema_extra={"minItems": 1})
 
 
-class _Spec(BaseModel):
-    model_config = ConfigDict(frozen=True, strict=True, extra="forbid", allow_inf_nan=False)
-
-
-class _Shape(_Spec):
+class _Shape(Strict):
     """What all kinds have.
 
     Attributes:
@@ -72,7 +68,7 @@ class Triangle(_Shape):
     duration_s: Positive
 
 
-class Harmonic(_Spec):
+class Harmonic(Strict):
     """One component of a complex harmonic."""
 
     amplitude: Positive
@@ -216,7 +212,7 @@ SinglePart: TypeAlias = Annotated[
 ]
 
 
-class Sequence(_Spec):
+class Sequence(Strict):
     """Waveforms one after the other; the unit stands here, not in the parts."""
 
     kind: Literal["sequence"]

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
-from hilctl.arrays import F64
-from hilctl.errors import InputError
+from hilctl.base.arrays import F64
+from hilctl.base.errors import InputError
 from hilctl.waveforms.shapes import check_length
 from hilctl.waveforms.spec import FileWaveform
 

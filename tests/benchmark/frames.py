@@ -16,10 +16,7 @@ from pymodbus.framer.socket import FramerSocket
 from pymodbus.pdu import DecodePDU
 from pymodbus.pdu.register_message import ReadWriteMultipleRegistersRequest
 
-from hilctl_drivers.ascii_lines import LineFormat, fixed_number, parse_number
-from hilctl_drivers.checks import CRCS
-from hilctl_drivers.framing import Framing, binary_framing
-from hilctl_drivers.modbus_frames import (
+from hilctl_drivers.modbus.pdu import (
     feedback_pdu,
     read_pdu,
     rtu_adu,
@@ -27,8 +24,11 @@ from hilctl_drivers.modbus_frames import (
     write_pdu,
     write_read_pdu,
 )
-from hilctl_drivers.modbus_transactions import RtuTransaction, TcpTransaction
-from hilctl_drivers.registers import RegisterFormat
+from hilctl_drivers.modbus.registers import RegisterFormat
+from hilctl_drivers.modbus.transactions import RtuTransaction, TcpTransaction
+from hilctl_drivers.text.lines import LineFormat, fixed_number, parse_number
+from hilctl_drivers.wire.crc import CRCS
+from hilctl_drivers.wire.framing import Framing, binary_framing
 
 CALLS = 20_000
 ROUNDS = 9

@@ -20,12 +20,12 @@ from hilctl.identify.bench import Bench
 from hilctl.identify.cycles import average_cycle
 from hilctl.identify.data import Loop
 from hilctl.identify.fit import Judgement, judge
-from hilctl.identify.fitting import identify
+from hilctl.identify.identify import identify
 from hilctl.identify.settings import Settings
 from hilctl.kernels.hysteresis import deadband_block
 from hilctl.models.integrated import IntegratedModel
 from hilctl.models.published import exponential_integrated
-from hilctl_drivers.terfenol import TerfenolActuator, TerfenolParameters
+from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
 
 RATE_HZ = 50_000.0
 PLAYS, DEADBANDS = 12, 8

@@ -14,10 +14,10 @@ from pathlib import Path
 import numpy as np
 
 from hilctl.learning.session import Learned, Runner, Session, unpaced
-from hilctl.learning.unpaced import run_unpaced
-from hilctl.run_result import RunResult
-from hilctl.start import checked_experiment
-from hilctl_drivers.simulated import SimulatedTerfenol, TerfenolOptions
+from hilctl.run.result import RunResult
+from hilctl.run.start import checked_experiment
+from hilctl.run.unpaced import run_unpaced
+from hilctl_drivers.simulated.rigs import SimulatedTerfenol, TerfenolOptions
 
 EXPERIMENT = Path(__file__).parents[2] / "configs" / "terfenol_sine_6a.yaml"
 SOFT_S = 0.2

@@ -72,8 +72,8 @@ def serving(server: Path, *words: str, fds: tuple[int, ...] = ()) -> Iterator[st
 
 def driver_batch(folder: Path, link: str, **where: object) -> Batch:
     """Return the driver's side: command in, displacement out, as in a tick."""
-    from hilctl_drivers.modbus_dac import ModbusDac
-    from hilctl_drivers.modbus_options import ModbusOptions
+    from hilctl_drivers.modbus.device import ModbusDac
+    from hilctl_drivers.modbus.options import ModbusOptions
 
     profile = folder / "profile.yaml"
     profile.write_text(PROFILE.format(link=link), encoding="utf-8")

@@ -17,10 +17,10 @@ from pathlib import Path
 import numpy as np
 
 from hilctl.analysis.report import SegmentReport, judge
-from hilctl.compensator import Compensator
-from hilctl.errors import InputError
-from hilctl.experiment import LoadedExperiment, load_experiment
-from hilctl.limiter import Limiter
+from hilctl.base.errors import InputError
+from hilctl.experiment.load import LoadedExperiment, load_experiment
+from hilctl.loop.compensator import Compensator
+from hilctl.loop.limiter import Limiter
 from hilctl.models.base import HysteresisModel
 from hilctl.models.files import load_model
 from hilctl.recording.data import Recording, Samples, Ticks

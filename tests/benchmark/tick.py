@@ -18,15 +18,15 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from hilctl import loop_process
-from hilctl.blocks import Head
-from hilctl.compensator import Compensator
-from hilctl.config_parts import Realtime
-from hilctl.control_page import Field
-from hilctl.experiment import LoadedExperiment, load_experiment
-from hilctl.pacer import SystemClock
-from hilctl.realtime import prepare
-from hilctl.ring import SampleRing, memory_folder
+from hilctl.base.blocks import Head
+from hilctl.experiment.load import LoadedExperiment, load_experiment
+from hilctl.loop.compensator import Compensator
+from hilctl.loop.pacer import SystemClock
+from hilctl.machine.realtime import prepare
+from hilctl.machine.settings import Realtime
+from hilctl.run import loop_process
+from hilctl.run.ring import SampleRing, memory_folder
+from hilctl.run.shared_page import Field
 from hilctl.waveforms.build import build
 
 EXPERIMENT = Path(__file__).parents[2] / "configs" / "terfenol_sine_6a.yaml"

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from hilctl.config_parts import Realtime
-from hilctl.doctor.latency import Latency, measure
+from hilctl.machine.latency import Latency, measure
+from hilctl.machine.settings import Realtime
 
 SOURCE = Path(__file__).with_suffix(".c")
 LONGEST_US = 60_000

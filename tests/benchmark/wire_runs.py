@@ -24,7 +24,7 @@ STALL_EVERY_S = 0.5
 AMPLIFIER = {"amplifier": {"gain_a_per_v": 1.0}}
 COMMON = {"sensor": {"um_per_v": 12.5}, "timeout_s": 0.5, "watchdog": "none"}
 BOARD = {"kind": "serial_dac", "output": "DAC", "input": "ADC", **AMPLIFIER}
-DCON_READER = ROOT / "tests" / "profiles" / "dcon_module.yaml"
+DCON_READER = ROOT / "tests" / "data" / "dcon_module.yaml"
 
 
 @dataclass(frozen=True, slots=True)
@@ -220,7 +220,7 @@ def loop_process(supervisor: int) -> int | None:
     try:
         children = Path(f"/proc/{supervisor}/task/{supervisor}/children").read_text().split()
         for child in children:
-            if b"hilctl.loop_process" in Path(f"/proc/{child}/cmdline").read_bytes():
+            if b"hilctl.run.loop_process" in Path(f"/proc/{child}/cmdline").read_bytes():
                 return int(child)
     except FileNotFoundError:  # it has just ended
         pass

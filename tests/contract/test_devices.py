@@ -13,12 +13,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilctl.errors import DeviceError
-from hilctl.ports import Device
-from hilctl.registry import BUILTIN, device_class
+from hilctl.base.device import Device
+from hilctl.base.errors import DeviceError
+from hilctl.experiment.registry import BUILTIN, device_class
 from hilctl_drivers.emulator.modbus_bench import EmulatorOptions, build
+from hilctl_drivers.modbus.profile import ModbusProfile
 from hilctl_drivers.profile import load_profile, shipped_profiles
-from hilctl_drivers.profile_modbus import ModbusProfile
 
 RATE_HZ = 10_000.0
 SAMPLES = 20

@@ -6,11 +6,11 @@ Time is the test's own: it passes by the messages and by what the device waits.
 import numpy as np
 import pytest
 
-from hilctl.errors import DeviceError
-from hilctl.registry import device_class
+from hilctl.base.errors import DeviceError
+from hilctl.experiment.registry import device_class
 from hilctl_drivers.emulator.in_process import InProcess
+from hilctl_drivers.modbus.profile import ModbusProfile
 from hilctl_drivers.profile import load_profile, shipped_profiles
-from hilctl_drivers.profile_modbus import ModbusProfile
 
 RATE_HZ = 10_000.0
 BLOCK = 50

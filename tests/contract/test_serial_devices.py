@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilctl.errors import DeviceError
-from hilctl.registry import device_class
+from hilctl.base.errors import DeviceError
+from hilctl.experiment.registry import device_class
 from hilctl_drivers.emulator.serial_bench import SerialEmulation
 from hilctl_drivers.emulator.serial_server import emulated_serial
 from hilctl_drivers.profile import load_profile, shipped_profiles

@@ -15,10 +15,10 @@ import numpy as np
 import pytest
 import yaml
 
+from hilctl.analysis.replay import replay
 from hilctl.recording.reader import read
-from hilctl.replay import replay
 
-PROFILES = Path(__file__).parents[1] / "profiles"
+PROFILES = Path(__file__).parents[1] / "data"
 EXPERIMENT = {
     "name": "wire_fault",
     "sample_rate_hz": 500,
@@ -86,7 +86,7 @@ class Run:
         """Find the loop process among the run's children."""
         children = Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children")
         for child in children.read_text().split():
-            if b"hilctl.loop_process" in Path(f"/proc/{child}/cmdline").read_bytes():
+            if b"hilctl.run.loop_process" in Path(f"/proc/{child}/cmdline").read_bytes():
                 return int(child)
         raise AssertionError("the run has no loop process")
 
@@ -196,5 +196,5 @@ def run(tmp_path):
 
 @pytest.fixture
 def profile():
-    """Return a function that gives the path of a profile of ``tests/profiles``."""
+    """Return a function that gives the path of a profile of ``tests/data``."""
     return lambda name: str(PROFILES / f"{name}.yaml")

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 import yaml
 
+from hilctl.analysis.replay import replay
 from hilctl.recording.reader import read
-from hilctl.replay import replay
-from hilctl.runs import runs
+from hilctl.run.run_folder import runs
 
 EXPERIMENT = {
     "name": "background",

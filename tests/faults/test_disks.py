@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 import yaml
 
+from hilctl.analysis.replay import replay
 from hilctl.recording.reader import read
-from hilctl.replay import replay
 
 RATE_HZ = 5000
 SECONDS = 4.0
@@ -37,7 +37,8 @@ EXPERIMENT = {
 }
 SLOW = """
 import sys, time
-from hilctl import cli, recorder
+from hilctl.run import recorder
+from hilctl import cli
 
 class SlowFile(recorder.OutputFile):
     '''A file on a disk that stands still once for as long as it is told, at its second MB or so.'''

@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 import yaml
 
-from hilctl.orphans import recover_orphans
+from hilctl.analysis.replay import replay
 from hilctl.recording.reader import read
-from hilctl.replay import replay
-from hilctl.runs import runs
+from hilctl.run.orphans import recover_orphans
+from hilctl.run.run_folder import runs
 
 KILLS = Path(__file__).parents[1] / "benchmark" / "kills.py"
 EXPERIMENT = {

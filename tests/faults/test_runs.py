@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 import yaml
 
-from hilctl.flags import Flag
-from hilctl.orphans import recover_orphans
+from hilctl.analysis.replay import replay
+from hilctl.base.flags import Flag
 from hilctl.recording.reader import read
-from hilctl.replay import replay
-from hilctl.runs import base_folder
-from hilctl.start import checked_experiment
-from hilctl.supervisor import Supervisor
+from hilctl.run.orphans import recover_orphans
+from hilctl.run.run_folder import base_folder
+from hilctl.run.start import checked_experiment
+from hilctl.run.supervisor import Supervisor
 
 MODELS = Path(__file__).parents[2] / "configs" / "models"
 

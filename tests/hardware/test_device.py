@@ -23,11 +23,11 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from hilctl.devices import probe
-from hilctl.errors import DeviceError
-from hilctl.experiment import LoadedExperiment, load_experiment
-from hilctl.limiter import CommandLimits, Limiter
-from hilctl.pacer import SystemClock
+from hilctl.base.errors import DeviceError
+from hilctl.experiment.inventory import probe
+from hilctl.experiment.load import LoadedExperiment, load_experiment
+from hilctl.loop.limiter import CommandLimits, Limiter
+from hilctl.loop.pacer import SystemClock
 
 SHARE = 0.1
 HOLD_S = 0.3

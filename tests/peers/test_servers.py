@@ -16,9 +16,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilctl.errors import DeviceError
-from hilctl_drivers.modbus_dac import ModbusDac
-from hilctl_drivers.modbus_options import ModbusOptions
+from hilctl.base.errors import DeviceError
+from hilctl_drivers.modbus.device import ModbusDac
+from hilctl_drivers.modbus.options import ModbusOptions
 
 HERE = Path(__file__).parent
 BAUD = 115_200

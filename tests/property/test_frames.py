@@ -19,16 +19,7 @@ from pymodbus.pdu.register_message import (
     WriteMultipleRegistersResponse,
 )
 
-from hilctl_drivers.ascii_lines import (
-    LineFormat,
-    dcon_answer,
-    fixed_number,
-    parse_fixed_number,
-    parse_number,
-)
-from hilctl_drivers.checks import CRCS
-from hilctl_drivers.framing import binary_framing
-from hilctl_drivers.modbus_frames import (
+from hilctl_drivers.modbus.pdu import (
     feedback_pdu,
     read_pdu,
     reply_data,
@@ -40,9 +31,18 @@ from hilctl_drivers.modbus_frames import (
     write_read_pdu,
     write_single_pdu,
 )
-from hilctl_drivers.modbus_transactions import RtuTransaction, TcpTransaction
-from hilctl_drivers.registers import RegisterFormat
-from hilctl_drivers.wire_errors import Corrupt, FrameError
+from hilctl_drivers.modbus.registers import RegisterFormat
+from hilctl_drivers.modbus.transactions import RtuTransaction, TcpTransaction
+from hilctl_drivers.text.lines import (
+    LineFormat,
+    dcon_answer,
+    fixed_number,
+    parse_fixed_number,
+    parse_number,
+)
+from hilctl_drivers.wire.crc import CRCS
+from hilctl_drivers.wire.errors import Corrupt, FrameError
+from hilctl_drivers.wire.framing import binary_framing
 
 BINARY = [(kind, crc) for kind in ("cobs", "length") for crc in CRCS if crc != "none"]
 NUMPY = {

@@ -7,8 +7,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hilctl.flags import Flag
-from hilctl.interlocks import InterlockLimits, Interlocks
+from hilctl.base.flags import Flag
+from hilctl.loop.interlocks import InterlockLimits, Interlocks
 
 RATE_HZ = 100.0
 LEVELS = st.sampled_from([-9.0, -2.0, -0.5, 0.0, 0.25, 0.5, 1.0, 3.0, 4.0, math.nan, math.inf])

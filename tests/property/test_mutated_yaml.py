@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from hilctl.errors import InputError
-from hilctl.experiment import resolve
-from hilctl.preflight import check
-from hilctl.yamlio import Document
+from hilctl.base.errors import InputError
+from hilctl.base.yaml.document import Document
+from hilctl.experiment.check import check
+from hilctl.experiment.load import resolve
 
 FILES = 10_000
 MODEL = """\

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import TypeAdapter
 
-from hilctl.segments import Segment
+from hilctl.base.segments import Segment
 from hilctl.waveforms.build import Reference, build
 from hilctl.waveforms.spec import AnyWaveform
 

@@ -7,17 +7,17 @@ import numpy as np
 import pytest
 import yaml
 
-from hilctl.compensator import Compensator
-from hilctl.errors import DataError
-from hilctl.memory import memory_after
+from hilctl.analysis.replay import replay
+from hilctl.base.errors import DataError
+from hilctl.experiment.initial_state import memory_after
+from hilctl.loop.compensator import Compensator
 from hilctl.models.base import HysteresisModel
 from hilctl.models.files import dump_model
 from hilctl.models.published import terfenol_rdpi
 from hilctl.models.staged import FieldLag, StagedModel, Structure
 from hilctl.recording.data import Recording
 from hilctl.recording.reader import read
-from hilctl.replay import replay
-from hilctl.start import start_run
+from hilctl.run.start import start_run
 
 GOLDEN = sorted((Path(__file__).parents[2] / "recordings" / "golden").glob("*.mcap"))
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from hilctl.errors import InputError
+from hilctl.base.errors import InputError
 from hilctl_drivers.emulator.memory import NoSuchRegister, Words
 from hilctl_drivers.emulator.overlay import Overlay
 from hilctl_drivers.emulator.register_map import RegisterMap
@@ -10,8 +10,8 @@ from hilctl_drivers.emulator.rig import Rig
 from hilctl_drivers.emulator.watchdog import HostWatchdog
 from hilctl_drivers.emulator.wiring import Wiring
 from hilctl_drivers.emulator.write_log import WriteLog
-from hilctl_drivers.profile_modbus import ModbusProfile
-from hilctl_drivers.profile_steps import ModbusStep, RegisterStep
+from hilctl_drivers.modbus.profile import ModbusProfile
+from hilctl_drivers.modbus.steps import ModbusStep, RegisterStep
 
 
 class Declined(Exception):  # noqa: N818  a reply, not a mistake

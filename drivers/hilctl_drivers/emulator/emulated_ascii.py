@@ -7,7 +7,7 @@ from hilctl_drivers.emulator.ascii_templates import Template, in_style
 from hilctl_drivers.emulator.rig import Rig
 from hilctl_drivers.emulator.wiring import Wiring
 from hilctl_drivers.emulator.write_log import WriteLog
-from hilctl_drivers.profile_ascii import (
+from hilctl_drivers.text.profile import (
     AsciiInput,
     AsciiProfile,
     AsciiStep,

@@ -5,16 +5,16 @@ from collections.abc import Callable
 
 import numpy as np
 
-from hilctl.arrays import F64
-from hilctl_drivers import board_protocol as board
-from hilctl_drivers.board_protocol import Status
-from hilctl_drivers.board_session import Values
+from hilctl.base.arrays import F64
+from hilctl_drivers.board import frames as board
+from hilctl_drivers.board.frames import Status
+from hilctl_drivers.board.profile import FrameProfile, FrameStreaming
+from hilctl_drivers.board.session import Values
 from hilctl_drivers.emulator.answer import Answer
 from hilctl_drivers.emulator.rig import Rig
 from hilctl_drivers.emulator.stream_player import StreamPlayer
 from hilctl_drivers.emulator.wiring import Wiring
 from hilctl_drivers.emulator.write_log import WriteLog
-from hilctl_drivers.profile_frames import FrameProfile, FrameStreaming
 
 
 class _Refuse(Exception):  # noqa: N818  a reply, not a mistake

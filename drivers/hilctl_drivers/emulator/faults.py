@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, TypeAlias, cast, get_args
 
-from hilctl.errors import InputError
+from hilctl.base.errors import InputError
 
 Kind: TypeAlias = Literal[
     "silence",

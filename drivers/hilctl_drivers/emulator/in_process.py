@@ -6,15 +6,15 @@ Nothing waits for anything: a second of streaming takes as long as its samples t
 from dataclasses import dataclass
 from pathlib import Path
 
-from hilctl.errors import InputError
+from hilctl.base.errors import InputError
 from hilctl_drivers.emulator.emulated import EmulatedDevice
 from hilctl_drivers.emulator.labjack_attach import attach_stream
 from hilctl_drivers.emulator.modbus_wire import ModbusWire
 from hilctl_drivers.emulator.rig import Rig
 from hilctl_drivers.emulator.write_log import WriteLog
-from hilctl_drivers.links import LostError, Missing, NoAnswerError
+from hilctl_drivers.modbus.profile import ModbusProfile
 from hilctl_drivers.profile import load_profile
-from hilctl_drivers.profile_modbus import ModbusProfile
+from hilctl_drivers.wire.links import LostError, Missing, NoAnswerError
 
 
 @dataclass(slots=True)
@@ -37,7 +37,7 @@ class VirtualTime:
 
 
 class InProcessLink:
-    """A :class:`~hilctl_drivers.links.Link` that hands each request to a wire.
+    """A :class:`~hilctl_drivers.wire.links.Link` that hands each request to a wire.
 
     Args:
         wire: Emulated devices and their framing.
@@ -59,11 +59,11 @@ class InProcessLink:
         return "in process"
 
     def open(self) -> None:
-        """See :meth:`~hilctl_drivers.links.Link.open`."""
+        """See :meth:`~hilctl_drivers.wire.links.Link.open`."""
         self.is_open = True
 
     def transact(self, request: bytes | bytearray, missing: Missing, usual: int = 0) -> bytes:
-        """Exchange, see :meth:`~hilctl_drivers.links.Link.transact`."""
+        """Exchange, see :meth:`~hilctl_drivers.wire.links.Link.transact`."""
         del usual
         if not self.is_open:
             raise LostError("not connected")
@@ -81,7 +81,7 @@ class InProcessLink:
         return reply
 
     def close(self) -> None:
-        """See :meth:`~hilctl_drivers.links.Link.close`."""
+        """See :meth:`~hilctl_drivers.wire.links.Link.close`."""
         self.is_open = False
 
 

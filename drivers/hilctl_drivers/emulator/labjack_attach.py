@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from hilctl.arrays import F64
+from hilctl.base.arrays import F64
 from hilctl_drivers.emulator.emulated import EmulatedDevice
 from hilctl_drivers.emulator.labjack_stream import LabJackStream
 from hilctl_drivers.emulator.rig import Rig

@@ -4,9 +4,9 @@ import struct
 
 import numpy as np
 
-from hilctl.arrays import F64
-from hilctl_drivers import modbus_stream_protocol as stream
-from hilctl_drivers.profile_stream import BYTES_A_SAMPLE, LabJackStreaming
+from hilctl.base.arrays import F64
+from hilctl_drivers.labjack import stream
+from hilctl_drivers.labjack.profile import BYTES_A_SAMPLE, LabJackStreaming
 
 _DROPPING, _DROPPED = 2940, 2941
 _LIMIT = 0xFFFF

@@ -1,6 +1,6 @@
 """Stream-out and stream-in of an emulated LabJack T4 or T7: registers in front of a scan clock.
 
-It does what :mod:`hilctl_drivers.modbus_stream_protocol` says of the device. What no document was
+It does what :mod:`hilctl_drivers.labjack.stream` says of the device. What no document was
 seen for is made up: that a trip of the watchdog ends the stream, and in which order queued sets of
 values are put out.
 """
@@ -10,14 +10,14 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from hilctl.arrays import F64
-from hilctl_drivers import modbus_stream_protocol as stream
+from hilctl.base.arrays import F64
 from hilctl_drivers.emulator.emulated import Declined
 from hilctl_drivers.emulator.labjack_input import LabJackInput
 from hilctl_drivers.emulator.scan_clock import Played, ScanClock
-from hilctl_drivers.profile_modbus import ModbusProfile
-from hilctl_drivers.profile_steps import RegisterStep
-from hilctl_drivers.profile_stream import BYTES_A_SAMPLE, LabJackStreaming
+from hilctl_drivers.labjack import stream
+from hilctl_drivers.labjack.profile import BYTES_A_SAMPLE, LabJackStreaming
+from hilctl_drivers.modbus.profile import ModbusProfile
+from hilctl_drivers.modbus.steps import RegisterStep
 
 _VALUE_EXCEPTION, _FAILURE_EXCEPTION = 3, 4
 _PERIOD_NS, _PERIODS_MAX = 100, 65_536

@@ -7,13 +7,13 @@ from pathlib import Path
 from types import FrameType
 from typing import cast, get_args
 
-from hilctl.errors import InputError
+from hilctl.base.errors import InputError
 from hilctl_drivers.emulator.faults import parse_fault
 from hilctl_drivers.emulator.modbus_bench import EmulatorOptions, ReaderLine, build
 from hilctl_drivers.emulator.modbus_wire import LinkKind
 from hilctl_drivers.emulator.serial_server import serve_serial
+from hilctl_drivers.modbus.profile import ModbusProfile
 from hilctl_drivers.profile import load_profile
-from hilctl_drivers.profile_modbus import ModbusProfile
 
 
 def serve(

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
-from hilctl.errors import InputError
+from hilctl.base.errors import InputError
 from hilctl_drivers.emulator.emulated import EmulatedDevice
 from hilctl_drivers.emulator.faults import Fault
 from hilctl_drivers.emulator.labjack_attach import attach_stream
@@ -18,8 +18,8 @@ from hilctl_drivers.emulator.modbus_wire import LinkKind, ModbusWire
 from hilctl_drivers.emulator.rig import Rig
 from hilctl_drivers.emulator.wiring import Wiring
 from hilctl_drivers.emulator.write_log import WriteLog
+from hilctl_drivers.modbus.profile import ModbusProfile
 from hilctl_drivers.profile import load_profile
-from hilctl_drivers.profile_modbus import ModbusProfile
 
 ReaderLine: TypeAlias = Literal["same", "own"]
 _SUFFIX = {"V": "v", "mA": "ma", "A": "a"}

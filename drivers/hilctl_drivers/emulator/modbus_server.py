@@ -9,7 +9,7 @@ import socket
 import time
 from collections.abc import Callable, Sequence
 
-from hilctl.errors import InputError
+from hilctl.base.errors import InputError
 from hilctl_drivers.emulator.faults import Fault, FaultPlan, spoil
 from hilctl_drivers.emulator.modbus_peers import Peer, PtyPeer, TcpPeer
 from hilctl_drivers.emulator.modbus_wire import CORRUPT_AT, ModbusWire

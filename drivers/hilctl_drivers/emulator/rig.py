@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from hilctl_drivers.terfenol import TerfenolActuator, TerfenolParameters
+from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
 
 RATE_HZ = 10_000.0
 SETTLED_S = 1.0  # the slowest part of the rig has a time constant of 0.1 ms

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from hilctl.arrays import F64
-from hilctl_drivers.terfenol import TerfenolActuator, TerfenolParameters
+from hilctl.base.arrays import F64
+from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
 
 _SETTLED_S = 0.1
 

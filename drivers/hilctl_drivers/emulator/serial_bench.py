@@ -6,7 +6,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from hilctl.errors import InputError
+from hilctl.base.errors import InputError
+from hilctl_drivers.board.profile import FrameProfile
 from hilctl_drivers.emulator.emulated_ascii import EmulatedAscii
 from hilctl_drivers.emulator.emulated_board import EmulatedBoard
 from hilctl_drivers.emulator.faults import Fault
@@ -16,8 +17,7 @@ from hilctl_drivers.emulator.serial_line import FrameFraming, SerialLine, TextFr
 from hilctl_drivers.emulator.wiring import Wiring
 from hilctl_drivers.emulator.write_log import WriteLog
 from hilctl_drivers.profile import load_profile
-from hilctl_drivers.profile_ascii import AsciiProfile
-from hilctl_drivers.profile_frames import FrameProfile
+from hilctl_drivers.text.profile import AsciiProfile
 
 SerialProfile: TypeAlias = AsciiProfile | FrameProfile
 

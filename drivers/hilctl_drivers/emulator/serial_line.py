@@ -8,12 +8,12 @@ from collections.abc import Sequence
 from contextlib import suppress
 from typing import Protocol
 
-from hilctl_drivers.ascii_lines import LineFormat
+from hilctl_drivers.board.profile import FrameProfile
 from hilctl_drivers.emulator.answer import Answer, SerialDevice
-from hilctl_drivers.framing import Framing, binary_framing
-from hilctl_drivers.profile_ascii import AsciiProfile
-from hilctl_drivers.profile_frames import FrameProfile
-from hilctl_drivers.wire_errors import Corrupt
+from hilctl_drivers.text.lines import LineFormat
+from hilctl_drivers.text.profile import AsciiProfile
+from hilctl_drivers.wire.errors import Corrupt
+from hilctl_drivers.wire.framing import Framing, binary_framing
 
 _CHUNK = 65536
 

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from hilctl_drivers.profile_parts import Range
-from hilctl_drivers.terfenol import TerfenolParameters
+from hilctl_drivers.simulated.terfenol import TerfenolParameters
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 from typing import IO, Any
 
-from hilctl.errors import InputError
+from hilctl.base.errors import InputError
 
 
 class WriteLog:

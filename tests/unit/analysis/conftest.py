@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilctl.arrays import F64, I64, U32
-from hilctl.flags import Flag
+from hilctl.base.arrays import F64, I64, U32
+from hilctl.base.flags import Flag
+from hilctl.base.segments import Segment
 from hilctl.recording.data import Event, Recording, Samples, Ticks
-from hilctl.segments import Segment
 
 MakeRecording = Callable[..., Recording]
 

@@ -10,9 +10,9 @@ import pytest
 
 from hilctl.analysis.html import page, write_html
 from hilctl.analysis.report import summarize
-from hilctl.errors import InputError
+from hilctl.base.errors import InputError
+from hilctl.base.segments import Segment
 from hilctl.recording.data import Event, Recording
-from hilctl.segments import Segment
 
 NASTY = """<script>alert("x")</script>&amp;<img src=x onerror='y'>"""
 

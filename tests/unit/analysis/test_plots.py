@@ -7,8 +7,8 @@ import pytest
 from matplotlib.collections import FillBetweenPolyCollection
 
 from hilctl.analysis import canvas, loops, plots, traces
+from hilctl.base.segments import Segment
 from hilctl.recording.data import Recording, Ticks
-from hilctl.segments import Segment
 
 PERIOD = 1000.0
 

@@ -9,11 +9,11 @@ import pytest
 from rich.console import Console
 
 from hilctl.analysis.report import RunReport, render, summarize, worst_segment
-from hilctl.arrays import F64
-from hilctl.errors import DataError
-from hilctl.flags import Flag
+from hilctl.base.arrays import F64
+from hilctl.base.errors import DataError
+from hilctl.base.flags import Flag
+from hilctl.base.segments import Segment
 from hilctl.recording.data import Recording, Ticks
-from hilctl.segments import Segment
 
 RATE_HZ = 50_000.0
 LAG = 0.05

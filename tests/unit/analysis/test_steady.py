@@ -5,10 +5,10 @@ import pytest
 
 from hilctl.analysis.report import summarize
 from hilctl.analysis.steady import steady_part
-from hilctl.plan import Tuning
+from hilctl.base.segments import Segment
+from hilctl.loop.plan import Tuning
+from hilctl.loop.tuning import TUNED, Tuner, tuning_text
 from hilctl.recording.data import Event
-from hilctl.segments import Segment
-from hilctl.tuner import TUNED, Tuner, tuning_text
 
 PERIOD = 100
 CYCLES = 20

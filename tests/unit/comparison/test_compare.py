@@ -6,15 +6,15 @@ from pathlib import Path
 
 import pytest
 
+from hilctl.base.errors import InputError
+from hilctl.cli.compare_view import headings, notes, render, table_rows
 from hilctl.cli.comparing import _numbers
 from hilctl.cli.comparing import compare as command
 from hilctl.comparison.catalogue import CATALOGUE, entry
 from hilctl.comparison.compare import Request, compare
 from hilctl.comparison.figure import comparison_figure
 from hilctl.comparison.page import comparison_page
-from hilctl.comparison.render import headings, notes, render, table_rows
 from hilctl.comparison.saving import save_models
-from hilctl.errors import InputError
 from hilctl.models.files import load_model
 from hilctl.recording.reader import read
 

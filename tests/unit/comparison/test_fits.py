@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
+from hilctl.base.errors import DataError, InputError
 from hilctl.comparison.asymmetric import fit_asymmetric
 from hilctl.comparison.data import Frame, read_loops
 from hilctl.comparison.differential import fit_bouc_wen, fit_duhem
 from hilctl.comparison.envelopes import fit_generalised
 from hilctl.comparison.judging import model_error
 from hilctl.comparison.operators import fit_kp, fit_preisach, fit_straight
-from hilctl.errors import DataError, InputError
 from hilctl.identify.data import Loop
 from hilctl.models.bouc_wen import BoucWenModel
 from hilctl.models.deadband import DeadbandFunction

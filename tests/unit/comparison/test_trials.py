@@ -5,13 +5,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hilctl.base.errors import InputError
+from hilctl.base.yaml.document import Document
 from hilctl.comparison.trials import CYCLES, Bench, full_stroke, waveforms_of
-from hilctl.errors import InputError
-from hilctl.experiment import load_experiment, resolve
+from hilctl.experiment.load import load_experiment, resolve
 from hilctl.models.ppi import PpiModel
 from hilctl.models.published import piezo_ppi
 from hilctl.waveforms.spec import Chirp, Sine, Triangle
-from hilctl.yamlio import Document
 
 CONFIGS = Path(__file__).parents[3] / "configs"
 TEXT = """

@@ -3,12 +3,12 @@
 import pytest
 
 from hilctl_drivers.feed_time import feed_time, with_feeding
-from hilctl_drivers.modbus_frames import coil_pdu, read_pdu, reply_size, rtu_adu, write_single_pdu
-from hilctl_drivers.modbus_options import ModbusOptions
-from hilctl_drivers.modbus_setup import ModbusSetup
+from hilctl_drivers.modbus.options import ModbusOptions
+from hilctl_drivers.modbus.pdu import coil_pdu, read_pdu, reply_size, rtu_adu, write_single_pdu
+from hilctl_drivers.modbus.setup import ModbusSetup
 from hilctl_drivers.profile import load_profile, parse_profile
-from hilctl_drivers.serial_options import SerialOptions
-from hilctl_drivers.serial_setup import SerialSetup
+from hilctl_drivers.serial.options import SerialOptions
+from hilctl_drivers.serial.setup import SerialSetup
 from hilctl_drivers.wire_time import exchange_time
 
 CHAR_S = 10 / 9600

@@ -7,7 +7,10 @@ from typing import Any
 import pytest
 import yaml
 
-from hilctl.errors import ConfigError, InputError
+from hilctl.base.errors import ConfigError, InputError
+from hilctl_drivers.board.profile import FrameProfile
+from hilctl_drivers.modbus.profile import ModbusProfile
+from hilctl_drivers.modbus.steps import EnsureStep, RegisterStep
 from hilctl_drivers.profile import (
     FOLDER,
     load_profile,
@@ -16,10 +19,7 @@ from hilctl_drivers.profile import (
     shipped_profiles,
     with_link,
 )
-from hilctl_drivers.profile_ascii import AsciiProfile
-from hilctl_drivers.profile_frames import FrameProfile
-from hilctl_drivers.profile_modbus import ModbusProfile
-from hilctl_drivers.profile_steps import EnsureStep, RegisterStep
+from hilctl_drivers.text.profile import AsciiProfile
 
 MODBUS = """\
 vendor: Acme

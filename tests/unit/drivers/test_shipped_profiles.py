@@ -5,13 +5,13 @@ from typing import get_args
 import pytest
 import yaml
 
-from hilctl_drivers.modbus_frames import read_pdu, rtu_adu, write_single_pdu
+from hilctl_drivers.board.profile import FrameProfile
+from hilctl_drivers.modbus.pdu import read_pdu, rtu_adu, write_single_pdu
+from hilctl_drivers.modbus.profile import ModbusProfile
+from hilctl_drivers.modbus.steps import EnsureStep, RegisterStep
 from hilctl_drivers.profile import FOLDER, Profile, load_profile, shipped_profiles
-from hilctl_drivers.profile_ascii import AsciiProfile, SendStep, fields_of
-from hilctl_drivers.profile_frames import FrameProfile
-from hilctl_drivers.profile_modbus import ModbusProfile
 from hilctl_drivers.profile_problems import value_at
-from hilctl_drivers.profile_steps import EnsureStep, RegisterStep
+from hilctl_drivers.text.profile import AsciiProfile, SendStep, fields_of
 
 NAMES = (
     "adam_4024", "adam_4024_ascii", "adam_4117", "adam_6024", "adam_6217", "adam_6224",

@@ -4,9 +4,9 @@ import dataclasses
 
 import pytest
 
-from hilctl_drivers.framing import binary_framing
-from hilctl_drivers.modbus_frames import reply_size, rtu_adu, write_pdu
+from hilctl_drivers.modbus.pdu import reply_size, rtu_adu, write_pdu
 from hilctl_drivers.profile import Profile, load_profile, parse_profile, with_link
+from hilctl_drivers.wire.framing import binary_framing
 from hilctl_drivers.wire_time import WireTime, exchange_time
 
 RTU = """\

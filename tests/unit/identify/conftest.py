@@ -6,12 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilctl.arrays import F64, I64
+from hilctl.base.arrays import F64, I64
+from hilctl.base.segments import Segment
 from hilctl.identify.cycles import average_cycle
 from hilctl.identify.data import Loop
 from hilctl.models.plays import PlayModel
 from hilctl.recording.data import Recording, Samples, Ticks
-from hilctl.segments import Segment
 
 RATE_HZ = 50_000.0
 

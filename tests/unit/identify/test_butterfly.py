@@ -2,7 +2,7 @@
 
 import pytest
 
-from hilctl.errors import DataError
+from hilctl.base.errors import DataError
 from hilctl.identify.butterfly import identify_butterfly
 from hilctl.models.butterfly import ButterflyModel
 from hilctl.models.deadband import DeadbandFunction

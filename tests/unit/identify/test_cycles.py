@@ -5,11 +5,11 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from hilctl.errors import DataError
+from hilctl.base.errors import DataError
+from hilctl.base.segments import Segment
 from hilctl.identify.cycles import average_cycle, find_cycles, loops_from_recording
 from hilctl.identify.data import History
 from hilctl.recording.data import Recording
-from hilctl.segments import Segment
 
 RATE_HZ = 50_000.0
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hilctl.errors import DataError
+from hilctl.base.errors import DataError
 from hilctl.identify.data import History, Loop
 
 PHASE = 2.0 * np.pi * np.arange(300) / 300

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares, lsq_linear
 
-from hilctl.arrays import F64
+from hilctl.base.arrays import F64
 from hilctl.identify.descend import descend
 from hilctl.identify.linear import bounded_and_free
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hilctl.errors import DataError
+from hilctl.base.errors import DataError
 from hilctl.identify.data import History, Loop
 from hilctl.identify.geometry import hysteresis_weights, loop_area, peak_hysteresis_percent
 

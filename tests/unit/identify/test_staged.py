@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hilctl.errors import DataError, InputError
+from hilctl.base.errors import DataError, InputError
 from hilctl.identify.bench import Bench
 from hilctl.identify.convex import convex_start
 from hilctl.identify.data import History, Loop
 from hilctl.identify.fit import Fit, judge
-from hilctl.identify.fitting import identify
+from hilctl.identify.identify import identify
 from hilctl.identify.layered import Layers, Point, bounds, error_and_slopes
 from hilctl.identify.settings import Settings
 from hilctl.identify.staged_bench import StagedBench

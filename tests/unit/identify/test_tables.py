@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilctl.errors import DataError
+from hilctl.base.errors import DataError
 from hilctl.identify.tables import read_table
 
 

@@ -13,7 +13,7 @@ import pytest
 from hilctl.identify.cycles import find_cycles
 from hilctl.identify.data import History
 from hilctl.identify.fit import Fit, judge
-from hilctl.identify.fitting import identify
+from hilctl.identify.identify import identify
 from hilctl.identify.settings import Settings
 from hilctl.identify.tables import read_table
 

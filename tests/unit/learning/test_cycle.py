@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilctl.errors import DataError
+from hilctl.base.errors import DataError
+from hilctl.base.segments import Segment
 from hilctl.learning.cycle import coefficients, cycle_error, harmonic_count
 from hilctl.recording.data import Recording, Samples, Ticks
-from hilctl.segments import Segment
 
 RATE_HZ = 10_000.0
 

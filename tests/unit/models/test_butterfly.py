@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from hilctl.errors import ModelError
+from hilctl.base.errors import ModelError
 from hilctl.models.butterfly import ButterflyModel
 from hilctl.models.deadband import DeadbandFunction
 from hilctl.models.files import dump_model, parse_model

@@ -3,7 +3,7 @@
 import pytest
 from pydantic import ValidationError
 
-from hilctl.errors import ModelError
+from hilctl.base.errors import ModelError
 from hilctl.models.base import HysteresisModel
 from hilctl.models.deadband import DeadbandFunction
 from hilctl.models.integrated import IntegratedModel

@@ -5,7 +5,7 @@ import random
 import pytest
 import yaml
 
-from hilctl.errors import ConfigError, InputError
+from hilctl.base.errors import ConfigError, InputError
 from hilctl.models.base import Provenance
 from hilctl.models.files import KINDS, dump_model, load_model, parse_model
 from hilctl.models.integrated import IntegratedModel

@@ -10,7 +10,7 @@ from hypothesis.extra import numpy as hnp
 from pydantic import ValidationError
 from scipy.integrate import solve_ivp
 
-from hilctl.errors import ConfigError
+from hilctl.base.errors import ConfigError
 from hilctl.models.bouc_wen import BoucWenModel
 from hilctl.models.duhem import DuhemModel
 from hilctl.models.files import dump_model, parse_model

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hilctl.errors import ModelError
+from hilctl.base.errors import ModelError
 from hilctl.models.deadband import DeadbandFunction
 from hilctl.models.integrated import IntegratedModel
 from hilctl.models.ppi import PpiModel

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from hilctl.errors import ModelError
+from hilctl.base.errors import ModelError
 from hilctl.models.base import Provenance
 from hilctl.models.files import dump_model, parse_model
 from hilctl.models.published import exponential_integrated, piezo_ppi, terfenol_rdpi

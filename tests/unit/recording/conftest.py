@@ -5,10 +5,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from hilctl.blocks import Batch
+from hilctl.base.blocks import Batch
+from hilctl.base.segments import Segment
 from hilctl.recording.data import Event
 from hilctl.recording.writer import RecordingWriter, RunFacts
-from hilctl.segments import Segment
 
 RATE_HZ = 50_000.0
 START_NS = 1_800_000_000_000_000_000

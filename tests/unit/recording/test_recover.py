@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from mcap.reader import NonSeekingReader, SeekingReader
 from mcap.writer import CompressionType, IndexType, Writer
 
-from hilctl.errors import DataError, HilctlError
+from hilctl.base.errors import DataError, HilctlError
 from hilctl.recording.reader import read
 from hilctl.recording.recover import recover_recording
 

@@ -7,7 +7,7 @@ import pytest
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
-from hilctl.errors import DataError
+from hilctl.base.errors import DataError
 from hilctl.recording.data import Event
 from hilctl.recording.reader import read
 

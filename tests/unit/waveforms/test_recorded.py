@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilctl.arrays import F64
-from hilctl.blocks import Batch
-from hilctl.errors import DataError, InputError
+from hilctl.base.arrays import F64
+from hilctl.base.blocks import Batch
+from hilctl.base.errors import DataError, InputError
 from hilctl.recording.writer import RecordingWriter, RunFacts
 from hilctl.waveforms.build import Reference
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hilctl.arrays import F64
+from hilctl.base.arrays import F64
 from hilctl.waveforms.build import Reference
 from hilctl.waveforms.shapes import common_period_s, sample_count
 

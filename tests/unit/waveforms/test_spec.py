@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from hilctl.errors import ConfigError
-from hilctl.experiment import resolve
-from hilctl.yamlio import Document
+from hilctl.base.errors import ConfigError
+from hilctl.base.yaml.document import Document
+from hilctl.experiment.load import resolve
 
 EXPERIMENT = """\
 name: minimal

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hilctl.errors import InputError
-from hilctl.segments import Segment
+from hilctl.base.errors import InputError
+from hilctl.base.segments import Segment
 from hilctl.waveforms import shapes
 from hilctl.waveforms.build import Reference
 

@@ -1,0 +1,91 @@
+"""Profiles of microcontroller boards; messages are in :mod:`hilctl_drivers.board.frames`."""
+
+from typing import Literal, Self, TypeAlias
+
+from pydantic import Field, model_validator
+
+from hilctl_drivers.board.frames import exchange_sizes
+from hilctl_drivers.modbus.registers import RegisterFormat
+from hilctl_drivers.profile_parts import BaseProfile, Name, Part, Range, Watchdog
+from hilctl_drivers.wire.line_settings import FramesLink
+
+ValueType: TypeAlias = Literal["int16", "uint16", "int32", "uint32", "float32", "float64"]
+
+
+class FrameChannel(Range):
+    """A DAC or ADC of a board: how its values stand in a message."""
+
+    type: ValueType = Field(description="how a raw value is stored")
+    order: str = Field(default="", description="as in a register; DCBA is least significant first")
+    scale: float = Field(default=1.0, description="value = raw * scale + offset")
+    offset: float = Field(default=0.0, description="value = raw * scale + offset")
+
+    @model_validator(mode="after")
+    def _fits(self) -> Self:
+        low, high = self.format.limits
+        half = 0.5 * abs(self.scale) if self.format.is_integer else 0.0
+        if self.min < low - half or self.max > high + half:
+            raise ValueError(
+                f"min and max must be inside what {self.type} holds, {low:g} to {high:g}"
+                f" {self.unit}, got {self.min:g} to {self.max:g}"
+            )
+        return self
+
+    @property
+    def format(self) -> RegisterFormat:
+        """How a value becomes bytes."""
+        return RegisterFormat(self.type, self.order, self.scale, self.offset)
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        """Lowest and highest value that it takes, in ``unit``."""
+        return self.min, self.max
+
+
+class FrameStreaming(Part):
+    """A sample clock and a FIFO of the board's own."""
+
+    fifo_depth: int = Field(ge=2, le=65535, description="samples that its FIFO holds")
+    block_max: int = Field(ge=1, le=4096, description="most samples of one message")
+    rate_min_hz: float = Field(gt=0.0, description="lowest rate of its sample clock, Hz")
+
+
+class FrameWatchdog(Watchdog):
+    """The board's watchdog: armed, given its safe value and cleared by a WATCHDOG message.
+
+    It has no message that only feeds, so exchanges must.
+    """
+
+    kick: Literal["any", "write"] = Field(description="what feeds it: any request, or a write")
+
+
+class FrameProfile(BaseProfile):
+    """A board that speaks binary frames."""
+
+    link: FramesLink
+    protocol: Literal["hilctl-1"] = Field(description="messages, see board_protocol.py")
+    exchange: Literal["single", "stream"] = Field(
+        description="single: one sample a message; stream: blocks through a FIFO"
+    )
+    streaming: FrameStreaming | Literal["none"] = "none"
+    outputs: dict[Name, FrameChannel] = Field(min_length=1, max_length=1)
+    inputs: dict[Name, FrameChannel] = Field(max_length=1)
+    watchdog: FrameWatchdog | Literal["none"]
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if (self.exchange == "stream") != (self.streaming != "none"):
+            raise ValueError("streaming and exchange: stream go together")
+        if self.streaming == "none":
+            return self
+        if self.streaming.block_max > self.streaming.fifo_depth:
+            raise ValueError("streaming.block_max must be <= streaming.fifo_depth")
+        channels = (*self.outputs.values(), *self.inputs.values())
+        size = max(channel.format.size for channel in channels)
+        need = max(exchange_sizes(self.streaming.block_max, size, stream=True))
+        if need > self.link.payload_max:
+            raise ValueError(
+                f"streaming.block_max samples need {need} bytes, link.payload_max is"
+                f" {self.link.payload_max}"
+            )
+        return self

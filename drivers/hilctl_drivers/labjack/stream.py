@@ -1,0 +1,190 @@
+"""Registers and messages of a LabJack T4's or T7's stream, read in command-response mode.
+
+Sources: LabJack's ljm_constants.json (addresses, types, descriptions); T-Series Datasheet 3.2.3
+Stream-Out, 3.2.4 Low-Level Stream, 20.0.0 and 20.0.1 (calibration constants). A scan reads the
+input and then puts the next value out; stream-out addresses give no data back. Where
+``LOOP_NUM_VALUES`` is 1, an output that has nothing new to put out repeats its last value.
+
+A read of ``DATA_CR`` gives four words, which are the number of samples in this read, the bytes left
+in the device's buffer, a status and what belongs to it; then that many samples of 16 bits, and
+words of no meaning up to the number that was asked for.
+"""
+
+import struct
+from dataclasses import dataclass
+from typing import Final, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from hilctl.base.arrays import F64
+from hilctl.base.errors import DeviceError
+from hilctl_drivers.labjack.frames import FRAME_HEAD, Frame, ReadFrame, WriteFrame
+from hilctl_drivers.labjack.profile import BYTES_A_SAMPLE
+from hilctl_drivers.modbus.pdu import PDU_MAX
+from hilctl_drivers.wire.errors import Mismatch
+
+SCANRATE_HZ: Final = 4002
+NUM_ADDRESSES: Final = 4004
+SETTLING_US: Final = 4008
+RESOLUTION_INDEX: Final = 4010
+BUFFER_SIZE_BYTES: Final = 4012
+AUTO_TARGET: Final = 4016
+DATATYPE: Final = 4018
+NUM_SCANS: Final = 4020
+OUT_TARGET: Final = 4040
+OUT_ALLOCATE_BYTES: Final = 4050
+OUT_LOOP_NUM_VALUES: Final = 4060
+OUT_SET_LOOP: Final = 4070
+OUT_BUFFER_STATUS: Final = 4080
+OUT_ENABLE: Final = 4090
+SCANLIST_ADDRESS: Final = 4100
+OUT_BUFFER_F32: Final = 4400
+DATA_CR: Final = 4500
+STREAM_OUT0: Final = 4800
+ENABLE: Final = 4990
+FLASH_READ_POINTER: Final = 61810
+FLASH_READ: Final = 61812
+
+COMMAND_RESPONSE: Final = 16
+"""``AUTO_TARGET``: data are fetched by reading ``DATA_CR``."""
+USE_AT_ONCE: Final = 1
+"""``OUT_SET_LOOP``: new values follow those that are still to be put out."""
+MISSING: Final = 0xFFFF
+"""Stands for dropped scans; the first input of a scan list has no such reading."""
+
+DATA_HEAD: Final = struct.Struct(">HHHH")
+"""samples, backlog in bytes, status, what belongs to the status."""
+_FLOAT_BYTES = 4
+_U32_WORDS = 2
+
+# One message reads data and the buffer's state, and then writes values and takes them into use.
+VALUES_MAX: Final = (PDU_MAX - 1 - 4 * FRAME_HEAD - 4) // _FLOAT_BYTES
+"""Values that one message brings."""
+SAMPLES_MAX: Final = (PDU_MAX - 1 - 2 * _U32_WORDS - DATA_HEAD.size) // 2
+"""Samples that one message fetches."""
+
+STATUS: Final = {
+    2940: "its buffer of readings was full: it drops scans",
+    2941: "its buffer of readings was full: {} scans were dropped",
+    2942: "scans overlap: the rate is too fast for these inputs and settings",
+    2943: "its buffer of readings was full: more scans were dropped than it can count",
+    2944: "it stopped after a number of scans",
+}
+
+
+def u32(value: int) -> bytes:
+    """Return register bytes of a whole number."""
+    return struct.pack(">I", value)
+
+
+def f32(value: float) -> bytes:
+    """Return register bytes of a float."""
+    return struct.pack(">f", value)
+
+
+READ_FRAMES: Final[tuple[Frame, ...]] = (
+    ReadFrame(DATA_CR, DATA_HEAD.size // 2 + SAMPLES_MAX),
+    ReadFrame(OUT_BUFFER_STATUS, _U32_WORDS),
+)
+"""What each message of a run begins with: what was before its own values came."""
+
+
+def value_frames(values: F64) -> tuple[Frame, ...]:
+    """Return what queues float64[n] values, n at most :data:`VALUES_MAX`."""
+    data = values.astype(">f4").tobytes()
+    return WriteFrame(OUT_BUFFER_F32, data), WriteFrame(OUT_SET_LOOP, u32(USE_AT_ONCE))
+
+
+@dataclass(frozen=True, slots=True)
+class StreamData:
+    """What a message of a run found.
+
+    Attributes:
+        raw: uint16[n], readings of the oldest scans that had not been fetched.
+        backlog: Scans that are left in the device.
+        free: Values that the output's buffer has room for.
+    """
+
+    raw: npt.NDArray[np.uint16]
+    backlog: int
+    free: int
+
+
+def stream_data(data: bytes, free: bytes) -> StreamData:
+    """Return what the answers to :data:`READ_FRAMES` say.
+
+    Raises:
+        DeviceError: The device dropped scans, or its stream stopped.
+        Mismatch: More samples than were asked for.
+    """
+    count, backlog_bytes, status, more = DATA_HEAD.unpack_from(data)
+    if status:
+        text = STATUS.get(status, "stream status {}")
+        raise DeviceError(text.format(more if status in STATUS else status))
+    if count > SAMPLES_MAX:
+        raise Mismatch(f"{count} samples in an answer that holds {SAMPLES_MAX}")
+    raw = np.frombuffer(data, ">u2", count, DATA_HEAD.size).astype(np.uint16)
+    if (raw == MISSING).any():
+        raise DeviceError("scans are missing from the stream")
+    return StreamData(raw, backlog_bytes // BYTES_A_SAMPLE, int.from_bytes(free, "big"))
+
+
+@dataclass(frozen=True, slots=True)
+class InputCalibration:
+    """How raw readings of one input become volts.
+
+    Attributes:
+        center: Raw reading at ``offset_v``.
+        positive_v: Volts of a step above it.
+        negative_v: Volts of a step below it, with its sign: readings below are
+            ``(center - raw) * negative_v``.
+        offset_v: Volts at the centre.
+    """
+
+    center: float
+    positive_v: float
+    negative_v: float
+    offset_v: float = 0.0
+
+    @classmethod
+    def decode(cls, form: Literal["two_slopes", "line"], data: bytes) -> "InputCalibration":
+        """Return the constants in internal flash.
+
+        Args:
+            form: As in the profile.
+            data: From :func:`calibration_span` on.
+
+        Raises:
+            DeviceError: They can't be any.
+        """
+        if form == "two_slopes":
+            positive, negative, center, _ = struct.unpack(">4f", data)
+            found = cls(center, positive, negative)
+        else:
+            slope, offset = struct.unpack(">2f", data)
+            found = cls(0.0, slope, -slope, offset)
+        numbers = (found.center, found.positive_v, found.negative_v, found.offset_v)
+        if not np.isfinite(numbers).all() or found.positive_v <= 0.0 or found.negative_v >= 0.0:
+            raise DeviceError(f"calibration constants in flash are none: {data.hex(' ')}")
+        return found
+
+    def volts(self, raw: npt.NDArray[np.uint16]) -> F64:
+        """Return uint16[n] readings as float64[n], V."""
+        steps = raw.astype(np.float64) - self.center
+        slopes = np.where(steps < 0.0, -self.negative_v, self.positive_v)
+        volts: F64 = steps * slopes + self.offset_v
+        return volts
+
+
+def calibration_span(
+    form: Literal["two_slopes", "line"], address: int, channel: int
+) -> tuple[int, int]:
+    """Return flash address and bytes of an input's constants.
+
+    Args:
+        form: As in the profile. ``two_slopes`` are those of the high-speed converter at gain 1.
+        address: Where the constants begin.
+        channel: Number of the input.
+    """
+    return (address, 16) if form == "two_slopes" else (address + 8 * channel, 8)

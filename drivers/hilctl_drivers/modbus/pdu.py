@@ -1,0 +1,251 @@
+"""Modbus messages: request PDUs, checks of reply PDUs, and their TCP and RTU envelopes.
+
+Sources: "MODBUS Application Protocol Specification" V1.1b3 (sections 6.1 to 6.17 for the functions,
+7 for exceptions), "MODBUS Messaging on TCP/IP Implementation Guide" V1.0b (3.1.3), "MODBUS over
+Serial Line" V1.02 (2.5.1, CRC in 6.2.2), and for function 76 LabJack's "Protocol Details [Direct
+Modbus TCP]". Addresses are PDU addresses: counted from 0.
+"""
+
+import struct
+
+from hilctl_drivers.wire.crc import Bytes, crc16_modbus
+from hilctl_drivers.wire.errors import BadRequest, Corrupt, Incomplete, Mismatch, Refused
+
+READ_COILS, READ_DISCRETE, READ_HOLDING, READ_INPUT = 1, 2, 3, 4
+WRITE_COIL, WRITE_REGISTER, WRITE_REGISTERS, WRITE_READ = 5, 6, 16, 23
+FEEDBACK = 76
+
+PDU_MAX = 253
+READ_MAX, WRITE_MAX, WRITE_READ_MAX, BITS_MAX = 125, 123, 121, 2000
+TCP_HEAD = 7
+"""Bytes of the MBAP header, unit included."""
+
+EXCEPTIONS = {
+    1: "illegal function", 2: "illegal data address", 3: "illegal data value",
+    4: "device failure", 5: "acknowledged, still working", 6: "device busy",
+    8: "memory parity error", 10: "gateway path unavailable",
+    11: "gateway target does not answer",
+}  # fmt: skip
+
+
+def _check_span(what: str, address: int, count: int, count_max: int) -> None:
+    """Raise BadRequest unless ``count`` things from ``address`` on exist and fit a message."""
+    if not 1 <= count <= count_max:
+        raise BadRequest(f"{what} count must be 1 to {count_max} in one message, got {count}")
+    if not 0 <= address <= 0x10000 - count:
+        raise BadRequest(f"{what} address must be 0 to {0x10000 - count}, got {address}")
+
+
+def _written(address: int, data: bytes, count_max: int) -> int:
+    """Return how many registers ``data`` is; raise BadRequest where they can't be written."""
+    if len(data) % 2:
+        raise BadRequest(f"registers have 2 bytes each, got {len(data)} bytes")
+    _check_span("written register", address, len(data) // 2, count_max)
+    return len(data) // 2
+
+
+def read_pdu(function: int, address: int, count: int) -> bytes:
+    """Return a request to read bits (functions 1, 2) or registers (3, 4).
+
+    Raises:
+        BadRequest: Another function, or ``address`` and ``count`` are outside the specification's
+            limits: 2000 bits or 125 registers, addresses to 65535.
+    """
+    if function in {READ_COILS, READ_DISCRETE}:
+        _check_span("bit", address, count, BITS_MAX)
+    elif function in {READ_HOLDING, READ_INPUT}:
+        _check_span("register", address, count, READ_MAX)
+    else:
+        raise BadRequest(f"functions that read are 1, 2, 3 and 4, got {function}")
+    return struct.pack(">BHH", function, address, count)
+
+
+def write_pdu(address: int, data: bytes) -> bytes:
+    """Return a request to write registers (function 16).
+
+    Args:
+        address: First register.
+        data: Register bytes, 2 each; at most 123 registers.
+
+    Raises:
+        BadRequest: Odd, empty or too much data, or past address 65535.
+    """
+    count = _written(address, data, WRITE_MAX)
+    return struct.pack(">BHHB", WRITE_REGISTERS, address, count, len(data)) + data
+
+
+def write_single_pdu(address: int, data: bytes) -> bytes:
+    """Return a request to write one register (function 6), ``data`` being its 2 bytes.
+
+    Raises:
+        BadRequest: Not 2 bytes, or no such address.
+    """
+    _written(address, data, 1)
+    return struct.pack(">BH", WRITE_REGISTER, address) + data
+
+
+def coil_pdu(address: int, on: bool) -> bytes:
+    """Return a request to switch one coil (function 5).
+
+    Raises:
+        BadRequest: No such address.
+    """
+    _check_span("coil", address, 1, 1)
+    return struct.pack(">BHH", WRITE_COIL, address, 0xFF00 if on else 0)
+
+
+def write_read_pdu(read_address: int, read_count: int, write_address: int, data: bytes) -> bytes:
+    """Return a request to write registers, then read registers (function 23).
+
+    Args:
+        read_address: First register to read.
+        read_count: Registers to read, at most 125.
+        write_address: First register to write.
+        data: Register bytes to write, 2 each; at most 121 registers.
+
+    Raises:
+        BadRequest: Outside these limits, or past address 65535.
+    """
+    count = _written(write_address, data, WRITE_READ_MAX)
+    _check_span("register", read_address, read_count, READ_MAX)
+    head = (WRITE_READ, read_address, read_count, write_address, count, len(data))
+    return struct.pack(">BHHHHB", *head) + data
+
+
+def feedback_pdu(write_address: int, data: bytes, read_address: int, read_count: int) -> bytes:
+    """Return a LabJack Modbus Feedback request: one read frame, then one write frame (76).
+
+    Frames are carried out in their order, so what is read does not show yet what is written.
+
+    Arguments and errors are as for :func:`write_read_pdu`, with at most 122 registers to write and
+    126 to read: what fits a PDU of 253 bytes.
+    """
+    count = _written(write_address, data, (PDU_MAX - 9) // 2)
+    _check_span("register", read_address, read_count, (PDU_MAX - 1) // 2)
+    read = struct.pack(">BBHB", FEEDBACK, 0, read_address, read_count)
+    return read + struct.pack(">BHB", 1, write_address, count) + data
+
+
+def reply_layout(pdu: bytes) -> tuple[bytes, int]:
+    """Return what a good reply to this request PDU begins with, and how many data bytes follow.
+
+    Raises:
+        BadRequest: A function that is not one of those built here.
+    """
+    function = pdu[0]
+    if function in {READ_COILS, READ_DISCRETE}:
+        size = (int.from_bytes(pdu[3:5], "big") + 7) // 8
+    elif function in {READ_HOLDING, READ_INPUT, WRITE_READ}:
+        size = 2 * int.from_bytes(pdu[3:5], "big")
+    elif function in {WRITE_COIL, WRITE_REGISTER, WRITE_REGISTERS}:
+        return pdu[:5], 0
+    elif function == FEEDBACK:
+        return pdu[:1], 2 * pdu[4]
+    else:
+        raise BadRequest(f"function {function} is not one of those known here")
+    return bytes((function, size)), size
+
+
+def reply_size(pdu: bytes) -> int:
+    """Return how many bytes the PDU of a good reply to this request PDU has."""
+    head, size = reply_layout(pdu)
+    return len(head) + size
+
+
+def reply_data(request_pdu: bytes, reply_pdu: bytes) -> bytes:
+    """Check a reply against its request and return what was read.
+
+    Returns:
+        Register bytes, or packed bits (lowest first) for functions 1 and 2; empty for writes.
+
+    Raises:
+        Refused: An exception reply; ``code`` is the exception code.
+        Mismatch: Another function, byte count, length, or echoed address, count or value.
+    """
+    head, size = reply_layout(request_pdu)
+    function = request_pdu[0]
+    if len(reply_pdu) == 2 and reply_pdu[0] == function | 0x80:
+        code = reply_pdu[1]
+        name = EXCEPTIONS.get(code, "unknown")
+        raise Refused(f"function {function} refused with exception {code} ({name})", code)
+    if not reply_pdu or reply_pdu[0] != function:
+        got = reply_pdu[0] if reply_pdu else "nothing"
+        raise Mismatch(f"asked with function {function}, answered with {got}")
+    if len(reply_pdu) != len(head) + size:
+        raise Mismatch(f"reply must have {len(head) + size} bytes, got {len(reply_pdu)}")
+    if reply_pdu[: len(head)] != head:
+        got_head = reply_pdu[: len(head)].hex(" ")
+        raise Mismatch(f"reply must begin with {head.hex(' ')}, got {got_head}")
+    return bytes(reply_pdu[len(head) :])
+
+
+def tcp_adu(transaction: int, unit: int, pdu: bytes) -> bytes:
+    """Return ``pdu`` with its MBAP header.
+
+    Raises:
+        BadRequest: Transaction outside 0 to 65535, unit outside 0 to 255, or a PDU over 253 bytes.
+    """
+    _check_envelope(unit, 0, pdu)
+    if not 0 <= transaction <= 0xFFFF:
+        raise BadRequest(f"transaction must be 0 to 65535, got {transaction}")
+    return struct.pack(">HHHB", transaction, 0, len(pdu) + 1, unit) + pdu
+
+
+def tcp_pdu(adu: Bytes, transaction: int, unit: int) -> bytes:
+    """Check the MBAP header of exactly one message and return its PDU.
+
+    Raises:
+        Incomplete: More bytes belong to it.
+        Corrupt: Not Modbus, an impossible length, or bytes behind its end.
+        Mismatch: Another transaction or unit.
+    """
+    if len(adu) < TCP_HEAD:
+        raise Incomplete(f"{len(adu)} of at least {TCP_HEAD + 1} bytes")
+    got_transaction, protocol, length, got_unit = struct.unpack_from(">HHHB", adu)
+    if protocol or not 2 <= length <= PDU_MAX + 1:
+        raise Corrupt(f"not a Modbus TCP header: {bytes(adu[:TCP_HEAD]).hex(' ')}")
+    if len(adu) < length + 6:
+        raise Incomplete(f"{len(adu)} of {length + 6} bytes")
+    if len(adu) > length + 6:
+        raise Corrupt(f"{len(adu) - length - 6} bytes behind the end of the reply")
+    if got_transaction != transaction:
+        raise Mismatch(f"transaction must be {transaction}, got {got_transaction}")
+    if got_unit != unit:
+        raise Mismatch(f"unit must be {unit}, got {got_unit}")
+    return bytes(adu[TCP_HEAD:])
+
+
+def rtu_adu(unit: int, pdu: bytes) -> bytes:
+    """Return ``pdu`` with unit and CRC.
+
+    Raises:
+        BadRequest: Unit outside 1 to 255 (0 is broadcast, which nobody answers), or a PDU over
+            253 bytes.
+    """
+    _check_envelope(unit, 1, pdu)
+    frame = bytes((unit,)) + pdu
+    return frame + crc16_modbus(frame).to_bytes(2, "little")
+
+
+def rtu_pdu(adu: Bytes, unit: int) -> bytes:
+    """Check unit and CRC of exactly one message and return its PDU.
+
+    Raises:
+        Incomplete: Fewer than 5 bytes, which no reply has.
+        Corrupt: The CRC is wrong.
+        Mismatch: Another unit.
+    """
+    if len(adu) < 5:
+        raise Incomplete(f"{len(adu)} of at least 5 bytes")
+    if crc16_modbus(adu):
+        raise Corrupt(f"CRC of {len(adu)} bytes is wrong: {bytes(adu[:16]).hex(' ')}")
+    if adu[0] != unit:
+        raise Mismatch(f"unit must be {unit}, got {adu[0]}")
+    return bytes(adu[1:-2])
+
+
+def _check_envelope(unit: int, unit_min: int, pdu: bytes) -> None:
+    if not unit_min <= unit <= 255:
+        raise BadRequest(f"unit must be {unit_min} to 255, got {unit}")
+    if not 1 <= len(pdu) <= PDU_MAX:
+        raise BadRequest(f"a PDU has 1 to {PDU_MAX} bytes, got {len(pdu)}")

@@ -1,0 +1,139 @@
+"""Physics of the simulated piezo stage: the published play-operator model and its sensor.
+
+Source: "Modeling and Compensation of Rate-Dependent Asymmetric Hysteresis Nonlinearities of
+Magnetostrictive Actuators", Concordia, chapter 3, section 4.4: stage PI P-753.31C driven over
+0..100 V, thresholds (3.25) and weights (3.26). Drive voltage stands for the E-505 amplifier's
+output; its gain of 10 lies before the command.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from hilctl.base.arrays import F64
+from hilctl.kernels.jit import kernel
+from hilctl_drivers.simulated.plant import Plant
+
+_INDEX = tuple(range(1, 11))
+
+
+@dataclass(frozen=True, slots=True)
+class PiezoParameters:
+    """Constants of the stage, its DAC, sensor and ADC.
+
+    Range, slope, thresholds and weights are published (chapter 3, section 4.4). The 2.632 V/um
+    quoted there span the 38 um stroke over 100 V; against the 10 V of an ADC that is 0.2632 V/um,
+    hence the range. The loops were identified over 10..70 V; above some 88 V the model leaves the
+    sensor's range and the reading stays at its end. Bandwidth and noise are typical of such a
+    sensor, not published.
+
+    Attributes:
+        drive_max_v: Top of the drive, whose bottom is 0 V.
+        slope_um_per_v: Weight p_0 of the drive itself.
+        thresholds_v: r_i = sigma i of the play operators.
+        weights_um_per_v: p_i = alpha exp(-beta i).
+        offset_um: Position at rest.
+        dac_codes: Codes above 0 V.
+        adc_codes: Codes on either side of zero.
+        sensor_range_um: Reading at either end of the sensor's range.
+        sensor_bandwidth_hz: Corner of the first-order sensor.
+        sensor_noise_um: Noise of each reading, rms.
+    """
+
+    drive_max_v: float = 100.0
+    slope_um_per_v: float = 0.2567
+    thresholds_v: tuple[float, ...] = tuple(3.548 * i for i in _INDEX)
+    weights_um_per_v: tuple[float, ...] = tuple(0.0383 * math.exp(-0.1206 * i) for i in _INDEX)
+    offset_um: float = 0.0
+    dac_codes: int = 65535
+    adc_codes: int = 32767
+    sensor_range_um: float = 38.0
+    sensor_bandwidth_hz: float = 10e3
+    sensor_noise_um: float = 1e-3
+
+
+@kernel(
+    "void(float64[::1], float64[::1], float64[::1], float64[::1], float64[::1], float64[:, ::1],"
+    " UniTuple(float64, 6))"
+)
+def _run(
+    command: F64,
+    noise_um: F64,
+    displacement_um: F64,
+    drive_v: F64,
+    state: F64,
+    plays: F64,
+    constants: tuple[float, float, float, float, float, float],
+) -> None:
+    """Read the sensor, put out the command and advance one sample period; for every sample.
+
+    Args:
+        command: float64[n], drive in V.
+        noise_um: float64[n], noise of each reading in um.
+        displacement_um: float64[n], filled with the sensor's readings.
+        drive_v: float64[n], filled with the drive at the instant of each reading.
+        state: float64[2]: drive in V, sensor output in um; updated.
+        plays: float64[3, m]: threshold, weight and output of each play operator; updated.
+        constants: Weight of the drive itself, what is left of the sensor's error after a sample
+            period, one DAC code in V, one ADC code in um, the sensor's range in um, the position
+            at rest in um.
+    """
+    slope, left, dac_code, adc_code, sensor_range, offset = constants
+    drive = state[0]
+    sensor = state[1]
+    for j in range(command.size):
+        reading = np.rint((sensor + noise_um[j]) / adc_code) * adc_code
+        displacement_um[j] = min(sensor_range, max(-sensor_range, reading))
+        drive_v[j] = drive
+        drive = np.rint(command[j] / dac_code) * dac_code
+        position = offset + slope * drive
+        for i in range(plays.shape[1]):
+            threshold = plays[0, i]
+            plays[2, i] = max(drive - threshold, min(drive + threshold, plays[2, i]))
+            position += plays[1, i] * plays[2, i]
+        sensor = position + left * (sensor - position)
+    state[0] = drive
+    state[1] = sensor
+
+
+class PiezoActuator(Plant):
+    """The stage with its sensor; commands and drive in V."""
+
+    def __init__(self, parameters: PiezoParameters, sample_rate_hz: float, seed: int = 1) -> None:
+        """Build the stage at rest: at its offset at 0 V, never driven before.
+
+        Args:
+            parameters: Physical constants.
+            sample_rate_hz: Samples a second, > 0.
+            seed: Seed of the sensor noise.
+        """
+        super().__init__(parameters.sensor_noise_um, seed)
+        thresholds = np.array(parameters.thresholds_v, dtype=np.float64)
+        weights = np.array(parameters.weights_um_per_v, dtype=np.float64)
+        self._plays = np.stack([thresholds, weights, np.zeros_like(weights)])
+        self._constants = (
+            parameters.slope_um_per_v,
+            math.exp(-2.0 * math.pi * parameters.sensor_bandwidth_hz / sample_rate_hz),
+            parameters.drive_max_v / parameters.dac_codes,
+            parameters.sensor_range_um / parameters.adc_codes,
+            parameters.sensor_range_um,
+            parameters.offset_um,
+        )
+        self._state = np.zeros(2)
+        self.reset()
+
+    def _rest(self) -> None:
+        self._state[:] = (0.0, self._constants[-1])
+        self._plays[2] = 0.0
+
+    def _advance(self, command: F64, noise_um: F64, displacement_um: F64, measured: F64) -> None:
+        _run(
+            command,
+            noise_um,
+            displacement_um,
+            measured,
+            self._state,
+            self._plays,
+            self._constants,
+        )

@@ -1,0 +1,71 @@
+"""What all simulated actuators share: blocks of any size, seeded sensor noise, time passing."""
+
+from abc import ABC, abstractmethod
+
+import numpy as np
+
+from hilctl.base.arrays import F64
+
+CHUNK = 4096  # samples a kernel call; bounds the scratch memory
+
+
+class Plant(ABC):
+    """A simulated actuator with its amplifier and sensor, advanced sample by sample.
+
+    A reading is taken at the instant its command is put out and can't show that command's effect;
+    the DAC then holds the command for one sample period. Blocks may be cut anywhere: the readings
+    are the same bit for bit, noise included.
+    """
+
+    def __init__(self, noise_um: float, seed: int) -> None:
+        """Remember the sensor's noise; the subclass calls :meth:`reset` once it is complete.
+
+        Args:
+            noise_um: Noise of each reading, rms.
+            seed: Seed of that noise.
+        """
+        self._noise_um = noise_um
+        self._seed = seed
+        self._command = np.empty(CHUNK)
+        self._noise = np.empty(CHUNK)
+        self._generator = np.random.Generator(np.random.PCG64(seed))
+
+    def reset(self) -> None:
+        """Go back to rest, with the noise from its start."""
+        self._generator = np.random.Generator(np.random.PCG64(self._seed))
+        self._rest()
+
+    def step(self, command: F64, displacement_um: F64, measured: F64) -> None:
+        """Put out a block of commands and read the sensors before each.
+
+        Args:
+            command: float64[n], finite and within the DAC's range: the caller checks, nothing is
+                clipped here.
+            displacement_um: float64[n], filled with readings of the displacement from rest.
+            measured: float64[n], filled with the command as it had come about at each reading.
+        """
+        for start in range(0, command.size, CHUNK):
+            part = slice(start, start + CHUNK)
+            size = command[part].size
+            held = self._command[:size]  # a copy: compiled code refuses read-only arrays
+            held[:] = command[part]
+            noise = self._noise[:size]
+            self._generator.standard_normal(out=noise)
+            noise *= self._noise_um
+            self._advance(held, noise, displacement_um[part], measured[part])
+
+    def hold(self, n_samples: int, command: float) -> None:
+        """Let ``n_samples`` sample periods pass with the output at ``command``."""
+        unread = np.empty((2, CHUNK))
+        held = np.full(CHUNK, command)
+        for start in range(0, n_samples, CHUNK):
+            size = min(CHUNK, n_samples - start)
+            self.step(held[:size], unread[0, :size], unread[1, :size])
+
+    @abstractmethod
+    def _rest(self) -> None:
+        """Put the state back to rest."""
+
+    @abstractmethod
+    def _advance(self, command: F64, noise_um: F64, displacement_um: F64, measured: F64) -> None:
+        """Do :meth:`step` for one chunk with its noise."""

@@ -1,0 +1,8 @@
+"""Devices that speak lines of text: SCPI, DCON and their like.
+
+profile.py  what a profile says of one
+lines.py    lines and the numbers in them
+queries.py  questions beside the exchange
+session.py  one conversation
+wire.py     sample by sample
+"""

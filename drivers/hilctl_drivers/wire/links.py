@@ -1,0 +1,83 @@
+"""Bytes there and back: one request, one reply, never longer than the time-out.
+
+Nothing is pipelined and nothing is sent twice. A reply ends where its own bytes say so, which the
+caller works out from what has come so far; pauses between bytes mean nothing. Texts of errors leave
+out who was asked for what: the device that owns the link adds it.
+
+This is what all links have in common; :mod:`hilctl_drivers.wire.tcp` and
+:mod:`hilctl_drivers.wire.serial_port` are the links.
+"""
+
+from collections.abc import Callable
+from typing import Protocol, TypeAlias
+
+from hilctl.base.errors import DeviceError
+
+Missing: TypeAlias = Callable[[bytearray], int]
+"""How many more bytes to wait for, at least, after those that have come; 0 where the reply is
+there. It may raise where they can't be the beginning of one."""
+
+
+class NoAnswerError(DeviceError):
+    """Nothing, or not all of a reply, came in time."""
+
+
+class LostError(DeviceError):
+    """The connection is gone: refused, reset, closed by the peer, or unplugged."""
+
+
+class Link(Protocol):
+    """A way to send a request and get its reply."""
+
+    @property
+    def name(self) -> str:
+        """Where it leads, for messages: ``host:port`` or the serial port."""
+        ...
+
+    def open(self) -> None:
+        """Connect.
+
+        Raises:
+            LostError: There is nobody, or the port is in use.
+        """
+        ...
+
+    def transact(
+        self, request: bytes | bytearray, missing: Missing, usual: int = 0
+    ) -> bytes | bytearray:
+        """Send ``request`` and return the whole reply.
+
+        Args:
+            request: What to send.
+            missing: Says how much of the reply is still to come.
+            usual: Size of a good reply, where it is known: ``missing`` is not asked then when just
+                that much has come.
+
+        Raises:
+            NoAnswerError: The reply was not complete in time.
+            LostError: The link is not open, or broke.
+            DeviceError: Bytes came that are no reply.
+        """
+        ...
+
+    def close(self) -> None:
+        """Let go of it; closing twice is fine."""
+        ...
+
+
+def why(error: OSError) -> str:
+    """Return the system's own words for an error, to stand in a sentence."""
+    text = error.strerror or str(error)
+    return text[:1].lower() + text[1:]
+
+
+def cut(got: int, wanted: int, timeout_s: float) -> str:
+    """Return what is wrong with a reply that was not complete in time.
+
+    Args:
+        got: Bytes that have come.
+        wanted: Bytes that were still waited for.
+        timeout_s: Time-out of the exchange, s.
+    """
+    what = f"only {got} bytes, {wanted} short," if got else "no answer"
+    return f"{what} within {timeout_s:g} s"

@@ -1,0 +1,183 @@
+"""Recompute a recording's commands from what was fed, by the code that made them."""
+
+from dataclasses import asdict, dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from hilctl.base.arrays import F64, U32
+from hilctl.base.errors import DataError
+from hilctl.base.flags import Flag
+from hilctl.base.yaml.document import Document
+from hilctl.experiment.file import Experiment
+from hilctl.loop.compensator import Compensator
+from hilctl.loop.limiter import Limiter
+from hilctl.models.base import HysteresisModel
+from hilctl.models.files import parse_model
+from hilctl.recording.data import Recording, Samples, Start
+
+_LIMIT_BITS = int(Flag.RANGE_LIMITED | Flag.SLEW_LIMITED | Flag.INVALID | Flag.RAMP)
+
+
+@dataclass(frozen=True, slots=True)
+class ReplayResult:
+    """How recomputed commands compare with the recorded ones.
+
+    Attributes:
+        samples: Samples recomputed.
+        left_out_samples: Samples behind a damaged stretch of the file, where the compensator's
+            memory is not known.
+        identical: Whether every wanted command, command and flag has the same bits.
+        first_difference: Index of the first sample that differs, or None.
+        differing_samples: How many differ.
+        largest_difference: Largest magnitude of a difference between commands.
+        rms_difference: Root mean square of the differences.
+        command_unit: ``A`` or ``V``.
+        command_min: Lowest recomputed command.
+        command_max: Highest recomputed command.
+        limited_samples: Recomputed samples that the limiter held back.
+    """
+
+    samples: int
+    left_out_samples: int
+    identical: bool
+    first_difference: int | None
+    differing_samples: int
+    largest_difference: float
+    rms_difference: float
+    command_unit: str
+    command_min: float
+    command_max: float
+    limited_samples: int
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return the fields as plain values."""
+        return asdict(self)
+
+
+def replay(recording: Recording, model: HysteresisModel | None = None) -> ReplayResult:
+    """Recompute every command.
+
+    Args:
+        recording: What was recorded.
+        model: Another model to invert instead of the recorded one; it starts from rest, is fed the
+            reference by its own preview, and the limits stay as recorded.
+
+    Raises:
+        DataError: The recording holds no samples or not what a replay needs, or ``model`` does not
+            fit a run without a compensator.
+    """
+    if recording.samples.index.size == 0 or not recording.starts:
+        raise DataError(f"{recording.path}: holds no samples to replay")
+    if model is not None and not recording.compensated:
+        raise DataError(f"{recording.path}: had no compensator: there is no reference to replay")
+    document = Document(f"{recording.path}: experiment.yaml", recording.experiment_yaml)
+    config = document.validate(Experiment)
+    chosen = model or _recorded_model(recording)
+    compensator = Compensator(chosen, recording.sample_rate_hz)
+    limiter = Limiter(config.command_limits(), 1.0 / recording.sample_rate_hz)
+    samples = recording.samples
+    wanted = np.empty_like(samples.wanted)
+    command = np.empty_like(samples.command)
+    flags = np.zeros_like(samples.flags)
+    known = np.zeros(samples.index.size, dtype=bool)
+    for start, rows in _stretches(recording):
+        known[rows] = True
+        limiter.last = start.previous_command
+        if model is None:
+            compensator.restore(start.state)
+        elif rows.start == 0:
+            compensator.begin(samples.reference_um[rows])
+        for part in _alike(samples.flags, rows):
+            fed = _fed(samples, part, compensator, as_recorded=model is None)
+            _recompute(samples, part, fed, compensator, limiter, (wanted, command, flags))
+    return _compare(recording, known, (wanted, command, flags))
+
+
+def _recorded_model(recording: Recording) -> HysteresisModel | None:
+    if not recording.compensated:
+        return None
+    return parse_model(f"{recording.path}: model.yaml", recording.model_yaml)
+
+
+def _stretches(recording: Recording) -> list[tuple[Start, slice]]:
+    """Return where each gapless stretch starts, and its rows.
+
+    Blocks lost from a damaged file leave gaps that no start stands behind: what follows them, up to
+    the next start, is left out.
+    """
+    index = recording.samples.index
+    firsts = [int(np.searchsorted(index, start.sample)) for start in recording.starts]
+    gaps = np.append(np.flatnonzero(np.diff(index) != 1) + 1, index.size)
+    ends = gaps[np.searchsorted(gaps, firsts, side="right")].tolist()
+    return [
+        (start, slice(first, end))
+        for start, first, end in zip(recording.starts, firsts, ends, strict=True)
+    ]
+
+
+def _alike(flags: U32, rows: slice) -> list[slice]:
+    """Cut rows where the waveform gives way to the ramp."""
+    ramp = (flags[rows] & Flag.RAMP.value) != 0
+    cuts = np.flatnonzero(np.diff(ramp)) + rows.start + 1
+    bounds = [rows.start, *cuts.tolist(), rows.stop]
+    return [slice(a, b) for a, b in pairwise(bounds) if b > a]
+
+
+def _fed(samples: Samples, rows: slice, compensator: Compensator, *, as_recorded: bool) -> F64:
+    """Return what the compensator is fed; another one than the recorded has its own preview."""
+    reference = samples.reference_um[rows]
+    if bool(np.isnan(reference).all()):
+        return samples.wanted[rows]
+    if not as_recorded:
+        return compensator.ahead(reference)
+    return samples.input_um[rows] if samples.input_um.size else reference
+
+
+def _recompute(
+    samples: Samples,
+    rows: slice,
+    fed: F64,
+    compensator: Compensator,
+    limiter: Limiter,
+    out: tuple[F64, F64, U32],
+) -> None:
+    wanted, command, flags = out[0][rows], out[1][rows], out[2][rows]
+    if samples.flags[rows.start] & Flag.RAMP.value:
+        wanted[:] = limiter.limits.safe
+        limiter.ramp(command, flags)
+        return
+    compensator.process(fed, wanted)
+    limiter.limit(wanted, command, flags)
+
+
+def _compare(
+    recording: Recording, known: npt.NDArray[np.bool_], recomputed: tuple[F64, F64, U32]
+) -> ReplayResult:
+    samples = recording.samples
+    wanted, command = recomputed[0][known], recomputed[1][known]
+    flags = recomputed[2][known]
+    recorded = samples.command[known]
+    same = (
+        (wanted.view(np.uint64) == samples.wanted[known].view(np.uint64))
+        & (command.view(np.uint64) == recorded.view(np.uint64))
+        & (flags == samples.flags[known] & np.uint32(_LIMIT_BITS))
+    )
+    different = np.flatnonzero(~same)
+    change = command - recorded
+    limited = flags & (Flag.RANGE_LIMITED | Flag.SLEW_LIMITED).value
+    return ReplayResult(
+        samples=command.size,
+        left_out_samples=samples.index.size - command.size,
+        identical=different.size == 0,
+        first_difference=int(samples.index[known][different[0]]) if different.size else None,
+        differing_samples=different.size,
+        largest_difference=float(np.max(np.abs(change))),
+        rms_difference=float(np.sqrt(np.mean(change**2))),
+        command_unit=recording.command_unit,
+        command_min=float(command.min()),
+        command_max=float(command.max()),
+        limited_samples=int(np.count_nonzero(limited)),
+    )

@@ -1,0 +1,40 @@
+"""Words that all rooms share; it knows none of them.
+
+arrays.py    array types
+device.py    the contract of a device and of a clock
+errors.py    every exception that is raised on purpose
+strict.py    base of every pydantic model
+files.py     text files, read once
+blocks.py    a sample's columns and a block of samples; flags.py  what may be said of a sample
+events.py    what a run tells beside its samples
+segments.py  which samples of a run are judged
+yaml/        plain YAML in, with the line of every value and all problems at once
+
+A device outside of this repository needs ``Device``, ``DeviceInfo``, ``DeviceOptions`` and
+``DeviceError`` from here, and nothing else.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from hilctl.base.device import Device as Device
+    from hilctl.base.device import DeviceInfo as DeviceInfo
+    from hilctl.base.device import DeviceOptions as DeviceOptions
+    from hilctl.base.errors import DeviceError as DeviceError
+
+__all__ = ["Device", "DeviceError", "DeviceInfo", "DeviceOptions"]
+
+_STANDS_IN = {
+    "Device": "device",
+    "DeviceInfo": "device",
+    "DeviceOptions": "device",
+    "DeviceError": "errors",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name when it is asked for: a short command has no time for pydantic."""
+    if name not in _STANDS_IN:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"hilctl.base.{_STANDS_IN[name]}"), name)

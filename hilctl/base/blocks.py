@@ -1,0 +1,62 @@
+"""Blocks of samples, as the loop makes them and the recorder takes them."""
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+
+from hilctl.base.arrays import F64, I64, U32
+
+COLUMNS = ("reference", "wanted", "command", "displacement_um", "measured", "input_um")
+"""Rows of a block's columns; ``input_um`` is of no meaning where the reference is the input."""
+ANSWERS = slice(COLUMNS.index("displacement_um"), COLUMNS.index("measured") + 1)
+"""Those that the device fills."""
+
+
+class Head(IntEnum):
+    """Numbers at the head of each block, int64 each."""
+
+    SEQUENCE = 0
+    FIRST_SAMPLE = 1
+    SAMPLES = 2
+    DROPPED_BEFORE = 3
+    DEADLINE_NS = 4
+    LATE_NS = 5
+    EXCHANGE_NS = 6
+
+
+@dataclass(frozen=True, slots=True)
+class Batch:
+    """k blocks with B samples each.
+
+    Attributes:
+        heads: int64[k, len(Head)].
+        states: float64[k, s]: the compensator's memory before each block, then the command
+            before it.
+        columns: float64[k, 6, B], see :data:`COLUMNS`.
+        flags: uint32[k, B].
+    """
+
+    heads: I64
+    states: F64
+    columns: F64
+    flags: U32
+
+    @classmethod
+    def empty(cls, blocks: int, block: int, state_size: int) -> "Batch":
+        """Return room for blocks, in this process's own memory."""
+        return cls(
+            np.zeros((blocks, len(Head)), dtype=np.int64),
+            np.zeros((blocks, state_size)),
+            np.full((blocks, len(COLUMNS), block), np.nan),
+            np.zeros((blocks, block), dtype=np.uint32),
+        )
+
+    def rows(self, chosen: slice | I64) -> "Batch":
+        """Return a copy of some blocks."""
+        return Batch(
+            self.heads[chosen].copy(),
+            self.states[chosen].copy(),
+            self.columns[chosen].copy(),
+            self.flags[chosen].copy(),
+        )

@@ -1,0 +1,146 @@
+"""What the loop needs from the world: a device to drive and a clock to keep time by.
+
+Only contracts live here. Devices implement :class:`Device` in ``hilctl_drivers`` or in other
+people's packages; :mod:`hilctl.loop.pacer` and the tests supply clocks.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, Literal, Protocol, TypeAlias
+
+from hilctl.base.arrays import F64
+from hilctl.base.strict import Strict
+
+CommandUnit: TypeAlias = Literal["A", "V"]
+"""Unit of what is sent to the device: coil current in ampere, or drive voltage in volt."""
+
+
+class DeviceOptions(Strict):
+    """Base of a device's own options in the experiment file: frozen, strict, no unknown keys."""
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceInfo:
+    """What a device says of itself before anything moves.
+
+    Attributes:
+        name: Registry name, for example ``simulated_terfenol``.
+        description: One line for people.
+        command_unit: Unit of the commands it takes.
+        command_min: Lowest command it accepts, in ``command_unit``.
+        command_max: Highest command it accepts, in ``command_unit``.
+        sensor_min_um: Lowest displacement its sensor can report.
+        sensor_max_um: Highest displacement its sensor can report.
+        max_rate_hz: Highest sample rate it can keep.
+        rate_note: Why ``max_rate_hz`` is what it is, in words; empty where there is no more to say.
+        buffered: Whether it has a sample clock and a FIFO of its own. Then the sample index is
+            the truth and a late tick costs FIFO depth; otherwise the host's clock paces it.
+        fifo_depth: Samples its FIFO holds; 0 where it has none.
+        latency_blocks: Exchanges from the one that sends a block to the one that brings its
+            displacements. 0 where they are the same; more where blocks are played from a FIFO of
+            the device, which then keeps the pace: :meth:`Device.exchange` waits for its clock.
+        measures_command: Whether :meth:`Device.exchange` fills ``measured``.
+        holds: What it holds alone while it is open, each by a name that is the same for every
+            device that would hold it (``serial:/dev/ttyUSB0``, ``tcp:10.0.0.5:502``): one run at a
+            time may hold it. Empty where any number may run side by side.
+        details: Anything worth keeping with a recording (serial numbers, physical parameters).
+    """
+
+    name: str
+    description: str
+    command_unit: CommandUnit
+    command_min: float
+    command_max: float
+    sensor_min_um: float
+    sensor_max_um: float
+    max_rate_hz: float
+    rate_note: str = ""
+    buffered: bool = False
+    fifo_depth: int = 0
+    latency_blocks: int = 0
+    measures_command: bool = False
+    holds: tuple[str, ...] = ()
+    details: Mapping[str, str] = field(default_factory=dict)
+
+
+class Device(Protocol):
+    """A DAC, its amplifier, the actuator and its sensor, seen as one thing.
+
+    A device refuses what it can't do with :class:`~hilctl.base.errors.DeviceError`; it never clips,
+    wraps or rounds a command into range.
+    """
+
+    Options: ClassVar[type[DeviceOptions]]
+
+    def __init__(self, options: Any) -> None:
+        """Take options, an instance of :attr:`Options`, and touch nothing outside."""
+        ...
+
+    @property
+    def info(self) -> DeviceInfo:
+        """What the device is and what it accepts; constant and readable before :meth:`open`."""
+        ...
+
+    def open(self, sample_rate_hz: float, block: int) -> None:
+        """Connect, check that the device is what it should be, and get ready to exchange.
+
+        Must not move the output.
+
+        Args:
+            sample_rate_hz: Samples a second.
+            block: Samples in each exchange.
+
+        Raises:
+            DeviceError: It can't be reached, or can't keep this rate or block.
+        """
+        ...
+
+    def exchange(
+        self, first_sample: int, command: F64, displacement_um: F64, measured: F64
+    ) -> None:
+        """Send one block of commands and read one block of displacements.
+
+        ``displacement_um[j]`` is sampled when ``command[j]`` is put out, so it can't yet show
+        that command's effect. Where ``info.latency_blocks`` is more than 0, displacements and
+        measured commands are those of the block sent that many exchanges before; the first ones,
+        which answer no block, are left alone.
+
+        Args:
+            first_sample: Index of the block's first sample since the start of the run. A jump
+                means that samples in between were skipped; the output held its last value.
+            command: float64[block], in ``info.command_unit``; not modified.
+            displacement_um: float64[block], filled by the call.
+            measured: float64[block], the command as measured by the device, filled by the call
+                if ``info.measures_command``; left alone otherwise.
+
+        Raises:
+            DeviceError: A command is out of range or not finite (then nothing was sent), the
+                device did not answer in time or answered wrongly, or it is not open.
+        """
+        ...
+
+    def make_safe(self, command: float) -> None:
+        """Put the output at ``command`` at once, without a ramp: the last resort.
+
+        Opens a connection of its own where there is none.
+
+        Raises:
+            DeviceError: The device can't be reached or does not confirm.
+        """
+        ...
+
+    def close(self) -> None:
+        """Let go of the port and leave the output as it is. Closing twice is fine."""
+        ...
+
+
+class Clock(Protocol):
+    """Monotonic time in nanoseconds."""
+
+    def now_ns(self) -> int:
+        """Return the time in ns; never goes back."""
+        ...
+
+    def sleep_until_ns(self, deadline_ns: int) -> None:
+        """Sleep until ``deadline_ns``; return at once where that is past."""
+        ...

@@ -1,0 +1,12 @@
+"""The experiment: its file, what the file refers to, and whether it may start. Moves nothing.
+
+file.py           pydantic models of the file; parts.py, limits.py and feedback_keys.py its parts
+load.py           from a file to the experiment with all that it refers to
+correction.py     what learning has added to the compensator's input
+initial_state.py  what the run before left in the actuator
+check.py          the whole run worked out beforehand, held against device, model and limits
+forecast.py       what a run will do
+interlocks.py     interlocks and feedback.py feedback, from the file's keys
+registry.py       devices by name; inventory.py  what there is on this machine
+schema.py         the file's JSON schema
+"""

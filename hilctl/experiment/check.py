@@ -1,0 +1,248 @@
+"""Everything that can be known before anything moves: ranges, rates, and the whole command.
+
+Feedforward needs no answer from the actuator, so every command of the run is worked out here first,
+by the same compensator that will run, and held against the limits.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from hilctl.base.arrays import F64
+from hilctl.base.errors import ConfigError, DataError, InputError, ModelError, Problem
+from hilctl.experiment.feedback import feedback_problems
+from hilctl.experiment.forecast import Forecast, forecast_of
+from hilctl.experiment.initial_state import Memory, memory_after
+from hilctl.experiment.interlocks import HeatForecast, interlock_problems
+from hilctl.experiment.load import LoadedExperiment
+from hilctl.loop.compensator import Compensator
+from hilctl.waveforms.build import Reference, build
+
+
+@dataclass(frozen=True, slots=True)
+class Checked:
+    """An experiment that may start.
+
+    Attributes:
+        loaded: The experiment.
+        reference: Every sample of its waveform.
+        forecast: What it will do.
+        ahead: float64[n], what the compensator is fed; None where that is the reference itself.
+        state: The compensator's memory before the first sample; None where it is at rest.
+        memory: What a run before left in the actuator; None where it is at rest.
+    """
+
+    loaded: LoadedExperiment
+    reference: Reference
+    forecast: Forecast
+    ahead: F64 | None = None
+    state: F64 | None = None
+    memory: Memory | None = None
+
+    @property
+    def fed(self) -> F64:
+        """What the compensator is fed: float64[n]."""
+        return self.reference.values if self.ahead is None else self.ahead
+
+
+def check(loaded: LoadedExperiment) -> Checked:
+    """Work out the whole run and hold it against device, model and limits.
+
+    Args:
+        loaded: The experiment.
+
+    Raises:
+        ConfigError: The run must not start; all reasons are listed, each saying by how much.
+    """
+    problems = _device_problems(loaded) + interlock_problems(loaded)
+    config = loaded.config
+    try:
+        reference = build(config.waveform, config.sample_rate_hz, loaded.folder)
+    except InputError as error:
+        problems.append(_problem(loaded, "waveform", str(error)))
+        raise ConfigError(problems) from None
+    problems += _reference_problems(loaded, reference)
+    heat = HeatForecast(config)
+    try:
+        compensator = Compensator(loaded.model, config.sample_rate_hz)
+        problems += feedback_problems(loaded, compensator.preview)
+        corrected = _corrected(loaded, reference, problems)
+        memory = _memory(loaded, problems)
+        ahead, state = _feed(loaded, corrected, compensator, memory)
+        own = ahead is not reference.values or config.feedback is not None
+        forecast = forecast_of(loaded, reference, ahead, heat, state)
+    except ModelError as error:
+        problems.append(_problem(loaded, "compensator.model", str(error)))
+        raise ConfigError(problems) from None
+    problems += _command_problems(loaded, forecast) + heat.problems(loaded)
+    if problems:
+        raise ConfigError(problems)
+    return Checked(loaded, reference, forecast, ahead if own else None, state, memory)
+
+
+def _feed(
+    loaded: LoadedExperiment, values: F64, compensator: Compensator, memory: Memory | None
+) -> tuple[F64, F64 | None]:
+    """Return what the compensator is fed, and its memory before that where it is not at rest."""
+    config = loaded.config
+    if memory is not None:
+        compensator.restore(memory.state)
+        values = memory.lead_in(values, max(1, round(config.safe.ramp_s * config.sample_rate_hz)))
+    compensator.begin(values)
+    at_rest = memory is None and not compensator.preview
+    return compensator.ahead(values), None if at_rest else compensator.state()
+
+
+def _memory(loaded: LoadedExperiment, problems: list[Problem]) -> Memory | None:
+    """Return what the run before left in the actuator, where one is named."""
+    config = loaded.config
+    if config.compensator is None or config.compensator.initial_state is None:
+        return None
+    assert loaded.model is not None
+    path = loaded.folder / config.compensator.initial_state
+    try:
+        return memory_after(path, loaded.model, config.sample_rate_hz)
+    except DataError as error:
+        problems.append(_problem(loaded, "compensator.initial_state", str(error)))
+        return None
+
+
+def _corrected(loaded: LoadedExperiment, reference: Reference, problems: list[Problem]) -> F64:
+    """Return the reference with what has been learned: float64[n]; itself where nothing has."""
+    correction = loaded.correction
+    if correction is None:
+        return reference.values
+    try:
+        return reference.values + correction.samples(reference, loaded.model)
+    except InputError as error:
+        hint = "learn again with 'hilctl learn', or take it out"
+        problems.append(_problem(loaded, "compensator.correction", str(error), hint=hint))
+        return reference.values
+
+
+def check_tuned(
+    checked: Checked, now: tuple[float, float], wanted: tuple[float, float], samples: int
+) -> None:
+    """Work out what a running reference would do with another gain and offset.
+
+    Args:
+        checked: The experiment that runs.
+        now: Gain and offset of the reference at this moment.
+        wanted: Gain and offset that it is to have.
+        samples: Samples that the change takes.
+
+    Raises:
+        ConfigError: It would leave device, model or limits; the error says by how much.
+    """
+    loaded, plain = checked.loaded, checked.reference
+    change = abs(wanted[0] - now[0]) * np.abs(plain.values).max() + abs(wanted[1] - now[1])
+    values = _led_in(plain.values * wanted[0] + wanted[1], samples)
+    fed = _led_in(checked.fed * wanted[0] + wanted[1], samples)
+    tuned = Reference(values, plain.unit, plain.sample_rate_hz, plain.segments)
+    heat = HeatForecast(loaded.config)
+    problems = _reference_problems(loaded, tuned)
+    problems += _command_problems(loaded, forecast_of(loaded, tuned, fed, heat))
+    problems += heat.problems(loaded)
+    if loaded.model is None:
+        fastest = change / samples * plain.sample_rate_hz + checked.forecast.slew_per_s
+        if fastest > loaded.config.limits.slew_per_s:
+            rule = f"the change must take longer: at most {loaded.config.limits.slew_per_s:g}/s"
+            problems.append(_problem(loaded, "limits", rule, f"{fastest:.4g}/s"))
+    if problems:
+        raise ConfigError(problems)
+
+
+def _led_in(values: F64, samples: int) -> F64:
+    """Return values with that many samples before them, from 0 to the first."""
+    return np.concatenate((np.linspace(0.0, values[0], samples + 1)[:-1], values))
+
+
+def _problem(
+    loaded: LoadedExperiment, key: str, rule: str, value: str = "", hint: str = ""
+) -> Problem:
+    return Problem(loaded.document.where(tuple(key.split("."))), key, rule, value, hint)
+
+
+def _device_problems(loaded: LoadedExperiment) -> list[Problem]:
+    config, info = loaded.config, loaded.device.info
+    found: list[Problem] = []
+
+    def add(key: str, rule: str, value: object) -> None:
+        found.append(_problem(loaded, key, rule, str(value)))
+
+    unit = info.command_unit
+    if config.limits.unit != unit:
+        add("limits", f"must be in {unit}, what {info.name} is driven with", config.limits.unit)
+    else:
+        low, high = config.limits.command_range
+        span = f"{info.command_min:g} to {info.command_max:g} {unit}"
+        if low < info.command_min or high > info.command_max:
+            add("limits", f"must lie within what {info.name} takes, {span}", f"{low:g} to {high:g}")
+    if config.sample_rate_hz > info.max_rate_hz:
+        rule = f"must be <= {info.max_rate_hz:g}, the fastest that {info.name} can keep"
+        note = f" ({info.rate_note})" if info.rate_note else ""
+        add("sample_rate_hz", rule + note, config.sample_rate_hz)
+    if config.block > 1 and not info.buffered:
+        add(
+            "block", f"must be 1: {info.name} has no sample clock and FIFO of its own", config.block
+        )
+    blocks = max(2, info.latency_blocks + 1)
+    if info.buffered and blocks * config.block > info.fifo_depth:
+        fifo = f"the FIFO of {info.name}, {info.fifo_depth} samples"
+        rule = f"must be <= {info.fifo_depth // blocks}: {blocks} blocks must fit into {fifo}"
+        add("block", rule, config.block)
+    low_um, high_um = config.limits.stroke_um
+    if low_um < info.sensor_min_um or high_um > info.sensor_max_um:
+        span = f"{info.sensor_min_um:g} to {info.sensor_max_um:g} um"
+        value = f"{low_um:g} to {high_um:g}"
+        add("limits.stroke_um", f"must lie within what the sensor can report, {span}", value)
+    model = loaded.model
+    if model is not None and model.input_unit != unit:
+        rule = f"must give commands in {unit}, what {info.name} is driven with"
+        add("compensator.model", rule, model.input_unit)
+    return found
+
+
+def _reference_problems(loaded: LoadedExperiment, reference: Reference) -> list[Problem]:
+    if reference.unit != "um":
+        return []
+    low, high = float(reference.values.min()), float(reference.values.max())
+    spans = {"limits.stroke_um": loaded.config.limits.stroke_um}
+    if loaded.model is not None and loaded.model.output_range_um is not None:
+        spans["the range that compensator.model was found on"] = loaded.model.output_range_um
+    found = []
+    for name, (lowest, highest) in spans.items():
+        excess = max(lowest - low, high - highest)
+        if excess > 0.0:
+            rule = f"reference must stay within {name}, {lowest:g} to {highest:g} um"
+            value = f"{low:.6g} to {high:.6g} um"
+            hint = f"{excess:.3g} um too far: change the waveform's amplitude or offset"
+            found.append(_problem(loaded, "waveform", rule, value, hint))
+    return found
+
+
+def _command_problems(loaded: LoadedExperiment, forecast: Forecast) -> list[Problem]:
+    limits = loaded.config.limits
+    low, high = limits.command_range
+    unit = limits.unit
+    found = []
+    if not (math.isfinite(forecast.command_min) and math.isfinite(forecast.command_max)):
+        rule = "every command must be a finite number"
+        value = f"{forecast.command_min:.6g} to {forecast.command_max:.6g} {unit}"
+        return [_problem(loaded, "compensator.model", rule, value)]
+    excess = max(low - forecast.command_min, forecast.command_max - high)
+    if excess > 0.0:
+        key = "limits.drive_v" if unit == "V" else "limits.peak_current_a"
+        value = f"{forecast.command_min:.6g} to {forecast.command_max:.6g} {unit}"
+        hint = f"{excess:.3g} {unit} too much: lower the waveform's amplitude, or raise the limit"
+        rule = f"the run must stay within {low:g} to {high:g} {unit}"
+        found.append(_problem(loaded, key, rule, value, hint))
+    if forecast.slew_per_s > limits.slew_per_s:
+        key = "limits.slew_v_per_s" if unit == "V" else "limits.slew_a_per_s"
+        value = f"{forecast.slew_per_s:.6g}"
+        times = forecast.slew_per_s / limits.slew_per_s
+        hint = f"{times:.3g} times the limit: lower the frequency, soften the start, or raise it"
+        rule = f"the run must change no faster than {limits.slew_per_s:g} {unit}/s"
+        found.append(_problem(loaded, key, rule, value, hint))
+    return found

@@ -1,0 +1,234 @@
+"""What has been learned: a correction of the compensator's input, one period of each waveform.
+
+A correction is added to the wanted displacement before the compensator. It is kept as Fourier
+coefficients, so that it fits any sampling of its period, and with the cycle it was learned for: it
+is refused for another waveform, sample rate or model.
+"""
+
+import hashlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import numpy.typing as npt
+import yaml
+from pydantic import Field, model_validator
+
+from hilctl.base.arrays import F64
+from hilctl.base.errors import InputError
+from hilctl.base.files import TextFiles
+from hilctl.base.segments import Segment
+from hilctl.base.strict import Strict
+from hilctl.base.yaml.document import Document, load_document
+from hilctl.models.base import HysteresisModel
+from hilctl.models.files import dump_model
+from hilctl.waveforms.build import Reference
+
+PHASES = 64
+"""Points of the wanted cycle that tell one waveform from another."""
+
+_GRID = 1 << 16  # the highest harmonic of 2048 loses 0.5 % of its amplitude between points
+_TOLERANCE = 1e-3
+_SAME_PERIOD = 1e-6
+
+C128 = npt.NDArray[np.complex128]
+
+
+class LearnedCycle(Strict):
+    """One period of a correction: ``sum cosine_k cos(k phi) + sine_k sin(k phi)``.
+
+    Attributes:
+        label: The waveform, for people.
+        period_samples: Its period; phase 0 is at the waveform's first sample.
+        reference_um: The wanted displacement at 64 even phases.
+        cosine_um: Coefficients of k = 0, 1, ...
+        sine_um: Coefficients of the same k; that of k = 0 has no meaning and is 0.
+        start_percent: Peak error before learning, in percent of the peak-to-peak displacement.
+        error_percent: Peak error with this correction.
+    """
+
+    label: str
+    period_samples: Annotated[float, Field(gt=0.0)]
+    reference_um: Annotated[tuple[float, ...], Field(min_length=PHASES, max_length=PHASES)]
+    cosine_um: Annotated[tuple[float, ...], Field(min_length=1)]
+    sine_um: tuple[float, ...]
+    start_percent: float | None = None
+    error_percent: float | None = None
+
+    @model_validator(mode="after")
+    def _same_length(self) -> "LearnedCycle":
+        if len(self.cosine_um) != len(self.sine_um):
+            text = f"{len(self.sine_um)} for {len(self.cosine_um)}"
+            raise ValueError(f"sine_um must have one value a value of cosine_um: {text}")
+        return self
+
+    @classmethod
+    def from_coefficients(
+        cls, label: str, period: float, signature_um: F64, coefficients: C128, **figures: float
+    ) -> "LearnedCycle":
+        """Make it from complex coefficients c_k, see :attr:`coefficients`."""
+        last = int(np.flatnonzero(np.abs(coefficients) > 0.0).max(initial=0))
+        kept = coefficients[: last + 1] * np.where(np.arange(last + 1) > 0, 2.0, 1.0)
+        return cls(
+            label=label,
+            period_samples=period,
+            reference_um=tuple(signature_um.tolist()),
+            cosine_um=tuple(kept.real.tolist()),
+            sine_um=(0.0, *(-kept.imag[1:]).tolist()),
+            **figures,
+        )
+
+    @property
+    def coefficients(self) -> C128:
+        """complex128[K + 1], c_k of ``c_0 + 2 Re sum c_k exp(i k phi)``, in um."""
+        both = np.array(self.cosine_um) - 1j * np.array(self.sine_um)
+        both[1:] *= 0.5
+        return both
+
+    def at(self, index: npt.NDArray[np.int64]) -> F64:
+        """Return the correction at samples counted from the waveform's first: float64[n], in um."""
+        grid = evaluate(self.coefficients, _GRID)
+        place = np.mod(index.astype(np.float64), self.period_samples) * (
+            _GRID / self.period_samples
+        )
+        values: F64 = np.interp(place, np.arange(_GRID + 1), np.append(grid, grid[0]))
+        return values
+
+
+class Correction(Strict):
+    """Learned cycles, and what they were learned with.
+
+    Attributes:
+        sample_rate_hz: Samples a second.
+        model_sha256: Of the compensator's model.
+        cycles: One for each waveform.
+        provenance: Experiment, runs, delay found, versions; text to text.
+    """
+
+    sample_rate_hz: Annotated[float, Field(gt=0.0)]
+    model_sha256: str
+    cycles: Annotated[tuple[LearnedCycle, ...], Field(min_length=1)]
+    provenance: Mapping[str, str] = Field(default_factory=dict)
+
+    def samples(self, reference: Reference, model: HysteresisModel | None) -> F64:
+        """Return the correction of every sample of a run: float64[n], in um.
+
+        It grows and shrinks with the waveform's soft start and end; where there is no soft start,
+        it grows over the first period.
+
+        Raises:
+            InputError: It was learned at another rate or with another model, or no part of the
+                reference is a waveform that it was learned for.
+        """
+        if model_sha256(model) != self.model_sha256:
+            raise InputError("was learned with another model")
+        if not _alike(reference.sample_rate_hz, self.sample_rate_hz):
+            was, now = self.sample_rate_hz, reference.sample_rate_hz
+            raise InputError(f"was learned at {was:g} samples a second, not at {now:g}")
+        out = np.zeros_like(reference.values)
+        found = False
+        for segment in reference.segments:
+            for cycle in self.cycles:
+                if fits(cycle, reference.values, segment):
+                    index = np.arange(segment.stop - segment.start)
+                    faded = cycle.at(index) * envelope(segment)
+                    out[segment.start : segment.stop] = faded
+                    found = True
+        if not found:
+            known = "; ".join(cycle.label for cycle in self.cycles)
+            raise InputError(f"was learned for another waveform: {known}")
+        return out
+
+
+class CorrectionFile(Strict):
+    """A correction file: one correction under the key ``correction``."""
+
+    correction: Correction
+
+
+def evaluate(coefficients: C128, points: int) -> F64:
+    """Return one period on even phases from c_k: float64[points], in the unit of c_k."""
+    size = min(coefficients.size, points // 2)
+    spectrum = np.zeros(points // 2 + 1, dtype=np.complex128)
+    spectrum[:size] = coefficients[:size]
+    return np.fft.irfft(spectrum * points, points)
+
+
+def signature(values: F64, segment: Segment) -> F64 | None:
+    """Return one steady period of a reference at 64 even phases, in its unit.
+
+    Args:
+        values: float64[n], the whole run's reference.
+        segment: Which part of it.
+
+    Returns:
+        float64[64]; None where there is no period, or no whole one at full amplitude.
+    """
+    if segment.period <= 0.0:
+        return None
+    before = np.ceil((segment.steady_start - segment.start) / segment.period - 1e-9)
+    first = segment.start + before * segment.period
+    place = first + np.arange(PHASES) / PHASES * segment.period
+    if place[-1] + 1.0 > segment.steady_stop:
+        return None
+    cycle: F64 = np.interp(place, np.arange(values.size), values)
+    return cycle
+
+
+def fits(cycle: LearnedCycle, values: F64, segment: Segment) -> bool:
+    """Return whether a cycle was learned for a segment: same period, same wanted displacement."""
+    wanted = signature(values, segment)
+    if wanted is None or not _alike(cycle.period_samples, segment.period):
+        return False
+    learned = np.array(cycle.reference_um)
+    return bool(np.abs(wanted - learned).max() <= _TOLERANCE * np.ptp(learned))
+
+
+def envelope(segment: Segment) -> F64:
+    """Return how much of a correction is added at each sample of a segment, from 0 to 1."""
+    n = segment.stop - segment.start
+    out = np.ones(n)
+    rise = segment.steady_start - segment.start or min(n, int(segment.period))
+    fall = segment.stop - segment.steady_stop
+    out[:rise] *= 0.5 - 0.5 * np.cos(np.pi * np.arange(rise) / max(rise, 1))
+    out[n - fall :] *= 0.5 + 0.5 * np.cos(np.pi * (np.arange(fall) + 1) / max(fall, 1))
+    return out
+
+
+def _alike(a: float, b: float) -> bool:
+    return abs(a - b) <= _SAME_PERIOD * abs(b)
+
+
+def model_sha256(model: HysteresisModel | None) -> str:
+    """Return what tells a compensator's model from another; empty without one."""
+    return hashlib.sha256(dump_model(model).encode()).hexdigest() if model else ""
+
+
+def load_correction(path: Path, files: TextFiles | None = None) -> Correction:
+    """Read a correction file.
+
+    Args:
+        path: The file.
+        files: Where it is read from; the disk where None.
+
+    Raises:
+        InputError: The file can't be read.
+        ConfigError: It breaks a rule; all problems are listed.
+    """
+    return load_document(path, files).validate(CorrectionFile).correction
+
+
+def parse_correction(name: str, text: str) -> Correction:
+    """Read a correction from a YAML text, for example a recording's attachment.
+
+    Raises:
+        ConfigError: See :func:`load_correction`.
+    """
+    return Document(name, text).validate(CorrectionFile).correction
+
+
+def dump_correction(correction: Correction) -> str:
+    """Return a correction as YAML; reading it back gives the same one, bit for bit."""
+    mapping: dict[str, Any] = correction.model_dump(mode="json", exclude_none=True)
+    return yaml.safe_dump({"correction": mapping}, sort_keys=False, width=100)

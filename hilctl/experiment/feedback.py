@@ -1,0 +1,134 @@
+"""Feedback from an experiment: what it needs is refused before a run, and built for it."""
+
+import cmath
+import math
+
+from hilctl.base.errors import Problem
+from hilctl.experiment.feedback_keys import FeedbackConfig
+from hilctl.experiment.file import Experiment
+from hilctl.experiment.load import LoadedExperiment
+from hilctl.loop.compensator import Compensator
+from hilctl.loop.feedback import (
+    LEAST_GAIN_MARGIN,
+    LEAST_PHASE_MARGIN_DEG,
+    Feedback,
+    Gains,
+    gains_for,
+    highest_bandwidth_hz,
+    margins,
+    rate_needed_hz,
+)
+
+_HIGHEST_RATE_HZ = 1e6
+
+
+def make_feedback(config: Experiment, compensator: Compensator) -> Feedback | None:
+    """Return the feedback of a run, or None where there is none."""
+    wanted = config.feedback
+    if wanted is None:
+        return None
+    rate_hz = config.sample_rate_hz
+    due_after = round(wanted.sensor_delay_s * rate_hz) + (0 if compensator.preview else 1)
+    return Feedback(_gains(wanted, rate_hz), rate_hz, wanted.limit_um, due_after)
+
+
+def feedback_problems(loaded: LoadedExperiment, preview: int) -> list[Problem]:
+    """Return why an experiment can't have the feedback that it asks for.
+
+    Args:
+        loaded: The experiment.
+        preview: Samples by which its compensator looks ahead: a correction takes as long to show.
+    """
+    config, info = loaded.config, loaded.device.info
+    wanted = config.feedback
+    if wanted is None:
+        return []
+    found: list[tuple[str, str, str, str]] = []
+    if config.compensator is None:
+        found.append(("feedback", "needs a compensator: it corrects what goes into one", "", ""))
+    if info.latency_blocks:
+        rule = f"needs a device that answers each sample at once: {info.name} plays from a FIFO"
+        hint = f"its displacements come {info.latency_blocks} exchanges later"
+        found.append(("feedback", rule, "", hint))
+    if config.block > 1:
+        hint = "a block's first displacement would be as old as the block"
+        found.append(("block", "must be 1 with feedback", str(config.block), hint))
+    if not found:
+        delay_s = wanted.sensor_delay_s + max(0, preview - 1) / config.sample_rate_hz
+        found += _gain_problems(wanted, config.sample_rate_hz, delay_s)
+        found += _resonance_problems(loaded, wanted)
+    return [
+        Problem(loaded.document.where(tuple(key.split("."))), key, rule, value, hint)
+        for key, rule, value, hint in found
+    ]
+
+
+def _gains(wanted: FeedbackConfig, rate_hz: float) -> Gains:
+    if wanted.bandwidth_hz is not None:
+        return gains_for(min(wanted.bandwidth_hz, 0.5 * rate_hz), rate_hz)
+    return Gains(wanted.kp or 0.0, wanted.ki_per_s or 0.0)
+
+
+def _gain_problems(
+    wanted: FeedbackConfig, rate_hz: float, delay_s: float
+) -> list[tuple[str, str, str, str]]:
+    """Hold the gains against the delay: phase margin of 60 degrees, gain margin of 2."""
+    if wanted.bandwidth_hz is not None:
+        highest_hz = highest_bandwidth_hz(rate_hz, delay_s)
+        if wanted.bandwidth_hz <= highest_hz:
+            return []
+        rule = f"must be <= {highest_hz:.4g} Hz at {rate_hz:g} Hz and a delay of {delay_s:.3g} s"
+        needed_hz = rate_needed_hz(wanted.bandwidth_hz, delay_s)
+        return [("feedback.bandwidth_hz", rule, f"{wanted.bandwidth_hz:g}", _needs(needed_hz))]
+    gains = _gains(wanted, rate_hz)
+    if _stable(gains, rate_hz, delay_s):
+        return []
+    gain_margin, phase_margin = margins(gains, rate_hz, delay_s)
+    rule = (
+        f"must leave a gain margin of {LEAST_GAIN_MARGIN:g} and a phase margin of "
+        f"{LEAST_PHASE_MARGIN_DEG:g} degrees at {rate_hz:g} Hz and a delay of {delay_s:.3g} s"
+    )
+    value = f"kp {gains.kp:g}, ki_per_s {gains.ki_per_s:g}: {gain_margin:.3g}, {phase_margin:.3g}"
+    return [("feedback", rule, value, _needs(_rate_for(gains, rate_hz, delay_s)))]
+
+
+def _stable(gains: Gains, rate_hz: float, delay_s: float) -> bool:
+    gain_margin, phase_margin = margins(gains, rate_hz, delay_s)
+    return gain_margin >= LEAST_GAIN_MARGIN and phase_margin >= LEAST_PHASE_MARGIN_DEG
+
+
+def _rate_for(gains: Gains, rate_hz: float, delay_s: float) -> float:
+    """Return a rate, to 5 %, at which the gains have their margins; infinite without one."""
+    while rate_hz < _HIGHEST_RATE_HZ:
+        rate_hz *= 1.05
+        if _stable(gains, rate_hz, delay_s):
+            return rate_hz
+    return math.inf
+
+
+def _needs(rate_hz: float) -> str:
+    if rate_hz <= _HIGHEST_RATE_HZ:
+        return f"this needs at least {rate_hz:.4g} samples a second"
+    return "no sample rate is enough for this"
+
+
+def _resonance_problems(
+    loaded: LoadedExperiment, wanted: FeedbackConfig
+) -> list[tuple[str, str, str, str]]:
+    """Hold the gain at the resonance, where a light one multiplies it by 1/(2 damping), to half."""
+    structure = getattr(loaded.model, "structure", None)
+    natural_hz = wanted.resonance_hz or getattr(structure, "natural_hz", None)
+    damping = wanted.damping_ratio or getattr(structure, "damping_ratio", None)
+    if natural_hz is None or damping is None:
+        rule = "needs resonance_hz and damping_ratio of the actuator with its load"
+        return [("feedback", rule, "", "the model does not tell them, and feedback excites it")]
+    rate_hz = loaded.config.sample_rate_hz
+    gains = _gains(wanted, rate_hz)
+    turn = 1.0 - cmath.exp(-2j * math.pi * min(natural_hz / rate_hz, 0.5))
+    size = abs(gains.kp + gains.ki_per_s / rate_hz / turn) / (2.0 * damping)
+    if size * LEAST_GAIN_MARGIN <= 1.0:
+        return []
+    rule = f"must have a gain of at most {1.0 / LEAST_GAIN_MARGIN:g} at the resonance"
+    where = f"{natural_hz:g} Hz, damping {damping:g}"
+    hint = f"at most bandwidth_hz {damping * natural_hz:.3g}, or ki_per_s of 2 pi times that"
+    return [("feedback", rule, f"{size:.3g} at {where}", hint)]

@@ -1,0 +1,159 @@
+"""The experiment file: frozen, strict models of the YAML, and all of its problems at once."""
+
+from typing import Annotated, Any, Literal, Self, TypeVar
+
+from pydantic import BeforeValidator, Field, model_validator
+
+from hilctl.base.device import CommandUnit
+from hilctl.base.strict import Strict
+from hilctl.experiment.feedback_keys import FeedbackConfig
+from hilctl.experiment.limits import InterlockKeys
+from hilctl.experiment.parts import Interval, Name, RecordingConfig, Timing
+from hilctl.loop.limiter import CommandLimits
+from hilctl.machine.settings import Realtime
+from hilctl.waveforms.spec import AnyWaveform
+
+T = TypeVar("T")
+
+
+def _none_or_mapping(value: Any) -> Any:
+    if value == "none":
+        return None
+    if not isinstance(value, dict):
+        rule = "must be none, or a mapping with the key model"
+        raise ValueError(f"{rule}: {value!r}")  # noqa: TRY004  pydantic wants this one
+    return value
+
+
+class Limits(InterlockKeys):
+    """What the limiter and the interlocks hold the run to; the limiter is last before the device.
+
+    Attributes:
+        peak_current_a: Largest magnitude of the coil current, for devices driven in A.
+        slew_a_per_s: Fastest change of the coil current.
+        drive_v: Lowest and highest drive voltage, for devices driven in V.
+        slew_v_per_s: Fastest change of the drive voltage.
+        stroke_um: Displacements that the sensor may show; outside, the run ends by its way out.
+    """
+
+    peak_current_a: Annotated[float, Field(gt=0.0)] | None = None
+    slew_a_per_s: Annotated[float, Field(gt=0.0)] | None = None
+    drive_v: Interval | None = None
+    slew_v_per_s: Annotated[float, Field(gt=0.0)] | None = None
+    stroke_um: Interval
+
+    @model_validator(mode="after")
+    def _one_unit(self) -> Self:
+        current = (self.peak_current_a, self.slew_a_per_s)
+        voltage = (self.drive_v, self.slew_v_per_s)
+        complete = None not in current or None not in voltage
+        mixed = any(v is not None for v in current) and any(v is not None for v in voltage)
+        if mixed or not complete:
+            raise ValueError(
+                "must have either peak_current_a and slew_a_per_s (a device driven in A) or "
+                "drive_v and slew_v_per_s (a device driven in V)"
+            )
+        return self
+
+    @property
+    def unit(self) -> CommandUnit:
+        """Unit of the commands that are limited."""
+        return "V" if self.drive_v is not None else "A"
+
+    @property
+    def command_range(self) -> tuple[float, float]:
+        """Lowest and highest command, in :attr:`unit`."""
+        if self.drive_v is not None:
+            return self.drive_v
+        peak = self.peak_current_a or 0.0
+        return -peak, peak
+
+    @property
+    def slew_per_s(self) -> float:
+        """Fastest change of the command, in :attr:`unit` a second."""
+        return self.slew_v_per_s or self.slew_a_per_s or 0.0
+
+
+class Safe(Strict):
+    """Where the output goes on every way out of a run.
+
+    Attributes:
+        value: Command of the safe state, in the device's unit.
+        ramp_s: Time that the ramp takes from the largest command allowed.
+    """
+
+    value: float = 0.0
+    ramp_s: Annotated[float, Field(gt=0.0)] = 0.2
+
+
+class CompensatorConfig(Strict):
+    """The model whose inverse stands before the actuator.
+
+    Attributes:
+        model: Model file, relative to the experiment file's folder.
+        correction: File of what ``hilctl learn`` has found for this waveform, relative to the same
+            folder; None where nothing is added to the reference.
+        initial_state: Recording of the run before this one, relative to the same folder, so that
+            the compensator begins with what that run left in the actuator, and reaches the
+            reference from there within ``safe.ramp_s``; None for an actuator at rest.
+    """
+
+    model: str
+    correction: str | None = None
+    initial_state: str | None = None
+
+
+class Experiment(Strict):
+    """One experiment: everything that a run needs to know.
+
+    Attributes:
+        name: Short name, part of the recording's file name.
+        description: What it is for.
+        device: ``kind`` and the device's own options.
+        sample_rate_hz: Samples a second.
+        block: Samples exchanged in one tick; more than 1 needs a device with a FIFO.
+        waveform: What to run.
+        compensator: ``none``, read as None, or the model to invert.
+        feedback: A controller around the compensator; None where there is none.
+        limits: What the run is held to.
+        safe: Where the output goes on the way out.
+        timing: What happens to late ticks.
+        recording: Where and how the run is recorded.
+        realtime: How the loop's process asks for real time.
+    """
+
+    name: Name
+    description: str = ""
+    device: dict[str, Any]
+    sample_rate_hz: Annotated[float, Field(ge=1e-3, le=1e6)]
+    block: Annotated[int, Field(ge=1, le=4096)] = 1
+    waveform: AnyWaveform
+    compensator: Annotated[
+        CompensatorConfig | None,
+        BeforeValidator(
+            _none_or_mapping, json_schema_input_type=Literal["none"] | CompensatorConfig
+        ),
+    ]
+    feedback: FeedbackConfig | None = None
+    limits: Limits
+    safe: Safe = Field(default_factory=Safe)
+    timing: Timing = Field(default_factory=Timing)
+    recording: RecordingConfig = Field(default_factory=RecordingConfig)
+    realtime: Realtime = Field(default_factory=Realtime)
+
+    @property
+    def tick_s(self) -> float:
+        """Time from one tick to the next, in s."""
+        return self.block / self.sample_rate_hz
+
+    def command_limits(self) -> CommandLimits:
+        """Return what the limiter holds commands to, in the device's unit."""
+        low, high = self.limits.command_range
+        furthest = max(high - self.safe.value, self.safe.value - low)
+        return CommandLimits(
+            low=low,
+            high=high,
+            slew_per_s=self.limits.slew_per_s,
+            safe=self.safe.value,
+            ramp_per_s=min(self.limits.slew_per_s, furthest / self.safe.ramp_s),
+        )

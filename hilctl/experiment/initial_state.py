@@ -1,0 +1,78 @@
+"""What a run before left in the actuator, as the memory that a compensator has to begin with."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from hilctl.base.arrays import F64
+from hilctl.base.errors import DataError
+from hilctl.models.base import HysteresisModel
+from hilctl.recording.data import Recording
+from hilctl.recording.reader import read
+
+_STILL_S = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Memory:
+    """Where a run before left the actuator.
+
+    Attributes:
+        state: float64[state_size], the compensator's memory, at rest there.
+        stands_um: Displacement there, by the model.
+        run_id: That run.
+    """
+
+    state: F64
+    stands_um: float
+    run_id: str
+
+    def lead_in(self, fed: F64, samples: int) -> F64:
+        """Return what is fed, begun from where the actuator stands.
+
+        Args:
+            fed: float64[n], in um.
+            samples: Samples that the way takes; the whole of ``fed`` where that is shorter.
+        """
+        way = np.arange(min(samples, fed.size)) / samples
+        led = fed.copy()
+        led[: way.size] += 0.5 * (1.0 + np.cos(np.pi * way)) * (self.stands_um - fed[0])
+        return led
+
+
+def memory_after(path: Path, model: HysteresisModel, sample_rate_hz: float) -> Memory:
+    """Return what a recorded run, taken to have begun at rest, left behind.
+
+    All of its commands, the ramp out too, go through the model; what comes of it, through the
+    inverse. So any run will do, with or without a compensator, by this model or another.
+
+    Args:
+        path: The run's recording.
+        model: The model that the compensator inverts.
+        sample_rate_hz: Samples a second; the recording's must be the same.
+
+    Raises:
+        DataError: The recording can't be read, or is not of a whole run of such commands.
+        ModelError: The model has no inverse.
+    """
+    recording = read(path)
+    _check(recording, model, sample_rate_hz)
+    command = recording.samples.command
+    still = np.full(round(_STILL_S * sample_rate_hz), command[-1])
+    came = model.forward(sample_rate_hz).process(np.concatenate((command, still)))
+    inverse = model.inverse(sample_rate_hz)
+    inverse.process(came[inverse.preview :])
+    return Memory(inverse.state(), float(came[-1]), recording.run.get("run_id", ""))
+
+
+def _check(recording: Recording, model: HysteresisModel, sample_rate_hz: float) -> None:
+    path, index = recording.path, recording.samples.index
+    if recording.command_unit != model.input_unit:
+        units = f"{recording.command_unit}, the model takes {model.input_unit}"
+        raise DataError(f"{path}: was recorded in {units}")
+    if recording.sample_rate_hz != sample_rate_hz:
+        rates = f"{recording.sample_rate_hz:g} Hz, this run is at {sample_rate_hz:g} Hz"
+        raise DataError(f"{path}: was recorded at {rates}")
+    if index.size == 0 or recording.dropped or index[-1] + 1 != index.size or not recording.end:
+        raise DataError(f"{path}: is not of a whole run: where it left the actuator is not known")

@@ -1,0 +1,170 @@
+"""From an experiment file to the experiment with all that the file refers to."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeVar
+
+import yaml
+
+from hilctl.base.device import Device
+from hilctl.base.errors import ConfigError, InputError, Problem
+from hilctl.base.files import TextFiles
+from hilctl.base.yaml.document import Document, load_document
+from hilctl.experiment.correction import Correction, load_correction
+from hilctl.experiment.file import Experiment
+from hilctl.experiment.registry import device_class, known_devices
+from hilctl.models.base import HysteresisModel
+from hilctl.models.files import load_model
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, slots=True)
+class LoadedExperiment:
+    """An experiment with all that its file refers to.
+
+    Attributes:
+        config: The experiment.
+        device: The device, made but not opened.
+        model: The compensator's model, or None.
+        folder: Folder that file names in it are relative to.
+        yaml_text: The experiment as it will run, command-line settings included.
+        document: The file, which knows where each value stands.
+        correction: What is added to the reference before the compensator, or None.
+        files: The files that it refers to, as they were read.
+    """
+
+    config: Experiment
+    device: Device
+    model: HysteresisModel | None
+    folder: Path
+    yaml_text: str
+    document: Document
+    correction: Correction | None = None
+    files: TextFiles = field(default_factory=TextFiles)
+
+
+def load_experiment(path: Path, settings: Sequence[str] = ()) -> LoadedExperiment:
+    """Read an experiment file, apply ``key=value`` settings, and load what it refers to.
+
+    Raises:
+        InputError: The file can't be read.
+        ConfigError: Rules are broken; the error lists every one of them.
+    """
+    return resolve(load_document(path), path.parent, settings)
+
+
+def resolve(
+    document: Document,
+    folder: Path,
+    settings: Sequence[str] = (),
+    files: TextFiles | None = None,
+) -> LoadedExperiment:
+    """Build an experiment from a YAML document, see :func:`load_experiment`.
+
+    Args:
+        document: The experiment.
+        folder: What file names in it are relative to.
+        settings: ``key=value`` texts over it.
+        files: Where those files are read from; the disk where None.
+    """
+    files = TextFiles() if files is None else files
+    for setting in settings:
+        document.set(setting)
+    problems: list[Problem] = []
+    config = _collect(problems, lambda: document.validate(Experiment))
+    device = _collect(problems, lambda: _make_device(document))
+    named = _NamedFiles(document, folder, files)
+    model = _collect(problems, lambda: named.load("model", load_model))
+    correction = _collect(problems, lambda: named.load("correction", load_correction))
+    if config is not None:
+        problems += _joint_problems(config, document)
+    if problems or config is None or device is None:
+        raise ConfigError(problems)
+    yaml_text = yaml.safe_dump(_plain(document.data), sort_keys=False, width=100)
+    return LoadedExperiment(config, device, model, folder, yaml_text, document, correction, files)
+
+
+def _joint_problems(config: Experiment, document: Document) -> list[Problem]:
+    """Return broken rules that tie one part of the experiment to another."""
+    found: list[Problem] = []
+
+    def add(loc: tuple[str, str], rule: str, value: object = "", hint: str = "") -> None:
+        found.append(Problem(document.where(loc), ".".join(loc), rule, str(value), hint))
+
+    unit, limits = config.waveform.unit, config.limits
+    if unit is None:
+        add(("waveform", "unit"), "is required", hint="um, A or V")
+    elif config.compensator is not None and unit != "um":
+        add(("waveform", "unit"), "must be um where a compensator stands", unit)
+    elif config.compensator is None and unit != limits.unit:
+        rule = f"must be {limits.unit}, the unit of the limits, where compensator is none"
+        add(("waveform", "unit"), rule, unit)
+    low, high = limits.command_range
+    if not low <= config.safe.value <= high:
+        rule = f"must lie within the limits, {low:g} to {high:g} {limits.unit}"
+        add(("safe", "value"), rule, f"{config.safe.value:g}")
+    return found
+
+
+def _collect(problems: list[Problem], load: Callable[[], T]) -> T | None:
+    try:
+        return load()
+    except ConfigError as error:
+        problems.extend(error.problems)
+    return None
+
+
+def _make_device(document: Document) -> Device | None:
+    given = document.data.get("device")
+    if not isinstance(given, dict):
+        return None
+    kind = given.get("kind")
+    where = document.where(("device", "kind"))
+    if not isinstance(kind, str):
+        rule, value = ("must be text", repr(kind)) if "kind" in given else ("is required", "")
+        hint = f"known: {', '.join(sorted(known_devices()))}"
+        raise ConfigError([Problem(where, "device.kind", rule, value, hint)])
+    try:
+        chosen = device_class(kind)
+    except InputError as error:
+        raise ConfigError([Problem(where, "device.kind", str(error))]) from None
+    options = document.validate(chosen.Options, at=("device",), without=("kind",))
+    try:
+        return chosen(options)
+    except ConfigError:
+        raise
+    except InputError as error:
+        raise ConfigError([Problem(document.where(("device",)), "device", str(error))]) from None
+
+
+@dataclass(frozen=True, slots=True)
+class _NamedFiles:
+    """Files that keys of the compensator name."""
+
+    document: Document
+    folder: Path
+    files: TextFiles
+
+    def load(self, key: str, load: Callable[[Path, TextFiles], T]) -> T | None:
+        """Return what the file that ``key`` names holds; None where it names none."""
+        compensator = self.document.data.get("compensator")
+        name = compensator.get(key) if isinstance(compensator, dict) else None
+        if not isinstance(name, str):
+            return None
+        try:
+            return load(self.folder / name, self.files)
+        except ConfigError:
+            raise
+        except InputError as error:
+            where = self.document.where(("compensator", key))
+            raise ConfigError([Problem(where, f"compensator.{key}", str(error))]) from None
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _plain(inner) for key, inner in value.items()}
+    if isinstance(value, tuple):
+        return [_plain(inner) for inner in value]
+    return value

@@ -1,0 +1,97 @@
+"""Common types of the experiment file, and its parts about the machine: time, recording, CPU."""
+
+import re
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    Field,
+    WithJsonSchema,
+    model_validator,
+)
+
+from hilctl.base.strict import Strict
+
+_NAME = "[A-Za-z0-9][A-Za-z0-9_.-]{0,79}"
+
+
+def _name(text: str) -> str:
+    if not re.fullmatch(_NAME, text):
+        raise ValueError(
+            "must be at most 80 letters, digits, '.', '_' and '-', "
+            f"and begin with a letter or digit: {text!r}"
+        )
+    return text
+
+
+def _two(value: Any) -> Any:
+    if isinstance(value, tuple) and len(value) != 2:
+        raise ValueError(f"must be [lowest, highest]: {list(value)}")
+    return value
+
+
+def _rising(interval: tuple[float, float]) -> tuple[float, float]:
+    if not interval[0] < interval[1]:
+        raise ValueError(f"must be [lowest, highest]: {list(interval)}")
+    return interval
+
+
+Name = Annotated[
+    str, AfterValidator(_name), WithJsonSchema({"type": "string", "pattern": f"^{_NAME}$"})
+]
+Interval = Annotated[
+    tuple[float, float],
+    BeforeValidator(_two),
+    AfterValidator(_rising),
+    Field(description="lowest, highest"),
+]
+
+
+class Timing(Strict):
+    """What happens to late ticks.
+
+    Attributes:
+        late_policy: For devices paced by this machine: ``skip`` whole ticks and keep the phase,
+            ``catch_up`` with a burst, or ``slip`` the phase. Devices with a sample clock of their
+            own always catch up: their FIFO takes the burst.
+        late_after: A tick counts as late when it wakes this many tick periods after it was due.
+        max_late_s: A tick later than this ends the run.
+        max_consecutive_late: So many late ticks one after the other end the run; 0 for any number.
+            Left out, as many as come in two seconds: this machine can't keep the rate.
+        grace_s: Time after the start in which late ticks count, but don't end the run.
+    """
+
+    late_policy: Literal["skip", "catch_up", "slip"] = "skip"
+    late_after: Annotated[float, Field(gt=0.0)] = 0.5
+    max_late_s: Annotated[float, Field(gt=0.0)] = 1.0
+    max_consecutive_late: Annotated[int, Field(ge=0)] | None = None
+    grace_s: Annotated[float, Field(ge=0.0)] = 0.0
+
+
+class RecordingConfig(Strict):
+    """Where and how a run is recorded.
+
+    Attributes:
+        folder: Folder for recordings without a name of their own, relative to where hilctl runs.
+        flush_s: Longest time that a sample stays out of the file; until then the ring keeps it.
+        scope_rate_hz: Highest rate of the ``/scope`` topic.
+        ring_s: Seconds of samples that the ring between loop and recorder holds.
+        on_failure: What a run does that can't be recorded any more, for a full or a slow disk:
+            ``stop`` by its way out, or ``go_on`` and count what is lost.
+    """
+
+    folder: str = "recordings"
+    flush_s: Annotated[float, Field(gt=0.0, le=10.0)] = 2.0
+    scope_rate_hz: Annotated[float, Field(gt=0.0, le=1000.0)] = 1000.0
+    ring_s: Annotated[float, Field(ge=1.0, le=60.0)] = 10.0
+    on_failure: Literal["stop", "go_on"] = "stop"
+
+    @model_validator(mode="after")
+    def _room(self) -> Self:
+        if self.ring_s < 3.0 * self.flush_s:
+            raise ValueError(
+                "ring_s must be at least three times flush_s, which the ring has to bridge: "
+                f"{self.ring_s:g} and {self.flush_s:g}"
+            )
+        return self

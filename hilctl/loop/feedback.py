@@ -1,0 +1,162 @@
+"""Feedback around the compensator: what the model does not know, drift above all, is taken out.
+
+A PI controller adds a correction to the compensator's input. It holds the last displacement that
+has come back against the reference that was due then. With the compensator before it, the actuator
+is a gain of about 1 and a delay, so what limits the bandwidth is the delay, and with it the rate.
+"""
+
+import math
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from hilctl.base.errors import InputError
+from hilctl.loop.in_flight import SentBlock
+
+LOOP_DELAY = 2
+"""Samples from a correction to the first tick that sees its effect: one until the sensor can show
+it, and one until the displacement that came with that exchange is used."""
+
+LEAST_GAIN_MARGIN = 2.0
+LEAST_PHASE_MARGIN_DEG = 60.0
+_FREQUENCIES = 4096
+
+
+@dataclass(frozen=True, slots=True)
+class Gains:
+    """Gains of the controller.
+
+    Attributes:
+        kp: um of correction per um of error, >= 0.
+        ki_per_s: Rate of the correction per um of error, per s, > 0.
+    """
+
+    kp: float
+    ki_per_s: float
+
+    def __post_init__(self) -> None:
+        if not (0.0 <= self.kp < math.inf and 0.0 < self.ki_per_s < math.inf):
+            raise InputError(f"kp must be >= 0 and ki_per_s > 0: {self.kp}, {self.ki_per_s}")
+
+
+def gains_for(bandwidth_hz: float, rate_hz: float) -> Gains:
+    """Return the gains whose open loop crosses 1 at ``bandwidth_hz``, below half the rate.
+
+    An actuator that is a gain of 1 and a delay needs no proportional part: the integral alone
+    crosses 1 at ``ki / (2 pi)``, and falls from there on.
+    """
+    return Gains(0.0, 2.0 * rate_hz * math.sin(math.pi * bandwidth_hz / rate_hz))
+
+
+def highest_bandwidth_hz(rate_hz: float, extra_delay_s: float = 0.0) -> float:
+    """Return the largest bandwidth that leaves the least phase margin.
+
+    The integral is 90 degrees late less half a sample, the loop two samples: together 1.5 samples.
+    The margin of 60 degrees leaves 30 degrees for these and the extra delay.
+
+    Args:
+        rate_hz: Samples a second.
+        extra_delay_s: What link and sensor add.
+    """
+    share = (90.0 - LEAST_PHASE_MARGIN_DEG) / 360.0
+    return share / ((LOOP_DELAY - 0.5) / rate_hz + extra_delay_s)
+
+
+def rate_needed_hz(bandwidth_hz: float, extra_delay_s: float = 0.0) -> float:
+    """Return the sample rate that a bandwidth needs; infinite where the extra delay forbids it."""
+    share = (90.0 - LEAST_PHASE_MARGIN_DEG) / 360.0
+    left_s = share / bandwidth_hz - extra_delay_s
+    return (LOOP_DELAY - 0.5) / left_s if left_s > 0.0 else math.inf
+
+
+def margins(gains: Gains, rate_hz: float, extra_delay_s: float = 0.0) -> tuple[float, float]:
+    """Return gain margin and phase margin, in degrees, on an actuator of gain 1.
+
+    The gain margin is 1 over the largest open-loop gain wherever the loop is later than 180
+    degrees; 0 degrees of phase margin stand for a loop gain that never falls below 1.
+    """
+    angle = np.geomspace(1e-6, math.pi, _FREQUENCIES)
+    controller = gains.kp + gains.ki_per_s / rate_hz / (1.0 - np.exp(-1j * angle))
+    size = np.abs(controller)
+    late = angle * (LOOP_DELAY + extra_delay_s * rate_hz) - np.angle(controller)
+    beyond = size[late >= math.pi]
+    gain_margin = float(1.0 / beyond.max()) if beyond.size else math.inf
+    above = np.flatnonzero(size >= 1.0)
+    if not above.size:
+        return gain_margin, 180.0
+    if above[-1] == angle.size - 1:
+        return gain_margin, 0.0
+    return gain_margin, math.degrees(math.pi - float(late[: above[-1] + 1].max()))
+
+
+class Feedback:
+    """The controller of one run; told of every tick, it never waits and never gives a NaN.
+
+    Args:
+        gains: Its gains.
+        rate_hz: Samples a second.
+        limit_um: Largest correction, > 0.
+        due_after: Samples from a reference to the displacement that is to show it: 0 where the
+            compensator looks ahead for it, 1 where it does not, and what link and sensor add.
+    """
+
+    def __init__(self, gains: Gains, rate_hz: float, limit_um: float, due_after: int) -> None:
+        if not 0.0 < limit_um < math.inf:
+            raise InputError(f"limit_um must be > 0: {limit_um}")
+        self._kp = gains.kp
+        self._step = gains.ki_per_s / rate_hz
+        self._limit_um = limit_um
+        self._due: deque[float] = deque([math.nan] * (due_after + 1), due_after + 1)
+        self._integral_um = 0.0
+        self.correction_um = 0.0
+        """Correction of the tick under way, in um, within the limit."""
+
+    def follow(self, block: SentBlock) -> None:
+        """Correct the input of the next sample.
+
+        Args:
+            block: Block of one sample: reference and input are the next one's, all the rest is
+                still of the last exchange.
+        """
+        if block.skipped:
+            self.forget()
+        limited = block.wanted.item(0) != block.command.item(0)
+        reference_um, displacement_um = block.reference.item(0), block.displacement_um.item(0)
+        block.input_um[0] += self.correct(reference_um, displacement_um, limited=limited)
+
+    def correct(self, reference_um: float, displacement_um: float, *, limited: bool) -> float:
+        """Return the correction of the next sample, in um.
+
+        An error that is not a number, as at the start, after a gap, or of a lost sensor, leaves
+        the correction as it is.
+
+        Args:
+            reference_um: Reference of this sample, after tuning.
+            displacement_um: Displacement that the last exchange brought.
+            limited: Whether the limiter held the last command back: then the integral may only
+                shrink.
+        """
+        error_um = self._due[0] - displacement_um
+        self._due.append(reference_um)
+        if not math.isfinite(error_um):
+            return self.correction_um
+        before, proportional = self._integral_um, self._kp * error_um
+        after = before + self._step * error_um
+        limit = self._limit_um
+        wish = proportional + after
+        if abs(wish) > limit and wish * error_um > 0.0:
+            edge = math.copysign(limit, wish) - proportional
+            after = edge if (edge - before) * error_um > 0.0 else before
+        if limited and abs(after) > abs(before):
+            after = before
+        self._integral_um = min(limit, max(-limit, after))
+        self.correction_um = min(limit, max(-limit, proportional + after))
+        return self.correction_um
+
+    def forget(self) -> None:
+        """Pass over samples that were skipped: no displacement is judged until references are new.
+
+        The correction and the integral stay.
+        """
+        self._due.extend([math.nan] * len(self._due))

@@ -1,0 +1,103 @@
+"""The last thing before the device: range and slew of every command.
+
+Pure: (wanted, previous, limits, time step) to (command, flags). The loop and the replay share it.
+"""
+
+from dataclasses import dataclass
+
+from hilctl.base.arrays import F64, U32
+from hilctl.base.errors import InputError
+from hilctl.base.flags import Flag
+from hilctl.kernels.limit import limit_block
+
+
+@dataclass(frozen=True, slots=True)
+class CommandLimits:
+    """Limits of a command, in the device's unit (A or V).
+
+    Attributes:
+        low: Lowest command.
+        high: Highest command.
+        slew_per_s: Fastest change, > 0.
+        safe: Command of the safe state, within [low, high].
+        ramp_per_s: Change on the way to the safe state, > 0 and at most ``slew_per_s``.
+    """
+
+    low: float
+    high: float
+    slew_per_s: float
+    safe: float
+    ramp_per_s: float
+
+    def __post_init__(self) -> None:
+        finite = float("-inf") < self.low < self.high < float("inf")
+        if not finite:
+            raise InputError(f"limits must be finite and rising: {self.low}, {self.high}")
+        if not self.low <= self.safe <= self.high:
+            raise InputError(
+                f"the safe value must lie within {self.low} to {self.high}: {self.safe}"
+            )
+        if not 0.0 < self.ramp_per_s <= self.slew_per_s < float("inf"):
+            raise InputError(
+                "the ramp must be > 0 and no faster than the slew limit "
+                f"{self.slew_per_s}: {self.ramp_per_s}"
+            )
+
+
+_RANGE_LIMITED = int(Flag.RANGE_LIMITED)
+_SLEW_LIMITED = int(Flag.SLEW_LIMITED)
+_INVALID = int(Flag.INVALID)
+
+
+class Limiter:
+    """Holds commands to their limits and remembers the last one.
+
+    Args:
+        limits: What commands are held to.
+        dt_s: Time from one sample to the next.
+    """
+
+    def __init__(self, limits: CommandLimits, dt_s: float) -> None:
+        self.limits = limits
+        self.last = limits.safe
+        self._step = limits.slew_per_s * dt_s
+        self._ramp_step = limits.ramp_per_s * dt_s
+
+    def limit(self, wanted: F64, command: F64, flags: U32) -> int:
+        """Fill ``command`` (float64[n]) with what may be put out; add to ``flags`` (uint32[n]).
+
+        Returns:
+            Index of the first wish that was not finite, or -1.
+        """
+        return self._apply(wanted, self._step, command, flags)
+
+    def ramp(self, command: F64, flags: U32) -> bool:
+        """Fill ``command`` with the next stretch of the way to the safe value.
+
+        Returns:
+            Whether the safe value is reached at the end of it.
+        """
+        flags |= Flag.RAMP.value
+        scratch = flags.copy()
+        wanted = command.copy()
+        wanted[:] = self.limits.safe
+        self._apply(wanted, self._ramp_step, command, scratch)
+        return self.last == self.limits.safe
+
+    def _apply(self, wanted: F64, max_step: float, command: F64, flags: U32) -> int:
+        limits = self.limits
+        first_invalid = limit_block(
+            wanted,
+            self.last,
+            limits.low,
+            limits.high,
+            max_step,
+            _RANGE_LIMITED,
+            _SLEW_LIMITED,
+            _INVALID,
+            command,
+            flags,
+        )
+        if command.size:
+            self.last = command.item(-1)
+        return first_invalid

@@ -1,0 +1,139 @@
+"""Absolute deadlines, the policy for late ticks, and exact counters of them."""
+
+import ctypes
+import errno
+import os
+import time
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
+
+from hilctl.base.device import Clock
+
+LatePolicy: TypeAlias = Literal["skip", "catch_up", "slip", "follow"]
+
+_FOLLOW = 1.0 / 64.0
+_TIMER_ABSTIME = 1
+
+
+class _Timespec(ctypes.Structure):
+    _fields_ = (("tv_sec", ctypes.c_long), ("tv_nsec", ctypes.c_long))
+
+
+class SystemClock:
+    """CLOCK_MONOTONIC, with sleeps to an absolute time that don't drift."""
+
+    def __init__(self) -> None:
+        self._nanosleep = ctypes.CDLL(None).clock_nanosleep  # returns its error, never sets errno
+        self._spec = _Timespec()
+        self._pointer = ctypes.byref(self._spec)
+
+    now_ns = staticmethod(time.monotonic_ns)
+    """Returns the time in ns."""
+
+    def sleep_until_ns(self, deadline_ns: int) -> None:
+        """Sleep until ``deadline_ns``; return at once where that is past."""
+        self._spec.tv_sec, self._spec.tv_nsec = divmod(deadline_ns, 1_000_000_000)
+        while True:
+            code = self._nanosleep(time.CLOCK_MONOTONIC, _TIMER_ABSTIME, self._pointer, None)
+            if code == 0:
+                return
+            if code != errno.EINTR:
+                raise OSError(code, os.strerror(code))
+
+
+@dataclass(slots=True)
+class Lateness:
+    """Exact counters of late ticks.
+
+    Attributes:
+        late_ticks: Ticks that woke later than the limit after they were due.
+        skipped_ticks: Ticks left out to keep the phase.
+        worst_ns: Largest lateness.
+        worst_tick: Tick that had it.
+        longest_run: Most late ticks one after the other.
+    """
+
+    late_ticks: int = 0
+    skipped_ticks: int = 0
+    worst_ns: int = 0
+    worst_tick: int = 0
+    longest_run: int = 0
+
+
+class Pacer:
+    """Wakes the loop at absolute times.
+
+    Args:
+        clock: Time.
+        period_ns: Time from one tick to the next; it need not be a whole number of ns.
+        policy: What happens when a tick wakes a whole period late or more. ``follow`` is for
+            devices whose exchange waits for their own clock: there is no other wait, and the
+            deadlines follow that clock, so that a late tick is one that came later than usual.
+        late_after_ns: Lateness from which a tick counts as late.
+    """
+
+    def __init__(
+        self, clock: Clock, period_ns: float, policy: LatePolicy, late_after_ns: float
+    ) -> None:
+        self._clock = clock
+        self._period_ns = period_ns
+        self._policy = policy
+        self._late_after_ns = late_after_ns
+        self._origin_ns = 0
+        self.late_run = 0
+        """Late ticks one after the other, up to this one."""
+        self.tick = -1
+        self.deadline_ns = 0
+        self.late_ns = 0
+        self.counters = Lateness()
+
+    def begin(self, start_ns: int) -> None:
+        """Make the first tick due at ``start_ns``."""
+        self._origin_ns = start_ns
+
+    def wait(self) -> int:
+        """Sleep until the next tick.
+
+        Returns:
+            How many ticks were skipped before it.
+        """
+        self.tick += 1
+        self.deadline_ns = self._origin_ns + round(self.tick * self._period_ns)
+        if self._policy == "follow" and self.tick:
+            self._follow()
+            return 0
+        self._clock.sleep_until_ns(self.deadline_ns)
+        now_ns = self._clock.now_ns()
+        self.late_ns = now_ns - self.deadline_ns
+        self._count()
+        if self.late_ns < self._period_ns or self._policy in {"catch_up", "follow"}:
+            return 0
+        if self._policy == "slip":
+            self._origin_ns += self.late_ns
+            return 0
+        skipped = int(self.late_ns / self._period_ns)
+        self.tick += skipped
+        self.counters.skipped_ticks += skipped
+        return skipped
+
+    def _follow(self) -> None:
+        """Take this moment as the tick: at once where it is early, slowly where it is late."""
+        self.late_ns = self._clock.now_ns() - self.deadline_ns
+        if self.late_ns < 0:
+            self._origin_ns += self.late_ns
+            self.deadline_ns += self.late_ns
+            self.late_ns = 0
+        self._origin_ns += round(self.late_ns * _FOLLOW)
+        self._count()
+
+    def _count(self) -> None:
+        counters = self.counters
+        if self.late_ns > counters.worst_ns:
+            counters.worst_ns = self.late_ns
+            counters.worst_tick = self.tick
+        if self.late_ns > self._late_after_ns:
+            counters.late_ticks += 1
+            self.late_run += 1
+            counters.longest_run = max(counters.longest_run, self.late_run)
+        else:
+            self.late_run = 0

@@ -1,0 +1,15 @@
+"""Two processes round one loop: shared memory, recording, requests, recovery.
+
+start.py           from an experiment file to a finished run
+supervisor.py      starts the loop's process, records, makes the rig safe
+child.py           its hold on that process; hang_watch.py  whether it hangs
+loop_process.py    the loop's process
+ring.py            sample blocks in shared memory, behind shared_page.py
+recorder.py        into the recording; tail.py, metadata.py and ending.py what it says there
+run_folder.py      runs that are going on, and who holds a device
+requests.py        what a run may be asked, over control_socket.py; client.py asks
+systemd.py         readiness and watchdog of a service
+orphans.py         what dead runs left behind
+unpaced.py         a run of a simulated device that needs no real time
+result.py          where a run stands, and how it ended
+"""

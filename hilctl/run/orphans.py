@@ -1,0 +1,105 @@
+"""Runs whose processes have died: what they left in memory goes into their recordings."""
+
+import json
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from hilctl.base.blocks import Batch, Head
+from hilctl.base.errors import HilctlError
+from hilctl.base.events import LoopEvent
+from hilctl.loop.plan import Outcome
+from hilctl.recording.recover import recover_recording
+from hilctl.run.ending import end_facts
+from hilctl.run.ring import SampleRing
+from hilctl.run.run_folder import RunFolder, runs, taken_over
+from hilctl.run.shared_page import Field, Phase
+
+
+@dataclass(frozen=True, slots=True)
+class Orphan:
+    """A run that somebody else had to finish.
+
+    Attributes:
+        name: The run's name.
+        recording: Its recording.
+        safe: Whether the loop has put the output at its safe value before it left.
+        text: What became of it, for people.
+    """
+
+    name: str
+    recording: Path
+    safe: bool
+    text: str
+
+
+def recover_orphans() -> list[Orphan]:
+    """Finish the recordings of all dead runs of this user, and clear their folders away."""
+    found = []
+    for run in runs():
+        if run.alive:
+            continue
+        with taken_over(run) as ours, _undisturbed():
+            if ours:
+                found.append(_recover(run))
+                run.remove()
+    return found
+
+
+def _recover(run: RunFolder) -> Orphan:
+    path = Path(run.card.recording)
+    outcome, batches, events, end = _left_behind(run)
+    where = "at its safe value" if outcome.safe else "NOT known to be safe: look at it"
+    try:
+        recovered = recover_recording(path, batches, end, events=events, ended_at=outcome.ended_at)
+        text = f"{outcome.reason}; output {where}; {recovered.samples} samples: {recovered.reason}"
+    except (HilctlError, OSError) as error:
+        text = f"{outcome.reason}; output {where}; its recording could not be recovered: {error}"
+    return Orphan(run.card.name, path, outcome.safe, text)
+
+
+def _left_behind(
+    run: RunFolder,
+) -> tuple[Outcome, list[Batch], list[LoopEvent], dict[str, str]]:
+    """Return how the loop ended, blocks and events that are not safe yet, facts of the end."""
+    died = Outcome("fault", "supervisor and loop died", 0, False, 0)
+    try:
+        ring = SampleRing.attach(run.ring)
+    except (OSError, ValueError):
+        return died, [], [], {"code": died.code, "reason": died.reason, "output_safe": "false"}
+    batches = []
+    while True:
+        while (batch := ring.pop()) is not None:
+            batches.append(batch)
+        if not ring.skip_damaged():
+            break
+    outcome = _account(ring) or died
+    if ring.get(Field.PHASE) != Phase.ENDED:
+        last = batches[-1].heads[-1] if batches else None
+        next_sample = 0 if last is None else int(last[Head.FIRST_SAMPLE]) + ring.block
+        if (unanswered := ring.unanswered(next_sample)) is not None:
+            batches.append(unanswered)
+    return outcome, batches, ring.pop_events(), end_facts(outcome, ring)
+
+
+def _account(ring: SampleRing) -> Outcome | None:
+    """Return what the loop said of its end, if it did."""
+    phase = ring.get(Field.PHASE)
+    if phase == Phase.FAILED:
+        return Outcome("fault", ring.read_text(), 0, False, 0)
+    if phase == Phase.ENDED:
+        with suppress(ValueError, TypeError):
+            return Outcome(**json.loads(ring.read_text()))
+    return None
+
+
+@contextmanager
+def _undisturbed() -> Iterator[None]:
+    """Let no Ctrl-C come between a recovered recording and the end of its folder."""
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)

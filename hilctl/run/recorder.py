@@ -1,0 +1,175 @@
+"""The recording side of a run: claims the file, writes batches, survives a full disk."""
+
+import time
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from datetime import UTC, datetime
+from functools import partial
+from pathlib import Path
+
+from hilctl.base.blocks import Batch, Head
+from hilctl.base.errors import InputError
+from hilctl.base.events import LoopEvent
+from hilctl.experiment.check import Checked
+from hilctl.experiment.correction import dump_correction
+from hilctl.models.files import dump_model
+from hilctl.recording.data import Event
+from hilctl.recording.writer import OutputFile, RecordingWriter, RunFacts
+from hilctl.run.metadata import run_facts
+from hilctl.run.tail import Tail
+
+_SAMPLES_BEFORE = 50
+
+
+class Recorder:
+    """Records one run into one file.
+
+    A write that fails ends the recording, not the draining: what comes after is counted as lost.
+
+    Args:
+        checked: The experiment.
+        path: File to record to.
+        overwrite: Whether an existing file may be replaced.
+
+    Raises:
+        InputError: The file exists or can't be written.
+    """
+
+    def __init__(self, checked: Checked, path: Path, *, overwrite: bool) -> None:
+        self.path = path
+        self.error = ""
+        self._next_sample = 0
+        self._flushed = 0
+        self._checked = checked
+        self._writer: RecordingWriter | None = None
+        self._start_unix_ns = 0
+        self._unix_ns = steady_unix_ns()
+        self._tail = Tail(_SAMPLES_BEFORE)
+        try:
+            self._file = OutputFile(path, overwrite=overwrite)
+        except FileExistsError:
+            raise InputError(
+                f"{path}: exists already: give another --output, or --overwrite"
+            ) from None
+        except OSError as error:
+            raise self._unwritable(error) from None
+
+    def _unwritable(self, error: OSError) -> InputError:
+        return InputError(f"{self.path}: can't be written: {error.strerror}")
+
+    def begin(self, start_unix_ns: int, set_up: Mapping[str, str]) -> None:
+        """Write what is known before the first sample.
+
+        Args:
+            start_unix_ns: When it is due.
+            set_up: How the loop's process was set up, see
+                :func:`hilctl.machine.realtime.step_facts`.
+
+        Raises:
+            InputError: The file can't be written.
+        """
+        self._start_unix_ns = start_unix_ns
+        self._unix_ns = steady_unix_ns()
+        try:
+            self._writer = RecordingWriter(
+                self._file.begin(), self._facts(start_unix_ns, set_up), start_unix_ns
+            )
+        except OSError as error:
+            raise self._unwritable(error) from None
+
+    def give_back(self) -> None:
+        """Leave no file behind where there was none: the run does not start."""
+        self._file.give_back()
+
+    def batch(self, batch: Batch) -> None:
+        """Write a batch, or count it as lost where the file can't be written any more."""
+        self._next_sample = int(batch.heads[-1, Head.FIRST_SAMPLE]) + batch.flags.shape[1]
+        self._tail.add(batch)
+        self._write(partial(self._begun.batch, batch))
+
+    def event(self, event: LoopEvent) -> None:
+        """Write what the loop told."""
+        rate_hz = self._checked.loaded.config.sample_rate_hz
+        time_ns = self._start_unix_ns + round(event.sample * 1e9 / rate_hz)
+        before = self._tail.up_to(event.sample)
+        told = Event(time_ns, event.sample, event.level, event.code, event.text, before)
+        self._write(partial(self._begun.event, told))
+
+    def flush(self) -> None:
+        """Hand all that was written to the kernel."""
+        self._write(self._begun.flush)
+        if not self.error:
+            self._flushed = self._begun.samples
+
+    def finish(self, end: Mapping[str, str], ended_at: int) -> None:
+        """Write how the run ended, and close the file.
+
+        Args:
+            end: Facts of the end, with ``code`` and ``reason``.
+            ended_at: Index after the last sample.
+        """
+        self._next_sample = max(self._next_sample, ended_at)
+        now_ns = self._unix_ns()
+        level = "info" if end["code"] == "completed" else "error"
+        event = Event(now_ns, max(0, ended_at - 1), level, "run_ended", end["reason"])
+        self._write(partial(self._begun.event, event))
+        self._write(partial(self._begun.finish, {**end, "ended": iso_time(now_ns)}, ended_at))
+        if self.error:
+            with suppress(OSError):  # the disk's refusal is known already
+                self._file.stream.close()
+        self._write(self._file.stream.close)
+
+    @property
+    def samples(self) -> int:
+        """Samples written; where the file could not be written to its end, those flushed before."""
+        return self._flushed if self.error else self._begun.samples
+
+    @property
+    def next_sample(self) -> int:
+        """Index after the last sample written or lost."""
+        return self._next_sample
+
+    @property
+    def missing(self) -> int:
+        """Samples known to be missing: counted in the recording, or lost because it was cut."""
+        return self._next_sample - self._flushed if self.error else self._begun.missing
+
+    @property
+    def _begun(self) -> RecordingWriter:
+        assert self._writer is not None
+        return self._writer
+
+    def _write(self, write: Callable[[], None]) -> None:
+        if self.error:
+            return
+        try:
+            write()
+        except OSError as error:
+            self.error = f"{self.path}: can't be written: {error.strerror}"
+
+    def _facts(self, start_unix_ns: int, set_up: Mapping[str, str]) -> RunFacts:
+        loaded = self._checked.loaded
+        config, info = loaded.config, loaded.device.info
+        return RunFacts(
+            facts={**run_facts(self._checked, iso_time(start_unix_ns)), **set_up},
+            segments=self._checked.reference.segments,
+            experiment_yaml=loaded.yaml_text,
+            model_yaml=dump_model(loaded.model) if loaded.model else "",
+            correction_yaml=dump_correction(loaded.correction) if loaded.correction else "",
+            sample_rate_hz=config.sample_rate_hz,
+            command_unit=info.command_unit,
+            measures_command=info.measures_command,
+            records_input=self._checked.ahead is not None,
+            scope_rate_hz=config.recording.scope_rate_hz,
+        )
+
+
+def steady_unix_ns() -> Callable[[], int]:
+    """Return a clock of Unix time in ns that goes on from now, whatever the machine's is set to."""
+    offset_ns = time.time_ns() - time.monotonic_ns()
+    return lambda: time.monotonic_ns() + offset_ns
+
+
+def iso_time(unix_ns: int) -> str:
+    """Return a Unix time in ns as ISO 8601, UTC."""
+    return datetime.fromtimestamp(unix_ns * 1e-9, tz=UTC).isoformat(timespec="milliseconds")

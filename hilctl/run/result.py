@@ -1,0 +1,48 @@
+"""Where a run stands, and how it ended, for those who show it."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from hilctl.base.blocks import Batch
+
+
+@dataclass(frozen=True, slots=True)
+class RunResult:
+    """How a run ended.
+
+    Attributes:
+        path: The recording.
+        code: ``completed``, ``stopped`` or ``fault``.
+        reason: One line for people.
+        safe: Whether the output is known to be at its safe value.
+        stop_signal: Number of the signal that stopped it, SIGTERM for a stop order, or 0.
+        samples: Samples recorded.
+        missing: Samples counted as dropped, skipped or lost.
+        late_ticks: Ticks that woke late.
+    """
+
+    path: Path
+    code: str
+    reason: str
+    safe: bool
+    stop_signal: int
+    samples: int
+    missing: int
+    late_ticks: int
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """Where a run stands.
+
+    Attributes:
+        samples: Samples recorded so far.
+        total: Samples of the waveform.
+        late_ticks: Ticks that woke late so far.
+        batch: The newest samples.
+    """
+
+    samples: int
+    total: int
+    late_ticks: int
+    batch: Batch

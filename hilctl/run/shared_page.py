@@ -1,0 +1,144 @@
+"""What loop and supervisor tell each other: numbers, one text, and events, in shared memory.
+
+Each number has one writer, and is written whole. Nobody ever waits for the other.
+"""
+
+import json
+from dataclasses import asdict
+from enum import IntEnum
+from mmap import mmap
+
+import numpy as np
+
+from hilctl.base.arrays import F64, I64
+from hilctl.base.events import LoopEvent
+
+_PAGE = 4096
+_TEXT_BYTES = 8192
+_EVENT_BYTES = 1024
+_EVENT_SLOTS = 32
+_EVENTS_AT = _PAGE + _TEXT_BYTES
+SIZE = _EVENTS_AT + _EVENT_SLOTS * _EVENT_BYTES
+"""Bytes that the page, the text and the events take."""
+
+
+class Field(IntEnum):
+    """Numbers in the control page, int64 each; those named as gain or offset are float64."""
+
+    MAGIC = 0
+    SLOTS = 1
+    BLOCK = 2
+    STATE_SIZE = 3
+    IN_FLIGHT = 4
+    HEAD = 8
+    TAIL = 16
+    PHASE = 24
+    GO = 25
+    STOP = 26
+    LOOP_BEAT_NS = 27
+    SUPERVISOR_BEAT_NS = 28
+    START_NS = 29
+    NEXT_SAMPLE = 30
+    LATE_TICKS = 32
+    SKIPPED_TICKS = 33
+    WORST_LATE_NS = 34
+    WORST_LATE_TICK = 35
+    LONGEST_LATE_RUN = 36
+    EVENT_HEAD = 40
+    EVENT_TAIL = 41
+    EVENTS_LOST = 42
+    TUNE_WANTED = 48
+    TUNE_TAKEN = 49
+    TUNE_GAIN = 50
+    TUNE_OFFSET = 51
+    TUNE_SAMPLES = 52
+
+
+class Phase(IntEnum):
+    """How far the loop process has come."""
+
+    STARTING = 0
+    READY = 1
+    RUNNING = 2
+    ENDED = 3
+    FAILED = 4
+    REFUSED = 5
+    CLOSING = 6
+
+
+class ControlPage:
+    """The page, seen from either side.
+
+    Args:
+        memory: Shared memory of at least :data:`SIZE` bytes; the page stands at its start.
+    """
+
+    def __init__(self, memory: mmap) -> None:
+        self._map = memory
+        self.control: I64 = np.frombuffer(memory, dtype=np.int64, count=_PAGE // 8)
+        self.numbers = memoryview(memory)[:_PAGE].cast("q")
+        """The same numbers as Python's own: three times as fast to read and write singly."""
+        self._floats: F64 = np.frombuffer(memory, dtype=np.float64, count=_PAGE // 8)
+        self._event_tail = self.get(Field.EVENT_TAIL)
+
+    def get(self, field: Field) -> int:
+        """Return a number."""
+        return int(self.control[field])
+
+    def put(self, field: Field, value: int) -> None:
+        """Set a number."""
+        self.control[field] = value
+
+    def get_float(self, field: Field) -> float:
+        """Return a number that is no whole one."""
+        return float(self._floats[field])
+
+    def put_float(self, field: Field, value: float) -> None:
+        """Set a number that is no whole one."""
+        self._floats[field] = value
+
+    def write_text(self, text: str) -> None:
+        """Leave a text for the other side, cut to what fits."""
+        self._write(_PAGE, _TEXT_BYTES, text)
+
+    def read_text(self) -> str:
+        """Return the text that the other side left."""
+        return self._read(_PAGE, _TEXT_BYTES)
+
+    def push_event(self, event: LoopEvent) -> None:
+        """Leave an event; where there is no room it is counted as lost."""
+        head = self.get(Field.EVENT_HEAD)
+        if head - self.get(Field.EVENT_TAIL) >= _EVENT_SLOTS:
+            self.control[Field.EVENTS_LOST] += 1
+            return
+        text = event.text
+        while len(raw := json.dumps({**asdict(event), "text": text})) > _EVENT_BYTES - 8:
+            text = text[: len(text) * 3 // 4]
+        self._write(_EVENTS_AT + head % _EVENT_SLOTS * _EVENT_BYTES, _EVENT_BYTES, raw)
+        self.put(Field.EVENT_HEAD, head + 1)
+
+    def pop_events(self) -> list[LoopEvent]:
+        """Take the events that came since; they keep their room until :meth:`release`."""
+        head, found = self.get(Field.EVENT_HEAD), []
+        first = max(self._event_tail, head - _EVENT_SLOTS)
+        for number in range(first, head):
+            raw = self._read(_EVENTS_AT + number % _EVENT_SLOTS * _EVENT_BYTES, _EVENT_BYTES)
+            try:
+                found.append(LoopEvent(**json.loads(raw)))
+            except (ValueError, TypeError):
+                self.control[Field.EVENTS_LOST] += 1  # damaged
+        self._event_tail = head
+        return found
+
+    def release(self) -> None:
+        """Give the room of all that was taken back to the loop: it is safe elsewhere."""
+        self.put(Field.EVENT_TAIL, self._event_tail)
+
+    def _write(self, at: int, size: int, text: str) -> None:
+        raw = text.encode()[: size - 8].decode(errors="ignore").encode()
+        self._map[at + 8 : at + 8 + len(raw)] = raw
+        self._map[at : at + 8] = len(raw).to_bytes(8, "little")
+
+    def _read(self, at: int, size: int) -> str:
+        length = min(int.from_bytes(self._map[at : at + 8], "little"), size - 8)
+        return bytes(self._map[at + 8 : at + 8 + length]).decode(errors="replace")

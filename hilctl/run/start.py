@@ -1,0 +1,73 @@
+"""From an experiment file to a finished run: load, check, run."""
+
+import os
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from hilctl.base.errors import InputError
+from hilctl.experiment.check import Checked, check
+from hilctl.experiment.load import load_experiment
+from hilctl.run.result import Progress, RunResult
+from hilctl.run.supervisor import Supervisor
+
+
+def checked_experiment(path: Path, settings: Sequence[str]) -> Checked:
+    """Load an experiment and hold it against device, model and limits.
+
+    Raises:
+        InputError: It can't be used; all problems are listed.
+    """
+    return check(load_experiment(path, settings))
+
+
+def output_of(checked: Checked, output: Path | None) -> Path:
+    """Return the recording to write: the one given, or a new name in the experiment's folder.
+
+    Raises:
+        InputError: The folder can't be made.
+    """
+    if output is not None:
+        return output
+    folder = Path(checked.loaded.config.recording.folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{folder}: can't be made: {error.strerror}") from None
+    return default_output(checked.loaded.config.name, folder, time.localtime())
+
+
+def start_run(
+    path: Path,
+    settings: Sequence[str],
+    output: Path | None,
+    overwrite: bool,
+    on_progress: Callable[[Progress], None],
+) -> RunResult:
+    """Run an experiment file to its end.
+
+    Args:
+        path: Experiment file.
+        settings: ``key=value`` texts over it.
+        output: Recording to write; a name in the experiment's folder where None.
+        overwrite: Whether an existing recording may be replaced.
+        on_progress: Called with each batch of samples.
+
+    Raises:
+        InputError: Nothing has moved, and no file is left.
+        RunError: The device could not be opened; nothing has moved, and no file is left.
+    """
+    checked = checked_experiment(path, settings)
+    output = output_of(checked, output)
+    return Supervisor(checked, output, overwrite=overwrite, on_progress=on_progress).run()
+
+
+def default_output(name: str, folder: Path, now: time.struct_time) -> Path:
+    """Return the file for a run that was given none: ``folder/name-date-time.mcap``."""
+    stamp = time.strftime("%Y%m%d-%H%M%S", now)
+    candidate = folder / f"{name}-{stamp}.mcap"
+    number = 2
+    while os.path.lexists(candidate):
+        candidate = folder / f"{name}-{stamp}-{number}.mcap"
+        number += 1
+    return candidate

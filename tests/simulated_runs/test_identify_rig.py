@@ -1,0 +1,192 @@
+"""Models identified on the simulated magnetostrictive rig, which none of them is.
+
+No public measured current-to-displacement record of a magnetostrictive actuator is known, so these
+figures rest on the simulation; those beside them are of the dissertation's own rig.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hilctl.analysis.metrics import fold, peak_hysteresis_percent
+from hilctl.base.arrays import F64
+from hilctl.identify.cycles import average_cycle
+from hilctl.identify.data import Loop
+from hilctl.identify.fit import Fit, judge
+from hilctl.identify.identify import identify
+from hilctl.identify.settings import Kind, Settings
+from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
+
+pytestmark = pytest.mark.rig
+
+RATE_HZ = 50_000.0
+Tone = tuple[float, float]
+"""Amplitude in A, frequency in Hz."""
+
+
+def drive(command_a: Callable[[F64], F64], seconds: float, seed: int = 3) -> tuple[F64, F64]:
+    """Return a current and the displacement that the rig gives."""
+    command = np.ascontiguousarray(command_a(np.arange(round(seconds * RATE_HZ)) / RATE_HZ))
+    displacement_um, current_a = np.empty_like(command), np.empty_like(command)
+    actuator = TerfenolActuator(TerfenolParameters(), RATE_HZ, seed=seed)
+    actuator.step(command, displacement_um, current_a)
+    return command, displacement_um
+
+
+@cache
+def measured_loop(*tones: Tone, points: int = 300) -> Loop:
+    """Return the rig's averaged cycle under a sum of tones; the first is the fundamental."""
+    fundamental_hz = tones[0][1]
+
+    def command_a(time: F64) -> F64:
+        start = np.clip(time * fundamental_hz, 0.0, 1.0)
+        return start * sum(a * np.sin(2.0 * np.pi * f * time) for a, f in tones)
+
+    command, displacement_um = drive(command_a, 6.0 / fundamental_hz)
+    period = RATE_HZ / fundamental_hz
+    first = round(2 * period)
+    phase = np.arange(command.size - first) / period
+    values = np.stack([command[first:], displacement_um[first:]])
+    label = " + ".join(f"{a:g} A {f:g} Hz" for a, f in tones)
+    v, y = average_cycle(label, phase, values, period, points)
+    return Loop(label, v, y, fundamental_hz, RATE_HZ)
+
+
+def sines(amplitudes: Sequence[float], frequencies: Sequence[float], points: int) -> list[Loop]:
+    return [measured_loop((a, f), points=points) for a in amplitudes for f in frequencies]
+
+
+def fit(kind: Kind, data: list[Loop], **choices: Any) -> Fit:
+    settings = replace(Settings.published(kind), **choices)
+    return identify(kind, data, settings, np.random.default_rng(1), lambda: 0.0)
+
+
+@cache
+def published_omega() -> Fit:
+    """Return Omega, 12 plays and 17 deadbands, on the published grid (6.24)."""
+    return fit("integrated", sines([3.0, 6.0], [10.0, 50.0, 100.0, 150.0, 250.0], 300))
+
+
+def test_omega_meets_the_published_error_on_the_published_grid() -> None:
+    """The peak error is at most 3.72 %, of the largest and of each loop's own peak-to-peak."""
+    found = published_omega()
+    assert found.peak_percent <= 3.0
+    assert found.own_peak_percent <= 3.72
+    assert found.rms_percent <= 0.65
+    assert found.model.operators == 12
+    assert found.model.input_range == pytest.approx((-6.0, 6.0), abs=1e-3)
+
+
+def test_starts_end_at_the_same_error() -> None:
+    """As published, different starting values end at nearly the same errors."""
+    ends = [start.rms_percent for start in published_omega().starts]
+    assert max(ends) <= 1.1 * min(ends)
+
+
+def test_omega_holds_for_other_inputs() -> None:
+    """Loops that were not fitted, 5 A and the two complex inputs (6.4), are met nearly as well."""
+    others = [
+        *sines([5.0], [1.0, 10.0, 150.0, 250.0], 300),
+        measured_loop((1.0, 50.0), (5.0, 100.0)),
+        measured_loop((1.0, 100.0), (5.0, 200.0)),
+    ]
+    tried = judge(published_omega().model, others)
+    assert tried.own_peak_percent <= 3.72
+
+
+def test_omega_at_full_rate_is_as_good_as_on_its_loops() -> None:
+    """Run sample by sample at 50 kHz, the model is as near to the rig as the loops said."""
+
+    def command_a(time: F64) -> F64:
+        return np.clip(time * 250.0, 0.0, 1.0) * 6.0 * np.sin(2.0 * np.pi * 250.0 * time)
+
+    command, displacement_um = drive(command_a, 6.0 / 250.0)
+    modelled_um = published_omega().model.forward(RATE_HZ).process(command)
+    steady = slice(round(2.0 * RATE_HZ / 250.0), None)
+    error_um = (modelled_um - displacement_um)[steady]
+    peak_percent = 100.0 * np.max(np.abs(error_um)) / np.ptp(displacement_um[steady])
+    (on_loop,) = (e for e in published_omega().errors if e.label == "6 A 250 Hz")
+    assert peak_percent == pytest.approx(on_loop.peak_percent, abs=0.5)
+
+
+def test_free_weights_and_more_plays_are_better() -> None:
+    """36 plays and free weights each lower the peak error, as published for 36 plays."""
+    data = sines([3.0, 6.0], [10.0, 50.0, 100.0, 150.0, 250.0], 300)
+    more = fit("integrated", data, plays=36, starts=3)
+    free = fit("integrated", data, weights="free", starts=2)
+    assert more.peak_percent < published_omega().peak_percent
+    assert free.peak_percent <= 1.9
+
+
+@cache
+def staged() -> Fit:
+    """Return the staged model of a short campaign."""
+    tones = [(3.0, 1.0), (3.0, 250.0), (5.0, 100.0), (6.6, 1.0), (6.6, 50.0), (6.6, 100.0)]
+    data = [measured_loop(tone) for tone in (*tones, (6.6, 150.0), (6.6, 250.0), (6.0, 400.0))]
+    return fit("staged", data)
+
+
+def test_staged_model_finds_lag_and_resonance() -> None:
+    """From loops alone, lag and resonance come within 10 % of what the rig was built with."""
+    rig, found = TerfenolParameters(), staged()
+    assert found.parameters["tau_s"] == pytest.approx(rig.lag_s, rel=0.1)
+    growth = rig.lag_growth_m_per_a * rig.coil_factor_per_m
+    assert found.parameters["growth_per_unit"] == pytest.approx(growth, rel=0.1)
+    assert found.parameters["natural_hz"] == pytest.approx(2292.0, rel=0.1)
+    assert found.peak_percent <= 0.8
+
+
+def compensated(frequency_hz: float) -> tuple[float, float]:
+    """Return peak hysteresis and peak error in percent, the full stroke through the inverse."""
+    period = RATE_HZ / frequency_hz
+    time = np.arange(round(8 * period)) / RATE_HZ
+    swell = 0.5 - 0.5 * np.cos(np.pi * np.clip(time * frequency_hz / 3.0, 0.0, 1.0))
+    reference_um = swell * (40.8 * np.sin(2.0 * np.pi * frequency_hz * time) - 6.9)
+    inverse = staged().model.inverse(RATE_HZ)
+    ahead = np.append(reference_um[inverse.preview :], np.full(inverse.preview, reference_um[-1]))
+    command = inverse.process(ahead)
+    _, displacement_um = drive(lambda _: command, time.size / RATE_HZ, seed=11)
+    index = np.arange(time.size)[-round(4 * period) :]
+    cycle = fold(index, period, (reference_um[index], displacement_um[index]))
+    error = np.max(np.abs(cycle.signals[1] - cycle.signals[0]))
+    hysteresis = peak_hysteresis_percent(*cycle.signals)
+    assert hysteresis is not None
+    return hysteresis, 100.0 * float(error) / float(np.ptp(cycle.signals[1]))
+
+
+@pytest.mark.parametrize("frequency_hz", [5.0, 50.0, 100.0, 200.0, 250.0])
+def test_staged_inverse_straightens_the_rig(frequency_hz: float) -> None:
+    """At full stroke, noise not seen before, hysteresis is at most 1 % (published: up to 3.7 %)."""
+    hysteresis, error = compensated(frequency_hz)
+    assert hysteresis <= 1.0
+    assert error <= 1.0
+
+
+def test_without_rate_or_deadbands_the_model_is_far_off() -> None:
+    """At 6 A up to 200 Hz a PPI misses the rate and an RDPI the asymmetry (4.5: 13.5 and 9.6 %)."""
+    data = sines([3.0, 6.0], [10.0, 100.0, 200.0], 200)
+    omega = fit("integrated", data, starts=3)
+    no_rate = fit("ppi", data, plays=12, weights="exponential", starts=3, output_offset=True)
+    no_deadbands = fit("rdpi", data, plays=12, weights="exponential", starts=3)
+    assert omega.peak_percent < 3.0
+    assert no_rate.peak_percent > 3.0 * omega.peak_percent
+    assert no_deadbands.peak_percent > 2.0 * omega.peak_percent
+
+
+def test_rdpi_at_small_amplitude() -> None:
+    """At 2.3 A, 1 to 200 Hz, weighted by hysteresis, n = 4 gives thresholds near the published.
+
+    Published: alpha = 0.309 A, gamma = 2.73e-4 s. The rig is asymmetric even there, so a constant
+    displacement takes off much of the error.
+    """
+    data = sines([2.3], [1.0, 50.0, 100.0, 200.0], 400)
+    plain = fit("rdpi", data)
+    offset = fit("rdpi", data, output_offset=True)
+    assert plain.parameters["alpha"] == pytest.approx(0.309, rel=0.2)
+    assert plain.parameters["gamma"] == pytest.approx(2.73e-4, rel=0.25)
+    assert plain.peak_percent <= 6.0
+    assert offset.peak_percent <= 3.72

@@ -1,0 +1,295 @@
+"""Exports, read back bit for bit by readers that are not ours."""
+
+import csv
+import errno
+import json
+import stat
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pyarrow import parquet
+from scipy.io import loadmat
+
+from hilctl.analysis.export import columns, export
+from hilctl.base.errors import DataError, InputError
+from hilctl.base.segments import Segment
+from hilctl.recording.data import Recording, Samples, Ticks
+
+NAMES = {
+    "A": ("wanted_a", "current_a", "measured_a"),
+    "V": ("wanted_v", "drive_v", "measured_v"),
+}
+YAML = "name: prüf-Lauf  # \u03bcm\n"
+
+
+def recording(unit: str = "A", *, measured: bool = True, n: int = 2000) -> Recording:
+    """Return a run of awkward numbers, with a gap in its index."""
+    rng = np.random.default_rng(7)
+    awkward = [np.nan, np.inf, -np.inf, -0.0, 5e-324, 1.7976931348623157e308, 0.1, 1e16, 1 / 3]
+
+    def column() -> np.ndarray:
+        values = rng.normal(size=n) * 10.0 ** rng.integers(-20, 20, n)
+        values[: len(awkward)] = awkward
+        return values
+
+    index = np.arange(n, dtype=np.int64)
+    index[n // 2 :] += 500
+    samples = Samples(
+        index=index,
+        reference_um=column(),
+        wanted=column(),
+        command=column(),
+        measured=column() if measured else np.empty(0),
+        displacement_um=column(),
+        flags=rng.integers(0, 2**32, n, dtype=np.uint32),
+    )
+    return Recording(
+        path=Path("folder/run.mcap"),
+        run={"name": "test", "device": "serial_dac"},
+        end={"reason": "done"},
+        sample_rate_hz=50_000.0,
+        command_unit=unit,
+        compensated=True,
+        segments=(Segment("sine", 0, n, 0, n, 1000.0 / 3.0),),
+        samples=samples,
+        dropped=500,
+        ticks=Ticks(*(np.empty(0, dtype=np.int64),) * 4),
+        events=(),
+        experiment_yaml=YAML,
+        model_yaml="",
+    )
+
+
+def expected(run: Recording) -> dict[str, np.ndarray]:
+    """Return every column under the name it must have, in the order it must have."""
+    wanted, command, measured = NAMES[run.command_unit]
+    table = {
+        "sample": run.samples.index,
+        "t_s": run.samples.index / 50_000.0,
+        "reference_um": run.samples.reference_um,
+        wanted: run.samples.wanted,
+        command: run.samples.command,
+        "displacement_um": run.samples.displacement_um,
+        "flags": run.samples.flags,
+    }
+    return table | ({measured: run.samples.measured} if run.samples.measured.size else {})
+
+
+def check_same_bits(found: np.ndarray, wanted: np.ndarray) -> None:
+    """Compare bytes, so that NaN equals NaN and -0.0 does not equal 0.0."""
+    assert found.dtype == wanted.dtype
+    assert np.ascontiguousarray(found).tobytes() == wanted.tobytes()
+
+
+def read_csv(path: Path) -> dict[str, np.ndarray]:
+    """Read with the csv module and Python's float and int."""
+    with path.open(newline="", encoding="utf-8") as stream:
+        rows = list(csv.reader(stream))
+    kinds = {"sample": np.int64, "flags": np.uint32}
+    cells = zip(*rows[1:], strict=True)
+    return {
+        name: np.array([int(c) for c in column], dtype=kinds[name])
+        if name in kinds
+        else np.array([float(c) for c in column])
+        for name, column in zip(rows[0], cells, strict=True)
+    }
+
+
+def read_npz(path: Path) -> dict[str, np.ndarray]:
+    """Read with numpy, without pickles."""
+    with np.load(path, allow_pickle=False) as archive:
+        return {name: archive[name] for name in archive.files}
+
+
+def read_parquet(path: Path) -> dict[str, np.ndarray]:
+    """Read with pyarrow."""
+    table = parquet.read_table(path)
+    return {name: table[name].to_numpy() for name in table.column_names}
+
+
+def read_mat(path: Path) -> dict[str, np.ndarray]:
+    """Read with scipy; MATLAB's vectors are columns."""
+    return {
+        name: value[:, 0] if value.ndim == 2 else value
+        for name, value in loadmat(path).items()
+        if not name.startswith("__")
+    }
+
+
+READERS = {".csv": read_csv, ".npz": read_npz, ".parquet": read_parquet, ".mat": read_mat}
+
+
+@pytest.mark.parametrize("suffix", READERS)
+@pytest.mark.parametrize("unit", ["A", "V"])
+@pytest.mark.parametrize("measured", [True, False])
+def test_every_column_comes_back_bit_for_bit(
+    tmp_path: Path, suffix: str, unit: str, measured: bool
+) -> None:
+    """Names with units in order, types and bits kept, NaN, infinities and -0.0 included."""
+    run = recording(unit, measured=measured)
+    path = tmp_path / f"out{suffix}"
+    assert export(run, path) == 2000
+    found = READERS[suffix](path)
+    wanted = expected(run)
+    assert [name for name in found if name in wanted] == list(wanted)
+    assert NAMES[unit][2] in found or not measured
+    for name, column in wanted.items():
+        check_same_bits(found[name], column)
+
+
+def test_csv_has_one_header_line_and_rows_across_blocks(tmp_path: Path) -> None:
+    """A long table is written in blocks without losing or doubling a row."""
+    run = recording(n=40_001)
+    export(run, tmp_path / "out.csv")
+    lines = (tmp_path / "out.csv").read_text().splitlines()
+    assert lines[0] == (
+        "sample,t_s,reference_um,wanted_a,current_a,displacement_um,flags,measured_a"
+    )
+    assert [int(line.split(",")[0]) for line in lines[1:]] == run.samples.index.tolist()
+
+
+def check_facts(facts: dict[str, str]) -> None:
+    """Check what is kept beside the columns."""
+    run = json.loads(facts["run"])
+    assert run["name"] == "test"
+    assert run["sample_rate_hz"] == 50_000.0
+    assert run["command_unit"] == "A"
+    assert run["compensated"] is True
+    assert run["recording"] == "run.mcap"
+    assert json.loads(facts["end"]) == {"reason": "done"}
+    assert json.loads(facts["segments"])[0]["period"] == 1000.0 / 3.0
+    assert facts["experiment_yaml"] == YAML
+    assert facts["model_yaml"] == ""
+
+
+def test_npz_keeps_the_facts_of_the_run(tmp_path: Path) -> None:
+    """As text arrays beside the columns."""
+    export(recording(), tmp_path / "out.npz")
+    found = read_npz(tmp_path / "out.npz")
+    check_facts({name: str(value) for name, value in found.items() if value.ndim == 0})
+
+
+def test_parquet_keeps_the_facts_of_the_run(tmp_path: Path) -> None:
+    """In the schema's metadata, under hilctl's name."""
+    export(recording(), tmp_path / "out.parquet")
+    metadata = parquet.read_schema(tmp_path / "out.parquet").metadata
+    ours = {k.decode(): v.decode() for k, v in metadata.items() if k.startswith(b"hilctl.")}
+    check_facts({name.removeprefix("hilctl."): text for name, text in ours.items()})
+
+
+def test_mat_keeps_the_facts_of_the_run_without_structs(tmp_path: Path) -> None:
+    """As texts beside plain column vectors."""
+    export(recording(), tmp_path / "out.mat")
+    found = {k: v for k, v in loadmat(tmp_path / "out.mat").items() if not k.startswith("__")}
+    texts = {k: v[0] if v.size else "" for k, v in found.items() if v.dtype.kind == "U"}
+    check_facts({name: str(text) for name, text in texts.items()})
+    assert all(v.dtype.names is None for v in found.values())
+    assert all(v.shape == (2000, 1) for k, v in found.items() if k not in texts)
+
+
+@pytest.mark.parametrize(
+    ("t0", "t1", "first", "last"),
+    [
+        (None, None, 0, 2499),
+        (0.01, None, 500, 2499),
+        (None, 0.01, 0, 499),
+        (0.00101, 0.00201, 51, 100),
+        (0.03, 99.0, 1500, 2499),
+        (-5.0, 1 / 50_000, 0, 0),
+    ],
+)
+def test_times_cut_by_sample_index(t0, t1, first: int, last: int) -> None:
+    """From t0 on, before t1, by the time of the sample and not by its row."""
+    index = columns(recording(), t0, t1)["sample"]
+    assert (index[0], index[-1]) == (first, last)
+
+
+def test_measured_is_cut_like_the_rest() -> None:
+    """All columns keep the same length."""
+    assert {c.size for c in columns(recording(), 0.01, 0.02).values()} == {500}
+    without = columns(recording(measured=False), 0.01, 0.02)
+    assert {c.size for c in without.values()} == {500}
+
+
+def test_what_the_compensator_was_fed_is_there_where_it_was_recorded() -> None:
+    """Fed other than the reference, a run has one more column; other runs don't."""
+    plain = recording()
+    fed = replace(plain.samples, input_um=plain.samples.reference_um + 1.0)
+    table = columns(replace(plain, samples=fed), 0.01, 0.02)
+    np.testing.assert_array_equal(table["input_um"], fed.input_um[500:1000])
+    assert "input_um" not in columns(plain)
+
+
+@pytest.mark.parametrize(("t0", "t1"), [(0.02, 0.01), (0.021, 0.029), (5.0, None), (np.nan, None)])
+def test_no_samples_between_the_times_is_an_error(tmp_path: Path, t0, t1) -> None:
+    """Nothing is written; a stretch that was lost counts as nothing."""
+    with pytest.raises(DataError, match=r"sample|finite"):
+        export(recording(), tmp_path / "out.csv", t0, t1)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_empty_recording_is_an_error(tmp_path: Path) -> None:
+    """A run without samples has no table."""
+    run = recording()
+    with pytest.raises(DataError, match=r"run\.mcap: holds no sample from its start to its end"):
+        export(replace(run, samples=run.samples.part(0, 0)), tmp_path / "out.npz")
+
+
+@pytest.mark.parametrize("name", ["out.xlsx", "out", "out.csv.gz"])
+def test_unknown_suffix_names_the_known_ones(tmp_path: Path, name: str) -> None:
+    """The message says what can be written."""
+    with pytest.raises(InputError, match=r"must be one of \.csv, \.npz, \.parquet, \.mat"):
+        export(recording(), tmp_path / name)
+
+
+def test_existing_file_is_kept_unless_told(tmp_path: Path) -> None:
+    """A file of that name is refused, and replaced only on request."""
+    path = tmp_path / "out.CSV"
+    path.write_text("precious")
+    with pytest.raises(InputError, match=r"out\.CSV: exists already"):
+        export(recording(), path)
+    assert path.read_text() == "precious"
+    export(recording(), path, overwrite=True)
+    assert path.read_text().startswith("sample,")
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_full_disk_leaves_the_old_file_and_nothing_else(tmp_path: Path, monkeypatch) -> None:
+    """A write that breaks off half-way is not seen under the file's name."""
+
+    def savez(stream, **_arrays) -> None:
+        stream.write(b"half of it")
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(np, "savez", savez)
+    path = tmp_path / "out.npz"
+    path.write_text("precious")
+    with pytest.raises(InputError, match=r"out\.npz: can't be written: No space left on device"):
+        export(recording(), path, overwrite=True)
+    assert path.read_text() == "precious"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_folder_that_is_not_there_is_an_input_error(tmp_path: Path) -> None:
+    """The message names the file and the reason."""
+    with pytest.raises(InputError, match=r"out\.npz: can't be written: No such file"):
+        export(recording(), tmp_path / "missing" / "out.npz")
+
+
+def test_missing_pyarrow_says_what_to_install(tmp_path: Path, monkeypatch) -> None:
+    """Parquet without pyarrow is refused with the way out, and leaves nothing behind."""
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    with pytest.raises(InputError, match=r"pip install 'hilctl\[parquet\]'"):
+        export(recording(), tmp_path / "out.parquet")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_file_has_ordinary_permissions(tmp_path: Path) -> None:
+    """Readable as any new file is, not as a private temporary one."""
+    plain = tmp_path / "plain"
+    plain.touch()
+    export(recording(), tmp_path / "out.mat")
+    assert stat.S_IMODE((tmp_path / "out.mat").stat().st_mode) == stat.S_IMODE(plain.stat().st_mode)

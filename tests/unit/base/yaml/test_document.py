@@ -1,0 +1,346 @@
+"""Documents: values with their places, settings from the command line, problems in words."""
+
+from typing import Annotated, Literal
+
+import pytest
+from pydantic import BaseModel, ConfigDict, Field
+
+from hilctl.base.errors import ConfigError, InputError
+from hilctl.base.yaml.document import Document, dotted, load_document
+from hilctl.base.yaml.messages import did_you_mean
+
+TEXT = """\
+name: bench
+limits:
+  peak_a: 6.0
+  steps: [1, 2, 3]
+parts:
+  - kind: round
+    radius_um: 2.5
+  - kind: square
+    side_um: 4.0
+"""
+
+
+class Strict(BaseModel):
+    model_config = ConfigDict(frozen=True, strict=True, extra="forbid", allow_inf_nan=False)
+
+
+class Round(Strict):
+    kind: Literal["round"] = "round"
+    radius_um: float = Field(gt=0.0, lt=10.0)
+
+
+class Square(Strict):
+    kind: Literal["square"] = "square"
+    side_um: float = Field(ge=0.0, le=10.0)
+    square: float = 0.0
+
+
+class Limits(Strict):
+    peak_a: float
+    steps: tuple[int, ...] = Field(default=(), min_length=1, max_length=3)
+    slow: bool = False
+
+
+class Bench(Strict):
+    name: str
+    limits: Limits
+    parts: tuple[Annotated[Round | Square, Field(discriminator="kind")], ...] = ()
+    colours: dict[str, float] = Field(default_factory=dict)
+
+
+def document(text=TEXT):
+    return Document("bench.yaml", text)
+
+
+def problems(text, **settings):
+    """Return every problem of a text, or of the settings made on it."""
+    with pytest.raises(ConfigError) as caught:
+        document(text).validate(Bench, **settings)
+    return str(caught.value).split("\n")
+
+
+def refusal(action, *arguments):
+    with pytest.raises(ConfigError) as caught:
+        action(*arguments)
+    return str(caught.value)
+
+
+def changed(before, after):
+    assert before in TEXT
+    return TEXT.replace(before, after)
+
+
+def test_values_are_plain():
+    """Mappings, tuples, numbers, text and None: what pydantic's strict mode takes."""
+    data = document("a: 1\nb: [1.5, x, true, null]\nc: {d: 0x10, e: 1.0e+3}\nf:\n").data
+    assert data == {"a": 1, "b": (1.5, "x", True, None), "c": {"d": 16, "e": 1000.0}, "f": None}
+
+
+def test_a_good_document_becomes_a_model():
+    """All of it, lists and unions included, is built."""
+    bench = document().validate(Bench)
+    assert bench.limits == Limits(peak_a=6.0, steps=(1, 2, 3))
+    assert bench.parts == (Round(radius_um=2.5), Square(side_um=4.0))
+
+
+@pytest.mark.parametrize(("loc", "place"), [
+    (("name",), 1), (("limits",), 2), (("limits", "peak_a"), 3), (("limits", "steps", 1), 4),
+    (("parts", 1, "side_um"), 9), (("parts", 1, "missing"), 8), (("nowhere", "at", "all"), 1),
+])  # fmt: skip
+def test_every_value_has_its_line(loc, place):
+    """A value's line, or that of the nearest thing around it."""
+    assert document().where(loc) == f"bench.yaml:{place}"
+
+
+@pytest.mark.parametrize(("before", "after", "problem"), [
+    ("6.0", "'6.0'",
+     "bench.yaml:3: limits.peak_a: must be a number, got '6.0' (remove the quotes)"),
+    ("6.0", "1e3", "bench.yaml:3: limits.peak_a: must be a number, got '1e3' "
+     "(YAML reads this as text: write 1000.0 or 1.0e+3)"),
+    ("6.0", "2.5E3", "bench.yaml:3: limits.peak_a: must be a number, got '2.5E3' "
+     "(YAML reads this as text: write 2500.0 or 2.5e+3)"),
+    ("6.0", "1e-3", "bench.yaml:3: limits.peak_a: must be a number, got '1e-3' "
+     "(YAML reads this as text: write 0.001 or 1.0e-3)"),
+    ("6.0", "six", "bench.yaml:3: limits.peak_a: must be a number, got 'six'"),
+    ("6.0", "nan", "bench.yaml:3: limits.peak_a: must be a number, got 'nan'"),
+    ("6.0", "1e999", "bench.yaml:3: limits.peak_a: must be a number, got '1e999'"),
+    ("6.0", ".nan", "bench.yaml:3: limits.peak_a: must be a finite number, got nan"),
+    ("6.0", "-.inf", "bench.yaml:3: limits.peak_a: must be a finite number, got -inf"),
+    ("6.0", "1.0e+999", "bench.yaml:3: limits.peak_a: must be a finite number, got inf"),
+    ("6.0", "2024-01-01", "bench.yaml:3: limits.peak_a: must be a number, got '2024-01-01'"),
+    ("6.0", "", "bench.yaml:3: limits.peak_a: must be a number, got nothing"),
+    ("[1, 2, 3]", "[1, 2.5]", "bench.yaml:4: limits.steps.1: must be a whole number, got 2.5"),
+    ("[1, 2, 3]", "[]", "bench.yaml:4: limits.steps: must have at least 1 values, got []"),
+    ("[1, 2, 3]", "[1, 2, 3, 4]",
+     "bench.yaml:4: limits.steps: must have at most 3 values, got [1, 2, 3, 4]"),
+    ("[1, 2, 3]", "7", "bench.yaml:4: limits.steps: must be a list, got 7"),
+    ("bench", "on", "bench.yaml:1: name: must be text, got True "
+     "(YAML reads yes, no, on and off as true and false: put the text in quotes)"),
+    ("bench", "5", "bench.yaml:1: name: must be text, got 5"),
+    ("  peak_a: 6.0\n", "", "bench.yaml:2: limits.peak_a: is required"),
+    ("peak_a", "peek_a", "bench.yaml:3: limits.peek_a: unknown key (did you mean 'peak_a'?)"),
+    ("peak_a", "zzz", "bench.yaml:3: limits.zzz: unknown key (known: peak_a, slow, steps)"),
+    ("2.5", "0.0", "bench.yaml:7: parts.0.radius_um: must be > 0.0, got 0.0"),
+    ("2.5", "10.0", "bench.yaml:7: parts.0.radius_um: must be < 10.0, got 10.0"),
+    ("4.0", "-1", "bench.yaml:9: parts.1.side_um: must be >= 0.0, got -1"),
+    ("4.0", "11", "bench.yaml:9: parts.1.side_um: must be <= 10.0, got 11"),
+    ("side_um", "square: 1.0\n    sid_um",
+     "bench.yaml:10: parts.1.sid_um: unknown key (did you mean 'side_um'?)"),
+    ("radius_um: 2.5", "round: 2.5",
+     "bench.yaml:7: parts.0.round: unknown key (known: kind, radius_um)"),
+    ("kind: square", "kind: sqare",
+     "bench.yaml:8: parts.1.kind: must be one of 'round', 'square', got 'sqare'"),
+    ("kind: square\n    ", "", "bench.yaml:8: parts.1: needs a 'kind'"),
+    ("parts:", "colours: {red: x}\nparts:",
+     "bench.yaml:5: colours.red: must be a number, got 'x'"),
+])  # fmt: skip
+def test_broken_rules_in_words(before, after, problem):
+    """Line, key, rule, value and hint of each kind of mistake."""
+    assert problem in problems(changed(before, after))
+
+
+def test_all_problems_come_together():
+    """One error holds them all."""
+    text = changed("bench", "7").replace("6.0", "x").replace("2.5", "-1").replace("4.0", "y")
+    assert [line.split(": ")[:2] for line in problems(text)] == [
+        ["bench.yaml:1", "name"],
+        ["bench.yaml:3", "limits.peak_a"],
+        ["bench.yaml:7", "parts.0.radius_um"],
+        ["bench.yaml:9", "parts.1.side_um"],
+    ]
+
+
+def test_part_of_a_document():
+    """A part is validated by itself, with whole keys, and without what belongs to others."""
+    first = ("parts", 0)
+    assert document().validate(Round, at=first).radius_um == 2.5
+    with pytest.raises(ConfigError, match=r"bench\.yaml:6: parts\.0\.kind: unknown key"):
+        document().validate(Limits, at=first)
+    with pytest.raises(ConfigError) as caught:
+        document().validate(Limits, at=first, without=("kind",))
+    assert str(caught.value).split("\n") == [
+        "bench.yaml:6: parts.0.peak_a: is required",
+        "bench.yaml:7: parts.0.radius_um: unknown key (known: peak_a, slow, steps)",
+    ]
+
+
+def test_long_values_are_cut():
+    """A value fits on the line of its message."""
+    (line,) = problems(changed("6.0", "x" * 500))
+    assert len(line) < 120
+    assert line.endswith("...")
+
+
+def test_duplicate_keys_are_all_named():
+    """Each key that stands twice is named with both lines."""
+    text = changed("peak_a: 6.0", "peak_a: 6.0\n  peak_a: 7.0") + "name: again\n"
+    assert refusal(document, text).split("\n") == [
+        "bench.yaml:4: limits.peak_a: stands already at bench.yaml:3",
+        "bench.yaml:11: name: stands already at bench.yaml:1",
+    ]
+
+
+@pytest.mark.parametrize(("text", "message"), [
+    ("", "bench.yaml:1: must hold a mapping of keys to values"),
+    ("- 1\n", "bench.yaml:1: must hold a mapping of keys to values"),
+    ("a: 1\nb: [1\n", "bench.yaml:3: is not readable YAML"),
+    ("a: 1\n\tb: 2\n", "bench.yaml:2: is not readable YAML"),
+    ("a: 1\n---\nb: 2\n", "bench.yaml:2: is not readable YAML (but found another document)"),
+    ("a: \0\n", "bench.yaml: is not readable YAML (unacceptable character #x0000"),
+    ("a: &x 1\nb: *x\n", "bench.yaml:2: is not readable YAML (aliases"),
+    ("a: &x\n  b: *x\n", "bench.yaml:2: is not readable YAML (aliases"),
+    ("a: {<<: *x}\n", "bench.yaml:1: is not readable YAML (aliases"),
+    ("a: 1\nb: !!float 1\n", "bench.yaml:2: is not readable YAML (tags"),
+    ("a: 1\nb: !!python/name:os.system x\n", "bench.yaml:2: is not readable YAML (tags"),
+    ("!!set {a, b}\n", "bench.yaml:1: is not readable YAML (tags"),
+    ("a: 1\n? [b]\n: 2\n", "bench.yaml:2: is not readable YAML (a key must be text)"),
+    ("a: 1\n{b: c}: 2\n", "bench.yaml:2: is not readable YAML (a key must be text)"),
+    pytest.param("a: " + 9_000 * "{b: ",
+                 "bench.yaml:1: is not readable YAML (nested more than 32 deep)", id="9000 deep"),
+    ("a: " + 40 * "[", "bench.yaml:1: is not readable YAML (nested more than 32 deep)"),
+    ('a: "\\ud800"\n', "bench.yaml:1: is not readable YAML (holds half a character"),
+    ('a: "\\U99999999"\n', "bench.yaml: is not readable YAML ("),
+    ('a: "\\U7fffffff"\n', "bench.yaml: is not readable YAML ("),
+])  # fmt: skip
+def test_what_is_not_plain_yaml_is_refused(text, message):
+    """Broken syntax, tags, aliases, odd keys, deep nesting: one line that says which and where."""
+    assert refusal(document, text).startswith(message)
+
+
+def test_nesting_up_to_the_limit_is_read():
+    """The limit on nesting is far from what a configuration needs."""
+    value = document("a: " + 31 * "[" + "1" + 31 * "]").data["a"]
+    for _ in range(31):
+        (value,) = value
+    assert value == 1
+
+
+@pytest.mark.parametrize(("text", "value"), [
+    ("2024-01-01", "2024-01-01"), ("2024-01-01T10:00:00Z", "2024-01-01T10:00:00Z"),
+    ("2024-13-99", "2024-13-99"), ("0x_", "0x_"), ("=", "="), ("<<", "<<"),
+    ("0x" + "f" * 32, float(0x10**32)), ("18446744073709551615", 2**64 - 1), ("1_000", 1_000),
+    pytest.param("9" * 5_000, "9" * 5_000, id="5000 digits"),
+    pytest.param("1" + "0" * 400, float("inf"), id="400 digits"),
+])  # fmt: skip
+def test_odd_scalars_become_text_or_numbers(text, value):
+    """Dates stay text, what can't be built stays text, very long whole numbers are floats."""
+    read = document(f"a: {text}\n").data["a"]
+    assert read == value
+    assert type(read) is type(value)
+
+
+def test_keys_are_text():
+    """Numbers, null and booleans as keys are their text."""
+    assert document("1: a\nnull: b\ntrue: c\n2024-01-01: d\n").data == {
+        "1": "a", "null": "b", "true": "c", "2024-01-01": "d",
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(("assignment", "loc", "value"), [
+    ("name=other", ("name",), "other"),
+    ("limits.peak_a=2", ("limits", "peak_a"), 2),
+    ("limits.peak_a = 2.5", ("limits", "peak_a"), 2.5),
+    ("limits.slow=true", ("limits", "slow"), True),
+    ("limits.steps=[4, 5]", ("limits", "steps"), (4, 5)),
+    ("limits.steps.2=9", ("limits", "steps"), (1, 2, 9)),
+    ("limits={peak_a: 1.0}", ("limits",), {"peak_a": 1.0}),
+    ("parts.1.side_um=7.5", ("parts", 1), {"kind": "square", "side_um": 7.5}),
+    ("colours.red=1.0", ("colours",), {"red": 1.0}),
+    ("name=", ("name",), None),
+    ("name=a=b", ("name",), "a=b"),
+])  # fmt: skip
+def test_set_changes_one_place(assignment, loc, value):
+    """A setting reaches mappings and list items, makes new keys, and leaves the rest."""
+    changed_document, data = document(), document().data
+    changed_document.set(assignment)
+    found = changed_document.data
+    for part in loc:
+        found = found[part]
+    assert found == value
+    others = {key: data[key] for key in data if key != loc[0]}
+    assert {key: changed_document.data[key] for key in others} == others
+
+
+def test_settings_add_up():
+    """Later settings see what earlier ones made."""
+    one = document()
+    one.set("limits={peak_a: 1.0}")
+    one.set("limits.steps=[1]")
+    one.set("limits.steps.0=3")
+    assert one.validate(Bench).limits == Limits(peak_a=1.0, steps=(3,))
+
+
+def test_problems_of_a_setting_point_to_it():
+    """What a setting broke is reported with the setting, not with a line of the file."""
+    one = document()
+    for assignment in ("limits.peak_a=1e3", "parts.0={kind: round, radius: 1.0}", "colors.red=1"):
+        one.set(assignment)
+    with pytest.raises(ConfigError) as caught:
+        one.validate(Bench)
+    assert str(caught.value).split("\n") == [
+        "--set limits.peak_a=1e3: limits.peak_a: must be a number, got '1e3' "
+        "(YAML reads this as text: write 1000.0 or 1.0e+3)",
+        "--set parts.0={kind: round, radius: 1.0}: parts.0.radius_um: is required",
+        "--set parts.0={kind: round, radius: 1.0}: parts.0.radius: unknown key "
+        "(did you mean 'radius_um'?)",
+        "--set colors.red=1: colors: unknown key (did you mean 'colours'?)",
+    ]
+
+
+def test_a_setting_forgets_the_places_it_replaces():
+    """Lines of replaced values are not used for the new ones; other lines stay."""
+    one = document()
+    one.set("parts=[{kind: round, radius_um: 1.0}]")
+    assert one.where(("parts", 0, "radius_um")).startswith("--set parts=")
+    assert one.where(("parts", 1, "side_um")).startswith("--set parts=")
+    assert one.where(("limits", "peak_a")) == "bench.yaml:3"
+
+
+@pytest.mark.parametrize(("assignment", "message"), [
+    ("name", "--set name: must be dotted.key=value"),
+    ("=5", "--set =5: must be dotted.key=value"),
+    ("limits..peak_a=5", "--set limits..peak_a=5: must be dotted.key=value"),
+    (".".join("a" * 40) + "=1", "--set a.a"),
+    ("name.first=5", "--set name.first=5: name.first: there is no such key to set"),
+    ("limits.peak_a.x=5", "--set limits.peak_a.x=5: limits.peak_a.x: there is no such key to set"),
+    ("limits.steps.3=5", "--set limits.steps.3=5: limits.steps.3: there is no such key to set"),
+    ("limits.steps.-1=5", "--set limits.steps.-1=5: limits.steps.-1: there is no such key"),
+    ("limits.steps.²=5", "--set limits.steps.²=5: limits.steps.²: there is no such key"),
+    ("parts.one.side_um=5", "--set parts.one.side_um=5: parts.one: there is no such key to set"),
+    ("name=[1", "--set name=[1: name: is not readable YAML, got '[1' ("),
+    ("name=*x", "--set name=*x: name: is not readable YAML, got '*x' (aliases"),
+    ("name=!!int 5", "--set name=!!int 5: name: is not readable YAML, got '!!int 5' (tags"),
+    ('name="\\U99999999"', '--set name="\\U99999999": name: is not readable YAML'),
+    ("limits={peak_a: 1, peak_a: 2}",
+     "--set limits={peak_a: 1, peak_a: 2}: limits.peak_a: stands twice"),
+])  # fmt: skip
+def test_settings_that_cannot_be_made(assignment, message):
+    """A bad path, an unreadable value, a key twice: refused, with the setting in the message."""
+    assert refusal(document().set, assignment).startswith(message)
+
+
+def test_files_are_read_or_refused(tmp_path):
+    """A file's name is in its places; what can't be read is an InputError with the path."""
+    path = tmp_path / "bench.yaml"
+    path.write_text(TEXT, encoding="utf-8")
+    assert load_document(path).where(("limits", "peak_a")) == f"{path}:3"
+    for bad, message in [
+        (tmp_path / "none.yaml", "no such file"),
+        (tmp_path, "is not a file"),
+        (tmp_path / "a\0b", "can't be read: embedded null byte"),
+    ]:
+        with pytest.raises(InputError, match=message):
+            load_document(bad)
+    path.write_bytes(b"\xff\xfe\xfd")
+    with pytest.raises(InputError, match="is not UTF-8 text"):
+        load_document(path)
+
+
+def test_keys_and_suggestions():
+    """Dotted keys and suggestions."""
+    assert dotted(("a", 0, "b")) == "a.0.b"
+    assert did_you_mean("slwo", ["slow", "fast"]) == "did you mean 'slow'?"
+    assert did_you_mean("zzz", ["slow", "fast"]) == "known: fast, slow"
+    assert did_you_mean("zzz", []) == ""

@@ -1,0 +1,334 @@
+"""``serial_dac`` through a board's FIFO, against an emulated board with a clock of its own."""
+
+import json
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hilctl.base.blocks import Batch
+from hilctl.base.errors import DeviceError
+from hilctl.base.flags import Flag
+from hilctl.loop.compensator import Compensator
+from hilctl.loop.in_flight import DelayLine
+from hilctl.loop.interlocks import InterlockLimits, Interlocks
+from hilctl.loop.limiter import CommandLimits, Limiter
+from hilctl.loop.loop import Loop
+from hilctl.loop.pacer import Pacer, SystemClock
+from hilctl.loop.plan import Plan
+from hilctl_drivers.emulator.faults import parse_fault
+from hilctl_drivers.emulator.serial_server import SerialEmulation, emulated_serial
+from hilctl_drivers.profile import shipped_profiles
+from hilctl_drivers.serial.device import SerialDac
+from hilctl_drivers.serial.options import SerialOptions
+from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
+
+RATE_HZ = 10_000.0
+BLOCK = 100
+FIFO_BLOCKS = 5
+MS = 1_000_000
+
+
+class Clock:
+    """The board's time: the machine's, and what a test lets pass on top."""
+
+    def __init__(self):
+        self.extra_ns = 0
+
+    def __call__(self):
+        return time.monotonic_ns() + self.extra_ns
+
+
+class Board:
+    """A streaming device that is wired to an emulated board."""
+
+    def __init__(self, emulator, log, clock, **options):
+        self.emulator = emulator
+        self.clock = clock
+        self._log = log
+        made = {**emulator.options, "timeout_s": 0.1, "fifo_blocks": FIFO_BLOCKS, **options}
+        self.device = SerialDac(SerialOptions.model_validate(made))
+        self.sent = 0
+
+    def open(self):
+        self.device.open(RATE_HZ, BLOCK)
+        self.sent = 0
+
+    def exchange(self, command):
+        """Send one block; return the displacements that came back with it."""
+        displacement_um, measured = np.full(BLOCK, np.nan), np.full(BLOCK, np.nan)
+        self.device.exchange(self.sent, command, displacement_um, measured)
+        self.sent += BLOCK
+        return displacement_um
+
+    def hold(self, command, blocks):
+        return [self.exchange(np.full(BLOCK, float(command))) for _ in range(blocks)]
+
+    def events(self):
+        return [json.loads(line) for line in self._log.read_text().splitlines()]
+
+
+@pytest.fixture
+def board(tmp_path):
+    """Return a function that wires a streaming device to an emulated board."""
+    text = shipped_profiles()["cobs_board_fifo"].read_text()
+    profile = tmp_path / "board.yaml"
+    profile.write_text(text.replace("boot_wait_s: 2.0", "boot_wait_s: 0.0"))
+    stack = []
+
+    def of(faults=(), noise=False, **options):
+        log = tmp_path / f"log{len(stack)}.jsonl"
+        made = tuple(parse_fault(fault) for fault in faults)
+        clock = Clock()
+        wanted = SerialEmulation(str(profile), log=log, faults=made, noise=noise)
+        served = emulated_serial(wanted, clock)
+        stack.append((Board(served.__enter__(), log, clock, **options), served))
+        return stack[-1][0]
+
+    yield of
+    for made, served in stack:
+        made.device.wire.release()
+        served.__exit__(None, None, None)
+
+
+def sine(n):
+    return 3.0 * np.sin(2 * np.pi * 50.0 * np.arange(n) / RATE_HZ)
+
+
+def test_says_that_it_streams(board):
+    """Its FIFO and the exchanges until an answer are known before it is opened."""
+    info = board().device.info
+    assert info.buffered
+    assert (info.fifo_depth, info.latency_blocks) == (8192, FIFO_BLOCKS)
+    assert info.details["fifo_depth"] == "8192 samples"
+    assert info.details["fifo_level"] == f"{FIFO_BLOCKS} blocks"
+
+
+def test_each_displacement_belongs_to_its_command(board):
+    """What comes back is what the same actuator does sample by sample, as many blocks later."""
+    bench = board()
+    bench.open()
+    commands = sine(20 * BLOCK)
+    back = [bench.exchange(part) for part in np.split(commands, 20)]
+    assert np.isnan(np.concatenate(back[:FIFO_BLOCKS])).all()
+    found = np.concatenate(back[FIFO_BLOCKS:])
+    actuator = TerfenolActuator(replace(TerfenolParameters(), sensor_noise_um=0.0), RATE_HZ)
+    expected, measured = np.empty(found.size), np.empty(found.size)
+    sent = commands[: found.size].astype(np.float32).astype(np.float64)
+    actuator.step(sent, expected, measured)
+    assert found == pytest.approx(expected, abs=1e-5)
+
+
+def test_the_board_keeps_the_pace(board):
+    """Blocks go out at once until the FIFO is filled, then one for each that was put out."""
+    bench = board()
+    bench.open()
+    bench.hold(1.0, FIFO_BLOCKS)
+    assert bench.emulator.device.player.played < BLOCK
+    start = time.monotonic()
+    bench.hold(1.0, 10)
+    assert time.monotonic() - start > 0.9 * 10 * BLOCK / RATE_HZ
+    assert bench.device.wire.fifo_level_min > (FIFO_BLOCKS - 1) * BLOCK
+
+
+def test_a_stall_of_this_machine_costs_fifo_and_no_sample(board):
+    """After a stall shorter than the FIFO holds, blocks go out in a burst and none is missing."""
+    bench = board(fifo_blocks=20)  # 200 ms, of which this machine may take some for itself
+    bench.open()
+    bench.hold(1.0, 25)
+    bench.clock.extra_ns += 100 * MS
+    assert all(np.isfinite(each).all() for each in bench.hold(1.0, 20))
+    assert bench.emulator.device.player.underruns == 0
+    bench.device.close()
+
+
+def test_an_underrun_is_told_with_its_length(board):
+    """A stall longer than the FIFO holds ends in an error that says by how many samples."""
+    bench = board()
+    bench.open()
+    bench.hold(1.0, 10)
+    bench.clock.extra_ns += 80 * MS
+    with pytest.raises(DeviceError, match=r"underrun: .* nothing to put out for (\d+) sample") as e:
+        bench.hold(1.0, 1)
+    assert 100 <= int(str(e.value).split("put out for ")[1].split()[0]) <= 600
+    bench.device.make_safe(0.0)
+    assert bench.events()[-1]["event"] == "safe"
+
+
+@pytest.mark.parametrize(
+    ("fault", "text"),
+    [
+        ("silence", "no answer within 0.11 s"),
+        ("corrupt", "crc16_ccitt_false|not a COBS frame|behind the final"),
+        ("cut", "within 0.11 s"),
+        ("duplicate", "bytes"),
+        ("wrong_id", "reply 91 to message"),
+        ("exception", "refused by the board"),
+    ],
+)
+def test_a_bad_answer_is_an_error_and_the_output_can_still_be_made_safe(board, fault, text):
+    """No wrong reading is taken, and what is queued is dropped for the safe value."""
+    bench = board(faults=[f"{fault}@15"])
+    bench.open()
+    with pytest.raises(DeviceError, match=text):
+        bench.hold(2.0, 20)
+    bench.device.make_safe(0.0)
+    last = bench.events()[-1]
+    assert (last["event"], last["current_a"]) == ("safe", 0.0)
+    bench.open()
+    bench.hold(0.0, 8)
+
+
+def test_a_silent_host_is_noticed_by_the_board(board):
+    """Its watchdog drops what is queued and goes to the safe value; blocks are refused then."""
+    bench = board(watchdog={"timeout_s": 0.2, "safe_command": -1.0})
+    bench.open()
+    bench.hold(2.0, 10)
+    bench.clock.extra_ns += 200 * MS
+    with pytest.raises(DeviceError, match="watchdog has tripped"):
+        bench.hold(2.0, 1)
+    last = bench.events()[-1]
+    assert (last["event"], last["current_a"]) == ("watchdog", -1.0)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, 10.01, -10.01])
+def test_a_block_with_a_bad_value_is_refused_whole(board, bad):
+    """Nothing of it is queued, and the run can go on."""
+    bench = board()
+    bench.open()
+    bench.hold(1.0, 2)
+    command = np.full(BLOCK, 1.0)
+    command[40] = bad
+    with pytest.raises(DeviceError, match=r"command\[40\] must be in"):
+        bench.exchange(command)
+    assert bench.emulator.device.player.queued == 2 * BLOCK
+    bench.hold(1.0, 2)
+
+
+def test_samples_follow_one_another(board):
+    """A jump is refused: the board puts samples out one after the other, whatever their index."""
+    bench = board()
+    bench.open()
+    bench.hold(1.0, 2)
+    bench.sent += BLOCK
+    with pytest.raises(DeviceError, match="samples must follow one another, 200 is next, got 300"):
+        bench.hold(1.0, 1)
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "block", "options", "text"),
+    [
+        (RATE_HZ, 513, {}, "block must be 1 to 512 samples, got 513"),
+        (RATE_HZ, 500, {"fifo_blocks": 16}, "must fit into the FIFO, 8192 .*at most 15 with this"),
+        (50.0, 10, {}, "sample rate must be >= 100 Hz, got 50"),
+        (200_000.0, 500, {}, r"sample rate must be in \(0, 100000\] Hz"),
+        (RATE_HZ, 500, {"watchdog": {"timeout_s": 0.1}}, "3 exchanges must come within"),
+    ],
+)
+def test_what_the_fifo_can_not_do_is_refused_at_open(board, rate_hz, block, options, text):
+    """With what would be possible; nothing was put out."""
+    bench = board(**options)
+    with pytest.raises(DeviceError, match=text):
+        bench.device.open(rate_hz, block)
+    assert bench.events() == []
+
+
+def test_opening_again_starts_at_zero_and_keeps_the_output(board):
+    """After close the output holds; the next run counts from 0 and starts where it is."""
+    bench = board()
+    bench.open()
+    held = bench.hold(2.0, 20)[-1]
+    bench.device.close()
+    bench.open()
+    first = bench.hold(2.0, FIFO_BLOCKS + 1)[-1]
+    assert first[0] == pytest.approx(held[-1], abs=0.5)
+
+
+class Sink:
+    """Keeps copies of all blocks."""
+
+    def __init__(self):
+        self.firsts, self.columns, self.flags = [], [], []
+
+    def push(self, head, state, columns, flags):
+        self.firsts.append(head[0])
+        self.columns.append(columns.copy())
+        self.flags.append(flags.copy())
+        return True
+
+
+class Unwatched:
+    """Nobody who asks for anything."""
+
+    def beat(self, next_sample):
+        return ""
+
+    def closing(self):
+        pass
+
+    def tuning(self):
+        return None
+
+    def tell(self, event):
+        pass
+
+
+def run_loop(bench, n):
+    """Run a sine of n samples through the real loop; return its outcome and what it recorded."""
+    clock, sink = SystemClock(), Sink()
+    limits = CommandLimits(low=-5.0, high=5.0, slew_per_s=1e5, safe=0.0, ramp_per_s=1e3)
+    period_ns = 1e9 * BLOCK / RATE_HZ
+    bench.open()
+    compensator = Compensator(None, RATE_HZ)
+    sent = Batch.empty(bench.device.info.latency_blocks + 1, BLOCK, compensator.state_size + 1)
+    loop = Loop(
+        Plan(sine(n), False, BLOCK, 1e9),
+        bench.device,
+        compensator,
+        Limiter(limits, 1.0 / RATE_HZ),
+        Interlocks(InterlockLimits(stroke_um=(-100.0, 100.0)), RATE_HZ),
+        Pacer(clock, period_ns, "follow", 0.5 * period_ns),
+        clock,
+        DelayLine(sent),
+        sink,
+        Unwatched(),
+    )
+    return loop.run(clock.now_ns()), sink
+
+
+def test_a_whole_run_loses_nothing(board):
+    """Every sample of the waveform and the ramp is recorded with the displacement it caused."""
+    bench = board(noise=True)
+    outcome, sink = run_loop(bench, 5_050)
+    assert (outcome.code, outcome.safe, outcome.dropped) == ("completed", True, 0)
+    assert sink.firsts == list(range(0, outcome.ended_at, BLOCK))
+    columns = np.concatenate(sink.columns, axis=1)
+    assert columns[2, :5_050].tolist() == sine(5_050).tolist()
+    assert np.isfinite(columns[3]).all()
+    assert columns[2, -1] == 0.0
+    played = [event for event in bench.events() if event["event"] == "played"]
+    assert sum(event["samples"] for event in played) >= outcome.ended_at
+    bench.device.close()
+
+
+@pytest.mark.parametrize("fault", ["silence", "corrupt", "cut", "unplug"])
+def test_a_run_that_loses_the_board_leaves_by_the_one_way_out(board, fault):
+    """The reason is kept, blocks under way are recorded as unanswered, the coil is at 0 A."""
+    bench = board(faults=[f"{fault}@40"], watchdog={"timeout_s": 0.3, "safe_command": 0.0})
+    outcome, sink = run_loop(bench, 100_000)
+    assert outcome.code == "fault"
+    assert outcome.safe == (fault != "unplug")
+    flags = np.concatenate(sink.flags)
+    assert flags.size == outcome.ended_at
+    unanswered = (flags & Flag.SENSOR_INVALID) != 0
+    lost = (FIFO_BLOCKS + 1) * BLOCK  # those in the FIFO, and the one being sent
+    assert unanswered.sum() == lost
+    assert unanswered[-lost:].all()
+    bench.clock.extra_ns += 400 * MS
+    deadline = time.monotonic() + 5.0
+    while bench.events()[-1]["event"] == "played" and time.monotonic() < deadline:
+        time.sleep(0.005)
+    last = bench.events()[-1]
+    assert last["event"] in {"safe", "watchdog"}
+    assert last["current_a"] == 0.0

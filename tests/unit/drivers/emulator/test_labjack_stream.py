@@ -1,0 +1,162 @@
+"""The emulated LabJack's stream, asked register by register as LabJack's documents describe it."""
+
+import struct
+
+import pytest
+
+from hilctl_drivers.emulator.in_process import InProcess
+from hilctl_drivers.labjack.frames import Feedback, ReadFrame, WriteFrame
+from hilctl_drivers.wire.errors import Refused
+
+SETTINGS = {
+    4040: 1000, 4050: 256, 4060: 1, 4090: 1,  # stream-out 0: DAC0, 128 values, the last repeated
+    4004: 2, 4010: 0, 4012: 128, 4016: 16, 4018: 0, 4020: 0, 4100: 0, 4102: 4800,
+}  # fmt: skip
+
+
+def u32(value):
+    return struct.pack(">I", value)
+
+
+def f32(*values):
+    return struct.pack(f">{len(values)}f", *values)
+
+
+class Device:
+    """An emulated T7 and short words to ask it with."""
+
+    def __init__(self):
+        self.emulated = InProcess.of("labjack_t7")
+        self.emulated.link.open()
+        self._feedback = Feedback(self.emulated.link, 1)
+
+    def write(self, address, data):
+        self._feedback.call([WriteFrame(address, data)])
+
+    def read(self, address):
+        return int.from_bytes(self._feedback.read(address, 2), "big")
+
+    def set_up(self, rate_hz=1000.0, **changes):
+        for address, value in {**SETTINGS, **changes.get("settings", {})}.items():
+            self.write(address, u32(value))
+        self.write(4002, f32(rate_hz))
+
+    def play(self, *volts):
+        self._feedback.call([WriteFrame(4400, f32(*volts)), WriteFrame(4070, u32(1))])
+
+    def data(self, samples):
+        """Return samples, backlog, status, what belongs to it, and the readings."""
+        found = struct.unpack(f">{4 + samples}H", self._feedback.read(4500, 4 + samples))
+        return *found[:4], list(found[4 : 4 + found[0]])
+
+    def wait(self, seconds):
+        self.emulated.time.sleep(seconds)
+
+
+@pytest.fixture
+def device():
+    return Device()
+
+
+@pytest.mark.parametrize(
+    ("wanted_hz", "made_hz"),
+    [(50_000.0, 50_000.0), (7_000.0, 1e7 / 1429), (48_000.0, 1e7 / 208), (100.0, 100.0)],
+)
+def test_the_scan_rate_is_rounded_to_periods_of_100_ns(device, wanted_hz, made_hz):
+    """Reading the register gives the rate that the clock makes."""
+    device.write(4002, f32(wanted_hz))
+    (found,) = struct.unpack(">f", u32(device.read(4002)))
+    assert found == pytest.approx(made_hz, rel=1e-6)
+
+
+def test_values_are_put_out_one_a_scan_and_the_last_is_repeated(device):
+    """The buffer empties at the scan rate; with nothing new the output stays."""
+    device.set_up()
+    assert device.read(4080) == 128
+    device.play(2.5, 3.0, 3.5)
+    assert device.read(4080) == 125
+    device.write(4990, u32(1))
+    device.wait(0.0021)
+    assert device.read(4080) == 127
+    assert device.emulated.rig.current_a == pytest.approx(2.0)
+    device.wait(0.010)
+    assert device.read(4080) == 128
+    assert device.emulated.rig.current_a == pytest.approx(4.0)
+    assert device.data(30)[0] == 12
+
+
+def test_values_wait_for_set_loop(device):
+    """What was written but not taken into use fills the buffer and is not put out."""
+    device.set_up()
+    device.write(4400, f32(5.0))
+    device.write(4990, u32(1))
+    device.wait(0.01)
+    assert device.read(4080) == 127
+    assert device.emulated.rig.current_a == pytest.approx(0.0)
+
+
+def test_readings_are_fetched_oldest_first(device):
+    """As many as were asked for; the rest is told as bytes."""
+    device.set_up()
+    device.play(2.5)
+    device.write(4990, u32(1))
+    device.wait(0.0101)
+    count, backlog, status, _, readings = device.data(4)
+    assert (count, backlog, status, len(readings)) == (4, 12, 0, 4)
+    assert device.data(100)[:3] == (6, 0, 0)
+
+
+def test_a_full_buffer_drops_scans_until_it_is_emptied(device):
+    """64 readings fit; the drops are told with their number once they are fetched."""
+    device.set_up()
+    device.play(2.5)
+    device.write(4990, u32(1))
+    device.wait(0.1)
+    assert device.data(60)[:4] == (60, 8, 2940, 0)
+    assert device.data(60)[:4] == (4, 0, 2940, 0)
+    assert device.data(60) == (1, 0, 2941, 36, [0xFFFF])
+    device.wait(0.0055)
+    assert device.data(60)[2] == 0
+
+
+@pytest.mark.parametrize(
+    ("what", "code"),
+    [
+        (lambda d: d.write(4990, u32(0)), 4),  # it does not stream
+        (lambda d: d.data(4), 4),
+        (lambda d: (d.set_up(settings={4100: 2}), d.write(4990, u32(1))), 4),  # another input
+        (lambda d: (d.set_up(settings={4016: 1}), d.write(4990, u32(1))), 4),  # to port 702
+        (lambda d: (d.set_up(rate_hz=60_000.0), d.write(4990, u32(1))), 4),  # too fast for two
+        (lambda d: d.set_up(settings={4050: 300}), 4),  # no power of 2
+        (lambda d: (d.set_up(), d.play(*[2.5] * 40), d.play(*[2.5] * 40), d.play(*[2.5] * 49)), 4),
+        (lambda d: (d.set_up(), d.play(5.1)), 3),
+        (lambda d: d.write(4400, f32(1.0)), 4),  # nothing allocated
+        (lambda d: (d.set_up(), d.write(4990, u32(1)), d.read(0)), 4),  # AIN0 while it streams
+    ],
+)
+def test_what_it_can_not_do_is_refused(device, what, code):
+    """With the exception that says whether the value or the moment is wrong."""
+    with pytest.raises(Refused) as refused:
+        what(device)
+    assert refused.value.code == code
+
+
+def test_calibration_constants_are_read_by_pointer(device):
+    """The pointer is written, and the buffer register read."""
+    device.write(61810, u32(0x3C4000))
+    data = device._feedback.call([ReadFrame(61812, 8)])[0]
+    assert struct.unpack(">4f", data) == pytest.approx(
+        (0.000315805780, -0.000315805800, 33523.0, -10.586956522)
+    )
+
+
+def test_a_trip_of_the_watchdog_ends_the_stream(device):
+    """The safe value stands; what was queued is not put out any more."""
+    for address, data in ((61640, u32(1)), (61642, f32(1.0)), (61604, u32(1)), (61600, u32(1))):
+        device.write(address, data)
+    device.set_up()
+    device.play(*[3.0] * 50)
+    device.write(4990, u32(1))
+    device.wait(5.0)
+    assert device.read(4990) == 0
+    assert device.emulated.rig.current_a == pytest.approx(-6.0)

@@ -1,0 +1,112 @@
+"""Registers and messages of a LabJack's stream, against LabJack's own tables."""
+
+import struct
+
+import numpy as np
+import pytest
+
+from hilctl.base.errors import DeviceError
+from hilctl_drivers.labjack import stream
+from hilctl_drivers.labjack.frames import WriteFrame, frames_pdu
+from hilctl_drivers.wire.errors import Mismatch
+
+DOCUMENTED = {
+    "SCANRATE_HZ": 4002, "NUM_ADDRESSES": 4004, "SETTLING_US": 4008, "RESOLUTION_INDEX": 4010,
+    "BUFFER_SIZE_BYTES": 4012, "AUTO_TARGET": 4016, "DATATYPE": 4018, "NUM_SCANS": 4020,
+    "OUT_TARGET": 4040, "OUT_ALLOCATE_BYTES": 4050, "OUT_LOOP_NUM_VALUES": 4060,
+    "OUT_SET_LOOP": 4070, "OUT_BUFFER_STATUS": 4080, "OUT_ENABLE": 4090, "SCANLIST_ADDRESS": 4100,
+    "OUT_BUFFER_F32": 4400, "DATA_CR": 4500, "STREAM_OUT0": 4800, "ENABLE": 4990,
+    "FLASH_READ_POINTER": 61810, "FLASH_READ": 61812,
+}  # fmt: skip
+"""Of stream-out 0, as in LabJack's ljm_constants.json."""
+
+
+def words(*values):
+    return struct.pack(f">{len(values)}H", *values)
+
+
+def test_addresses_are_the_documented_ones():
+    """Each constant has the address of LabJack's table."""
+    assert {name: getattr(stream, name) for name in DOCUMENTED} == DOCUMENTED
+
+
+def test_values_go_into_the_buffer_and_are_taken_into_use():
+    """Big-endian floats at 4400, then 1 at 4070."""
+    pdu = frames_pdu(stream.value_frames(np.array([1.0, 2.5])))
+    assert pdu == bytes.fromhex("4c 01 1130 04 3f800000 40200000 01 0fe6 02 00000001")
+
+
+def test_a_message_is_as_long_as_it_may_be():
+    """58 values and 120 readings fill a message of 253 bytes, and one more does not fit."""
+    assert (stream.VALUES_MAX, stream.SAMPLES_MAX) == (58, 120)
+    full = [*stream.READ_FRAMES, *stream.value_frames(np.zeros(stream.VALUES_MAX))]
+    assert len(frames_pdu(full)) == 253
+    assert 1 + sum(frame.reply_size for frame in full) == 253
+    with pytest.raises(DeviceError, match="at most 253 bytes"):
+        frames_pdu([*full[:2], WriteFrame(4400, bytes(236)), full[3]])
+
+
+def test_data_tell_readings_backlog_and_room():
+    """The first word counts samples, the second the bytes that are left."""
+    data = words(3, 40, 0, 0, 100, 200, 300) + bytes(20)
+    found = stream.stream_data(data, stream.u32(8000))
+    assert found.raw.tolist() == [100, 200, 300]
+    assert (found.backlog, found.free) == (20, 8000)
+
+
+@pytest.mark.parametrize(
+    ("head", "text"),
+    [
+        ((0, 0, 2940, 0), "full: it drops scans"),
+        ((1, 0, 2941, 77, 0xFFFF), "77 scans were dropped"),
+        ((0, 0, 2942, 0), "scans overlap"),
+        ((0, 0, 2943, 0), "more scans were dropped than it can count"),
+        ((0, 0, 2944, 0), "stopped after a number of scans"),
+        ((0, 0, 2605, 0), "stream status 2605"),
+        ((2, 0, 0, 0, 5, 0xFFFF), "scans are missing"),
+    ],
+)
+def test_a_stream_that_lost_something_is_an_error_in_words(head, text):
+    """Every status but 0 ends the stream, and so does the mark of a dropped scan."""
+    with pytest.raises(DeviceError, match=text):
+        stream.stream_data(words(*head) + bytes(240), stream.u32(0))
+
+
+def test_more_samples_than_asked_for_are_no_answer():
+    """A count that the message can't hold is not believed."""
+    with pytest.raises(Mismatch, match="121 samples in an answer that holds 120"):
+        stream.stream_data(words(121, 0, 0, 0) + bytes(240), stream.u32(0))
+
+
+def test_t7_readings_have_a_slope_on_each_side_of_the_centre():
+    """LabJack's nominal constants: 33523 is 0 V, 65535 is about 10.11 V and 0 about -10.59 V."""
+    data = struct.pack(">4f", 0.000315805780, -0.000315805800, 33523.0, -10.586956522)
+    volts = stream.InputCalibration.decode("two_slopes", data).volts(
+        np.array([0, 33522, 33523, 33524, 65535], dtype=np.uint16)
+    )
+    expected = [-10.586758, -0.0003158058, 0.0, 0.0003158058, 10.109575]
+    assert volts == pytest.approx(expected, rel=1e-5, abs=1e-12)
+
+
+def test_t4_readings_lie_on_a_line():
+    """volts = raw * slope + offset, with the nominal constants of AIN0."""
+    data = struct.pack(">2f", 3.235316e-04, -10.532965)
+    made = stream.InputCalibration.decode("line", data)
+    volts = made.volts(np.array([0, 32768, 65535], dtype=np.uint16))
+    assert volts == pytest.approx([-10.532965, 0.0685186, 10.669679], rel=1e-5)
+
+
+@pytest.mark.parametrize("numbers", [(0.0, 0.0), (float("nan"), 0.0), (-1e-4, 0.0)])
+def test_constants_that_are_none_are_refused(numbers):
+    """An erased flash must not turn readings into displacements."""
+    with pytest.raises(DeviceError, match="calibration constants in flash are none"):
+        stream.InputCalibration.decode("line", struct.pack(">2f", *numbers))
+
+
+@pytest.mark.parametrize(
+    ("form", "channel", "span"),
+    [("two_slopes", 3, (0x3C4000, 16)), ("line", 0, (0x3C4000, 8)), ("line", 3, (0x3C4018, 8))],
+)
+def test_constants_stand_where_the_flash_map_says(form, channel, span):
+    """The T7's high-speed set at gain 1 is shared; the T4 has a pair for each input."""
+    assert stream.calibration_span(form, 0x3C4000, channel) == span

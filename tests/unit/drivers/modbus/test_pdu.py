@@ -1,0 +1,334 @@
+"""Modbus messages: the specification's own examples, its limits, and replies to something else.
+
+"Specification" is "MODBUS Application Protocol Specification" V1.1b3.
+"""
+
+import struct
+
+import pytest
+from pymodbus.framer.rtu import FramerRTU
+from pymodbus.framer.socket import FramerSocket
+from pymodbus.pdu import DecodePDU
+from pymodbus.pdu.bit_message import WriteSingleCoilRequest
+from pymodbus.pdu.exceptionresponse import ExceptionResponse
+from pymodbus.pdu.register_message import (
+    ReadHoldingRegistersRequest,
+    ReadHoldingRegistersResponse,
+    ReadInputRegistersRequest,
+    ReadInputRegistersResponse,
+    ReadWriteMultipleRegistersRequest,
+    ReadWriteMultipleRegistersResponse,
+    WriteMultipleRegistersRequest,
+    WriteMultipleRegistersResponse,
+    WriteSingleRegisterRequest,
+    WriteSingleRegisterResponse,
+)
+
+from hilctl_drivers.modbus.pdu import (
+    coil_pdu,
+    feedback_pdu,
+    read_pdu,
+    reply_data,
+    reply_size,
+    rtu_adu,
+    rtu_pdu,
+    tcp_adu,
+    tcp_pdu,
+    write_pdu,
+    write_read_pdu,
+    write_single_pdu,
+)
+from hilctl_drivers.wire.errors import BadRequest, Corrupt, Incomplete, Mismatch, Refused
+
+H = bytes.fromhex
+FOUR = H("01020304")
+MANY = list(range(125))
+
+EXAMPLES = [
+    pytest.param(read_pdu(1, 0x13, 19), "01 0013 0013", "01 03 CD6B05", "CD6B05", id="6.1"),
+    pytest.param(read_pdu(2, 0xC4, 22), "02 00C4 0016", "02 03 ACDB35", "ACDB35", id="6.2"),
+    pytest.param(
+        read_pdu(3, 0x6B, 3), "03 006B 0003", "03 06 022B 0000 0064", "022B00000064", id="6.3"
+    ),
+    pytest.param(read_pdu(4, 8, 1), "04 0008 0001", "04 02 000A", "000A", id="6.4"),
+    pytest.param(coil_pdu(0xAC, True), "05 00AC FF00", "05 00AC FF00", "", id="6.5"),
+    pytest.param(write_single_pdu(1, H("0003")), "06 0001 0003", "06 0001 0003", "", id="6.6"),
+    pytest.param(
+        write_pdu(1, H("000A0102")), "10 0001 0002 04 000A 0102", "10 0001 0002", "", id="6.12"
+    ),
+    pytest.param(
+        write_read_pdu(3, 6, 14, H("00FF00FF00FF")),
+        "17 0003 0006 000E 0003 06 00FF 00FF 00FF",
+        "17 0C 00FE 0ACD 0001 0003 000D 00FF",
+        "00FE0ACD00010003000D00FF",
+        id="6.17",
+    ),
+    # Beijer GN-9289 manual 8.2.10.
+    pytest.param(
+        write_read_pdu(0x800, 2, 0x800, H("11223344")),
+        "17 0800 0002 0800 0002 04 1122 3344",
+        "17 04 1122 3344",
+        "11223344",
+        id="GN-9289",
+    ),
+    # LabJack's frames: write "01 addr16 nregs data", read "00 addr16 nregs"; the reply is data.
+    pytest.param(
+        feedback_pdu(1000, H("40200000"), 0, 2),
+        "4C 00 0000 02 01 03E8 02 40200000",
+        "4C 3F800000",
+        "3F800000",
+        id="LabJack MBFB",
+    ),
+    pytest.param(
+        feedback_pdu(3, H("12345678"), 1, 1),
+        "4C 00 0001 01 01 0003 02 12345678",
+        "4C 9ABC",
+        "9ABC",
+        id="LabJack MBFB, other sizes",
+    ),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("pdu", "request_hex", "reply_hex", "data_hex"), EXAMPLES)
+def test_published_examples(pdu, request_hex, reply_hex, data_hex):
+    """Request bytes, the reply's size and what is read from it."""
+    assert pdu == H(request_hex)
+    assert reply_size(pdu) == len(H(reply_hex))
+    assert reply_data(pdu, H(reply_hex)) == H(data_hex)
+
+
+@pytest.mark.parametrize(
+    ("pdu", "wire"),
+    [
+        (write_single_pdu(0, (1000).to_bytes(2, "big")), "01 06 00 00 03 E8 89 74"),
+        (read_pdu(3, 0x6B, 3), "01 03 00 6B 00 03 74 17"),
+        (H("03 06 02 2B 00 00 00 64"), "01 03 06 02 2B 00 00 00 64 05 7A"),
+        (read_pdu(4, 0, 8), "01 04 00 00 00 08 F1 CC"),
+    ],
+)
+def test_published_rtu_frames(pdu, wire):
+    """Waveshare AO 8CH (1000 to channel 1, reading 8), and a valve manual's read of 3 registers."""
+    assert rtu_adu(1, pdu) == H(wire)
+    assert rtu_pdu(H(wire), 1) == pdu
+
+
+def test_tcp_frame_byte_by_byte():
+    """Implementation Guide 3.1.3: transaction, protocol 0, length from the unit on, unit."""
+    assert tcp_adu(0x1501, 0xFF, read_pdu(3, 4, 1)) == H("1501 0000 0006 FF 03 0004 0001")
+    assert tcp_pdu(H("1501 0000 0005 FF 03 02 0005"), 0x1501, 0xFF) == H("03 02 0005")
+
+
+# Each request here and the same from pymodbus.
+SAME = [
+    (read_pdu(3, 0x6B, 125), ReadHoldingRegistersRequest(address=0x6B, count=125)),
+    (read_pdu(4, 65534, 2), ReadInputRegistersRequest(address=65534, count=2)),
+    (coil_pdu(7, True), WriteSingleCoilRequest(address=7, bits=[True])),
+    (coil_pdu(7, False), WriteSingleCoilRequest(address=7, bits=[False])),
+    (write_single_pdu(9, H("8001")), WriteSingleRegisterRequest(address=9, registers=[0x8001])),
+    (write_pdu(9, FOUR), WriteMultipleRegistersRequest(address=9, registers=[0x102, 0x304])),
+    (
+        write_read_pdu(0, 2, 0x800, FOUR),
+        ReadWriteMultipleRegistersRequest(
+            read_address=0, read_count=2, write_address=0x800, write_registers=[0x102, 0x304]
+        ),
+    ),
+]
+
+
+@pytest.mark.parametrize(("pdu", "theirs"), SAME)
+def test_requests_are_those_of_pymodbus(pdu, theirs):
+    """Same PDU and both envelopes; pymodbus's server side reads them back alike."""
+    theirs.dev_id, theirs.transaction_id = 17, 513
+    assert tcp_adu(513, 17, pdu) == FramerSocket(DecodePDU(True)).buildFrame(theirs)
+    assert rtu_adu(17, pdu) == FramerRTU(DecodePDU(True)).buildFrame(theirs)
+    for framer, adu, transaction in (
+        (FramerSocket, tcp_adu(513, 17, pdu), 513),
+        (FramerRTU, rtu_adu(17, pdu), 0),
+    ):
+        used, got = framer(DecodePDU(True)).handleFrame(adu, 17, transaction)
+        assert used == len(adu)
+        assert type(got) is type(theirs)
+        assert got.encode() == theirs.encode()
+
+
+@pytest.mark.parametrize(
+    ("pdu", "theirs", "data"),
+    [
+        (SAME[0][0], ReadHoldingRegistersResponse(registers=MANY), struct.pack(">125H", *MANY)),
+        (SAME[1][0], ReadInputRegistersResponse(registers=[1, 0xFFFF]), H("0001FFFF")),
+        (SAME[4][0], WriteSingleRegisterResponse(address=9, registers=[0x8001]), b""),
+        (SAME[5][0], WriteMultipleRegistersResponse(address=9, count=2), b""),
+        (SAME[6][0], ReadWriteMultipleRegistersResponse(registers=[5, 6]), H("00050006")),
+    ],
+)  # fmt: skip
+def test_replies_of_pymodbus_are_read(pdu, theirs, data):
+    """In both envelopes."""
+    theirs.dev_id, theirs.transaction_id = 17, 513
+    tcp = FramerSocket(DecodePDU(False)).buildFrame(theirs)
+    rtu = FramerRTU(DecodePDU(False)).buildFrame(theirs)
+    assert reply_data(pdu, tcp_pdu(tcp, 513, 17)) == data
+    assert reply_data(pdu, rtu_pdu(rtu, 17)) == data
+    assert len(rtu) == reply_size(pdu) + 3
+
+
+@pytest.mark.parametrize(
+    ("code", "name"), [(1, "illegal function"), (2, "address"), (77, "unknown")]
+)
+def test_exceptions_are_refusals_with_their_code(code, name):
+    """Specification section 7; pymodbus builds the reply."""
+    theirs = ExceptionResponse(23, code)
+    theirs.dev_id, theirs.transaction_id = 1, 5
+    adu = FramerSocket(DecodePDU(False)).buildFrame(theirs)
+    with pytest.raises(
+        Refused, match=f"function 23 refused with exception {code} .*{name}"
+    ) as caught:
+        reply_data(SAME[6][0], tcp_pdu(adu, 5, 1))
+    assert caught.value.code == code
+
+
+@pytest.mark.parametrize(
+    ("build", "arguments"),
+    [
+        (read_pdu, (3, 0, 126)),
+        (read_pdu, (4, 0, 0)),
+        (read_pdu, (3, 65535, 2)),
+        (read_pdu, (3, -1, 1)),
+        (read_pdu, (1, 0, 2001)),
+        (read_pdu, (2, 65536, 1)),
+        (read_pdu, (6, 0, 1)),
+        (write_pdu, (0, bytes(248))),
+        (write_pdu, (0, b"")),
+        (write_pdu, (0, b"abc")),
+        (write_pdu, (65535, FOUR)),
+        (write_single_pdu, (0, FOUR)),
+        (write_single_pdu, (0, b"")),
+        (write_single_pdu, (0, b"a")),
+        (write_single_pdu, (65536, b"ab")),
+        (coil_pdu, (-1, True)),
+        (coil_pdu, (65536, False)),
+        (write_read_pdu, (0, 126, 0, FOUR)),
+        (write_read_pdu, (0, 0, 0, FOUR)),
+        (write_read_pdu, (0, 1, 0, bytes(244))),
+        (write_read_pdu, (0, 1, 0, b"")),
+        (write_read_pdu, (65535, 2, 0, FOUR)),
+        (write_read_pdu, (0, 2, 65535, FOUR)),
+        (feedback_pdu, (0, bytes(246), 0, 1)),
+        (feedback_pdu, (0, FOUR, 0, 127)),
+        (feedback_pdu, (0, b"abc", 0, 2)),
+        (feedback_pdu, (65535, FOUR, 0, 2)),
+        (feedback_pdu, (0, FOUR, 65536, 1)),
+        (tcp_adu, (65536, 1, FOUR)),
+        (tcp_adu, (-1, 1, FOUR)),
+        (tcp_adu, (0, 256, FOUR)),
+        (tcp_adu, (0, 1, b"")),
+        (tcp_adu, (0, 1, bytes(254))),
+        (rtu_adu, (0, FOUR)),
+        (rtu_adu, (256, FOUR)),
+        (rtu_adu, (1, bytes(254))),
+        (reply_size, (H("2B 0E 01 00"),)),
+    ],
+)
+def test_what_the_specification_does_not_allow_is_not_built(build, arguments):
+    """Counts, addresses past 65535, odd data, units and transactions."""
+    with pytest.raises(BadRequest):
+        build(*arguments)
+
+
+@pytest.mark.parametrize(
+    "pdu",
+    [
+        read_pdu(1, 63536, 2000),
+        read_pdu(3, 65411, 125),
+        write_pdu(65413, bytes(246)),
+        write_read_pdu(65411, 125, 65415, bytes(242)),
+        feedback_pdu(0, bytes(244), 65410, 126),
+        coil_pdu(65535, True),
+    ],
+)
+def test_the_largest_of_each_fits(pdu):
+    """What the limits allow fits a message, asked and answered."""
+    assert len(pdu) <= 253
+    assert reply_size(pdu) <= 253
+    assert rtu_pdu(rtu_adu(247, pdu), 247) == tcp_pdu(tcp_adu(65535, 0, pdu), 65535, 0) == pdu
+
+
+@pytest.mark.parametrize(
+    ("pdu", "reply"),
+    [
+        (read_pdu(3, 0, 2), "04 04 00000000"),
+        (read_pdu(3, 0, 2), "03 02 0000"),
+        (read_pdu(3, 0, 2), "03 04 000000"),
+        (read_pdu(3, 0, 2), "03 04 0000000000"),
+        (read_pdu(3, 0, 2), "03 03 00000000"),
+        (read_pdu(3, 0, 2), "84 02"),
+        (read_pdu(3, 0, 2), "83"),
+        (read_pdu(3, 0, 2), "83 02 00"),
+        (read_pdu(3, 0, 2), ""),
+        (read_pdu(1, 0, 9), "01 01 00"),
+        (write_pdu(1, FOUR), "10 0002 0002"),
+        (write_pdu(1, FOUR), "10 0001 0001"),
+        (write_pdu(1, FOUR), "10 0001"),
+        (write_single_pdu(1, b"ab"), "06 0001 6163"),
+        (write_single_pdu(1, b"ab"), "06 0002 6162"),
+        (coil_pdu(1, True), "05 0001 0000"),
+        (write_read_pdu(0, 2, 9, FOUR), "17 02 0000"),
+        (write_read_pdu(0, 2, 9, FOUR), "03 04 00000000"),
+        (feedback_pdu(0, FOUR, 0, 2), "4C 0000"),
+        (feedback_pdu(0, FOUR, 0, 2), "4C 0000000000"),
+    ],
+)
+def test_answers_to_something_else_are_mismatches(pdu, reply):
+    """Function, byte count, length, and everything that a write echoes."""
+    with pytest.raises(Mismatch):
+        reply_data(pdu, H(reply))
+
+
+def test_another_function_is_named():
+    """The message says what was asked and what came."""
+    with pytest.raises(Mismatch, match="asked with function 3, answered with 4"):
+        reply_data(read_pdu(3, 0, 2), H("04 04 00000000"))
+    with pytest.raises(Mismatch, match="answered with nothing"):
+        reply_data(read_pdu(3, 0, 2), b"")
+
+
+GOOD = H("0102 0000 0005 11 03 02 0005")
+
+
+@pytest.mark.parametrize(
+    ("adu", "error", "rule"),
+    [
+        (H("0103 0000 0005 11 03 02 0005"), Mismatch, "transaction must be 258, got 259"),
+        (H("0102 0000 0005 12 03 02 0005"), Mismatch, "unit must be 17, got 18"),
+        (H("0102 0001 0005 11 03 02 0005"), Corrupt, "not a Modbus TCP header"),
+        (H("0102 0000 0001 11 03 02 0005"), Corrupt, "not a Modbus TCP header"),
+        (H("0102 0000 00FF 11 03 02 0005"), Corrupt, "not a Modbus TCP header"),
+        (H("0102 0000 0006 11 03 02 0005"), Incomplete, "11 of 12"),
+        (H("0102 0000 0004 11 03 02 0005"), Corrupt, "1 bytes behind"),
+        (GOOD * 2, Corrupt, "11 bytes behind"),
+    ],
+)
+def test_tcp_headers_of_something_else(adu, error, rule):
+    """Another transaction or unit, no Modbus, and lengths that don't fit."""
+    with pytest.raises(error, match=rule):
+        tcp_pdu(adu, 258, 17)
+
+
+def test_beginnings_of_frames_are_incomplete():
+    """As far as the envelope can tell."""
+    assert tcp_pdu(GOOD, 258, 17) == H("03 02 0005")
+    for cut in range(len(GOOD)):
+        with pytest.raises(Incomplete):
+            tcp_pdu(GOOD[:cut], 258, 17)
+    frame = rtu_adu(1, read_pdu(3, 0, 1))
+    for cut in range(5):
+        with pytest.raises(Incomplete):
+            rtu_pdu(frame[:cut], 1)
+
+
+def test_rtu_checks_crc_before_unit():
+    """A flipped unit is corruption; a good frame of another unit is a mismatch."""
+    frame = rtu_adu(2, H("03 02 0005"))
+    with pytest.raises(Mismatch, match="unit must be 1, got 2"):
+        rtu_pdu(frame, 1)
+    with pytest.raises(Corrupt, match="CRC"):
+        rtu_pdu(b"\x01" + frame[1:], 1)

@@ -1,0 +1,365 @@
+"""``serial_dac`` on lines of text and on single frames, against emulated devices on a pty."""
+
+import json
+import os
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hilctl.base.errors import DeviceError, InputError
+from hilctl_drivers.emulator.faults import parse_fault
+from hilctl_drivers.emulator.serial_server import SerialEmulation, emulated_serial
+from hilctl_drivers.profile import shipped_profiles
+from hilctl_drivers.serial.device import SerialDac
+from hilctl_drivers.serial.options import SerialOptions
+
+DCON = (Path(__file__).parents[3] / "data" / "dcon_module.yaml").read_text()
+KINDS = ["dcon", "scpi", "cobs", "length"]
+
+
+@pytest.fixture
+def profiles(tmp_path):
+    """Return paths of one profile of each kind, none of which waits for a board to boot."""
+    board = shipped_profiles()["cobs_board"].read_text()
+    board = board.replace("boot_wait_s: 2.0", "boot_wait_s: 0.0")
+    texts = {
+        "dcon": DCON,
+        "cobs": board,
+        "length": board.replace("framing: cobs", "framing: length"),
+    }
+    for name, text in texts.items():
+        (tmp_path / f"{name}.yaml").write_text(text)
+    made = {name: str(tmp_path / f"{name}.yaml") for name in texts}
+    return {**made, "scpi": "agilent_34970a"}
+
+
+class Clock:
+    """The emulator's time: the machine's, and what a test lets pass on top."""
+
+    def __init__(self):
+        self.extra_ns = 0
+
+    def __call__(self):
+        return time.monotonic_ns() + self.extra_ns
+
+
+class Rig:
+    """A device that is wired to its emulator."""
+
+    def __init__(self, emulator, log, clock, **options):
+        self.emulator = emulator
+        self.log = log
+        self.clock = clock
+        made = {**emulator.options, "timeout_s": 0.1, **options}
+        self.device = SerialDac(SerialOptions.model_validate(made))
+        self.sample = 0
+
+    def open(self):
+        self.device.open(20.0, 1)
+
+    def pass_s(self, seconds):
+        self.clock.extra_ns += round(seconds * 1e9)
+
+    def exchange(self, command):
+        displacement_um, measured = np.full(1, np.nan), np.full(1, np.nan)
+        self.device.exchange(self.sample, np.array([command]), displacement_um, measured)
+        self.sample += 1
+        return displacement_um[0]
+
+    def events(self):
+        return [json.loads(line) for line in self.log.read_text().splitlines()]
+
+    def current_a(self):
+        """What the coil carries by the emulator's log."""
+        return [event["current_a"] for event in self.events() if "current_a" in event][-1]
+
+    def await_current(self, current_a):
+        """Let the emulator come to a setting that it does not answer; fail where it never does."""
+        deadline = time.monotonic() + 20.0
+        while self.current_a() != pytest.approx(current_a):
+            assert time.monotonic() < deadline, f"still at {self.current_a()} A"
+            os.sched_yield()
+
+
+@pytest.fixture
+def rig(profiles, tmp_path):
+    """Return a function that wires a device of a kind to its emulator."""
+    stack = []
+
+    def of(kind, faults=(), reader=None, own_line=False, **options):
+        log = tmp_path / f"log{len(stack)}.jsonl"
+        wanted = SerialEmulation(
+            profiles.get(kind, kind),
+            log=log,
+            faults=tuple(parse_fault(text) for text in faults),
+            reader=reader,
+            own_line=own_line,
+        )
+        clock = Clock()
+        served = emulated_serial(wanted, clock)
+        made = Rig(served.__enter__(), log, clock, **options)
+        stack.append((made, served))
+        return made
+
+    yield of
+    for made, served in stack:
+        made.device.wire.release()
+        served.__exit__(None, None, None)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_command_arrives_and_a_reading_comes_back(rig, kind):
+    """Through amplifier and sensor, the coil carries what was asked and the rig is seen to move."""
+    bench = rig(kind)
+    bench.open()
+    assert abs(bench.exchange(0.0)) < 1.0
+    bench.exchange(5.0)
+    assert bench.current_a() == pytest.approx(5.0, abs=2e-3)
+    bench.pass_s(0.5)
+    assert 20.0 < bench.exchange(5.0) < 45.0
+    bench.device.close()
+    assert bench.current_a() == pytest.approx(5.0, abs=2e-3)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 10.1, -10.1])
+def test_bad_commands_are_refused_and_nothing_is_sent(rig, kind, bad):
+    """Nothing reaches the device, and the next good command does."""
+    bench = rig(kind)
+    bench.open()
+    with pytest.raises(DeviceError, match=r"serial_dac .*: command\[0\] must be in .*nothing was"):
+        bench.exchange(bad)
+    with pytest.raises(DeviceError, match="nothing was sent"):
+        bench.device.make_safe(bad)
+    assert not [event for event in bench.events() if event["event"] == "write"]
+    bench.exchange(1.0)
+
+
+FAULTS = {
+    "silence": "no answer within 0.1 s",
+    "delay": "no answer within 0.1 s",
+    "corrupt": "checksum of|not an answer to this|crc16_ccitt_false of .* is wrong",
+    "cut": "only . bytes, 1 short, within 0.1 s",
+    "duplicate": "must be one line|bytes behind",
+    "wrong_id": "not an answer to this|reply 90 to message",
+    "exception": "invalid command|no answer within|refused by the board",
+}
+
+
+def exchange_until_it_fails(bench, command=2.0):
+    for _ in range(40):
+        assert abs(bench.exchange(command)) < 30.0
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_bad_answer_is_an_error_and_the_output_can_still_be_made_safe(rig, kind, fault):
+    """No wrong reading is taken; the next request is not confused by what is left on the line."""
+    bench = rig(kind, faults=[f"{fault}:0.3@30" if fault == "delay" else f"{fault}@30"])
+    bench.open()
+    with pytest.raises(DeviceError, match=FAULTS[fault]) as caught:
+        exchange_until_it_fails(bench)
+    assert str(caught.value).startswith("serial_dac ")
+    with pytest.raises(DeviceError, match="not open"):
+        bench.exchange(2.0)
+    bench.device.make_safe(-1.0)
+    assert bench.current_a() == pytest.approx(-1.0, abs=2e-3)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_an_unplugged_port_is_an_error_everywhere(rig, kind):
+    """Exchange and make_safe say so within the time-out, and nothing hangs."""
+    bench = rig(kind, faults=["unplug@30"])
+    bench.open()
+    with pytest.raises(DeviceError, match="unplugged"):
+        exchange_until_it_fails(bench)
+    with pytest.raises(DeviceError, match="can't be opened"):
+        bench.device.make_safe(0.0)
+    bench.device.close()
+
+
+@pytest.mark.parametrize("kind", ["dcon", "cobs"])
+def test_a_silent_host_is_noticed_by_the_device(rig, kind):
+    """The device's own watchdog puts the output at the safe value, and then refuses commands."""
+    bench = rig(kind, watchdog={"timeout_s": 0.2, "safe_command": 0.0})
+    bench.open()
+    for _ in range(10):
+        bench.exchange(3.0)
+    bench.pass_s(0.2)
+    with pytest.raises(DeviceError, match="watchdog has tripped"):
+        bench.exchange(3.0)
+    assert (bench.events()[-1]["event"], bench.current_a()) == ("watchdog", 0.0)
+    bench.device.make_safe(0.5)
+    assert bench.current_a() == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize("kind", ["dcon", "cobs"])
+def test_exchanges_feed_the_watchdog_and_close_disarms_it(rig, kind):
+    """Through several of its timeouts nothing trips, nor after closing."""
+    bench = rig(kind, watchdog={"timeout_s": 0.3, "safe_command": 0.0})
+    bench.open()
+    for _ in range(20):
+        bench.exchange(3.0)
+        bench.pass_s(0.05)
+    bench.device.close()
+    bench.pass_s(1.0)
+    bench.open()
+    assert {event["event"] for event in bench.events()} == {"write"}
+
+
+def test_a_trip_of_an_earlier_run_is_cleared_at_open(rig):
+    """Opening clears it, and does not move the output."""
+    bench = rig("dcon", watchdog={"timeout_s": 0.1, "safe_command": 0.0})
+    bench.device.open(60.0, 1)
+    bench.exchange(3.0)
+    bench.device.wire.release()
+    with pytest.raises(DeviceError, match="not open"):
+        bench.device.close()
+    bench.pass_s(0.3)
+    bench.device.open(60.0, 1)
+    assert (bench.events()[-1]["event"], bench.current_a()) == ("watchdog", 0.0)
+    assert bench.exchange(1.0) < 45.0
+
+
+@pytest.mark.parametrize("own_line", [True, False])
+def test_the_sensor_may_stand_on_another_device(rig, profiles, tmp_path, own_line):
+    """On a line of its own, or on the same one at another address."""
+    path = tmp_path / "reader.yaml"
+    path.write_text(DCON.replace("checksum: dcon", "checksum: none"))
+    bench = rig("icp_m7024_dcon", reader=str(path), own_line=own_line, baud=115200)
+    bench.device.open(50.0, 1)
+    assert abs(bench.exchange(0.0)) < 1.0
+    bench.exchange(5.0)
+    bench.pass_s(0.5)
+    assert 20.0 < bench.exchange(5.0) < 45.0
+    assert bench.device.info.max_rate_hz < 200.0
+
+
+def test_scpi_supply_is_set_up_and_checked(rig):
+    """A Kepco BOP is put in current mode, and an error that it keeps is found on the way out."""
+    bench = rig("kepco_bop", reader="agilent_34970a", own_line=True)
+    bench.open()
+    bench.exchange(2.5)
+    bench.await_current(2.5)
+    bench.emulator.device.refusal(b"")  # leaves an error to be asked for
+    with pytest.raises(DeviceError, match=r"SYST:ERR\? says -200"):
+        bench.device.close()
+
+
+@pytest.mark.parametrize(("profile", "current_a"), [("kepco_bop", 2.5), ("tdk_lambda_gen", 3.0)])
+def test_the_output_is_measured_where_that_is_asked_for(rig, profile, current_a):
+    """What MEAS:CURR? or MC? says stands beside the command, and costs a part of the rate."""
+    quick = rig(profile, reader="agilent_34970a", own_line=True).device.info
+    bench = rig(profile, reader="agilent_34970a", own_line=True, measure="current")
+    info = bench.device.info
+    assert (quick.measures_command, info.measures_command) == (False, True)
+    assert "measuring current" in info.rate_note
+    assert info.max_rate_hz < quick.max_rate_hz
+    bench.device.open(10.0, 1)
+    displacement_um, measured = np.full(1, np.nan), np.full(1, np.nan)
+    bench.device.exchange(0, np.array([current_a]), displacement_um, measured)
+    assert measured[0] == pytest.approx(current_a, abs=1e-3)
+    assert np.isfinite(displacement_um).all()
+
+
+def test_a_reading_does_not_show_yet_what_the_command_does(rig):
+    """The sensor is asked first, however slow the line is."""
+    bench = rig("dcon")
+    bench.open()
+    bench.exchange(0.0)
+    bench.pass_s(0.5)
+    assert abs(bench.exchange(5.0)) < 1.0
+    bench.pass_s(0.5)
+    assert bench.exchange(5.0) > 20.0
+
+
+def test_a_reader_that_fails_is_named(rig):
+    """Which of the two devices did not answer is said."""
+    bench = rig("kepco_bop", reader="agilent_34970a", own_line=True)
+    bench.open()
+    bench.exchange(0.0)
+    bench.emulator.lines[1].devices = []
+    port = bench.emulator.lines[1].name
+    with pytest.raises(DeviceError, match=rf"reader Agilent 34970A .* at {port}: "):
+        exchange_until_it_fails(bench, 0.0)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("fault", ["silence", "corrupt", "duplicate", "wrong_id"])
+def test_making_safe_is_tried_twice(rig, kind, fault):
+    """A bad answer to the safe value itself does not end the attempt."""
+    message = {"dcon": 13, "scpi": 12, "cobs": 8, "length": 8}[kind]
+    bench = rig(kind, faults=[f"{fault}@{message}"])
+    bench.open()
+    for _ in range(5):
+        bench.exchange(2.0)
+    bench.device.make_safe(0.0)
+    assert bench.current_a() == pytest.approx(0.0, abs=2e-3)
+
+
+def test_another_device_is_noticed_at_open(rig, tmp_path):
+    """A self-test that is answered by something else ends the opening."""
+    path = tmp_path / "other.yaml"
+    path.write_text(DCON.replace("{2}7.*", "{2}9.*").replace("!027024", "!029024"))
+    bench = rig("dcon", profile=str(path))
+    with pytest.raises(DeviceError, match=r"\$02M must be answered like '!029024', got '!027024'"):
+        bench.open()
+
+
+def test_nobody_there_is_said(rig):
+    """A port that does not exist, and one that somebody else holds."""
+    bench = rig("dcon")
+    away = SerialDac(
+        SerialOptions.model_validate({**bench.emulator.options, "serial_port": "/dev/ttyNOWHERE"})
+    )
+    with pytest.raises(DeviceError, match=r"at /dev/ttyNOWHERE: can't be opened"):
+        away.open(20.0, 1)
+    bench.open()
+    second = SerialDac(SerialOptions.model_validate(bench.emulator.options))
+    with pytest.raises(DeviceError, match="lock"):
+        second.open(20.0, 1)
+
+
+def test_impossible_rates_and_blocks_are_refused(rig):
+    """At open, with what would be possible."""
+    bench = rig("dcon")
+    highest = bench.device.info.max_rate_hz
+    assert 250.0 < highest < 400.0
+    with pytest.raises(DeviceError, match=rf"must be in \(0, {highest:.6g}\] Hz"):
+        bench.device.open(1.01 * highest, 1)
+    with pytest.raises(DeviceError, match="block must be 1"):
+        bench.device.open(50.0, 2)
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({"output": "AO9"}, "output must be one that nobody DCON"),
+        ({"input": "AI9"}, "input must be one that nobody DCON"),
+        ({"profile": "labjack_t7"}, "use modbus_dac"),
+        ({"profile": "kepco_bop", "output": "current", "input": "current"}, "as reader"),
+        ({"reader_address": 3}, "go with reader"),
+        ({"measure": "AI0"}, "measure must be an input of nobody .* measures its own output"),
+        ({"profile": "cobs_board", "output": "DAC", "input": "ADC", "measure": "ADC"}, "lines of"),
+        ({"watchdog": {"timeout_s": 100.0}}, "timeout_s must be 0.1 to 25.5"),
+        ({"watchdog": {"timeout_s": 1.0, "safe_command": 11.0}}, "safe_command must be -10 to 10"),
+        ({"sensor": {"um_per_ma": 1.0}}, "the input is in V"),
+        ({"reader": "icp_m7024_dcon"}, "can't share the line"),
+    ],
+)
+def test_options_that_do_not_go_together_are_refused(profiles, changes, text):
+    """Before anything is opened."""
+    options = {
+        "profile": profiles["dcon"],
+        "serial_port": "/dev/x",
+        "output": "AO0",
+        "input": "AI0",
+        "amplifier": {"gain_a_per_v": 1.0},
+        "sensor": {"um_per_v": 12.5},
+        "watchdog": "none",
+        **changes,
+    }
+    with pytest.raises(InputError, match=text):
+        SerialDac(SerialOptions.model_validate(options))

@@ -1,0 +1,259 @@
+"""The simulated actuator's physics, against the published figures and against itself."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hilctl.base.arrays import F64
+from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
+
+RATED = TerfenolParameters()
+QUIET = replace(RATED, sensor_noise_um=0.0)
+RATE_HZ = 50e3
+
+
+def run(actuator: TerfenolActuator, command_a: F64) -> F64:
+    displacement_um = np.empty_like(command_a)
+    actuator.step(command_a, displacement_um, np.empty_like(command_a))
+    return displacement_um
+
+
+@cache
+def last_cycle(
+    harmonics: tuple[tuple[int, float], ...],
+    frequency_hz: float,
+    bias_a: float = 0.0,
+) -> tuple[F64, F64]:
+    """Command in A and displacement in um of the last cycle of sum of a sin(k w t)."""
+    # A slow loop changes little in a sample, and the internal step is the same at any rate.
+    rate_hz = RATE_HZ if frequency_hz > 10.0 else 2500.0
+    n = round(rate_hz / frequency_hz)
+    cycles = 2 if frequency_hz < 50.0 else 8
+    phase = 2.0 * np.pi * np.arange(n * cycles) / n
+    command_a = np.sum([a * np.sin(k * phase) for k, a in harmonics], axis=0)
+    displacement_um = run(TerfenolActuator(QUIET, rate_hz, bias_a=bias_a), command_a)
+    return command_a[-n:], displacement_um[-n:]
+
+
+def sine(amplitude_a: float, frequency_hz: float, bias_a: float = 0.0) -> tuple[F64, F64]:
+    return last_cycle(((1, amplitude_a),), frequency_hz, bias_a)
+
+
+def stroke_um(amplitude_a: float, frequency_hz: float) -> float:
+    return float(np.ptp(sine(amplitude_a, frequency_hz)[1]))
+
+
+def peak_hysteresis_percent(command_a: F64, displacement_um: F64) -> float:
+    """Largest gap between descending and ascending branch at one command, per peak-to-peak."""
+    start = -int(np.argmin(command_a))
+    command_a, displacement_um = np.roll(command_a, start), np.roll(displacement_um, start)
+    turn = int(np.argmax(command_a))
+    levels = np.linspace(command_a[0], command_a[turn], 1001)
+    ascending = np.interp(levels, command_a[: turn + 1], displacement_um[: turn + 1])
+    back_a = np.append(command_a[turn:], command_a[0])[::-1]
+    back_um = np.append(displacement_um[turn:], displacement_um[0])[::-1]
+    gap_um = np.interp(levels, back_a, back_um) - ascending
+    return float(100.0 * gap_um.max() / np.ptp(displacement_um))
+
+
+def hysteresis(amplitude_a: float, frequency_hz: float) -> float:
+    return peak_hysteresis_percent(*sine(amplitude_a, frequency_hz))
+
+
+def asymmetry_percent(amplitude_a: float) -> float:
+    _, displacement_um = sine(amplitude_a, 10.0)
+    difference_um = -displacement_um.min() - displacement_um.max()
+    return float(100.0 * difference_um / np.ptp(displacement_um))
+
+
+def minor_loop_um(first_a: float, third_a: float, frequency_hz: float, side: int) -> float:
+    """Peak-to-peak displacement of the minor loop at the input's maximum (1) or minimum (-1)."""
+    command_a, displacement_um = last_cycle(((1, first_a), (3, third_a)), frequency_hz)
+    rising = np.diff(np.append(command_a, command_a[0])) > 0.0
+    turns = np.flatnonzero(rising != np.roll(rising, 1))
+    excursions = []
+    for a, b in zip(turns, np.roll(turns, -1), strict=True):
+        span = np.arange(a, (b if b > a else b + command_a.size) + 1) % command_a.size
+        extent_a = abs(command_a[b] - command_a[a])
+        middle_a = 0.5 * (command_a[a] + command_a[b])
+        excursions.append((extent_a, middle_a, np.ptp(displacement_um[span])))
+    minor = sorted(excursions)[:4]  # the two that are left carry it from end to end
+    return float(np.mean([um for _, middle_a, um in minor if middle_a * side > 0.0]))
+
+
+PUBLISHED: list[tuple[str, float, float, Callable[[], float]]] = [
+    ("stroke 6 A 1 Hz, um", 83.1, 8.31, lambda: stroke_um(6.0, 1.0)),
+    ("stroke 7 A 10 Hz, um", 100.0, 10.0, lambda: stroke_um(7.0, 10.0)),
+    ("stroke 2.3 A 1 Hz, um", 25.8, 2.58, lambda: stroke_um(2.3, 1.0)),
+    ("hysteresis 6 A 1 Hz, %", 18.2, 1.82, lambda: hysteresis(6.0, 1.0)),
+    ("hysteresis 6 A 250 Hz, %", 49.1, 0.98, lambda: hysteresis(6.0, 250.0)),
+    ("hysteresis 2.3 A 1 Hz, %", 18.0, 1.80, lambda: hysteresis(2.3, 1.0)),
+    ("hysteresis 2.3 A 100 Hz, %", 25.7, 2.57, lambda: hysteresis(2.3, 100.0)),
+    ("asymmetry 3 A 10 Hz, %", 6.4, 5.0, lambda: asymmetry_percent(3.0)),
+    ("asymmetry 9 A 10 Hz, %", 17.31, 1.73, lambda: asymmetry_percent(9.0)),
+    ("minor loop (4, 3) A 20 Hz top, um", 18.0, 1.8, lambda: minor_loop_um(4, 3, 20.0, 1)),
+    ("minor loop (4, 3) A 20 Hz bottom, um", 26.0, 2.6, lambda: minor_loop_um(4, 3, 20.0, -1)),
+    ("minor loop (3, 4) A 20 Hz top, um", 34.0, 3.4, lambda: minor_loop_um(3, 4, 20.0, 1)),
+    ("minor loop (3, 4) A 50 Hz top, um", 34.0, 3.4, lambda: minor_loop_um(3, 4, 50.0, 1)),
+    ("minor loop (3, 4) A 100 Hz top, um", 34.0, 3.4, lambda: minor_loop_um(3, 4, 100.0, 1)),
+    ("minor loop (3, 4) A 20 Hz bottom, um", 42.0, 4.2, lambda: minor_loop_um(3, 4, 20.0, -1)),
+    ("minor loop (3, 4) A 50 Hz bottom, um", 42.0, 4.2, lambda: minor_loop_um(3, 4, 50.0, -1)),
+    ("minor loop (3, 4) A 100 Hz bottom, um", 42.0, 4.2, lambda: minor_loop_um(3, 4, 100.0, -1)),
+]
+
+
+class TestPublishedFigures:
+    """Figures 2.4 to 2.14, 4.2, 4.5, 5.5 and 6.3 of the dissertation that the rig stands for."""
+
+    @pytest.mark.parametrize(
+        ("name", "published", "tolerance", "figure"), PUBLISHED, ids=[row[0] for row in PUBLISHED]
+    )
+    def test_figure(
+        self, name: str, published: float, tolerance: float, figure: Callable[[], float]
+    ) -> None:
+        """The actuator shows the published figure."""
+        simulated = figure()
+        print(f"{name}: {simulated:.2f}, published {published:g}")
+        assert simulated == pytest.approx(published, abs=tolerance)
+
+    def test_loop_area_is_linear_in_frequency(self) -> None:
+        """At 6 A the area of the loop grows in proportion to the frequency, r^2 >= 0.99."""
+        frequencies_hz = [10.0, 50.0, 100.0, 150.0, 200.0, 250.0]
+        areas = []
+        for frequency_hz in frequencies_hz:
+            command_a, displacement_um = sine(6.0, frequency_hz)
+            slope_a = 0.5 * (np.roll(command_a, -1) - np.roll(command_a, 1))
+            areas.append(abs(float(np.dot(displacement_um, slope_a))))
+        assert np.corrcoef(frequencies_hz, areas)[0, 1] ** 2 >= 0.99
+        assert areas == sorted(areas)
+
+    def test_more_bias_gives_less_stroke_and_area(self) -> None:
+        """From 30 to 60 kA/m of bias field, stroke and loop area of a 3 A sine fall."""
+        strokes, areas = [], []
+        for bias_field in (30e3, 45e3, 60e3):
+            bias_a = (bias_field - RATED.magnet_field_a_per_m) / RATED.coil_factor_per_m
+            command_a, displacement_um = sine(2.965, 10.0, bias_a)
+            strokes.append(np.ptp(displacement_um))
+            areas.append(abs(np.dot(displacement_um, np.gradient(command_a))))
+        assert strokes == sorted(strokes, reverse=True)
+        assert areas == sorted(areas, reverse=True)
+
+    @pytest.mark.parametrize("load_kg", [0.0, 3.7, 9.2, 14.7])
+    def test_load_lowers_the_resonance(self, load_kg: float) -> None:
+        """A 0.1 A step rings at sqrt(stiffness / (moving mass + load))."""
+        mass_kg = RATED.moving_mass_kg + load_kg
+        damped = np.sqrt(RATED.stiffness_n_per_m / mass_kg * (1.0 - RATED.damping_ratio**2))
+        # Far less lag than rated, and no current loop to speak of: the ringing stands alone.
+        brisk = replace(QUIET, lag_s=1e-5, amplifier_bandwidth_hz=50e3, dac_codes=2**30)
+        ringing = run(TerfenolActuator(brisk, 200e3, load_kg), np.full(20_000, 0.1))
+        ringing -= ringing[-1]
+        crossings = np.flatnonzero(np.diff(np.sign(ringing)))[:5]
+        half_period_s = np.diff(crossings).mean() / 200e3
+        assert np.pi / half_period_s == pytest.approx(damped, rel=0.02)
+
+
+class TestRest:
+    """An actuator that is left alone."""
+
+    @pytest.mark.parametrize("bias_a", [0.0, -3.96, 5.89])
+    def test_rest_is_zero(self, bias_a: float) -> None:
+        """With no command the displacement is exactly 0, whatever the bias."""
+        displacement_um = run(TerfenolActuator(QUIET, RATE_HZ, bias_a=bias_a), np.zeros(1000))
+        assert not displacement_um.any()
+
+    def test_noise_is_the_sensors(self) -> None:
+        """The reading at rest has the published noise and no mean."""
+        displacement_um = run(TerfenolActuator(RATED, RATE_HZ), np.zeros(50_000))
+        assert displacement_um.std() == pytest.approx(0.03553, rel=0.02)
+        assert abs(displacement_um.mean()) < 0.001
+
+
+class TestTiming:
+    """When a command shows."""
+
+    def test_reading_comes_before_the_command(self) -> None:
+        """The first reading can't show the first command, neither as current nor as motion."""
+        displacement_um, current_a = np.empty(50), np.empty(50)
+        TerfenolActuator(QUIET, RATE_HZ).step(np.full(50, 2.0), displacement_um, current_a)
+        assert displacement_um[0] == 0.0
+        assert current_a[0] == 0.0
+        assert current_a[1] == pytest.approx(2.0 * (1.0 - np.exp(-2e4 * np.pi * 20e-6)), abs=1e-3)
+        assert displacement_um[-1] > 1.0
+
+    def test_command_is_quantised(self) -> None:
+        """The settled current is the DAC code nearest to the command, 0.305 mA apart."""
+        current_a = np.empty(200)
+        TerfenolActuator(QUIET, RATE_HZ).step(np.full(200, 0.0004), np.empty(200), current_a)
+        assert current_a[-1] == pytest.approx(10.0 / 32767.0)
+
+    def test_sensor_stops_at_its_range(self) -> None:
+        """A displacement beyond +-10 V of sensor output reads as the end of the range."""
+        strong = replace(QUIET, strain_um=1500.0)
+        displacement_um = run(TerfenolActuator(strong, RATE_HZ), np.repeat([-9.0, 9.0], 1000))
+        assert displacement_um.min() == -125.0
+        assert displacement_um.max() == 125.0
+
+    @pytest.mark.parametrize(("rate_hz", "frequency_hz"), [(50e3, 250.0), (500.0, 25.0)])
+    def test_integration_has_converged(self, rate_hz: float, frequency_hz: float) -> None:
+        """A tenth of the internal step moves no reading by more than 10 nm."""
+        n = round(4 * rate_hz / frequency_hz)
+        command_a = 6.0 * np.sin(2.0 * np.pi * frequency_hz * np.arange(n) / rate_hz)
+        fine = replace(QUIET, step_max_s=QUIET.step_max_s / 10.0)
+        coarse_um = run(TerfenolActuator(QUIET, rate_hz), command_a)
+        fine_um = run(TerfenolActuator(fine, rate_hz), command_a)
+        assert np.abs(coarse_um - fine_um).max() < 0.010
+
+
+class TestBlocks:
+    """Blocks, seeds and held samples."""
+
+    COMMAND_A = 6.0 * np.sin(np.arange(6000) / 30.0)
+
+    @settings(max_examples=30, deadline=None)
+    @given(cuts=st.lists(st.integers(0, 6000), max_size=12))
+    def test_cut_does_not_matter(self, cuts: list[int]) -> None:
+        """Readings are the same bit for bit wherever the blocks are cut."""
+        whole = run(TerfenolActuator(RATED, RATE_HZ), self.COMMAND_A)
+        actuator = TerfenolActuator(RATED, RATE_HZ)
+        parts = [run(actuator, part) for part in np.split(self.COMMAND_A, sorted(cuts))]
+        np.testing.assert_array_equal(np.concatenate(parts), whole)
+
+    def test_sample_by_sample(self) -> None:
+        """Blocks of one give the same bits as one block."""
+        whole = run(TerfenolActuator(RATED, RATE_HZ), self.COMMAND_A[:500])
+        actuator = TerfenolActuator(RATED, RATE_HZ)
+        parts = [run(actuator, self.COMMAND_A[k : k + 1]) for k in range(500)]
+        np.testing.assert_array_equal(np.concatenate(parts), whole)
+
+    def test_seed_decides_the_noise(self) -> None:
+        """Equal seeds give equal readings, others do not."""
+        one, same, other = (
+            run(TerfenolActuator(RATED, RATE_HZ, seed=seed), self.COMMAND_A) for seed in (3, 3, 4)
+        )
+        np.testing.assert_array_equal(one, same)
+        assert not np.array_equal(one, other)
+
+    def test_reset_starts_over(self) -> None:
+        """After a reset the actuator gives the same readings as a new one."""
+        actuator = TerfenolActuator(RATED, RATE_HZ)
+        first = run(actuator, self.COMMAND_A)
+        actuator.reset()
+        np.testing.assert_array_equal(run(actuator, self.COMMAND_A), first)
+
+    def test_hold_is_a_constant_command(self) -> None:
+        """Holding equals sending the same command that many times, over any length."""
+        sent, held = TerfenolActuator(RATED, RATE_HZ), TerfenolActuator(RATED, RATE_HZ)
+        run(sent, np.full(10_000, 2.5))
+        held.hold(10_000, 2.5)
+        np.testing.assert_array_equal(run(held, self.COMMAND_A), run(sent, self.COMMAND_A))
+
+    def test_command_is_left_alone(self) -> None:
+        """A read-only command is good enough."""
+        command_a = self.COMMAND_A.copy()
+        command_a.setflags(write=False)
+        run(TerfenolActuator(RATED, RATE_HZ), command_a)

@@ -1,0 +1,109 @@
+"""What Modbus and serial devices share: watchdogs that can't do what is asked, ports in use."""
+
+from typing import Any
+
+import pytest
+
+from hilctl.base.errors import InputError
+from hilctl_drivers.device import (
+    HostWatchdog,
+    channel,
+    check_senses,
+    check_watchdog,
+    held_address,
+    held_port,
+    line_settings,
+)
+from hilctl_drivers.profile import load_profile
+from hilctl_drivers.profile_parts import Range, Watchdog
+from hilctl_drivers.text.profile import AsciiProfile, AsciiWatchdog
+from hilctl_drivers.wiring import Amplifier, Sensor, SignalChain
+
+VOLTS = Range(unit="V", min=-10.0, max=10.0)
+
+
+def asked(has: Watchdog | str, offset_a: float = 0.0, **wanted: float) -> None:
+    """Hold a wanted watchdog against what a device has, on output B."""
+    amplifier = Amplifier(gain_a_per_v=2.0, offset_a=offset_a)
+    chain = SignalChain(VOLTS, VOLTS, amplifier, Sensor(um_per_v=1.0))
+    want = HostWatchdog.model_validate({"timeout_s": 1.0, **wanted})
+    check_watchdog("Acme", "B", VOLTS, chain, want, has)
+
+
+def watchdog(**changes: Any) -> AsciiWatchdog:
+    arm = ({"kind": "send", "text": "W{timeout}"},)
+    data = {
+        "unit_s": 0.1, "min_s": 0.1, "max_s": 10.0, "kick": "any", "on_trip": "safe",
+        "refuses_while_tripped": False, "arm": arm, **changes,
+    }  # fmt: skip
+    return AsciiWatchdog.model_validate(data)
+
+
+@pytest.mark.parametrize(
+    ("has", "wanted", "words"),
+    [
+        ("none", {}, "Acme has no host watchdog: it holds its last output"),
+        (watchdog(), {"timeout_s": 20.0}, "timeout_s must be 0.1 to 10"),
+        (watchdog(), {"safe_command": 30.0}, "safe_command must be -20 to 20, got 30"),
+        (watchdog(safe={"A": ()}), {}, "does nothing for B, only for A: take one of these, or"),
+        (watchdog(on_trip="hold"), {}, "holds B where it is when it trips: say watchdog: none"),
+        (watchdog(on_trip="zero"), {"safe_command": 3.0}, "puts B at 0 V, which is 0 A here"),
+        (watchdog(on_trip="reset"), {"offset_a": 1.0}, "which is 1 A here: .* got 0"),
+    ],
+)
+def test_watchdog_that_does_not_do_what_is_asked_is_refused(has, wanted, words):
+    """The same rules for lines of text as for Modbus: it must act, on this output, as wanted."""
+    with pytest.raises(InputError, match=words):
+        asked(has, **wanted)
+
+
+@pytest.mark.parametrize("has", [watchdog(), watchdog(safe={"B": ()}), watchdog(on_trip="zero")])
+def test_watchdog_that_does_is_taken(has):
+    """A safe value, one for this output among others, or 0 where that is asked for."""
+    asked(has)
+
+
+@pytest.mark.parametrize(
+    ("host", "held"),
+    [
+        ("10.0.0.5", "tcp:10.0.0.5:502"),
+        ("localhost", "tcp:127.0.0.1:502"),
+        ("DAC.lab", "tcp:dac.lab:502"),
+        ("fe80:0:0::0001", "tcp:[fe80::1]:502"),
+    ],
+)
+def test_addresses_have_one_name(host, held):
+    """Numbers in their shortest form; names as they are, for asking takes time."""
+    assert held_address(host, 502) == held
+
+
+def test_ports_have_one_name(tmp_path):
+    """A link under /dev/serial/by-id is the port that it leads to."""
+    (tmp_path / "ttyUSB0").touch()
+    (tmp_path / "usb-adapter").symlink_to("ttyUSB0")
+    assert held_port(str(tmp_path / "usb-adapter")) == f"serial:{tmp_path.resolve()}/ttyUSB0"
+
+
+def test_channels_are_found_by_name():
+    """An unknown name lists those that there are; none is said where there are none."""
+    assert channel("input", "A", {"A": 1, "B": 2}, "Acme") == 1
+    with pytest.raises(InputError, match=r"must be one that Acme has, got 'C' \(it has A, B\)"):
+        channel("input", "C", {"A": 1, "B": 2}, "Acme")
+    with pytest.raises(InputError, match=r"\(it has none\)"):
+        channel("input", "C", {}, "Acme")
+
+
+def test_input_of_its_own_output_is_no_sensor():
+    """A supply's own meter can't be the displacement sensor."""
+    supply = load_profile("kepco_bop")
+    assert isinstance(supply, AsciiProfile)
+    with pytest.raises(InputError, match="name the device that reads the sensor as reader"):
+        check_senses("current", next(iter(supply.inputs.values())), supply.title)
+
+
+def test_lines_are_set_as_their_profiles_say():
+    """Baud, characters, silence and levels; a line of text keeps its gap between commands."""
+    settings = line_settings(load_profile("tdk_lambda_gen").link)
+    assert (settings.baud, settings.parity, settings.gap_s) == (9600, "N", 0.005)
+    assert line_settings(load_profile("adam_4024").link).gap_s == pytest.approx(35 / 9600)
+    assert line_settings(load_profile("cobs_board").link).dtr is True

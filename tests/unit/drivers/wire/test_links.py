@@ -1,0 +1,354 @@
+"""Bytes over TCP and ptys: whole replies, deadlines, and clear words about what went wrong."""
+
+import os
+import pty
+import select
+import socket
+import struct
+import threading
+import tty
+from collections.abc import Callable, Iterator
+
+import pytest
+
+from hilctl.base.errors import DeviceError
+from hilctl_drivers.wire.links import LostError, NoAnswerError
+from hilctl_drivers.wire.serial_port import SerialLink, SerialSettings
+from hilctl_drivers.wire.tcp import TcpLink
+
+QUICK_S = 0.05
+PATIENT_S = 5.0
+REPLY = b"0123456789"
+
+
+def missing(received: bytearray) -> int:
+    return max(0, len(REPLY) - len(received))
+
+
+class Peer:
+    """A TCP server that does one thing with its first connection, in a thread of its own."""
+
+    def __init__(self, act: Callable[[socket.socket], None]) -> None:
+        self.server = socket.create_server(("127.0.0.1", 0))
+        self.port = self.server.getsockname()[1]
+        self._act = act
+        self.done = threading.Event()
+        self.thread = threading.Thread(target=self._run)
+        self.thread.start()
+
+    def _run(self) -> None:
+        connection, _ = self.server.accept()
+        with connection:
+            self._act(connection)
+            self.done.wait(10.0)
+
+    def stop(self) -> None:
+        self.done.set()
+        self.thread.join()
+        self.server.close()
+
+
+@pytest.fixture
+def serve() -> Iterator[Callable[[Callable[[socket.socket], None]], int]]:
+    """Return a function that starts a peer and returns its port."""
+    peers = []
+
+    def start(act: Callable[[socket.socket], None]) -> int:
+        peers.append(Peer(act))
+        return peers[-1].port
+
+    yield start
+    for peer in peers:
+        peer.stop()
+
+
+def tcp(port, timeout_s=PATIENT_S):
+    link = TcpLink("127.0.0.1", port, timeout_s)
+    link.open()
+    return link
+
+
+def test_tcp_reply_in_pieces_is_put_together(serve):
+    """A reply may come in any number of segments."""
+
+    def act(connection):
+        connection.recv(100)
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        for k in range(len(REPLY)):
+            connection.sendall(REPLY[k : k + 1])
+
+    link = tcp(serve(act))
+    assert link.transact(b"ask", missing) == REPLY
+    link.close()
+    link.close()
+
+
+def test_tcp_turns_nagle_off(serve):
+    """Small requests leave at once."""
+    link = tcp(serve(lambda connection: None))
+    assert link._socket.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
+    link.close()
+
+
+@pytest.mark.parametrize(
+    ("sent", "words"), [(b"", "no answer within 0.05 s"), (b"0123", "only 4 bytes, 6 short")]
+)
+def test_tcp_silence_ends_at_the_deadline(serve, sent, words):
+    """No reply, or a part of one, is an error in time, and the connection is given up."""
+
+    def act(connection):
+        connection.recv(100)
+        connection.sendall(sent)
+
+    link = tcp(serve(act), QUICK_S)
+    with pytest.raises(NoAnswerError, match=words):
+        link.transact(b"ask", missing)
+    with pytest.raises(LostError, match="not connected"):
+        link.transact(b"ask", missing)
+
+
+def test_tcp_trickle_does_not_move_the_deadline():
+    """A byte now and then does not keep an exchange alive: time is injected and runs out."""
+    ours, theirs = socket.socketpair()
+    theirs.sendall(b"012")
+    times = iter([0.0, 1.1])
+    link = TcpLink("", 0, 1.0, clock=lambda: next(times))
+    link._socket = ours
+    with pytest.raises(NoAnswerError, match="within 1 s"):
+        link.transact(b"ask", lambda received: 1)
+    theirs.close()
+
+
+def test_tcp_reset_closing_and_refusal_are_told_apart(serve):
+    """Each way to lose a peer has words of its own."""
+
+    def reset(connection):
+        connection.recv(100)
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        connection.close()
+
+    def hang_up(connection):
+        connection.recv(100)
+        connection.shutdown(socket.SHUT_RDWR)
+
+    with pytest.raises(LostError, match="connection reset by peer"):
+        tcp(serve(reset)).transact(b"ask", missing)
+    with pytest.raises(LostError, match="connection closed by the device"):
+        tcp(serve(hang_up)).transact(b"ask", missing)
+    with pytest.raises(LostError, match="can't connect: connection refused"):
+        tcp(1)
+
+
+def test_no_reply_wanted_is_not_waited_for(serve, line):
+    """A command that is not answered costs no time-out, on either link."""
+    _, name = line
+    wire = SerialLink(name, SerialSettings(), PATIENT_S)
+    wire.open()
+    for link in (tcp(serve(lambda connection: None)), wire):
+        assert link.transact(b"tell", lambda received: 0) == b""
+        link.close()
+
+
+@pytest.mark.parametrize(
+    ("sent", "words"), [(b"", "no answer within 0.05 s"), (b"0123", "only 4 bytes, 6 short")]
+)
+def test_a_known_size_moves_no_deadline(serve, line, sent, words):
+    """Silence and cut replies end in time too where the size of a good reply is known."""
+
+    def act(connection):
+        connection.recv(100)
+        connection.sendall(sent)
+
+    master, name = line
+    wire = SerialLink(name, SerialSettings(), QUICK_S)
+    wire.open()
+    wire.drain()
+    thread = threading.Thread(target=lambda: os.write(master, os.read(master, 100) and sent))
+    thread.start()
+    for link in (tcp(serve(act), QUICK_S), wire):
+        with pytest.raises(NoAnswerError, match=words):
+            link.transact(b"ask", missing, len(REPLY))
+        link.close()
+    thread.join()
+
+
+@pytest.mark.parametrize("size", [9, 11, 300])
+def test_a_reply_of_another_size_than_usual_is_asked_about(serve, size):
+    """Shorter, longer, and longer than what is read at once: what comes is what is returned."""
+    sent = bytes(size)
+
+    def act(connection):
+        connection.recv(100)
+        connection.sendall(sent)
+
+    link = tcp(serve(act))
+    assert link.transact(b"ask", lambda got: size - len(got), len(REPLY)) == sent
+    link.close()
+
+
+def test_full_serial_line_times_out(line):
+    """Nobody takes what is sent: an error in time, not a hang."""
+    _, name = line
+    link = SerialLink(name, SerialSettings(), QUICK_S)
+    link.open()
+    with pytest.raises(NoAnswerError, match="could not send within"):
+        link.transact(bytes(1_000_000), missing)
+    with pytest.raises(NoAnswerError, match="could not send within"):
+        link.transact(b"ask", missing)
+    link.close()
+
+
+def test_tcp_unknown_host_is_one_line():
+    """A name that can't be looked up is a device error, not a traceback."""
+    with pytest.raises(LostError, match="can't connect"):
+        TcpLink("host.invalid", 502, QUICK_S).open()
+
+
+def test_tcp_frame_error_closes_the_connection(serve):
+    """When the reply can't be one, what else is on its way must not be taken for the next."""
+
+    def act(connection):
+        connection.recv(100)
+        connection.sendall(REPLY)
+
+    def refuse(received):
+        raise DeviceError("not a reply")
+
+    link = tcp(serve(act))
+    with pytest.raises(DeviceError, match="not a reply"):
+        link.transact(b"ask", refuse)
+    with pytest.raises(LostError):
+        link.transact(b"ask", missing)
+
+
+@pytest.fixture
+def line() -> Iterator[tuple[int, str]]:
+    """Yield the far end of a pty and the device file of the near end."""
+    master, slave = pty.openpty()
+    tty.setraw(slave)
+    yield master, os.ttyname(slave)
+    os.close(slave)
+    os.close(master)
+
+
+def test_serial_exchanges(line):
+    """What is written gets there, and a reply that is waiting in pieces is put together."""
+    master, name = line
+    link = SerialLink(name, SerialSettings(115200, 8, "E", 1), PATIENT_S)
+    link.open()
+    link.drain()
+
+    def answer():
+        assert os.read(master, 100) == b"ask"
+        os.write(master, REPLY[:4])
+        os.write(master, REPLY[4:])
+
+    thread = threading.Thread(target=answer)
+    thread.start()
+    assert link.transact(b"ask", missing) == REPLY
+    thread.join()
+    assert link.low_latency is False  # a pty has no such setting
+    link.close()
+    link.close()
+
+
+def test_serial_port_is_ours_alone(line):
+    """A second one can't have the port, and is told so."""
+    _, name = line
+    first, second = (SerialLink(name, SerialSettings(), QUICK_S) for _ in range(2))
+    first.open()
+    with pytest.raises(LostError, match=r"can't be opened: .*lock"):
+        second.open()
+    first.close()
+    second.open()
+    second.close()
+
+
+def test_serial_late_reply_is_thrown_away(line):
+    """After a time-out, what still comes is not taken for the answer to the next request."""
+    master, name = line
+    link = SerialLink(name, SerialSettings(), QUICK_S)
+    link.open()
+    with pytest.raises(NoAnswerError, match=r"no answer within 0\.05 s"):
+        link.transact(b"one", missing)
+    os.write(master, b"late reply")
+    with pytest.raises(NoAnswerError):
+        link.transact(b"two", missing)
+    assert os.read(master, 100) == b"onetwo"
+    link.close()
+
+
+def test_serial_unasked_bytes_are_refused(line):
+    """A doubled reply is noticed before the next request is sent."""
+    master, name = line
+    link = SerialLink(name, SerialSettings(), PATIENT_S)
+    link.open()
+    link.drain()
+    os.write(master, REPLY)
+    select.select([link._fd], [], [], PATIENT_S)
+    with pytest.raises(DeviceError, match="10 bytes that nobody asked for"):
+        link.transact(b"ask", missing)
+    link.close()
+
+
+def test_serial_gap_is_kept():
+    """The next request waits until the line has been quiet for the gap."""
+    now, slept = [10.0], []
+
+    def sleep(seconds):
+        slept.append(seconds)
+        now[0] += seconds
+
+    master, slave = pty.openpty()
+    tty.setraw(slave)
+    settings = SerialSettings(9600, gap_s=0.004, boot_s=2.0)
+    link = SerialLink(os.ttyname(slave), settings, 1.0, clock=lambda: now[0], sleep=sleep)
+    link.open()
+    assert slept == [2.0]
+    link.drain()
+    for _ in range(2):
+        thread = threading.Thread(target=lambda: (os.read(master, 3), os.write(master, REPLY)))
+        thread.start()
+        assert link.transact(b"ask", missing) == REPLY
+        thread.join()
+    assert slept == [2.0, pytest.approx(0.004)]
+    link.close()
+    os.close(slave)
+    os.close(master)
+
+
+def test_serial_unplugged_is_one_line():
+    """A port that goes away in mid-exchange is told so, and is closed."""
+    master, slave = pty.openpty()
+    tty.setraw(slave)
+    link = SerialLink(os.ttyname(slave), SerialSettings(), PATIENT_S)
+    link.open()
+    link.drain()
+    os.close(slave)
+    thread = threading.Thread(target=lambda: (os.read(master, 3), os.close(master)))
+    thread.start()
+    with pytest.raises(LostError, match="port lost, unplugged"):
+        link.transact(b"ask", missing)
+    thread.join()
+    with pytest.raises(LostError, match="not open"):
+        link.transact(b"ask", missing)
+
+
+def test_serial_missing_port_is_one_line():
+    """A port that is not there is a device error with the system's own words."""
+    link = SerialLink("/dev/no_such_port", SerialSettings(), QUICK_S)
+    with pytest.raises(LostError, match="No such file"):
+        link.open()
+
+
+def test_serial_chatter_does_not_hang(line):
+    """A line that never gets quiet is an error within bounds."""
+    _, name = line
+    times = iter(range(1000))
+    link = SerialLink(name, SerialSettings(), 1.0, clock=lambda: float(next(times)))
+    link.open()
+    link._read = lambda: b"x"
+    link._poll = type("Always", (), {"poll": lambda self, ms: [1]})()
+    with pytest.raises(DeviceError, match="does not get quiet"):
+        link.transact(b"ask", missing)
+    link.close()

@@ -1,0 +1,466 @@
+"""What is worked out and refused before anything moves."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+from pydantic import ConfigDict
+
+from hilctl.base.arrays import F64
+from hilctl.base.device import DeviceInfo, DeviceOptions
+from hilctl.base.errors import ConfigError
+from hilctl.base.yaml.document import Document
+from hilctl.experiment.check import Checked, check, check_tuned
+from hilctl.experiment.load import LoadedExperiment, resolve
+from hilctl.models.base import HysteresisModel, Operator
+from hilctl.models.published import piezo_ppi, terfenol_rdpi
+from hilctl.models.rdpi import RdpiModel
+from hilctl.models.staged import FieldLag, StagedModel
+
+CURRENT = """\
+name: current
+device: {kind: simulated_terfenol}
+sample_rate_hz: 10000
+waveform: {kind: sine, unit: A, amplitude: 6.0, offset: 0.5, frequency_hz: 10.0, duration_s: 1.0}
+compensator: none
+limits: {peak_current_a: 7.0, slew_a_per_s: 20000.0, stroke_um: [-75.0, 60.0]}
+"""
+DISPLACEMENT = """\
+name: displacement
+device: {kind: simulated_terfenol}
+sample_rate_hz: 10000
+waveform:
+  kind: sine
+  unit: um
+  amplitude: 10.0
+  frequency_hz: 10.0
+  duration_s: 1.0
+  soft_start_s: 0.1
+compensator: {model: model.yaml}
+limits: {peak_current_a: 7.0, slew_a_per_s: 20000.0, stroke_um: [-75.0, 60.0]}
+"""
+MODEL = Path(__file__).parents[3] / "configs" / "models" / "terfenol_rdpi.yaml"
+INFO = DeviceInfo(
+    name="fake",
+    description="a device that does nothing",
+    command_unit="A",
+    command_min=-8.0,
+    command_max=8.0,
+    sensor_min_um=-100.0,
+    sensor_max_um=100.0,
+    max_rate_hz=20e3,
+)
+
+
+class FakeDevice:
+    """A device that only says what it is."""
+
+    Options: ClassVar[type[DeviceOptions]] = DeviceOptions
+
+    def __init__(self, info: DeviceInfo) -> None:
+        self.info = info
+
+    def open(self, sample_rate_hz: float, block: int) -> None:
+        """Refuse: nothing may be opened before the run."""
+        raise AssertionError("opened")
+
+    def exchange(
+        self, first_sample: int, command: F64, displacement_um: F64, measured: F64
+    ) -> None:
+        """Refuse: nothing may move before the run."""
+        raise AssertionError("moved")
+
+    def make_safe(self, command: float) -> None:
+        """Refuse: nothing may move before the run."""
+        raise AssertionError("moved")
+
+    def close(self) -> None:
+        """Do nothing."""
+
+
+class BrokenModel(HysteresisModel):
+    """A model whose inverse gives 0 A, and something that is not finite at one sample."""
+
+    model_config = ConfigDict(allow_inf_nan=True)
+    bad: float
+    at: int
+
+    @property
+    def operators(self) -> int:
+        """Return 1: the memory counts samples."""
+        return 1
+
+    def forward(self, sample_rate_hz: float) -> Operator:
+        """Refuse: only the inverse is run."""
+        raise AssertionError("forward")
+
+    def inverse(self, sample_rate_hz: float) -> Operator:
+        """Return the operator with the fault."""
+
+        def run(x: F64, memory: F64, out: F64) -> None:
+            out[:] = 0.0
+            first = int(memory[0])
+            if first <= self.at < first + x.size:
+                out[self.at - first] = self.bad
+            memory[0] += x.size
+
+        return Operator(run, self.operators)
+
+
+def loaded(
+    text: str,
+    *settings: str,
+    model: HysteresisModel | None = None,
+    **info: Any,
+) -> LoadedExperiment:
+    """Read an experiment and put a fake device and a model in."""
+    without_model = text.replace("{model: model.yaml}", "none").replace("unit: um", "unit: A")
+    made = resolve(Document("x.yaml", text if model is None else without_model), Path(), settings)
+    device = FakeDevice(replace(INFO, **info))
+    if model is None:
+        return replace(made, device=device)
+    waveform = made.config.waveform.model_copy(update={"unit": "um"})
+    config = made.config.model_copy(update={"waveform": waveform})
+    return replace(made, config=config, device=device, model=model)
+
+
+def checked(text: str, *settings: str, **given: Any) -> Checked:
+    return check(loaded(text, *settings, **given))
+
+
+def refusals(text: str, *settings: str, **given: Any) -> list[str]:
+    with pytest.raises(ConfigError) as caught:
+        checked(text, *settings, **given)
+    lines = text.splitlines()
+    for problem in caught.value.problems:
+        name, _, line = problem.where.partition(":")
+        key = problem.key.rpartition(".")[2]
+        assert name.startswith("--set") or key in lines[int(line) - 1], problem
+    return [str(replace(problem, where="x.yaml")) for problem in caught.value.problems]
+
+
+class TestForecast:
+    """What a run will do, in numbers."""
+
+    def test_without_a_compensator(self) -> None:
+        """The command is the waveform; its slew counts the step from the safe value."""
+        result = checked(CURRENT, "safe.value=-0.5")
+        values = 0.5 + 6.0 * np.sin(2.0 * np.pi * 10.0 * np.arange(10_000) / 10e3)
+        forecast = result.forecast
+        np.testing.assert_allclose(result.reference.values, values, rtol=0.0, atol=1e-11)
+        assert forecast.samples == 10_000
+        assert forecast.duration_s == pytest.approx(1.0)
+        assert forecast.command_unit == "A"
+        assert forecast.command_min == forecast.reference_min == pytest.approx(-5.5, abs=1e-4)
+        assert forecast.command_max == forecast.reference_max == pytest.approx(6.5, abs=1e-4)
+        assert forecast.slew_per_s == pytest.approx(1.0 * 10e3)  # from -0.5 to 0.5 in one sample
+        assert forecast.recording_mb == pytest.approx(10_000 * 45.0 / 1e6)
+
+    def test_slew_of_the_waveform_itself(self) -> None:
+        """Where the start is soft, the slew is the steepest part of the waveform."""
+        forecast = checked(CURRENT, "waveform.soft_start_s=0.1").forecast
+        assert forecast.slew_per_s == pytest.approx(2.0 * np.pi * 10.0 * 6.0, rel=1e-3)
+
+    def test_with_a_compensator(self) -> None:
+        """The command is that of the inverse, run through in one piece."""
+        model = terfenol_rdpi()
+        result = checked(DISPLACEMENT, model=model)
+        command = model.inverse(10e3).process(result.reference.values)
+        assert result.forecast.command_min == command.min()
+        assert result.forecast.command_max == command.max()
+        steps = np.abs(np.diff(command, prepend=0.0))
+        assert result.forecast.slew_per_s == steps.max() * 10e3
+        assert (result.forecast.reference_min, result.forecast.reference_max) == (
+            result.reference.values.min(),
+            result.reference.values.max(),
+        )
+
+    def test_safe_value_counts(self) -> None:
+        """The output starts at the safe value, so the range holds it."""
+        settings = ("waveform.amplitude=1.0", "safe.value=-2.0", "limits.slew_a_per_s=25000.0")
+        forecast = checked(CURRENT, *settings).forecast
+        assert forecast.command_min == -2.0
+        assert forecast.command_max == pytest.approx(1.5, abs=1e-4)
+
+    @pytest.mark.parametrize("chunk", [1, 7, 1000, 9999, 10_000, 10_001])
+    def test_chunks_change_nothing(self, monkeypatch: pytest.MonkeyPatch, chunk: int) -> None:
+        """However the reference is cut, the forecast is the same, bit for bit."""
+        model = terfenol_rdpi()
+        whole = checked(DISPLACEMENT, model=model).forecast
+        monkeypatch.setattr("hilctl.experiment.forecast._CHUNK", chunk)
+        assert checked(DISPLACEMENT, model=model).forecast == whole
+
+    def test_longer_than_a_chunk(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """A run of more than a million samples is forecast as if in one piece."""
+        settings = ("waveform.duration_s=120.0", "waveform.frequency_hz=0.37")
+        forecast = checked(DISPLACEMENT, *settings, model=terfenol_rdpi()).forecast
+        assert forecast.samples == 1_200_000
+        monkeypatch.setattr("hilctl.experiment.forecast._CHUNK", 2_000_000)
+        assert checked(DISPLACEMENT, *settings, model=terfenol_rdpi()).forecast == forecast
+
+    def test_what_is_fed_ahead_is_what_is_forecast(self) -> None:
+        """A compensator that looks ahead is fed the reference shifted, and held at its end."""
+        model = StagedModel.around(terfenol_rdpi(), lag=FieldLag(tau_s=2e-4), delay_s=3e-4)
+        result = checked(DISPLACEMENT, model=model)
+        values = result.reference.values
+        assert result.ahead is not None
+        assert result.fed is result.ahead
+        assert result.ahead.tolist() == [*values[4:].tolist(), *[values[-1]] * 4]
+        inverse = model.inverse(10e3)
+        inverse.process(values[:4].copy())
+        command = inverse.process(result.ahead.copy())
+        assert result.forecast.command_max == command.max()
+        plain = checked(DISPLACEMENT, model=terfenol_rdpi())
+        assert plain.ahead is None
+        assert plain.state is None
+        assert plain.fed is plain.reference.values
+        assert result.forecast.recording_mb > plain.forecast.recording_mb
+
+    def test_tuned_run_that_looks_ahead_is_worked_out_on_what_is_fed(self) -> None:
+        """A gain is refused by the current it would take with all of the compensator in it."""
+        model = StagedModel.around(terfenol_rdpi(), lag=FieldLag(tau_s=2e-3))
+        result = checked(DISPLACEMENT, model=model)
+        highest = result.forecast.command_max
+        check_tuned(result, (1.0, 0.0), (0.99 * 7.0 / highest, 0.0), 1000)
+        with pytest.raises(ConfigError, match="must stay within -7 to 7 A"):
+            check_tuned(result, (1.0, 0.0), (1.2 * 7.0 / highest, 0.0), 1000)
+
+    def test_run_before_that_can_t_be_read_is_refused(self) -> None:
+        """A recording that is not there is named with its key."""
+        text = DISPLACEMENT.replace("{model: model.yaml}", "{model: m, initial_state: gone.mcap}")
+        made = resolve(Document("x.yaml", text.replace("model: m,", f"model: {MODEL},")), Path())
+        with pytest.raises(ConfigError, match=r"initial_state: gone\.mcap: no such"):
+            check(replace(made, device=FakeDevice(INFO)))
+
+    def test_to_mapping(self) -> None:
+        """A forecast can be printed as JSON."""
+        forecast = checked(CURRENT).forecast
+        mapping = forecast.to_mapping()
+        assert mapping["samples"] == 10_000
+        assert mapping["command_unit"] == "A"
+        assert mapping["slew_per_s"] == forecast.slew_per_s
+
+    def test_nothing_is_touched(self) -> None:
+        """The device is neither opened nor driven, and the experiment comes out as it went in."""
+        given = loaded(CURRENT)
+        assert check(given).loaded is given
+
+
+class TestReference:
+    """References that go too far."""
+
+    def test_outside_the_stroke(self) -> None:
+        """A reference outside the stroke limits is refused, by how much included."""
+        found = refusals(
+            DISPLACEMENT,
+            "waveform.soft_start_s=0.0",
+            "limits.stroke_um=[-9.5, 60.0]",
+            model=terfenol_rdpi(),
+        )
+        assert found == [
+            "x.yaml: waveform: reference must stay within limits.stroke_um, -9.5 to 60 um, got "
+            "-10 to 10 um (0.5 um too far: change the waveform's amplitude or offset)"
+        ]
+
+    def test_outside_the_model(self) -> None:
+        """A reference beyond what the model was found on is refused; just within is not."""
+        model = terfenol_rdpi().model_copy(update={"output_range_um": (-12.0, 9.75)})
+        found = refusals(DISPLACEMENT, model=model)
+        assert found == [
+            "x.yaml: waveform: reference must stay within the range that compensator.model was "
+            "found on, -12 to 9.75 um, got -10 to 10 um (0.25 um too far: change the waveform's "
+            "amplitude or offset)"
+        ]
+        checked(DISPLACEMENT, "waveform.amplitude=9.75", model=model)
+
+    def test_outside_both(self) -> None:
+        """Both ranges are told, each with its own distance, and the current that would flow."""
+        model = terfenol_rdpi().model_copy(update={"output_range_um": (-12.0, 12.0)})
+        found = refusals(DISPLACEMENT, "waveform.amplitude=80.0", model=model)
+        assert len(found) == 3
+        assert "limits.stroke_um, -75 to 60 um" in found[0]
+        assert "(20 um too far" in found[0]
+        assert "-12 to 12 um" in found[1]
+        assert "(68 um too far" in found[1]
+        assert found[2].startswith("x.yaml: limits.peak_current_a: the run must stay within")
+
+    def test_a_current_is_no_displacement(self) -> None:
+        """A waveform in ampere is not held against micrometres."""
+        checked(CURRENT, "limits.stroke_um=[-1.0, 1.0]")
+
+
+class TestCommand:
+    """Commands that the limits do not allow."""
+
+    def test_peak(self) -> None:
+        """A peak over the limit is refused, by how much included."""
+        assert refusals(CURRENT, "limits.peak_current_a=6.25") == [
+            "x.yaml: limits.peak_current_a: the run must stay within -6.25 to 6.25 A, got -5.5 to "
+            "6.5 A (0.25 A too much: lower the waveform's amplitude, or raise the limit)"
+        ]
+        checked(CURRENT, "limits.peak_current_a=6.5001")
+
+    def test_lowest(self) -> None:
+        """The lower end counts as much as the upper."""
+        found = refusals(CURRENT, "waveform.offset=-2.0")
+        assert found == [
+            "x.yaml: limits.peak_current_a: the run must stay within -7 to 7 A, got -8 to 4 A "
+            "(1 A too much: lower the waveform's amplitude, or raise the limit)"
+        ]
+
+    def test_slew(self) -> None:
+        """A change faster than the limit is refused, with how many times too fast."""
+        found = refusals(CURRENT, "waveform.soft_start_s=0.1", "limits.slew_a_per_s=150.0")
+        assert found == [
+            "x.yaml: limits.slew_a_per_s: the run must change no faster than 150 A/s, got 377.004 "
+            "(2.51 times the limit: lower the frequency, soften the start, or raise it)"
+        ]
+        checked(CURRENT, "waveform.soft_start_s=0.1", "limits.slew_a_per_s=377.01")
+
+    def test_first_step(self) -> None:
+        """A waveform that does not begin at the safe value jumps there: that is a slew too."""
+        found = refusals(CURRENT, "limits.slew_a_per_s=4000.0")
+        assert len(found) == 1
+        assert "got 5000 (1.25 times the limit" in found[0]
+
+    def test_voltage(self) -> None:
+        """For a device driven in V the keys and units are those of a voltage."""
+        text = (
+            CURRENT.replace("unit: A", "unit: V")
+            .replace("peak_current_a: 7.0", "drive_v: [0.0, 5.0]")
+            .replace("slew_a_per_s: 20000.0", "slew_v_per_s: 100.0")
+        )
+        found = refusals(text, "waveform.soft_start_s=0.2", command_unit="V")
+        assert len(found) == 2
+        assert found[0].startswith(
+            "x.yaml: limits.drive_v: the run must stay within 0 to 5 V, got -5.5 to 6.5 V (5.5 V"
+        )
+        assert found[1].startswith(
+            "x.yaml: limits.slew_v_per_s: the run must change no faster than 100 V/s, got "
+        )
+
+    def test_model_that_can_not_be_inverted(self) -> None:
+        """A model whose inverse leaves the numbers is refused with the rest."""
+        model = RdpiModel(direct=1e-310, weights=(1.0, 1.0), thresholds=(0.3, 0.6))
+        found = refusals(DISPLACEMENT, "block=5", model=model)
+        assert len(found) == 2
+        assert found[0].startswith("x.yaml: block: must be 1")
+        assert found[1].startswith("x.yaml: compensator.model: the weights and thresholds are")
+
+    @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+    @pytest.mark.parametrize("at", [0, 1, 1500])
+    def test_not_a_number(self, monkeypatch: pytest.MonkeyPatch, bad: float, at: int) -> None:
+        """A command that is not finite is refused, wherever and in whichever chunk it stands."""
+        monkeypatch.setattr("hilctl.experiment.forecast._CHUNK", 1000)
+        found = refusals(DISPLACEMENT, model=BrokenModel(bad=bad, at=at))
+        assert len(found) == 1
+        assert found[0].startswith(
+            "x.yaml: compensator.model: every command must be a finite number, got "
+        )
+
+    def test_very_large_numbers(self) -> None:
+        """Numbers near the end of the range are refused in words, without a warning."""
+        found = refusals(CURRENT, "waveform.amplitude=1.0e+308", "waveform.offset=0.0")
+        assert len(found) == 2
+        assert "got -1e+308 to 1e+308 A (1e+308 A too much" in found[0]
+        assert "(inf times the limit" in found[1]
+
+
+class TestDevice:
+    """What the device can't do."""
+
+    def test_range(self) -> None:
+        """Limits wider than what the device takes are refused."""
+        assert refusals(CURRENT, command_max=6.9) == [
+            "x.yaml: limits: must lie within what fake takes, -8 to 6.9 A, got -7 to 7"
+        ]
+        assert refusals(CURRENT, command_min=-6.9) == [
+            "x.yaml: limits: must lie within what fake takes, -6.9 to 8 A, got -7 to 7"
+        ]
+        checked(CURRENT, command_min=-7.0, command_max=7.0)
+
+    def test_unit(self) -> None:
+        """Limits in A for a device driven in V are refused."""
+        found = refusals(CURRENT, command_unit="V")
+        assert found == ["x.yaml: limits: must be in V, what fake is driven with, got A"]
+
+    def test_rate(self) -> None:
+        """A rate that the device can't keep is refused; the fastest that it can is not."""
+        assert refusals(CURRENT, max_rate_hz=9999.0) == [
+            "x.yaml: sample_rate_hz: must be <= 9999, the fastest that fake can keep, got 10000.0"
+        ]
+        checked(CURRENT, max_rate_hz=10_000.0)
+
+    def test_block(self) -> None:
+        """Blocks are for devices that have a FIFO."""
+        assert refusals(CURRENT, "block=2") == [
+            "x.yaml: block: must be 1: fake has no sample clock and FIFO of its own, got 2"
+        ]
+        checked(CURRENT, "block=2", buffered=True, fifo_depth=4)
+
+    def test_fifo(self) -> None:
+        """Two blocks must fit in the FIFO: one that plays and one that is sent."""
+        assert refusals(CURRENT, "block=33", buffered=True, fifo_depth=64) == [
+            "x.yaml: block: must be <= 32: 2 blocks must fit into the FIFO of fake, 64 samples, "
+            "got 33"
+        ]
+        checked(CURRENT, "block=32", buffered=True, fifo_depth=64)
+
+    def test_blocks_kept_in_the_fifo(self) -> None:
+        """All blocks that the device keeps in its FIFO must fit, and the one being sent."""
+        kept = {"buffered": True, "fifo_depth": 64, "latency_blocks": 7}
+        assert refusals(CURRENT, "block=9", **kept) == [
+            "x.yaml: block: must be <= 8: 8 blocks must fit into the FIFO of fake, 64 samples, "
+            "got 9"
+        ]
+        checked(CURRENT, "block=8", **kept)
+
+    @pytest.mark.parametrize("stroke", ["[-100.5, 60.0]", "[-75.0, 100.5]"])
+    def test_sensor(self, stroke: str) -> None:
+        """A stroke that the sensor can't see can't be watched."""
+        found = refusals(CURRENT, f"limits.stroke_um={stroke}")
+        assert len(found) == 1
+        assert found[0].startswith(
+            "x.yaml: limits.stroke_um: must lie within what the sensor can report, -100 to 100 um"
+        )
+
+    def test_model_of_another_device(self) -> None:
+        """A model that gives volts is refused for a device driven with amperes."""
+        found = refusals(DISPLACEMENT, "limits.peak_current_a=8.0", model=piezo_ppi())
+        assert found[0] == (
+            "x.yaml: compensator.model: must give commands in A, what fake is driven with, got V"
+        )
+
+
+class TestAllAtOnce:
+    """Every reason is told in one go."""
+
+    def test_device_reference_and_command(self) -> None:
+        """Problems of the device, the reference and the command come together."""
+        found = refusals(
+            DISPLACEMENT,
+            "block=5",
+            "waveform.amplitude=100.0",
+            "limits.slew_a_per_s=1.0",
+            model=terfenol_rdpi(),
+            max_rate_hz=100.0,
+        )
+        keys = [each.split(": ")[1] for each in found]
+        assert keys == [
+            "sample_rate_hz",
+            "block",
+            "waveform",
+            "limits.peak_current_a",
+            "limits.slew_a_per_s",
+        ]
+
+    def test_device_and_a_waveform_that_can_not_be_built(self) -> None:
+        """Where there is no waveform, what is known of the device is still told."""
+        found = refusals(CURRENT, "block=5", "waveform.frequency_hz=6000.0")
+        assert found == [
+            "x.yaml: block: must be 1: fake has no sample clock and FIFO of its own, got 5",
+            "x.yaml: waveform: sine: every frequency must be below half the sample rate, 5000 Hz: "
+            "6000 Hz",
+        ]

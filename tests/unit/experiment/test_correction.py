@@ -1,0 +1,140 @@
+"""Corrections: what a file holds, where it is added, and for what it is refused."""
+
+import numpy as np
+import pytest
+
+from hilctl.base.errors import ConfigError, InputError
+from hilctl.base.segments import Segment
+from hilctl.experiment.correction import (
+    Correction,
+    LearnedCycle,
+    dump_correction,
+    envelope,
+    evaluate,
+    load_correction,
+    model_sha256,
+    parse_correction,
+    signature,
+)
+from hilctl.models.published import terfenol_rdpi
+from hilctl.waveforms.build import Reference, build
+from hilctl.waveforms.spec import Sequence, Sine
+
+RATE_HZ = 10_000.0
+COEFFICIENTS = np.array([0.5, 0.2 - 0.1j, 0.0, 0.05j])
+
+
+def sine(frequency_hz=150.0, amplitude=10.0, soft_s=0.1, **more):
+    return Sine(
+        kind="sine", unit="um", amplitude=amplitude, frequency_hz=frequency_hz, duration_s=0.5,
+        soft_start_s=soft_s, soft_end_s=soft_s, **more,
+    )  # fmt: skip
+
+
+def reference(waveform, tmp_path) -> Reference:
+    return build(waveform, RATE_HZ, tmp_path)
+
+
+def correction_for(made: Reference, segment: Segment, model=None) -> Correction:
+    wanted = signature(made.values, segment)
+    cycle = LearnedCycle.from_coefficients(segment.label, segment.period, wanted, COEFFICIENTS)
+    return Correction(
+        sample_rate_hz=made.sample_rate_hz, model_sha256=model_sha256(model), cycles=(cycle,)
+    )
+
+
+def test_a_file_gives_back_the_same_correction(tmp_path):
+    """Written and read again, every coefficient has the same bits."""
+    made = reference(sine(), tmp_path)
+    correction = correction_for(made, made.segments[0])
+    text = dump_correction(correction)
+    assert parse_correction("x", text) == correction
+    (tmp_path / "c.yaml").write_text(text)
+    back = load_correction(tmp_path / "c.yaml")
+    assert np.array_equal(back.cycles[0].coefficients, COEFFICIENTS)
+
+
+def test_the_correction_follows_the_phase_where_a_period_is_no_whole_number(tmp_path):
+    """In the steady part it is the Fourier sum at each sample's own phase."""
+    made = reference(sine(), tmp_path)
+    segment = made.segments[0]
+    added = correction_for(made, segment).samples(made, None)
+    steady = np.arange(segment.steady_start, segment.steady_stop)
+    turns = 2.0 * np.pi * steady / segment.period
+    expected = 0.5 + 0.4 * np.cos(turns) + 0.2 * np.sin(turns) - 0.1 * np.sin(3.0 * turns)
+    assert segment.period == pytest.approx(66.6667, abs=1e-3)
+    np.testing.assert_allclose(added[steady], expected, atol=1e-6)
+
+
+def test_the_correction_fades_with_the_waveform(tmp_path):
+    """It starts and ends at 0 and changes no faster than the fade and the cycle themselves."""
+    made = reference(sine(), tmp_path)
+    segment = made.segments[0]
+    added = correction_for(made, segment).samples(made, None)
+    assert added[0] == 0.0
+    assert abs(added[-1]) < 1e-4
+    steady = added[segment.steady_start : segment.steady_stop]
+    assert np.abs(np.diff(added)).max() < 1.1 * np.abs(np.diff(steady)).max()
+
+
+def test_without_a_soft_start_it_fades_in_over_one_period():
+    """Where the waveform starts at once, the correction still does not jump."""
+    fade = envelope(Segment("x", 0, 1000, 0, 1000, 100.0))
+    assert fade[0] == 0.0
+    assert fade[50] == pytest.approx(0.5)
+    assert (fade[100:] == 1.0).all()
+
+
+def test_only_the_waveform_that_was_learned_is_corrected(tmp_path):
+    """In a sequence, the other parts stay as they are; a repeated one is corrected each time."""
+    parts = (sine(100.0), sine(150.0), sine(150.0, amplitude=9.0))
+    made = reference(Sequence(kind="sequence", unit="um", parts=parts, repeat=2), tmp_path)
+    added = correction_for(made, made.segments[1]).samples(made, None)
+    corrected = [bool(added[s.start : s.stop].any()) for s in made.segments]
+    assert corrected == [False, True, False] * 2
+
+
+@pytest.mark.parametrize(
+    "other", [sine(151.0), sine(amplitude=10.1), sine(offset=0.1), sine(phase_deg=2.0)]
+)
+def test_another_waveform_is_refused(other, tmp_path):
+    """A correction of another period, amplitude, offset or phase would do harm."""
+    made = reference(sine(), tmp_path)
+    correction = correction_for(made, made.segments[0])
+    with pytest.raises(InputError, match=r"another waveform: sine 10 um 150 Hz"):
+        correction.samples(reference(other, tmp_path), None)
+
+
+def test_another_length_or_fade_is_the_same_waveform(tmp_path):
+    """What was learned in a short run serves a long one."""
+    made = reference(sine(), tmp_path)
+    correction = correction_for(made, made.segments[0])
+    longer = sine(soft_s=0.2).model_copy(update={"duration_s": 3.0})
+    assert np.abs(correction.samples(reference(longer, tmp_path), None)).max() > 0.5
+
+
+def test_another_rate_or_model_is_refused(tmp_path):
+    """Samples and compensator must be those that it was learned with."""
+    made = reference(sine(), tmp_path)
+    correction = correction_for(made, made.segments[0], terfenol_rdpi())
+    with pytest.raises(InputError, match="another model"):
+        correction.samples(made, None)
+    faster = build(sine(), 2.0 * RATE_HZ, tmp_path)
+    with pytest.raises(InputError, match=r"10000 samples a second, not at 20000"):
+        correction.samples(faster, terfenol_rdpi())
+
+
+def test_a_file_with_unequal_coefficients_is_refused(tmp_path):
+    """The message names both lengths."""
+    made = reference(sine(), tmp_path)
+    text = dump_correction(correction_for(made, made.segments[0]))
+    broken = text.replace("    sine_um:\n    - 0.0\n", "    sine_um:\n")
+    assert broken != text
+    with pytest.raises(ConfigError, match="one value a value of cosine_um: 3 for 4"):
+        parse_correction("c.yaml", broken)
+
+
+def test_evaluation_drops_what_a_coarse_grid_can_not_show():
+    """Harmonics at or above half the points are left out instead of folded back."""
+    values = evaluate(np.array([1.0, 0.0, 0.5, 0.5, 0.25]), 6)
+    np.testing.assert_allclose(values, 1.0 + np.cos(2.0 * 2.0 * np.pi * np.arange(6) / 6))

@@ -1,0 +1,662 @@
+"""Experiment files: what is accepted, and exactly what is said of what is not."""
+
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, ClassVar
+
+import pytest
+
+from hilctl.base.device import DeviceOptions
+from hilctl.base.errors import ConfigError, InputError
+from hilctl.base.yaml.document import Document
+from hilctl.experiment import registry
+from hilctl.experiment.load import LoadedExperiment, load_experiment, resolve
+from hilctl.models.ppi import PpiModel
+from hilctl.models.rdpi import RdpiModel
+from hilctl.waveforms.spec import Sine
+
+FULL = """\
+name: full_example
+description: Everything that an experiment can say.
+device:
+  kind: simulated_terfenol
+  seed: 3
+  noise: false
+  load_kg: 3.7
+  fault:
+    kind: sensor_nan
+    at_sample: 9000
+sample_rate_hz: 50000
+block: 50
+waveform:
+  kind: sine
+  unit: um
+  amplitude: 2.5
+  offset: -1.0
+  frequency_hz: 10.0
+  phase_deg: 90
+  duration_s: 2.0
+  soft_start_s: 0.1
+  soft_end_s: 0.2
+compensator:
+  model: model.yaml
+limits:
+  peak_current_a: 7.07
+  slew_a_per_s: 20000.0
+  stroke_um: [-75.0, 60.0]
+safe:
+  value: 0.5
+  ramp_s: 0.2
+timing:
+  late_policy: catch_up
+  late_after: 0.25
+  max_late_s: 2.0
+  max_consecutive_late: 7
+  grace_s: 0.5
+recording:
+  folder: runs
+  flush_s: 0.5
+  scope_rate_hz: 500.0
+  ring_s: 20.0
+  on_failure: go_on
+"""
+LINES = {
+    line.split(":")[0].strip(): number for number, line in enumerate(FULL.splitlines(), start=1)
+}
+
+MODEL = """\
+model:
+  kind: rdpi
+  input_unit: A
+  direct: 2.7
+  weights: [2.3, 0.1, 0.4]
+  thresholds: [0.3, 0.6, 0.9]
+  gamma_s: 0.0003
+  output_range_um: [-12.0, 12.0]
+"""
+
+MINIMAL = """\
+name: minimal
+device: {kind: simulated_terfenol}
+sample_rate_hz: 1000
+waveform: {kind: hold, unit: A, level: 1.0, duration_s: 1.0}
+compensator: none
+limits: {peak_current_a: 2.0, slew_a_per_s: 5000.0, stroke_um: [-75.0, 60.0]}
+"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A folder with model.yaml in it."""
+    (tmp_path / "model.yaml").write_text(MODEL)
+    return tmp_path
+
+
+def load(text: str, folder: Path = Path(), settings: tuple[str, ...] = ()) -> LoadedExperiment:
+    return resolve(Document("x.yaml", text), folder, settings)
+
+
+def problems(text: str, folder: Path = Path(), settings: tuple[str, ...] = ()) -> list[str]:
+    """Return what is said of a file that must be refused, one text a problem."""
+    with pytest.raises(ConfigError) as caught:
+        load(text, folder, settings)
+    assert str(caught.value) == "\n".join(str(problem) for problem in caught.value.problems)
+    return [str(problem) for problem in caught.value.problems]
+
+
+def changed(old: str, new: str, text: str = FULL) -> str:
+    assert text.count(old) == 1, old
+    return text.replace(old, new)
+
+
+class TestAccepted:
+    """Files that keep all rules."""
+
+    def test_full_example(self, folder: Path) -> None:
+        """Every key arrives where it belongs."""
+        loaded = load(FULL, folder)
+        config = loaded.config
+        assert (config.name, config.sample_rate_hz, config.block) == ("full_example", 50e3, 50)
+        assert config.waveform == Sine(
+            kind="sine",
+            unit="um",
+            amplitude=2.5,
+            offset=-1.0,
+            frequency_hz=10.0,
+            phase_deg=90.0,
+            duration_s=2.0,
+            soft_start_s=0.1,
+            soft_end_s=0.2,
+        )
+        assert config.compensator is not None
+        assert config.compensator.model == "model.yaml"
+        assert (config.limits.unit, config.limits.command_range) == ("A", (-7.07, 7.07))
+        assert (config.limits.slew_per_s, config.limits.stroke_um) == (20e3, (-75.0, 60.0))
+        assert (config.safe.value, config.safe.ramp_s) == (0.5, 0.2)
+        assert config.timing.late_policy == "catch_up"
+        assert (config.timing.late_after, config.timing.max_late_s) == (0.25, 2.0)
+        assert (config.timing.max_consecutive_late, config.timing.grace_s) == (7, 0.5)
+        assert config.recording.model_dump() == {
+            "folder": "runs",
+            "flush_s": 0.5,
+            "scope_rate_hz": 500.0,
+            "ring_s": 20.0,
+            "on_failure": "go_on",
+        }
+        assert config.tick_s == pytest.approx(1e-3)
+        assert loaded.device.info.details["seed"] == "3"
+        assert loaded.device.info.details["load_kg"] == "3.7"
+        assert isinstance(loaded.model, RdpiModel)
+        assert loaded.model.thresholds == (0.3, 0.6, 0.9)
+        assert loaded.folder == folder
+
+    def test_defaults(self) -> None:
+        """What is not given has its documented default."""
+        loaded = load(MINIMAL)
+        config = loaded.config
+        assert config.block == 1
+        assert config.description == ""
+        assert config.compensator is None
+        assert loaded.model is None
+        assert (config.safe.value, config.safe.ramp_s) == (0.0, 0.2)
+        assert config.timing.model_dump() == {
+            "late_policy": "skip",
+            "late_after": 0.5,
+            "max_late_s": 1.0,
+            "max_consecutive_late": None,
+            "grace_s": 0.0,
+        }
+        assert config.recording.model_dump() == {
+            "folder": "recordings",
+            "flush_s": 2.0,
+            "scope_rate_hz": 1000.0,
+            "ring_s": 10.0,
+            "on_failure": "stop",
+        }
+        assert config.waveform.model_dump()["offset"] == 0.0
+
+    def test_voltage(self) -> None:
+        """A device driven in V has its limits in V."""
+        text = (
+            MINIMAL.replace("simulated_terfenol", "simulated_piezo")
+            .replace("unit: A", "unit: V")
+            .replace("peak_current_a: 2.0", "drive_v: [-1.0, 5.0]")
+            .replace("slew_a_per_s", "slew_v_per_s")
+        )
+        limits = load(text).config.limits
+        assert (limits.unit, limits.command_range, limits.slew_per_s) == ("V", (-1.0, 5.0), 5000.0)
+
+    def test_frozen(self) -> None:
+        """Nothing can be changed once it is read."""
+        config = load(MINIMAL).config
+        with pytest.raises(ValueError, match="frozen"):
+            config.block = 2  # type: ignore[misc]
+
+    def test_ramp(self, folder: Path) -> None:
+        """The way out takes ramp_s from the command furthest away, within the slew limit."""
+        limits = load(FULL, folder).config.command_limits()
+        assert (limits.low, limits.high, limits.safe) == (-7.07, 7.07, 0.5)
+        assert limits.ramp_per_s == pytest.approx(7.57 / 0.2)
+        slow = changed("slew_a_per_s: 20000.0", "slew_a_per_s: 10.0")
+        assert load(slow, folder).config.command_limits().ramp_per_s == 10.0
+
+    def test_text_reads_back_the_same(self, folder: Path) -> None:
+        """The experiment as it will run, settings included, reads back as the same experiment."""
+        text = changed("description: Everything that an experiment can say.", "description: '1e3'")
+        loaded = load(text, folder, ("waveform.frequency_hz=12.5", "limits.stroke_um.0=-70"))
+        again = load(loaded.yaml_text, folder)
+        assert again.config == loaded.config
+        assert again.config.waveform.model_dump()["frequency_hz"] == 12.5
+        assert again.config.limits.stroke_um == (-70.0, 60.0)
+        assert again.config.description == "1e3"
+        assert again.yaml_text == loaded.yaml_text
+
+    def test_file(self, folder: Path) -> None:
+        """Files in an experiment are found beside it."""
+        (folder / "x.yaml").write_text(FULL)
+        loaded = load_experiment(folder / "x.yaml")
+        assert loaded.model is not None
+        assert loaded.folder == folder
+
+
+ONE_RULE: list[tuple[str, str, str, str]] = [
+    # key whose line is named, text to replace, replacement, message after file and line
+    ("name", "name: full_example", "name: a b",
+     "name: must be at most 80 letters, digits, '.', '_' and '-', and begin with a letter or "
+     "digit: 'a b'"),
+    ("name", "name: full_example", "name: 12", "name: must be text, got 12"),
+    ("name", "name: full_example", "name: on",
+     "name: must be text, got True (YAML reads yes, no, on and off as true and false: put the text "
+     "in quotes)"),
+    ("sample_rate_hz", "sample_rate_hz: 50000", "sample_rate_hz: 50e3",
+     "sample_rate_hz: must be a number, got '50e3' (YAML reads this as text: write 50000.0 or "
+     "50.0e+3)"),
+    ("sample_rate_hz", "sample_rate_hz: 50000", "sample_rate_hz: '50000'",
+     "sample_rate_hz: must be a number, got '50000' (remove the quotes)"),
+    ("sample_rate_hz", "sample_rate_hz: 50000", "sample_rate_hz: 0",
+     "sample_rate_hz: must be >= 0.001, got 0"),
+    ("sample_rate_hz", "sample_rate_hz: 50000", "sample_rate_hz: 2.0e+6",
+     "sample_rate_hz: must be <= 1000000.0, got 2000000.0"),
+    ("sample_rate_hz", "sample_rate_hz: 50000", "sample_rate_hz: .inf",
+     "sample_rate_hz: must be a finite number, got inf"),
+    ("sample_rate_hz", "sample_rate_hz: 50000", "sample_rate_hz:",
+     "sample_rate_hz: must be a number, got nothing"),
+    ("block", "block: 50", "block: 0", "block: must be >= 1, got 0"),
+    ("block", "block: 50", "block: 4097", "block: must be <= 4096, got 4097"),
+    ("block", "block: 50", "block: 50.5", "block: must be a whole number, got 50.5"),
+    ("block", "block: 50", "block: true", "block: must be a whole number, got True "
+     "(YAML reads yes, no, on and off as true and false: write a number)"),
+    ("unit", "unit: um", "unit: mm", "waveform.unit: must be one of 'um', 'A' or 'V', got 'mm'"),
+    ("unit", "unit: um", "unit: A",
+     "waveform.unit: must be um where a compensator stands, got A"),
+    ("amplitude", "amplitude: 2.5", "amplitude: 0", "waveform.amplitude: must be > 0.0, got 0"),
+    ("amplitude", "amplitude: 2.5", "amplitude: .nan",
+     "waveform.amplitude: must be a finite number, got nan"),
+    ("amplitude", "amplitude: 2.5", "amplitude: [2.5]",
+     "waveform.amplitude: must be a number, got [2.5]"),
+    ("offset", "offset: -1.0", "offset: -1,0", "waveform.offset: must be a number, got '-1,0'"),
+    ("frequency_hz", "frequency_hz: 10.0", "frequency_hz: 1e3",
+     "waveform.frequency_hz: must be a number, got '1e3' (YAML reads this as text: write 1000.0 or "
+     "1.0e+3)"),
+    ("duration_s", "duration_s: 2.0", "duration_s: -2.0",
+     "waveform.duration_s: must be > 0.0, got -2.0"),
+    ("soft_start_s", "soft_start_s: 0.1", "soft_start_s: -0.1",
+     "waveform.soft_start_s: must be >= 0.0, got -0.1"),
+    ("phase_deg", "phase_deg: 90", "phase: 90",
+     "waveform.phase: unknown key (did you mean 'phase_deg'?)"),
+    ("model", "model: model.yaml", "model: 3", "compensator.model: must be text, got 3"),
+    ("compensator", "compensator:\n  model: model.yaml", "compensator: {}",
+     "compensator.model: is required"),
+    ("compensator", "compensator:\n  model: model.yaml", "compensator: inverse",
+     "compensator: must be none, or a mapping with the key model: 'inverse'"),
+    ("compensator", "compensator:\n  model: model.yaml", "compensator:",
+     "compensator: must be none, or a mapping with the key model: None"),
+    ("limits", "  slew_a_per_s: 20000.0\n", "",
+     "limits: must have either peak_current_a and slew_a_per_s (a device driven in A) or drive_v "
+     "and slew_v_per_s (a device driven in V)"),
+    ("limits", "  peak_current_a: 7.07\n", "  drive_v: [-1, 1]\n",
+     "limits: must have either peak_current_a and slew_a_per_s (a device driven in A) or drive_v "
+     "and slew_v_per_s (a device driven in V)"),
+    ("peak_current_a", "peak_current_a: 7.07", "peak_current_a: -7.07",
+     "limits.peak_current_a: must be > 0.0, got -7.07"),
+    ("slew_a_per_s", "slew_a_per_s: 20000.0", "slew_a_per_s: 0",
+     "limits.slew_a_per_s: must be > 0.0, got 0"),
+    ("stroke_um", "[-75.0, 60.0]", "[60.0, -75.0]",
+     "limits.stroke_um: must be [lowest, highest]: [60.0, -75.0]"),
+    ("stroke_um", "[-75.0, 60.0]", "[5, 5]",
+     "limits.stroke_um: must be [lowest, highest]: [5.0, 5.0]"),
+    ("stroke_um", "[-75.0, 60.0]", "[-75.0]",
+     "limits.stroke_um: must be [lowest, highest]: [-75.0]"),
+    ("stroke_um", "[-75.0, 60.0]", "[-75.0, 0, 60.0]",
+     "limits.stroke_um: must be [lowest, highest]: [-75.0, 0, 60.0]"),
+    ("stroke_um", "[-75.0, 60.0]", "60.0", "limits.stroke_um: must be a list, got 60.0"),
+    ("stroke_um", "[-75.0, 60.0]", "[low, 60.0]",
+     "limits.stroke_um.0: must be a number, got 'low'"),
+    ("value", "value: 0.5", "value: 7.1",
+     "safe.value: must lie within the limits, -7.07 to 7.07 A, got 7.1"),
+    ("ramp_s", "ramp_s: 0.2", "ramp_s: 0.0", "safe.ramp_s: must be > 0.0, got 0.0"),
+    ("late_policy", "late_policy: catch_up", "late_policy: hurry",
+     "timing.late_policy: must be one of 'skip', 'catch_up' or 'slip', got 'hurry'"),
+    ("late_after", "late_after: 0.25", "late_after: 0", "timing.late_after: must be > 0.0, got 0"),
+    ("max_late_s", "max_late_s: 2.0", "max_late_s: -1", "timing.max_late_s: must be > 0.0, got -1"),
+    ("folder", "folder: runs", "folder: no",
+     "recording.folder: must be text, got False (YAML reads yes, no, on and off as true and false: "
+     "put the text in quotes)"),
+    ("flush_s", "flush_s: 0.5", "flush_s: 10.5", "recording.flush_s: must be <= 10.0, got 10.5"),
+    ("scope_rate_hz", "scope_rate_hz: 500.0", "scope_rate_hz: 1001",
+     "recording.scope_rate_hz: must be <= 1000.0, got 1001"),
+    ("ring_s", "ring_s: 20.0", "ring_s: 0.5", "recording.ring_s: must be >= 1.0, got 0.5"),
+    ("ring_s", "ring_s: 20.0", "ring_s: 61", "recording.ring_s: must be <= 60.0, got 61"),
+    ("seed", "seed: 3", "seed: -3", "device.seed: must be >= 0, got -3"),
+    ("seed", "seed: 3", "seed: 3.5", "device.seed: must be a whole number, got 3.5"),
+    ("seed", "seed: 3", "sed: 3", "device.sed: unknown key (did you mean 'seed'?)"),
+    ("noise", "noise: false", "noise: 0", "device.noise: must be true or false, got 0"),
+    ("load_kg", "load_kg: 3.7", "load_kg: 101", "device.load_kg: must be <= 100.0, got 101"),
+    ("at_sample", "at_sample: 9000", "at_sample: soon",
+     "device.fault.at_sample: must be a whole number, got 'soon'"),
+    ("fault", "    at_sample: 9000\n", "", "device.fault.at_sample: is required"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("key", "old", "new", "message"), ONE_RULE, ids=[f"{c[0]}-{c[2].strip()}" for c in ONE_RULE]
+)
+def test_one_broken_rule(folder: Path, key: str, old: str, new: str, message: str) -> None:
+    """One broken rule is one problem, with its line, key, rule, value and what to do."""
+    assert problems(changed(old, new), folder) == [f"x.yaml:{LINES[key]}: {message}"]
+
+
+def test_ring_must_bridge_the_time_between_flushes(folder: Path) -> None:
+    """The rule ties two keys together: it is told at their section."""
+    text = changed("ring_s: 20.0", "ring_s: 1.0")
+    rule = "ring_s must be at least three times flush_s, which the ring has to bridge: 1 and 0.5"
+    assert problems(text, folder) == [f"x.yaml:{LINES['recording']}: recording: {rule}"]
+
+
+@pytest.mark.parametrize(
+    "key", ["name", "device", "sample_rate_hz", "waveform", "compensator", "limits"]
+)
+def test_required(key: str) -> None:
+    """A section that is left out is named; the line is that of the file's first key."""
+    text = "".join(line for line in MINIMAL.splitlines(True) if not line.startswith(f"{key}:"))
+    assert problems(text) == [f"x.yaml:1: {key}: is required"]
+
+
+@pytest.mark.parametrize("key", ["waveform", "limits", "safe", "timing", "recording", "device"])
+@pytest.mark.parametrize(("value", "shown"), [("5", "5"), ("[1]", "[1]"), ("text", "'text'")])
+def test_section_that_is_no_mapping(key: str, value: str, shown: str) -> None:
+    """A section must be a mapping."""
+    lines = [line for line in MINIMAL.splitlines() if not line.startswith(f"{key}:")]
+    text = "\n".join([*lines, f"{key}: {value}"])
+    expected = f"x.yaml:{len(lines) + 1}: {key}: must be a mapping of keys to values, got {shown}"
+    assert problems(text) == [expected]
+
+
+class TestMany:
+    """Several broken rules at once."""
+
+    def test_all_are_listed(self, folder: Path) -> None:
+        """One error lists every problem of the file, its device's options and its model."""
+        text = FULL
+        for old, new in [
+            ("name: full_example", "name: ''"),
+            ("seed: 3", "seed: x"),
+            ("load_kg: 3.7", "load: 3.7"),
+            ("block: 50", "block: 0.5"),
+            ("frequency_hz: 10.0", "frequency_hz: 1e3"),
+            ("model: model.yaml", "model: lost.yaml"),
+            ("ramp_s: 0.2", "ramp: 0.2"),
+            ("flush_s: 0.5", "flush_s: .nan"),
+        ]:
+            text = changed(old, new, text)
+        found = problems(text, folder)
+        where = sorted((int(each.split(":")[1]), each.split(": ")[1]) for each in found)
+        assert where == [
+            (LINES["name"], "name"),
+            (LINES["seed"], "device.seed"),
+            (LINES["load_kg"], "device.load"),
+            (LINES["block"], "block"),
+            (LINES["frequency_hz"], "waveform.frequency_hz"),
+            (LINES["model"], "compensator.model"),
+            (LINES["ramp_s"], "safe.ramp"),
+            (LINES["flush_s"], "recording.flush_s"),
+        ]
+
+    def test_units_and_safe_value_together(self) -> None:
+        """Rules between sections are reported together, each where it is broken."""
+        text = MINIMAL.replace("unit: A", "unit: um") + "safe:\n  value: -2.5\n"
+        assert problems(text) == [
+            "x.yaml:4: waveform.unit: must be A, the unit of the limits, where compensator is "
+            "none, got um",
+            "x.yaml:8: safe.value: must lie within the limits, -2 to 2 A, got -2.5",
+        ]
+
+    def test_safe_value_not_given(self) -> None:
+        """Limits that leave 0 out need a safe value."""
+        text = (
+            MINIMAL.replace("simulated_terfenol", "simulated_piezo")
+            .replace("unit: A", "unit: V")
+            .replace("peak_current_a: 2.0", "drive_v: [1.0, 5.0]")
+            .replace("slew_a_per_s", "slew_v_per_s")
+        )
+        found = "x.yaml:1: safe.value: must lie within the limits, 1 to 5 V, got 0"
+        assert problems(text) == [found]
+
+
+class TestSet:
+    """Values given on the command line."""
+
+    def test_over_the_file(self, folder: Path) -> None:
+        """Values, nested values, list items and whole sections replace the file's."""
+        config = load(
+            FULL,
+            folder,
+            (
+                "block=10",
+                "waveform.frequency_hz=20.0",
+                "limits.stroke_um.1=55.5",
+                "device.fault=null",
+                "timing={late_policy: slip}",
+                "name='7'",
+            ),
+        ).config
+        assert (config.block, config.name, config.limits.stroke_um) == (10, "7", (-75.0, 55.5))
+        assert config.waveform.model_dump()["frequency_hz"] == 20.0
+        assert config.timing.late_policy == "slip"
+        assert config.timing.late_after == 0.5
+
+    def test_a_section_the_file_has_not(self) -> None:
+        """A key in a section that is not in the file makes the section."""
+        loaded = load(MINIMAL, settings=("recording.folder=elsewhere", "device.seed=9"))
+        assert loaded.config.recording.folder == "elsewhere"
+        assert loaded.device.info.details["seed"] == "9"
+
+    def test_item_of_a_list_of_mappings(self, folder: Path) -> None:
+        """A part of a sequence can be set by its index."""
+        sequence = (
+            "waveform={kind: sequence, unit: um, parts: ["
+            "{kind: hold, level: 1.0, duration_s: 1.0}, {kind: hold, level: 2.0, duration_s: 1.0}]}"
+        )
+        config = load(FULL, folder, (sequence, "waveform.parts.1.level=3.0")).config
+        parts = config.waveform.model_dump()["parts"]
+        assert [part["level"] for part in parts] == [1.0, 3.0]
+
+    @pytest.mark.parametrize(
+        ("setting", "message"),
+        [
+            ("block=2.5", "block: must be a whole number, got 2.5"),
+            (
+                "waveform.frequency_hz=1e3",
+                "waveform.frequency_hz: must be a number, got '1e3' (YAML reads this as text: "
+                "write 1000.0 or 1.0e+3)",
+            ),
+            (
+                "waveform.frequency_hz=.nan",
+                "waveform.frequency_hz: must be a finite number, got nan",
+            ),
+            ("limits.stroke_um.0=x", "limits.stroke_um.0: must be a number, got 'x'"),
+            (
+                "waveform.freq_hz=3.0",
+                "waveform.freq_hz: unknown key (did you mean 'frequency_hz'?)",
+            ),
+            ("device.seeds=3", "device.seeds: unknown key (did you mean 'seed'?)"),
+            ("safe.value=99", "safe.value: must lie within the limits, -7.07 to 7.07 A, got 99"),
+            ("limits.stroke_um.2=5", "limits.stroke_um.2: there is no such key to set"),
+            ("block.size=5", "block.size: there is no such key to set"),
+            ("name", "must be dotted.key=value"),
+            ("=5", "must be dotted.key=value"),
+            ("waveform..unit=um", "must be dotted.key=value"),
+        ],
+    )
+    def test_broken(self, folder: Path, setting: str, message: str) -> None:
+        """A broken rule is blamed on the option it was given with."""
+        assert problems(FULL, folder, (setting,)) == [f"--set {setting}: {message}"]
+
+    def test_not_yaml(self, folder: Path) -> None:
+        """A value that is not YAML is shown."""
+        found = problems(FULL, folder, ("waveform.unit=[um",))
+        assert len(found) == 1
+        assert found[0].startswith(
+            "--set waveform.unit=[um: waveform.unit: is not readable YAML, got '[um'"
+        )
+
+    def test_a_broken_file_can_be_mended(self, folder: Path) -> None:
+        """What is set stands in for what the file says, so that is not held against it."""
+        text = changed("frequency_hz: 10.0", "frequency_hz: 1e3")
+        assert load(text, folder, ("waveform.frequency_hz=10.0",)).config.block == 50
+
+
+class TestDevice:
+    """The device section."""
+
+    def test_unknown_device(self) -> None:
+        """A device that there is not is refused with the nearest name."""
+        text = MINIMAL.replace("simulated_terfenol", "simulated_terfanol")
+        assert problems(text) == [
+            "x.yaml:2: device.kind: unknown device 'simulated_terfanol' (did you mean "
+            "'simulated_terfenol'?)"
+        ]
+
+    def test_without_kind(self) -> None:
+        """A device needs a kind; the known ones are listed."""
+        found = problems(MINIMAL.replace("{kind: simulated_terfenol}", "{seed: 1}"))
+        assert len(found) == 1
+        assert found[0].startswith("x.yaml:2: device.kind: is required (known: ")
+        assert all(name in found[0] for name in registry.BUILTIN)
+
+    def test_kind_that_is_no_text(self) -> None:
+        """A kind that is no text is shown."""
+        found = problems(MINIMAL.replace("kind: simulated_terfenol", "kind: 5"))
+        assert len(found) == 1
+        assert found[0].startswith("x.yaml:2: device.kind: must be text, got 5 (known: ")
+
+    @pytest.mark.parametrize("kind", sorted(registry.BUILTIN))
+    def test_options_of_every_built_in_device(self, kind: str) -> None:
+        """Each built-in device refuses an option that it does not have, with its line."""
+        text = MINIMAL.replace("simulated_terfenol", f"{kind}, nosuchoption: 1")
+        found = problems(text)
+        assert any("x.yaml:2: device.nosuchoption: unknown key" in each for each in found)
+
+    def test_device_that_refuses_its_options(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """What a device says on being made is a problem of the device section."""
+
+        class Picky:
+            Options: ClassVar[type[DeviceOptions]] = DeviceOptions
+
+            def __init__(self, options: Any) -> None:
+                raise InputError("picky.yaml: no such profile")
+
+        monkeypatch.setitem(registry.BUILTIN, "picky", "picky_driver:Picky")
+        monkeypatch.setitem(sys.modules, "picky_driver", SimpleNamespace(Picky=Picky))
+        text = MINIMAL.replace("simulated_terfenol", "picky").replace("name: minimal", "name: ''")
+        found = problems(text)
+        assert found[1:] == ["x.yaml:2: device: picky.yaml: no such profile"]
+
+
+class TestModel:
+    """The compensator's model file."""
+
+    def refused(self, folder: Path, old: str, new: str) -> list[str]:
+        (folder / "model.yaml").write_text(changed(old, new, MODEL))
+        return problems(FULL, folder)
+
+    def test_missing(self, folder: Path) -> None:
+        """A model file that is not there is a problem of the line that names it."""
+        found = problems(changed("model: model.yaml", "model: sub/lost.yaml"), folder)
+        path = folder / "sub" / "lost.yaml"
+        assert found == [f"x.yaml:{LINES['model']}: compensator.model: {path}: no such file"]
+
+    def test_folder(self, folder: Path) -> None:
+        """A folder is no model file."""
+        (folder / "sub").mkdir()
+        found = problems(changed("model: model.yaml", "model: sub"), folder)
+        path = folder / "sub"
+        assert found == [f"x.yaml:{LINES['model']}: compensator.model: {path}: is not a file"]
+
+    def test_not_yaml(self, folder: Path) -> None:
+        """A model file that is not YAML is named with its line."""
+        found = self.refused(folder, "weights: [2.3, 0.1, 0.4]", "weights: [2.3, 0.1, 0.4")
+        assert len(found) == 1
+        assert found[0].startswith(f"{folder / 'model.yaml'}:6: is not readable YAML")
+
+    @pytest.mark.parametrize(
+        ("old", "new", "message"),
+        [
+            ("direct: 2.7", "direct: 0.0",
+             "1: model: a_0 must be > 0 for the inverse to exist: 0.0"),
+            ("[2.3, 0.1, 0.4]", "[2.3, -0.1, 0.4]",
+             "1: model: a_2 must be >= 0 for the inverse to exist: -0.1"),
+            ("[0.3, 0.6, 0.9]", "[0.3, 0.9, 0.6]",
+             "1: model: r must rise from 0 (the thresholds must dilate): r_3 = 0.6 after 0.9"),
+            ("[0.3, 0.6, 0.9]", "[0.0, 0.6, 0.9]",
+             "1: model: r must rise from 0 (the thresholds must dilate): r_1 = 0.0 after 0.0"),
+            ("[0.3, 0.6, 0.9]", "[0.3, 0.6]",
+             "1: model: weights must have one value a threshold: 3 for 2"),
+            ("gamma_s: 0.0003", "gamma_s: -0.1", "7: model.gamma_s: must be >= 0.0, got -0.1"),
+            ("gamma_s: 0.0003", "gama_s: 0.1",
+             "7: model.gama_s: unknown key (did you mean 'gamma_s'?)"),
+            ("direct: 2.7", "direct: 3e0",
+             "4: model.direct: must be a number, got '3e0' (YAML reads this as text: write 3.0 or "
+             "3.0e+0)"),
+            ("weights: [2.3, 0.1, 0.4]", "weights: [2.3, .nan, 0.4]",
+             "5: model.weights.1: must be a finite number, got nan"),
+            ("input_unit: A", "input_unit: mA",
+             "3: model.input_unit: must be one of 'A' or 'V', got 'mA'"),
+        ],
+    )  # fmt: skip
+    def test_broken(self, folder: Path, old: str, new: str, message: str) -> None:
+        """A broken model names its own file and line, the condition and the index."""
+        assert self.refused(folder, old, new) == [f"{folder / 'model.yaml'}:{message}"]
+
+    def test_deadband_that_turns_back(self, folder: Path) -> None:
+        """A cumulative slope that is not positive is named with the index it fails at."""
+        (folder / "model.yaml").write_text(
+            "model:\n"
+            "  kind: integrated\n"
+            "  direct: 2.7\n"
+            "  weights: [2.3]\n"
+            "  thresholds: [0.3]\n"
+            "  deadband:\n"
+            "    up_thresholds: [5.0, 10.0]\n"
+            "    up_weights: [-0.5, -0.5]\n"
+        )
+        assert problems(FULL, folder) == [
+            f"{folder / 'model.yaml'}:6: model.deadband: every cumulative deadband slope must be "
+            "> 0 for the inverse to exist: g_0 + ... + g_2 = 0.0"
+        ]
+
+    def test_rate_independent_model(self, folder: Path) -> None:
+        """Any kind of model can stand there."""
+        (folder / "model.yaml").write_text(
+            "model: {kind: ppi, direct: 2.7, weights: [2.3], thresholds: [0.3]}\n"
+        )
+        assert isinstance(load(FULL, folder).model, PpiModel)
+
+
+class TestFile:
+    """Files that are no experiment."""
+
+    def message(self, path: Path) -> str:
+        with pytest.raises(InputError) as caught:
+            load_experiment(path)
+        return str(caught.value)
+
+    def test_missing(self, tmp_path: Path) -> None:
+        """A file that is not there is named."""
+        assert self.message(tmp_path / "no.yaml") == f"{tmp_path / 'no.yaml'}: no such file"
+
+    def test_folder(self, tmp_path: Path) -> None:
+        """A folder is no file."""
+        assert self.message(tmp_path) == f"{tmp_path}: is not a file"
+
+    def test_binary(self, tmp_path: Path) -> None:
+        """Bytes that are no text are refused as such."""
+        path = tmp_path / "x.yaml"
+        path.write_bytes(b"\x89PNG\r\n\x1a\n\x00\x00\xff\xfe")
+        assert self.message(path) == f"{path}: is not UTF-8 text"
+        path.write_bytes(b"\x00\x01\x02\x03")
+        assert self.message(path).startswith(f"{path}: is not readable YAML (")
+
+    @pytest.mark.parametrize("text", ["", "\n\n", "# only a comment\n", "- 1\n- 2\n", "text\n"])
+    def test_no_mapping(self, tmp_path: Path, text: str) -> None:
+        """A file must hold a mapping: nothing, a list or a word is none."""
+        path = tmp_path / "x.yaml"
+        path.write_text(text)
+        assert self.message(path) == f"{path}:1: must hold a mapping of keys to values"
+
+    def test_key_twice(self) -> None:
+        """A key that stands twice is refused with both places, nested or not."""
+        twice = FULL.replace("  soft_end_s: 0.2\n", "  soft_end_s: 0.2\n  amplitude: 3.0\n")
+        twice += "name: again\n"
+        assert problems(twice) == [
+            f"x.yaml:{LINES['soft_end_s'] + 1}: waveform.amplitude: stands already at "
+            f"x.yaml:{LINES['amplitude']}",
+            f"x.yaml:{FULL.count(chr(10)) + 2}: name: stands already at x.yaml:1",
+        ]
+
+    def test_syntax(self) -> None:
+        """What is no YAML is named with the line where reading stopped."""
+        found = problems(FULL.replace("  unit: um\n", "  unit: um\n bad: [\n"))
+        assert len(found) == 1
+        assert found[0].startswith(f"x.yaml:{LINES['unit'] + 1}: is not readable YAML (")

@@ -1,0 +1,102 @@
+"""What a run before left behind: the compensator that begins with it meets its model exactly."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hilctl.base.blocks import Batch, Head
+from hilctl.base.errors import DataError
+from hilctl.experiment.initial_state import Memory, memory_after
+from hilctl.models.published import exponential_integrated, piezo_ppi
+from hilctl.models.staged import FieldLag, StagedModel
+from hilctl.recording.writer import RecordingWriter, RunFacts
+
+RATE_HZ = 10_000.0
+BLOCK = 50
+OMEGA = exponential_integrated(
+    alpha=0.3, gamma_s=0.0, a_0=1.0, alpha_0=0.2, beta_0=0.3, g_0=6.0, alpha_1=0.3, beta_1=0.1,
+    d_p=0.8, alpha_2=0.4, beta_2=0.1, d_n=0.8, plays=6, deadbands_a_side=2,
+)  # fmt: skip
+STAGED = StagedModel.around(
+    OMEGA, lag=FieldLag(tau_s=2e-4, growth_per_unit=0.2), delay_s=2.0 / RATE_HZ
+)
+COMMAND = 4.0 * np.sin(np.pi * np.arange(1000) / 999.0)
+
+
+def record(path: Path, command, *, first=0, whole=True) -> Path:
+    """Write a run of these commands, of which the compensator knew nothing."""
+    blocks = command.size // BLOCK
+    batch = Batch.empty(blocks, BLOCK, 1)
+    batch.heads[:, Head.FIRST_SAMPLE] = first + BLOCK * np.arange(blocks)
+    batch.heads[:, Head.SAMPLES] = BLOCK
+    batch.heads[0, Head.DROPPED_BEFORE] = first
+    batch.columns[:, 2] = command.reshape(blocks, BLOCK)
+    facts = RunFacts(
+        facts={"run_id": "before", "sample_rate_hz": repr(RATE_HZ), "command_unit": "A",
+               "compensator": "none"},
+        segments=(), experiment_yaml="name: made\n", model_yaml="", sample_rate_hz=RATE_HZ,
+        command_unit="A", measures_command=False, scope_rate_hz=1000.0,
+    )  # fmt: skip
+    with path.open("xb") as stream:
+        writer = RecordingWriter(stream, facts, 1_700_000_000_000_000_000)
+        writer.batch(batch)
+        if whole:
+            writer.finish({"code": "completed"}, first + command.size)
+        else:
+            writer.flush()
+    return path
+
+
+@pytest.mark.parametrize("model", [OMEGA, STAGED], ids=["integrated", "staged"])
+def test_compensator_goes_on_where_the_actuator_was_left(tmp_path, model):
+    """An actuator that is the model, left away from rest, then follows the reference exactly."""
+    memory = memory_after(record(tmp_path / "run.mcap", COMMAND), model, RATE_HZ)
+    plant, inverse = model.forward(RATE_HZ), model.inverse(RATE_HZ)
+    plant.process(np.concatenate((COMMAND, np.full(20_000, COMMAND[-1]))))
+    assert abs(memory.stands_um) > 0.5
+    assert memory.run_id == "before"
+    reference = np.linspace(0.0, 10.0, 500) + 5.0 * np.sin(np.arange(500) / 60.0)
+    fed = np.concatenate((reference[inverse.preview :], np.full(inverse.preview, reference[-1])))
+    fed = memory.lead_in(fed, 100)
+    inverse.restore(memory.state)
+    command = inverse.process(fed.copy())
+    assert abs(command[0] - COMMAND[-1]) < 1e-9
+    came = plant.process(command)
+    wanted = np.concatenate((np.full(inverse.preview, memory.stands_um), fed))[:500]
+    np.testing.assert_allclose(came, wanted, atol=1e-9)
+    np.testing.assert_allclose(came[110:], reference[110:], atol=1e-9)
+
+
+def test_from_rest_the_same_reference_is_missed(tmp_path):
+    """The comparison: a compensator that thinks the actuator at rest is off by what was left."""
+    plant, inverse = OMEGA.forward(RATE_HZ), OMEGA.inverse(RATE_HZ)
+    plant.process(COMMAND)
+    reference = np.linspace(0.0, 2.0, 500)
+    assert np.abs(plant.process(inverse.process(reference.copy())) - reference).max() > 0.5
+
+
+def test_lead_in_of_a_run_that_is_shorter():
+    """The way from where the actuator stands is cut where the run ends; nothing else changes."""
+    memory = Memory(np.zeros(1), 3.0, "")
+    fed = np.zeros(10)
+    led = memory.lead_in(fed, 20)
+    assert led[0] == 3.0
+    assert np.all(np.diff(led) < 0.0)
+    assert led.size == 10
+    assert not fed.any()
+
+
+@pytest.mark.parametrize(("model", "rate_hz", "made", "message"), [
+    (OMEGA, 5e3, {}, "was recorded at 10000 Hz, this run is at 5000 Hz"),
+    (piezo_ppi(), RATE_HZ, {}, "was recorded in A, the model takes V"),
+    (OMEGA, RATE_HZ, {"first": 50}, "is not of a whole run"),
+    (OMEGA, RATE_HZ, {"whole": False}, "is not of a whole run"),
+])  # fmt: skip
+def test_recordings_that_don_t_tell_are_refused(tmp_path, model, rate_hz, made, message):
+    """Another rate, another unit, lost samples, no end: refused with the reason."""
+    path = record(tmp_path / "run.mcap", COMMAND, **made)
+    with pytest.raises(DataError, match=message):
+        memory_after(path, model, rate_hz)
+    with pytest.raises(DataError, match="no such file"):
+        memory_after(tmp_path / "absent.mcap", model, rate_hz)

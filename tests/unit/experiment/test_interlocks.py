@@ -1,0 +1,281 @@
+"""Interlocks from an experiment, what is refused of them, and the thermal budget foreseen."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hilctl.base.errors import ConfigError
+from hilctl.base.yaml.document import Document
+from hilctl.experiment.check import check
+from hilctl.experiment.interlocks import interlock_limits
+from hilctl.experiment.load import resolve
+from hilctl.loop.interlocks import Interlocks
+from hilctl.models.published import terfenol_rdpi
+
+CURRENT = """\
+name: current
+device: {kind: simulated_terfenol}
+sample_rate_hz: 1000
+waveform: {kind: sine, unit: A, amplitude: 6.0, frequency_hz: 10.0, duration_s: 4.0}
+compensator: none
+safe: {value: 0.5}
+limits:
+  peak_current_a: 7.0
+  slew_a_per_s: 20000.0
+  stroke_um: [-75.0, 60.0]
+"""
+VOLTAGE = """\
+name: voltage
+device: {kind: simulated_piezo}
+sample_rate_hz: 1000
+waveform: {kind: hold, unit: V, level: 0.0, duration_s: 1.0}
+compensator: none
+limits:
+  drive_v: [0.0, 10.0]
+  slew_v_per_s: 100.0
+  stroke_um: [-1.0, 38.0]
+"""
+BUDGET = ("limits.rms_current_a=4.0", "limits.thermal_time_constant_s=1.5")
+
+
+def loaded(text, *settings, **info):
+    made = resolve(Document("x.yaml", text), Path(), settings)
+    if info:
+        made.device._info = replace(made.device.info, **info)
+    return made
+
+
+def refusals(text, *settings, **info):
+    with pytest.raises(ConfigError) as caught:
+        check(loaded(text, *settings, **info))
+    return [str(replace(problem, where="x.yaml")) for problem in caught.value.problems]
+
+
+class TestLimits:
+    """What the interlocks are set to."""
+
+    def test_only_stroke_and_sensor_without_a_key(self):
+        """What is not given is off."""
+        made = loaded(CURRENT)
+        limits = interlock_limits(made.config, made.device.info)
+        assert limits.stroke_um == (-75.0, 60.0)
+        assert limits.sensor_um == (-125.0, 125.0)
+        assert (limits.unit, limits.safe) == ("A", 0.5)
+        off = (limits.frozen_s, limits.deviation, limits.rms_current_a, limits.tracking_um)
+        assert set(off) == {math.inf}
+        assert (limits.deviation_s, limits.tracking_s, limits.frozen_um) == (0.0, 0.0, 0.0)
+
+    def test_every_key_arrives(self):
+        """Each key of the file sets what it names."""
+        keys = {
+            "rms_current_a": 4.0,
+            "thermal_time_constant_s": 9.0,
+            "tracking_error_um": 2.0,
+            "tracking_s": 0.1,
+            "frozen_s": 0.2,
+            "frozen_um": 0.03,
+            "measured_deviation_a": 0.4,
+            "deviation_s": 0.05,
+        }
+        made = loaded(CURRENT, *(f"limits.{key}={value}" for key, value in keys.items()))
+        limits = interlock_limits(made.config, made.device.info)
+        assert (limits.rms_current_a, limits.time_constant_s) == (4.0, 9.0)
+        assert (limits.tracking_um, limits.tracking_s) == (2.0, 0.1)
+        assert (limits.frozen_s, limits.frozen_um) == (0.2, 0.03)
+        assert limits.frozen_travel == pytest.approx(0.02 * 14.0)
+        assert (limits.deviation, limits.deviation_s) == (0.4, 0.05)
+
+    def test_in_volt(self):
+        """A device driven in V has its deviation and travel in V."""
+        made = loaded(VOLTAGE, "limits.measured_deviation_v=0.3", "limits.frozen_s=0.1")
+        limits = interlock_limits(made.config, made.device.info)
+        assert (limits.unit, limits.deviation) == ("V", 0.3)
+        assert limits.frozen_travel == pytest.approx(0.02 * 10.0)
+
+    @pytest.mark.parametrize(
+        ("setting", "words"),
+        [
+            ("rms_current_a=0", "must be > 0.0, got 0"),
+            ("thermal_time_constant_s=-1", "must be > 0.0, got -1"),
+            ("tracking_error_um=0", "must be > 0.0, got 0"),
+            ("tracking_s=-0.1", "must be >= 0.0, got -0.1"),
+            ("frozen_s=0", "must be > 0.0, got 0"),
+            ("frozen_um=-1", "must be >= 0.0, got -1"),
+            ("measured_deviation_a=.inf", "must be a finite number, got inf"),
+            ("deviation_s=-1", "must be >= 0.0, got -1"),
+            ("rms_curent_a=1", "unknown key (did you mean 'rms_current_a'?)"),
+        ],
+    )
+    def test_values_that_mean_nothing(self, setting, words):
+        """A value out of range is refused with its key, and a misspelt key too."""
+        with pytest.raises(ConfigError) as caught:
+            loaded(CURRENT, f"limits.{setting}")
+        [problem] = caught.value.problems
+        assert str(problem) == f"--set limits.{setting}: limits.{setting.split('=')[0]}: {words}"
+
+
+class TestConsistency:
+    """Interlocks that could not do what they say."""
+
+    @pytest.mark.parametrize(
+        ("text", "settings", "found"),
+        [
+            (
+                CURRENT,
+                ["tracking_error_um=2.0"],
+                ["tracking_error_um: needs a compensator: without one there is no reference in um "
+                 "to track"],
+            ),
+            (
+                CURRENT,
+                ["rms_current_a=4.0"],
+                ["rms_current_a: needs limits.thermal_time_constant_s"],
+            ),
+            (
+                CURRENT,
+                ["thermal_time_constant_s=4.0"],
+                ["thermal_time_constant_s: needs limits.rms_current_a"],
+            ),
+            (CURRENT, ["tracking_s=0.1"], ["tracking_s: needs limits.tracking_error_um"]),
+            (CURRENT, ["frozen_um=0.1"], ["frozen_um: needs limits.frozen_s"]),
+            (CURRENT, ["deviation_s=0.1"], ["deviation_s: needs limits.measured_deviation_a"]),
+            (VOLTAGE, ["deviation_s=0.1"], ["deviation_s: needs limits.measured_deviation_v"]),
+            (
+                CURRENT,
+                ["measured_deviation_v=1.0"],
+                ["measured_deviation_v: is for a device driven in V, but the limits are in A"],
+            ),
+            (
+                VOLTAGE,
+                ["rms_current_a=1.0", "thermal_time_constant_s=1.0", "measured_deviation_a=1.0"],
+                [f"{key}: is for a device driven in A, but the limits are in V"
+                 for key in ("rms_current_a", "thermal_time_constant_s", "measured_deviation_a")],
+            ),
+        ],
+    )  # fmt: skip
+    def test_refused_by_key(self, text, settings, found):
+        """Each is told with its key and what is missing, all at once."""
+        told = refusals(text, *(f"limits.{setting}" for setting in settings))
+        assert told == [f"x.yaml: limits.{each}" for each in found]
+
+    def test_device_that_does_not_measure(self):
+        """A deviation can only be seen where the device measures its command."""
+        told = refusals(CURRENT, "limits.measured_deviation_a=1.0", measures_command=False)
+        assert told == [
+            "x.yaml: limits.measured_deviation_a: needs a device that measures its command: "
+            "simulated_terfenol does not"
+        ]
+        check(loaded(CURRENT, "limits.measured_deviation_a=1.0"))
+
+    def test_place_in_the_file(self):
+        """The message leads to the line of the key."""
+        with pytest.raises(ConfigError) as caught:
+            check(loaded(CURRENT + "  deviation_s: 0.1\n"))
+        assert caught.value.problems[0].where == "x.yaml:11"
+
+    def test_all_of_them_together_are_fine(self):
+        """A compensated run on a device that measures may have every interlock."""
+        text = CURRENT.replace("unit: A", "unit: um")
+        settings = (
+            *BUDGET,
+            "limits.tracking_error_um=5.0",
+            "limits.tracking_s=0.1",
+            "limits.frozen_s=0.1",
+            "limits.frozen_um=0.01",
+            "limits.measured_deviation_a=0.5",
+            "limits.deviation_s=0.01",
+        )
+        path = Path(__file__).parents[3] / "configs"
+        made = resolve(
+            Document("x.yaml", text.replace("none", "{model: models/terfenol_omega.yaml}")),
+            path,
+            settings,
+        )
+        assert check(made).forecast.heating_rms_a > 0.1
+
+
+class TestHeatForecast:
+    """The thermal budget, known before the run."""
+
+    def test_without_a_budget(self):
+        """Nothing is forecast where nothing is held to it."""
+        forecast = check(loaded(CURRENT)).forecast
+        assert forecast.heating_rms_a is None
+        assert forecast.to_mapping()["heating_rms_a"] is None
+
+    def test_highest_running_rms(self):
+        """The forecast is the highest root of the heat, which starts at that of the safe value."""
+        settings = ("limits.rms_current_a=4.3", "limits.thermal_time_constant_s=0.5")
+        found = check(loaded(CURRENT, *settings)).forecast.heating_rms_a
+        command = 6.0 * np.sin(2.0 * np.pi * 10.0 * np.arange(4000) / 1e3)
+        heat, highest = 0.25, 0.0
+        for value in command:
+            heat += (value**2 - heat) * (1.0 - math.exp(-1.0 / 500.0))
+            highest = max(highest, heat)
+        assert found == pytest.approx(math.sqrt(highest), rel=1e-9)
+
+    def test_safe_value_alone(self):
+        """A run that never leaves the safe value shows its rms, and a smaller budget refuses it."""
+        hold = ["waveform={kind: hold, unit: A, level: 0.5, duration_s: 1.0}"]
+        budget = ("limits.rms_current_a=0.5", "limits.thermal_time_constant_s=1.0")
+        assert check(loaded(CURRENT, *hold, *budget)).forecast.heating_rms_a == 0.5
+        found = refusals(CURRENT, *hold, "limits.rms_current_a=0.4", budget[1])
+        assert found[0].endswith(
+            "got 0.5 A (0.1 A too much, and the budget is used up after 0 s: lower the waveform's "
+            "amplitude, or shorten the run)"
+        )
+
+    @pytest.mark.parametrize("chunk", [1, 700, 4000, 1_000_000])
+    def test_refused_with_when_and_by_how_much(self, monkeypatch, chunk):
+        """A waveform whose budget would trip is refused, however it is cut into chunks."""
+        monkeypatch.setattr("hilctl.experiment.forecast._CHUNK", chunk)
+        assert refusals(CURRENT, *BUDGET) == [
+            "x.yaml: limits.rms_current_a: the coil must stay within 4 A rms over 1.5 s, got "
+            "4.105 A (0.105 A too much, and the budget is used up after 3.23 s: lower the "
+            "waveform's amplitude, or shorten the run)"
+        ]
+
+    def test_refused_at_its_line(self):
+        """The refusal leads to the line of the budget."""
+        text = CURRENT + "  thermal_time_constant_s: 1.5\n  rms_current_a: 4.0\n"
+        with pytest.raises(ConfigError) as caught:
+            check(loaded(text))
+        assert [problem.where for problem in caught.value.problems] == ["x.yaml:12"]
+
+    def test_where_the_forecast_says_the_interlock_trips(self):
+        """The run itself would trip at the very sample that the refusal names.
+
+        A sine's heat is 18 (1 - e^(-t / tau)) with a ripple of 0.095 A^2, and 0.25 A^2 to begin
+        with: it reaches 16 A^2 between 3.205 and 3.275 s.
+        """
+        made = loaded(CURRENT, *BUDGET)
+        reference = 6.0 * np.sin(2.0 * np.pi * 10.0 * np.arange(4000) / 1e3)
+        interlocks = Interlocks(interlock_limits(made.config, made.device.info), 1e3)
+        none, flags = np.full(4000, np.nan), np.zeros(4000, dtype=np.uint32)
+        trip = interlocks.check(0, reference, none, np.zeros(4000), none, flags)
+        assert (trip.code, trip.sample) == ("thermal", 3230)
+
+    def test_budget_that_is_just_kept(self):
+        """What is just within the budget may run."""
+        check(loaded(CURRENT, "limits.rms_current_a=4.12", BUDGET[1]))
+
+    def test_commands_of_the_inverse_count(self):
+        """With a compensator it is the current that heats, not the reference."""
+        made = loaded(CURRENT, *BUDGET)
+        waveform = made.config.waveform.model_copy(update={"unit": "um", "amplitude": 15.0})
+        model = terfenol_rdpi()
+        limits = made.config.limits.model_copy(update={"slew_a_per_s": 1e6})
+        config = made.config.model_copy(update={"waveform": waveform, "limits": limits})
+        found = check(replace(made, config=config, model=model)).forecast
+        command = model.inverse(1e3).process(15.0 * np.sin(2.0 * np.pi * np.arange(4000) / 100.0))
+        settled = math.sqrt(float(np.mean(command[2000:] ** 2)))
+        assert 0.9 * settled < found.heating_rms_a < settled
+
+    def test_currents_near_the_end_of_the_numbers(self):
+        """Where the square overflows the refusal is in words, without a warning."""
+        found = refusals(CURRENT, *BUDGET, "waveform.amplitude=1.0e+200")
+        assert len(found) == 3
+        assert "limits.rms_current_a" in found[-1]

@@ -1,0 +1,38 @@
+"""The experiments and models that come with the project."""
+
+from pathlib import Path
+
+import pytest
+
+from hilctl.experiment.check import check
+from hilctl.experiment.load import load_experiment
+from hilctl.models.files import load_model
+
+CONFIGS = Path(__file__).parents[3] / "configs"
+EXPERIMENTS = sorted(path.name for path in CONFIGS.glob("*.yaml"))
+MODELS = sorted(path.name for path in (CONFIGS / "models").glob("*.yaml"))
+
+
+def test_there_are_some() -> None:
+    """The lists that the other tests go through are not empty."""
+    assert EXPERIMENTS
+    assert MODELS
+
+
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_experiment(name: str) -> None:
+    """Each experiment loads, may start, and tells editors of its schema."""
+    path = CONFIGS / name
+    first = path.read_text(encoding="utf-8").splitlines()[0]
+    assert first == "# yaml-language-server: $schema=schema.json"
+    checked = check(load_experiment(path))
+    assert checked.loaded.config.name == path.stem
+    assert checked.forecast.samples > 0
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_model(name: str) -> None:
+    """Each model loads and can be inverted."""
+    model = load_model(CONFIGS / "models" / name)
+    assert model.inverse(50e3).state().size > model.operators
+    assert model.output_range_um is not None

@@ -1,0 +1,354 @@
+"""Feedback around the compensator: gains, margins, windup, and what it does to bad readings."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hilctl.base.blocks import Batch
+from hilctl.base.errors import ConfigError, InputError
+from hilctl.base.yaml.document import Document
+from hilctl.experiment.check import check
+from hilctl.experiment.feedback import make_feedback
+from hilctl.experiment.feedback_keys import FeedbackConfig
+from hilctl.experiment.file import Experiment
+from hilctl.experiment.load import resolve
+from hilctl.loop.compensator import Compensator
+from hilctl.loop.feedback import (
+    Feedback,
+    Gains,
+    gains_for,
+    highest_bandwidth_hz,
+    margins,
+    rate_needed_hz,
+)
+from hilctl.loop.in_flight import DelayLine
+from hilctl.models.ppi import PpiModel
+from hilctl.models.staged import FieldLag, StagedModel, Structure
+
+RATE_HZ = 5000.0
+EXPERIMENT = """\
+name: feedback
+device: {kind: simulated_terfenol}
+sample_rate_hz: 5000
+block: 1
+waveform:
+  kind: sine
+  unit: um
+  amplitude: 10.0
+  frequency_hz: 10.0
+  duration_s: 0.5
+  soft_start_s: 0.1
+compensator: {model: model.yaml}
+limits: {peak_current_a: 7.0, slew_a_per_s: 20000.0, stroke_um: [-75.0, 60.0]}
+feedback: {limit_um: 5.0, bandwidth_hz: 50.0, resonance_hz: 2300.0, damping_ratio: 0.12}
+"""
+MODEL = "model: {kind: ppi, direct: 5.0, weights: [1.0, 0.5], thresholds: [0.3, 0.6]}\n"
+STAGED = """\
+model:
+  kind: staged
+  hysteresis: {kind: ppi, direct: 5.0, weights: [1.0, 0.5], thresholds: [0.3, 0.6]}
+  structure: {natural_hz: 300.0, damping_ratio: 0.12}
+"""
+
+
+def plant(feedback, samples=2000, *, gain=1.0, offset_um=0.0, reference=None, hold_back=math.inf):
+    """Run the controller on a gain and an offset, as the loop does; return errors in um.
+
+    A displacement shows the input of the sample before; the controller sees it a sample later.
+    """
+    wanted = np.zeros(samples) if reference is None else reference
+    errors, inputs, seen, limited = [], [0.0], math.nan, False
+    for k in range(samples):
+        wish = wanted[k] + feedback.correct(wanted[k], seen, limited=limited)
+        put_out = min(hold_back, max(-hold_back, wish))
+        limited = put_out != wish
+        seen = gain * inputs[-1] + offset_um
+        errors.append((wanted[k - 1] if k else 0.0) - seen)
+        inputs.append(put_out)
+    return np.array(errors)
+
+
+def loop(bandwidth_hz=100.0, limit_um=50.0, due_after=1):
+    return Feedback(gains_for(bandwidth_hz, RATE_HZ), RATE_HZ, limit_um, due_after)
+
+
+class TestMargins:
+    """What the delay leaves."""
+
+    @pytest.mark.parametrize("bandwidth_hz", [1.0, 50.0, 270.0])
+    def test_bandwidth_is_where_the_loop_crosses_one(self, bandwidth_hz):
+        """The integral's gain is 1 at the bandwidth, whatever the rate."""
+        step = gains_for(bandwidth_hz, RATE_HZ).ki_per_s / RATE_HZ
+        turn = 1.0 - np.exp(-2j * np.pi * bandwidth_hz / RATE_HZ)
+        assert abs(step / turn) == pytest.approx(1.0)
+
+    @pytest.mark.parametrize("delay_s", [0.0, 1e-4, 2e-3])
+    def test_highest_bandwidth_leaves_sixty_degrees(self, delay_s):
+        """At the highest bandwidth the phase margin is 60 degrees, and the gain margin above 2."""
+        highest_hz = highest_bandwidth_hz(RATE_HZ, delay_s)
+        gain, phase = margins(gains_for(highest_hz, RATE_HZ), RATE_HZ, delay_s)
+        assert phase == pytest.approx(60.0, abs=0.5)
+        assert gain > 2.0
+
+    def test_one_and_a_half_samples_of_delay(self):
+        """Without any other delay, the bandwidth is an eighteenth of the rate."""
+        assert highest_bandwidth_hz(1800.0) == pytest.approx(100.0)
+
+    @given(bandwidth_hz=st.floats(0.1, 1e3), delay_s=st.floats(0.0, 1e-2))
+    def test_rate_needed_is_the_inverse(self, bandwidth_hz, delay_s):
+        """At the rate that a bandwidth needs, it is the highest; where no rate will do, none is."""
+        rate_hz = rate_needed_hz(bandwidth_hz, delay_s)
+        if math.isinf(rate_hz):
+            assert highest_bandwidth_hz(1e12, delay_s) < bandwidth_hz * (1.0 + 1e-6)
+        else:
+            assert highest_bandwidth_hz(rate_hz, delay_s) == pytest.approx(bandwidth_hz)
+
+    def test_the_loop_swings_where_the_margin_is_gone(self):
+        """A gain margin of 1 by the sums is a swing that neither grows nor fades in time."""
+        ki = 1000.0
+        for _ in range(60):
+            ki *= margins(Gains(0.0, ki), RATE_HZ)[0]
+        for factor, fades in ((0.9, True), (1.1, False)):
+            feedback = Feedback(Gains(0.0, factor * ki), RATE_HZ, 1e12, 1)
+            errors = np.abs(plant(feedback, 400, offset_um=1.0))
+            assert (errors[-50:].max() < errors[10:60].max()) == fades
+
+    def test_a_loop_that_never_falls_below_one_has_no_phase_margin(self):
+        """A proportional gain above 1 keeps the loop gain above 1 for ever."""
+        assert margins(Gains(1.5, 1.0), RATE_HZ)[1] == 0.0
+
+    @pytest.mark.parametrize(("kp", "ki"), [(-0.1, 1.0), (0.0, 0.0), (math.nan, 1.0)])
+    def test_gains_out_of_range(self, kp, ki):
+        """Gains that could not be a controller's are refused."""
+        with pytest.raises(InputError, match="kp must be"):
+            Gains(kp, ki)
+
+
+class TestCorrection:
+    """What comes of an error."""
+
+    def test_offset_is_removed(self):
+        """A constant disturbance fades as e^(-2 pi bandwidth t)."""
+        errors = plant(loop(20.0), offset_um=3.0)
+        assert errors[0] == -3.0
+        assert abs(errors[-1]) < 1e-6
+        after = round(RATE_HZ / (2.0 * np.pi * 20.0))
+        assert errors[2 + after] == pytest.approx(-3.0 / np.e, rel=0.05)
+
+    def test_a_right_model_is_left_alone(self):
+        """References are held against the displacements that are to show them: no error, no act."""
+        reference = np.sin(np.arange(500) / 7.0)
+        feedback = loop(270.0)
+        errors = plant(feedback, 500, reference=reference)
+        assert np.abs(errors[1:]).max() == 0.0
+        assert feedback.correction_um == 0.0
+
+    def test_wrong_gain_is_brought_down(self):
+        """A tenth too much gain matters ten times less at a tenth of the bandwidth."""
+        reference = 10.0 * np.sin(2.0 * np.pi * 10.0 * np.arange(4000) / RATE_HZ)
+        without = plant(loop(1e-6), 4000, gain=1.1, reference=reference)[1000:]
+        with_it = plant(loop(100.0), 4000, gain=1.1, reference=reference)[1000:]
+        assert np.abs(with_it).max() < 0.15 * np.abs(without).max()
+
+    def test_correction_stays_within_its_limit(self):
+        """A disturbance beyond the limit is corrected as far as it goes, and left at once after."""
+        feedback = loop(100.0, limit_um=2.0)
+        assert plant(feedback, 500, offset_um=10.0)[-1] == pytest.approx(-8.0)
+        assert feedback.correction_um == -2.0
+        assert abs(plant(feedback, 60)[-1]) < 0.2
+
+    def test_integral_does_not_wind_up_behind_the_limiter(self):
+        """While commands are held back the integral stays, and does not grow to the limit."""
+        feedback = loop(100.0, limit_um=1e3)
+        plant(feedback, 5000, offset_um=10.0, hold_back=0.5)
+        assert abs(feedback.correction_um) < 3.0
+
+    def test_integral_may_shrink_behind_the_limiter(self):
+        """What was too much is taken back even while commands are held back."""
+        feedback = loop(20.0)
+        plant(feedback, 500, offset_um=4.0)
+        assert feedback.correction_um == pytest.approx(-4.0, abs=1e-3)
+        for _ in range(50):
+            feedback.correct(5.0, 0.0, limited=True)
+        assert -0.1 < feedback.correction_um <= 0.1
+
+    @pytest.mark.parametrize("reading", [math.nan, math.inf, -math.inf])
+    def test_a_lost_sensor_changes_nothing(self, reading):
+        """The correction stays what it was, to the bit, and is never a NaN."""
+        feedback = loop()
+        plant(feedback, 100, offset_um=1.0)
+        before = feedback.correction_um
+        assert feedback.correct(0.0, reading, limited=False) == before
+
+    def test_nothing_is_judged_after_a_gap_until_references_are_new(self):
+        """Skipped samples leave the correction for as long as displacements are of old ones."""
+        feedback = loop(due_after=2)
+        for _ in range(5):
+            feedback.correct(0.0, 1.0, limited=False)
+        before = feedback.correction_um
+        feedback.forget()
+        held = [feedback.correct(0.0, 1.0, limited=False) for _ in range(3)]
+        assert held == [before] * 3
+        assert feedback.correct(0.0, 1.0, limited=False) < before
+
+    @given(
+        readings=st.lists(st.floats(allow_nan=True, allow_infinity=True), max_size=80),
+        kp=st.floats(0.0, 1e6),
+        ki=st.floats(1e-6, 1e9),
+        limited=st.booleans(),
+    )
+    def test_never_more_than_the_limit(self, readings, kp, ki, limited):
+        """Whatever is read, the correction is a number within the limit."""
+        feedback = Feedback(Gains(kp, ki), RATE_HZ, 2.0, 1)
+        for reading in readings:
+            assert abs(feedback.correct(0.0, reading, limited=limited)) <= 2.0
+
+
+class TestFollow:
+    """What it takes from a block of the loop."""
+
+    def block(self):
+        made = DelayLine(Batch.empty(1, 1, 1)).newest
+        made.columns[:] = 0.0
+        return made
+
+    def test_correction_is_added_to_the_input(self):
+        """The input of the block is what it was, and the correction."""
+        feedback, block = loop(due_after=0), self.block()
+        feedback.follow(block)
+        block.displacement_um[0], block.input_um[0] = -1.0, 7.0
+        feedback.follow(block)
+        assert block.input_um[0] == 7.0 + feedback.correction_um
+        assert feedback.correction_um == pytest.approx(gains_for(100.0, RATE_HZ).ki_per_s / RATE_HZ)
+
+    def test_gap_is_passed_over(self):
+        """After skipped samples, old displacements are held against nothing."""
+        feedback, block = loop(due_after=0), self.block()
+        feedback.follow(block)
+        block.displacement_um[0], block.skipped = -1.0, 3
+        feedback.follow(block)
+        assert feedback.correction_um == 0.0
+
+    def test_a_command_that_was_held_back_stops_the_integral(self):
+        """The limiter is known to have acted where wanted and command differ."""
+        feedback, block = loop(due_after=0), self.block()
+        feedback.follow(block)
+        block.displacement_um[0], block.wanted[0] = -1.0, 1.0
+        feedback.follow(block)
+        assert feedback.correction_um == 0.0
+
+
+PLAYS = PpiModel(direct=5.0, weights=(1.0, 0.5), thresholds=(0.3, 0.6))
+LAGGING = StagedModel.around(PLAYS, lag=FieldLag(tau_s=5e-4))
+LATE = StagedModel.around(
+    PLAYS, structure=Structure(natural_hz=500.0, damping_ratio=0.3), delay_s=4e-4
+)
+
+
+@pytest.mark.parametrize("model", [PLAYS, LAGGING, LATE], ids=["plays", "lag", "structure, delay"])
+class TestAroundModels:
+    """Feedback around compensators that look ahead and such that don't, on the model itself."""
+
+    def errors(self, model, offset_um, limit_um=20.0):
+        """Run reference, feedback, compensator and actuator sample by sample; errors in um."""
+        compensator = Compensator(model, RATE_HZ)
+        config = Document("experiment", EXPERIMENT).validate(Experiment)
+        settings = {"limit_um": limit_um, "bandwidth_hz": 20.0}
+        config = config.model_copy(update={"feedback": FeedbackConfig(**settings)})
+        feedback = make_feedback(config, compensator)
+        actuator = model.forward(RATE_HZ)
+        reference = 8.0 * np.sin(2.0 * np.pi * 5.0 * np.arange(5000) / RATE_HZ) ** 3
+        ahead, wanted, errors = compensator.ahead(reference), np.zeros(1), np.zeros(5000)
+        seen_um, next_um = math.nan, offset_um
+        for k in range(5000):
+            fed = ahead[k] + feedback.correct(reference[k], seen_um, limited=False)
+            compensator.process(np.array([fed]), wanted)
+            answer = float(actuator.process(wanted.copy())[0]) + offset_um
+            if model is PLAYS:  # it answers at once, where a sensor could not show it yet
+                seen_um, next_um = next_um, answer
+            else:
+                seen_um = answer
+            errors[k] = reference[k - (model is PLAYS)] - seen_um
+        return errors
+
+    def test_a_right_model_is_left_alone(self, model):
+        """References meet the displacements that they belong to: what is corrected is next to nil.
+
+        Central differences are not the structure to the bit.
+        """
+        without = np.abs(self.errors(model, 0.0, limit_um=1e-12)).max()
+        assert np.abs(self.errors(model, 0.0)).max() <= 1.05 * without + 1e-9
+        assert without < 0.1
+
+    def test_an_offset_is_removed(self, model):
+        """It is taken out, and the loop is stable with all the delay that the compensator has."""
+        errors = np.abs(self.errors(model, 3.0))
+        assert errors[0] > 2.9
+        assert errors[-1000:].max() < 0.1
+
+
+class TestExperiment:
+    """What an experiment may ask for."""
+
+    def problems(self, folder, *settings, model=MODEL):
+        (folder / "model.yaml").write_text(model)
+        loaded = resolve(Document("experiment", EXPERIMENT), folder, settings)
+        with pytest.raises(ConfigError) as caught:
+            check(loaded)
+        return str(caught.value)
+
+    def test_good_one_is_taken(self, tmp_path):
+        """It starts, and its input is recorded beside the reference."""
+        (tmp_path / "model.yaml").write_text(MODEL)
+        checked = check(resolve(Document("experiment", EXPERIMENT), tmp_path, []))
+        np.testing.assert_array_equal(checked.ahead, checked.reference.values)
+
+    def test_block_of_more_than_one(self, tmp_path):
+        """Feedback needs a block of 1."""
+        assert "block: must be 1 with feedback" in self.problems(tmp_path, "block=50")
+
+    def test_too_much_bandwidth(self, tmp_path):
+        """The message says how much there can be, and the rate that it needs."""
+        text = self.problems(tmp_path, "feedback.bandwidth_hz=500.0", "feedback.damping_ratio=1.0")
+        assert "feedback.bandwidth_hz: must be <= 277.8 Hz at 5000 Hz" in text
+        assert "needs at least 9000 samples a second" in text
+
+    def test_delay_that_no_rate_makes_good(self, tmp_path):
+        """A sensor too late for a bandwidth is said to be so."""
+        text = self.problems(tmp_path, "feedback.sensor_delay_s=0.01")
+        assert "no sample rate is enough" in text
+
+    def test_gains_without_margin(self, tmp_path):
+        """Gains are held against their margins."""
+        gains = "feedback={limit_um: 5.0, kp: 0.2, ki_per_s: 4000.0, resonance_hz: 2300.0,"
+        text = self.problems(tmp_path, gains + " damping_ratio: 1.0}")
+        assert "gain margin of 2 and a phase margin of 60 degrees" in text
+        assert "samples a second" in text
+
+    def test_resonance_must_be_known(self, tmp_path):
+        """A model that does not tell the resonance leaves it to the experiment."""
+        text = self.problems(tmp_path, "feedback={limit_um: 5.0, bandwidth_hz: 20.0}")
+        assert "needs resonance_hz" in text
+
+    def test_resonance_of_the_model(self, tmp_path):
+        """That of a staged model's structure is taken, and held against the gain there."""
+        settings = "feedback={limit_um: 5.0, bandwidth_hz: 50.0}"
+        text = self.problems(tmp_path, settings, model=STAGED)
+        assert "at the resonance" in text
+        assert "bandwidth_hz 36" in text
+
+    def test_without_a_compensator(self, tmp_path):
+        """There is nothing to correct the input of."""
+        settings = ("compensator=none", "waveform.unit=A", "waveform.amplitude=1.0")
+        assert "feedback: needs a compensator" in self.problems(tmp_path, *settings)
+
+    @pytest.mark.parametrize("keys", ["{}", "{kp: 0.1}", "{bandwidth_hz: 1.0, ki_per_s: 1.0}"])
+    def test_bandwidth_or_gains(self, tmp_path, keys):
+        """Exactly one of the two ways to say how fast it is."""
+        (tmp_path / "model.yaml").write_text(MODEL)
+        setting = f"feedback={keys[:-1]}{', ' if len(keys) > 2 else ''}limit_um: 1.0}}"
+        with pytest.raises(ConfigError, match="either bandwidth_hz or ki_per_s"):
+            resolve(Document("experiment", EXPERIMENT), tmp_path, [setting])

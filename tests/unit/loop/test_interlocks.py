@@ -1,0 +1,485 @@
+"""What ends a run: each interlock by itself, at its very edge, and what it says."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hilctl.base.errors import InputError
+from hilctl.base.flags import Flag
+from hilctl.loop.interlocks import InterlockLimits, Interlocks, Trip, warming
+
+RATE_HZ = 1000.0
+STROKE = InterlockLimits(stroke_um=(-60.0, 50.0), sensor_um=(-100.0, 100.0))
+
+
+class Bench:
+    """Interlocks that are fed columns, each a number, a list, or NaN where it is left out."""
+
+    def __init__(self, limits, rate_hz=RATE_HZ):
+        self.interlocks = Interlocks(limits, rate_hz)
+        self.flags = np.zeros(0, dtype=np.uint32)
+
+    def feed(self, n, *, first=0, command=0.0, reference=math.nan, displacement=1.0, measured=None):
+        measured = math.nan if measured is None else measured
+        given = [
+            np.array(np.broadcast_to(each, n), dtype=np.float64)
+            for each in (command, reference, displacement, measured)
+        ]
+        self.flags = np.zeros(n, dtype=np.uint32)
+        return self.interlocks.check(first, *given, self.flags)
+
+    def flagged(self, flag):
+        return np.flatnonzero(self.flags & flag).tolist()
+
+
+def trips(limits, n, **columns):
+    """Return the trip, and where the flags of all interlocks stand, of one block."""
+    bench = Bench(limits)
+    trip = bench.feed(n, **columns)
+    return trip, bench
+
+
+class TestStroke:
+    """Displacements that may not be."""
+
+    @pytest.mark.parametrize("value", [-60.0, 0.0, 50.0])
+    def test_within(self, value):
+        """The limits themselves are allowed."""
+        trip, bench = trips(STROKE, 3, displacement=value)
+        assert trip is None
+        assert not bench.flags.any()
+
+    @pytest.mark.parametrize(
+        ("value", "shown"),
+        [(-60.001, "-60"), (50.001, "50"), (77.7, "77.7"), (np.nan, "nan"), (np.inf, "inf")],
+    )
+    def test_outside(self, value, shown):
+        """What is outside, or not a number, trips where it stands and is flagged there only."""
+        trip, bench = trips(STROKE, 4, first=100, displacement=[1.0, value, 2.0, value])
+        reason = (
+            f"displacement {shown} um at sample 101 is not within the stroke limits -60 to 50 um"
+        )
+        assert trip == Trip(101, "stroke", reason)
+        assert bench.flagged(Flag.SENSOR_INVALID) == [1, 3]
+
+    def test_sensor_without_ends(self):
+        """Where nothing is known of the sensor, an infinite reading is outside the stroke."""
+        limits = InterlockLimits(stroke_um=(-1.0, 2.0))
+        assert trips(limits, 1, displacement=np.inf)[0].code == "stroke"
+        assert trips(limits, 1, displacement=-np.inf)[0].code == "stroke"
+
+
+class TestSensorRange:
+    """A sensor that is at its end measures nothing."""
+
+    @pytest.mark.parametrize("rail", [-100.0, 100.0, 100.5, -101.0])
+    def test_at_the_end(self, rail):
+        """A reading at or beyond an end of the sensor's range is told as such."""
+        trip, bench = trips(STROKE, 3, displacement=[0.0, 0.0, rail])
+        assert trip.code == "sensor_range"
+        assert trip.sample == 2
+        assert trip.reason == (
+            f"displacement {rail:g} um at sample 2 is at the end of what the sensor can report, "
+            "-100 to 100 um"
+        )
+        assert bench.flagged(Flag.SENSOR_INVALID) == [2]
+
+    @pytest.mark.parametrize("rail", [-100.0, 100.0])
+    def test_stroke_as_wide_as_the_sensor(self, rail):
+        """A stroke that reaches to the sensor's ends does not allow them."""
+        limits = replace(STROKE, stroke_um=(-100.0, 100.0))
+        assert trips(limits, 1, displacement=rail)[0].code == "sensor_range"
+        assert trips(limits, 1, displacement=np.nextafter(rail, 0.0))[0] is None
+
+
+FROZEN = replace(STROKE, frozen_s=0.01, frozen_travel=0.5)
+
+
+class TestFrozen:
+    """A reading that stays the same although the command moves."""
+
+    def test_trips_after_its_time(self):
+        """The time counts from the sample at which the command has gone far enough."""
+        command = np.concatenate((np.zeros(20), np.full(40, 0.6)))
+        trip, bench = trips(FROZEN, 60, command=command, displacement=12.34567)
+        assert trip == Trip(
+            30,
+            "sensor_frozen",
+            "displacement at sample 30 is still 12.3457 um, 0.01 s after the command had moved by "
+            "0.5 A: the sensor is frozen",
+        )
+        assert bench.flagged(Flag.SENSOR_FROZEN) == list(range(30, 60))
+
+    def test_names_the_unit(self):
+        """A device driven in V is told in V."""
+        limits = replace(FROZEN, unit="V")
+        trip, _ = trips(limits, 60, command=np.arange(60.0), displacement=1.0)
+        assert "moved by 0.5 V" in trip.reason
+
+    def test_exactly_that_far_is_not_far_enough(self):
+        """The command must have moved by more than the travel, either way."""
+        still = np.zeros(50)
+        assert trips(FROZEN, 100, command=np.concatenate((still, still + 0.5)))[0] is None
+        assert trips(FROZEN, 100, command=np.concatenate((still, still - 0.5)))[0] is None
+        assert trips(FROZEN, 100, command=np.concatenate((still, still - 0.51)))[0].sample == 60
+
+    def test_travel_is_from_lowest_to_highest(self):
+        """Small moves up and down from rest add up to their span."""
+        command = np.concatenate((np.zeros(5), np.full(5, 0.3), np.full(40, -0.3)))
+        assert trips(FROZEN, 50, command=command)[0].sample == 20
+
+    def test_hold_never_trips(self):
+        """However long nothing moves, a reading that stays is what is to be expected."""
+        assert trips(FROZEN, 5000, command=3.0)[0] is None
+
+    def test_travel_starts_at_the_first_command(self):
+        """An output that rests away from 0, with a reading of exactly 0, has not travelled."""
+        assert trips(replace(FROZEN, safe=3.0), 500, command=3.0, displacement=0.0)[0] is None
+
+    def test_step_out_of_a_long_hold(self):
+        """After a long hold the reading has all of the time to answer a step."""
+        command = np.concatenate((np.zeros(500), np.full(500, 4.0)))
+        reading = np.concatenate((np.zeros(510), np.full(490, 30.0)))
+        assert trips(FROZEN, 1000, command=command, displacement=reading)[0] is None
+        late = np.concatenate((np.zeros(511), np.full(489, 30.0)))
+        assert trips(FROZEN, 1000, command=command, displacement=late)[0].sample == 510
+
+    def test_change_starts_everything_anew(self):
+        """A reading that changes, by a single bit, takes time and travel back to nothing."""
+        command = np.concatenate((np.zeros(20), np.full(40, 0.6)))
+        reading = np.full(60, 5.0)
+        reading[25:] = np.nextafter(5.0, 6.0)
+        assert trips(FROZEN, 60, command=command, displacement=reading)[0] is None
+        command[40:] = 0.0
+        assert trips(FROZEN, 60, command=command, displacement=reading)[0].sample == 50
+
+    def test_travel_before_a_change_does_not_count(self):
+        """Travel is measured from the command at which the reading last changed."""
+        command = np.linspace(0.0, 30.0, 61)
+        reading = np.full(61, 1.0)
+        reading[:30] = np.arange(30.0)
+        reading[30:] = 29.5
+        trip, _ = trips(FROZEN, 61, command=command, displacement=reading)
+        assert trip.sample == 42  # 30: the change; 32: more than 0.5 A from it; and 10 samples
+
+    def test_resolution(self):
+        """Changes up to the resolution count as none; more than that counts."""
+        limits = replace(FROZEN, frozen_um=0.25)
+        command = np.arange(100.0)
+        flicker = 1.0 + 0.25 * (np.arange(100) % 2)
+        assert trips(limits, 100, command=command, displacement=flicker)[0].sample == 11
+        wider = 1.0 + 0.26 * (np.arange(100) % 2)
+        assert trips(limits, 100, command=command, displacement=wider)[0] is None
+        creep = 1.0 + 0.1 * np.arange(100)
+        assert trips(limits, 100, command=command, displacement=creep)[0] is None
+
+    def test_invalid_readings_are_not_frozen(self):
+        """A reading that is not a number is told as that, never as frozen."""
+        trip, bench = trips(FROZEN, 100, command=np.arange(100.0), displacement=np.nan)
+        assert trip.code == "stroke"
+        assert bench.flagged(Flag.SENSOR_FROZEN) == []
+
+
+DEVIATION = replace(STROKE, deviation=0.5, deviation_s=0.003)
+
+
+class TestDeviation:
+    """A current that is not the one that was asked for."""
+
+    def test_trips_after_its_time(self):
+        """Too far away for longer than the time trips, and says all numbers."""
+        measured = np.concatenate((np.full(10, 2.0), np.full(10, 2.75)))
+        trip, bench = trips(DEVIATION, 20, first=0, command=2.0, measured=measured)
+        assert trip == Trip(
+            13,
+            "deviation",
+            "measured 2.75 A at sample 13, where 2 A was put out, is more than 0.5 A away for "
+            "longer than 0.003 s",
+        )
+        assert bench.flagged(Flag.DEVIATION) == list(range(13, 20))
+
+    @pytest.mark.parametrize("measured", [1.5, 2.0, 2.5])
+    def test_within(self, measured):
+        """The limit itself is allowed, either way."""
+        limits = replace(DEVIATION, safe=2.0, deviation_s=0.0)
+        assert trips(limits, 50, command=2.0, measured=measured)[0] is None
+
+    @pytest.mark.parametrize("measured", [1.49, 2.51, np.nan, np.inf, -np.inf])
+    def test_beyond_without_a_time(self, measured):
+        """Without a time the first sample beyond trips; a lost reading is beyond."""
+        limits = replace(DEVIATION, safe=2.0, deviation_s=0.0, unit="V")
+        trip, _ = trips(limits, 5, first=7, command=2.0, measured=measured)
+        assert trip.sample == 7
+        assert trip.reason == (
+            f"measured {measured:.4g} V at sample 7, where 2 V was put out, is more than 0.5 V away"
+        )
+
+    def test_either_command_may_be_measured(self):
+        """A reading before or after its own command takes effect is as good, in any block."""
+        limits = replace(DEVIATION, deviation_s=0.0)
+        command = np.array([0.0, 5.0, -5.0, 5.0])
+        for measured in (command, np.array([0.0, 0.0, 5.0, -5.0]), np.array([0.0, 2.0, -5.5, 5.5])):
+            assert trips(limits, 4, command=command, measured=measured)[0] is None
+            bench = Bench(limits)
+            for k in range(4):
+                assert bench.feed(1, first=k, command=command[k], measured=measured[k]) is None
+        trip, _ = trips(limits, 4, command=command, measured=np.array([0.0, 2.0, 5.6, 0.0]))
+        assert trip.reason.startswith("measured 5.6 A at sample 2, where 5 to -5 A was put out")
+        bench = Bench(limits)
+        bench.feed(1, command=5.0, measured=0.0)
+        trip = bench.feed(1, first=1, command=-5.0, measured=-5.6)
+        assert trip.reason.startswith("measured -5.6 A at sample 1, where 5 to -5 A was put out")
+
+    def test_starts_from_the_safe_value(self):
+        """Before the first command the output was at the safe value."""
+        limits = replace(DEVIATION, safe=-1.0, deviation_s=0.0)
+        assert trips(limits, 1, command=1.0, measured=-1.4)[0] is None
+        assert trips(limits, 1, command=1.0, measured=-1.6)[0].code == "deviation"
+
+    def test_back_in_time_starts_anew(self):
+        """Spikes shorter than the time don't add up."""
+        measured = np.tile([9.0, 9.0, 9.0, 0.0], 50)
+        assert trips(DEVIATION, 200, command=0.0, measured=measured)[0] is None
+
+    def test_off_without_a_limit(self):
+        """Where there is no limit, a device that does not measure is no fault."""
+        assert trips(STROKE, 100, command=2.0)[0] is None
+        assert trips(STROKE, 100, command=2.0, measured=1e9)[0] is None
+
+
+THERMAL = replace(STROKE, rms_current_a=2.0, time_constant_s=0.1)
+HEATING = [(0.0, -3.0), (-3.0, 0.0), (3.0, np.nan), (3.0, np.inf)]
+
+
+class TestThermal:
+    """The thermal budget of the coil, I2t."""
+
+    def test_trips_when_the_budget_is_used_up(self):
+        """At a constant current, after tau ln(i^2 / (i^2 - rms^2))."""
+        trip, bench = trips(THERMAL, 100, command=-3.0)
+        expected_s = 0.1 * math.log(9.0 / (9.0 - 4.0))
+        assert trip.sample == math.ceil(expected_s * RATE_HZ) - 1
+        assert trip.code == "thermal"
+        assert trip.reason == (
+            f"thermal budget of the coil, 2 A rms over 0.1 s, was used up at sample {trip.sample}"
+        )
+        assert bench.flagged(Flag.THERMAL) == list(range(trip.sample, 100))
+
+    def test_the_budget_itself_can_be_kept_for_ever(self):
+        """The rms current of the budget never trips; a little more does."""
+        assert trips(THERMAL, 20_000, command=2.0)[0] is None
+        assert trips(replace(THERMAL, safe=2.0), 20, command=2.0)[0] is None
+        assert trips(THERMAL, 20_000, command=2.001)[0] is not None
+
+    def test_sine_is_judged_by_its_rms(self):
+        """A fast sine may have a peak of the square root of two times the budget, and no more."""
+        sine = np.sin(2.0 * np.pi * 200.0 * np.arange(5000) / RATE_HZ)
+        assert trips(THERMAL, 5000, command=2.75 * sine)[0] is None
+        assert trips(THERMAL, 5000, command=2.9 * sine)[0].code == "thermal"
+
+    @pytest.mark.parametrize(("command", "measured"), HEATING)
+    def test_the_larger_of_commanded_and_measured(self, command, measured):
+        """Either current heats, whichever is larger; one that is not measured does not."""
+        trip, _ = trips(THERMAL, 100, command=command, measured=measured)
+        assert trip.sample == trips(THERMAL, 100, command=3.0)[0].sample
+
+    def test_starts_at_the_heat_of_the_safe_value(self):
+        """A coil that rests at a current is warm already."""
+        rested = replace(THERMAL, safe=-1.0)
+        trip, _ = trips(rested, 100, command=3.0)
+        assert trip.sample == math.ceil(0.1 * RATE_HZ * math.log(8.0 / 5.0)) - 1
+
+    def test_budget_is_the_square_of_the_rms(self):
+        """A current of 3 A may flow for ever where 3 A rms are allowed, one of 3.01 A not."""
+        limits = replace(THERMAL, rms_current_a=3.0)
+        assert trips(limits, 5000, command=3.0)[0] is None
+        assert trips(limits, 5000, command=3.01)[0] is not None
+
+    def test_off_for_whatever_current(self):
+        """Without a budget nothing is too hot."""
+        assert trips(STROKE, 1000, command=1e6)[0] is None
+
+
+TRACKING = replace(STROKE, tracking_um=2.0, tracking_s=0.005)
+
+
+class TestTracking:
+    """A displacement that is not where it should be."""
+
+    def test_trips_after_its_time(self):
+        """Too far away for longer than the time trips, and says by how much."""
+        reference = np.concatenate((np.full(10, 1.0), np.full(20, -1.5)))
+        trip, bench = trips(TRACKING, 30, reference=reference, displacement=1.0)
+        assert trip == Trip(
+            15,
+            "tracking_error",
+            "tracking error -2.5 um at sample 15 is beyond 2 um for longer than 0.005 s",
+        )
+        assert bench.flagged(Flag.TRACKING_ERROR) == list(range(15, 30))
+
+    def test_without_a_time(self):
+        """Without a time the first sample beyond trips; the limit itself does not."""
+        limits = replace(TRACKING, tracking_s=0.0)
+        assert trips(limits, 9, reference=3.0, displacement=1.0)[0] is None
+        assert trips(limits, 9, reference=-1.0, displacement=1.0)[0] is None
+        trip, _ = trips(limits, 9, reference=3.01, displacement=1.0)
+        assert trip.reason == "tracking error 2.01 um at sample 0 is beyond 2 um"
+
+    def test_back_in_time_starts_anew(self):
+        """Errors shorter than the time don't add up."""
+        reference = np.tile([9.0] * 5 + [1.0], 50)
+        assert trips(TRACKING, 300, reference=reference, displacement=1.0)[0] is None
+
+    def test_without_a_reference_there_is_no_error(self):
+        """The ramp and current runs have none, and end a stretch of errors."""
+        reference = np.array([9.0] * 5 + [np.nan] + [9.0] * 5 + [np.nan] * 50)
+        assert trips(TRACKING, 61, reference=reference, displacement=1.0)[0] is None
+
+    def test_off_without_a_limit(self):
+        """Without a limit any error will do."""
+        assert trips(STROKE, 100, reference=1e9, displacement=1.0)[0] is None
+
+
+EVERYTHING = replace(
+    STROKE,
+    frozen_s=0.001,
+    frozen_travel=0.5,
+    deviation=0.5,
+    rms_current_a=2.0,
+    time_constant_s=0.001,
+    tracking_um=2.0,
+)
+
+
+class TestSeveral:
+    """Where several interlocks trip."""
+
+    def test_cause_before_consequence(self):
+        """Of all that trip at one sample, the one that explains the others is told."""
+        limits = replace(EVERYTHING, frozen_s=1e-6)
+        moving = {"command": 9.0, "reference": 9.0, "displacement": 1.0}
+        told = []
+        for change in (
+            {"displacement": np.nan},
+            {},
+            {"displacement": 2.0},
+            {"displacement": 2.0, "measured": 9.0},
+            {"displacement": 2.0, "command": 0.0, "measured": 0.0},
+        ):
+            bench = Bench(limits)
+            bench.feed(1, command=0.0, measured=0.0)
+            bench.feed(1, first=1, command=0.0 if "command" in change else 9.0, measured=0.0)
+            told.append(bench.feed(1, first=2, **{**moving, **change}).code)
+        assert told == ["stroke", "sensor_frozen", "deviation", "thermal", "tracking_error"]
+
+    def test_the_first_sample_counts(self):
+        """A sample before another is told first, whatever trips there."""
+        reference = np.array([0.0, 9.0, 0.0])
+        displacement = np.array([0.0, 0.0, np.nan])
+        trip, _ = trips(EVERYTHING, 3, reference=reference, displacement=displacement, measured=0.0)
+        assert (trip.sample, trip.code) == (1, "tracking_error")
+
+    def test_conditions_that_last_are_told_in_every_block(self):
+        """Nothing is held back after the first trip: whoever asks decides."""
+        bench = Bench(STROKE)
+        assert bench.feed(5, displacement=99.0).sample == 0
+        assert bench.feed(5, first=5, displacement=99.0).sample == 5
+        assert bench.feed(5, first=10, displacement=1.0) is None
+
+
+class TestGaps:
+    """Samples that were never exchanged."""
+
+    def test_time_passes_with_the_output_held(self):
+        """Heat after a gap is that of the same samples with the last command held."""
+        whole, gap = Bench(THERMAL), Bench(THERMAL)
+        for bench in (whole, gap):
+            assert bench.feed(20, command=2.5) is None
+        assert whole.feed(30, first=20, command=2.5) is None
+        first = whole.feed(300, first=50, command=2.5).sample
+        assert first > 80
+        assert gap.feed(300, first=50, command=2.5).sample == first
+
+    def test_coil_cools_over_a_gap(self):
+        """Heat falls, too, while nothing flows."""
+        bench = Bench(THERMAL)
+        bench.feed(40, command=3.0)
+        bench.feed(1, first=40, command=0.0)
+        trip = bench.feed(100, first=2041, command=3.0)
+        assert trip.sample - 2041 == trips(THERMAL, 100, command=3.0)[0].sample
+
+    @pytest.mark.parametrize(
+        ("limits", "columns"),
+        [
+            (FROZEN, {"command": np.full(100, 9.0)}),
+            (DEVIATION, {"command": np.zeros(100), "measured": np.full(100, 9.0)}),
+            (TRACKING, {"reference": np.full(100, 9.0)}),
+        ],
+    )
+    def test_conditions_last_over_a_gap(self, limits, columns):
+        """What was wrong before a gap and after it counts for all of it."""
+        bench = Bench(limits)
+        bench.feed(1, command=0.0, measured=0.0)
+        start = {name: values[:2] for name, values in columns.items()}
+        assert bench.feed(2, first=1, **start) is None
+        rest = {name: values[:9] for name, values in columns.items()}
+        assert bench.feed(9, first=40, **rest).sample == 40
+
+    @pytest.mark.parametrize("limits", [FROZEN, DEVIATION, TRACKING])
+    def test_gap_alone_is_no_condition(self, limits):
+        """A gap after which all is as it should be trips nothing; what starts then starts anew."""
+        bench = Bench(limits)
+        assert bench.feed(5, measured=0.0, reference=1.0) is None
+        assert bench.feed(5, first=5000, measured=0.0, reference=1.0) is None
+        trip = bench.feed(50, first=5005, command=9.0, measured=-9.0, reference=9.0)
+        assert trip.sample == 5005 + {FROZEN: 10, DEVIATION: 3, TRACKING: 5}[limits]
+
+
+class TestTimes:
+    """Seconds to samples."""
+
+    @pytest.mark.parametrize(
+        ("time_s", "rate_hz", "samples"),
+        [(0.0, 1e3, 0), (1e-6, 1e3, 1), (0.07, 100.0, 7), (0.0101, 1e3, 11), (0.003, 5e4, 150)],
+    )
+    def test_rounded_up_but_for_the_last_bit(self, time_s, rate_hz, samples):
+        """A condition never has less than its time; 0.07 s at 100 Hz are 7 samples, not 8."""
+        bench = Bench(replace(TRACKING, tracking_s=time_s), rate_hz)
+        assert bench.feed(500, reference=9.0).sample == samples
+
+    def test_warming(self):
+        """The share of one sample is exact for a current that is held."""
+        assert warming(0.25, 100.0) == pytest.approx(1.0 - math.exp(-0.04), rel=1e-14)
+        assert warming(3600.0, 200e3) == pytest.approx(1.0 / (3600.0 * 200e3), rel=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "text"),
+    [
+        ("frozen_s", 0.0, "frozen_s must be > 0: 0.0"),
+        ("frozen_travel", 0.0, "frozen_travel must be > 0: 0.0"),
+        ("rms_current_a", -1.0, "rms_current_a must be > 0: -1.0"),
+        ("time_constant_s", math.nan, "time_constant_s must be > 0: nan"),
+        ("frozen_um", -0.1, "frozen_um must be >= 0: -0.1"),
+        ("deviation", math.nan, "deviation must be >= 0: nan"),
+        ("deviation_s", -1.0, "deviation_s must be >= 0: -1.0"),
+        ("tracking_um", -1.0, "tracking_um must be >= 0: -1.0"),
+        ("tracking_s", math.nan, "tracking_s must be >= 0: nan"),
+        ("stroke_um", (1.0, 1.0), "stroke_um must be lowest and highest: 1.0, 1.0"),
+        ("sensor_um", (2.0, 1.0), "sensor_um must be lowest and highest: 2.0, 1.0"),
+    ],
+)
+def test_limits_that_mean_nothing_are_refused(field, value, text):
+    """Limits themselves are checked, each rule by name."""
+    with pytest.raises(InputError) as caught:
+        replace(STROKE, **{field: value})
+    assert str(caught.value) == text
+
+
+def test_zero_is_a_limit_where_it_means_something():
+    """No distance at all may be asked for."""
+    limits = replace(STROKE, deviation=0.0, tracking_um=0.0, frozen_um=0.0, safe=1.0)
+    assert trips(limits, 5, command=1.0, measured=1.0, reference=1.0)[0] is None
+    assert trips(limits, 5, command=1.0, measured=1.1)[0].code == "deviation"

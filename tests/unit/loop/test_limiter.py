@@ -1,0 +1,123 @@
+"""The limiter as the loop uses it."""
+
+import numpy as np
+import pytest
+
+from hilctl.base.errors import InputError
+from hilctl.base.flags import Flag
+from hilctl.loop.limiter import CommandLimits, Limiter
+
+LIMITS = CommandLimits(low=-2.0, high=3.0, slew_per_s=100.0, safe=0.5, ramp_per_s=50.0)
+DT_S = 1e-3
+SWEEP = [-np.inf, -1e9, -3.0, -2.0, -1.0, 0.0, 0.5, 1.0, 3.0, 3.5, 1e9, np.inf, np.nan]
+
+
+def limited(limiter, wanted):
+    wanted = np.asarray(wanted, dtype=np.float64)
+    command, flags = np.empty_like(wanted), np.zeros(wanted.size, dtype=np.uint32)
+    limiter.limit(wanted, command, flags)
+    return command, flags
+
+
+def test_starts_at_the_safe_value():
+    """The first step is measured from the safe value, where the output rests before a run."""
+    command, flags = limited(Limiter(LIMITS, DT_S), [3.0])
+    assert command.tolist() == [0.6]
+    assert flags.tolist() == [Flag.SLEW_LIMITED]
+
+
+@pytest.mark.parametrize("before", SWEEP)
+@pytest.mark.parametrize("after", SWEEP)
+def test_no_pair_of_wishes_gets_out(before, after):
+    """Whatever is asked for, commands are finite, within range and within slew."""
+    limiter = Limiter(LIMITS, DT_S)
+    last = limiter.last
+    for wish in (before, after) * 40:
+        command, flags = limited(limiter, [wish])
+        assert LIMITS.low <= command[0] <= LIMITS.high
+        assert abs(command[0] - last) <= LIMITS.slew_per_s * DT_S * (1 + 1e-12)
+        assert bool(flags[0] & Flag.INVALID) == (not np.isfinite(wish))
+        assert bool(flags[0] & Flag.RANGE_LIMITED) == (
+            np.isfinite(wish) and not LIMITS.low <= wish <= LIMITS.high
+        )
+        assert limiter.last == command[0]
+        last = command[0]
+
+
+def test_the_sweep_covers_both_limits():
+    """The sweep above means something: both range limits are reached by it."""
+    limiter = Limiter(LIMITS, DT_S)
+    assert limited(limiter, [1e9] * 100)[0][-1] == LIMITS.high
+    assert limited(limiter, [-1e9] * 100)[0][-1] == LIMITS.low
+
+
+def test_wishes_within_limits_pass_untouched():
+    """Nothing is rounded, flagged or delayed where nothing has to be limited."""
+    wanted = 0.5 + 0.3 * np.sin(np.linspace(0.0, 3.0, 200))
+    command, flags = limited(Limiter(LIMITS, DT_S), wanted)
+    assert np.array_equal(command, wanted)
+    assert not flags.any()
+
+
+def test_ramp_ends_exactly_at_the_safe_value():
+    """The ramp goes straight to the safe value, in its own slew, and says when it is there."""
+    limiter = Limiter(LIMITS, DT_S)
+    limited(limiter, np.full(100, 3.0))
+    way, done = [], False
+    while not done:
+        command, flags = np.empty(7), np.zeros(7, dtype=np.uint32)
+        done = limiter.ramp(command, flags)
+        assert (flags == Flag.RAMP).all()
+        way += command.tolist()
+    steps = np.diff([3.0, *way])
+    assert way[-1] == LIMITS.safe
+    assert (steps <= 0.0).all()
+    assert np.abs(steps).max() == pytest.approx(LIMITS.ramp_per_s * DT_S)
+    assert len(way) == 56  # 2.5 / 0.05 = 50 samples, in blocks of 7
+
+
+def test_a_block_of_no_samples_changes_nothing():
+    """An empty block leaves the last command as it is."""
+    limiter = Limiter(LIMITS, DT_S)
+    limited(limiter, [0.55])
+    limited(limiter, [])
+    assert limiter.last == 0.55
+    assert not limiter.ramp(np.empty(0), np.zeros(0, dtype=np.uint32))
+
+
+FIELDS = {"low": -2.0, "high": 3.0, "slew_per_s": 100.0, "safe": 0.5, "ramp_per_s": 50.0}
+RANGE = "limits must be finite and rising: "
+SAFE = "the safe value must lie within -2.0 to 3.0: "
+RAMP = "the ramp must be > 0 and no faster than the slew limit "
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        ({"low": 4.0}, RANGE + "4.0, 3.0"),
+        ({"low": 3.0}, RANGE + "3.0, 3.0"),
+        ({"high": np.inf}, RANGE + "-2.0, inf"),
+        ({"low": -np.inf}, RANGE + "-inf, 3.0"),
+        ({"low": np.nan}, RANGE + "nan, 3.0"),
+        ({"safe": 3.1}, SAFE + "3.1"),
+        ({"safe": -2.1}, SAFE + "-2.1"),
+        ({"safe": np.nan}, SAFE + "nan"),
+        ({"ramp_per_s": 0.0}, RAMP + "100.0: 0.0"),
+        ({"ramp_per_s": 101.0}, RAMP + "100.0: 101.0"),
+        ({"slew_per_s": np.inf}, RAMP + "inf: 50.0"),
+    ],
+)
+def test_limits_that_mean_nothing_are_refused(change, text):
+    """Limits themselves are checked, each rule by name and with the values that break it."""
+    with pytest.raises(InputError) as caught:
+        CommandLimits(**{**FIELDS, **change})
+    assert str(caught.value) == text
+
+
+@pytest.mark.parametrize(
+    "change", [{"safe": -2.0}, {"safe": 3.0}, {"ramp_per_s": 100.0}, {"ramp_per_s": 1e-3}]
+)
+def test_edges_of_limits_are_allowed(change):
+    """The safe value may be at an end of the range, and the ramp as fast as the slew or slow."""
+    limits = CommandLimits(**{**FIELDS, **change})
+    assert {name: getattr(limits, name) for name in FIELDS} == {**FIELDS, **change}

@@ -1,0 +1,74 @@
+"""Gain and offset of a running reference."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hilctl.loop.plan import Tuning
+from hilctl.loop.tuning import Tuner, tuning_samples, tuning_text
+
+
+def run(tuner, reference, block, moves):
+    """Put a reference through in blocks; ``moves`` begin at sample indices."""
+    out = np.empty_like(reference)
+    for start in range(0, reference.size, block):
+        if start in moves:
+            tuner.move(moves[start])
+        part = slice(start, start + block)
+        tuner.apply(reference[part], out[part])
+    return out
+
+
+def test_untouched_reference_passes_bit_for_bit():
+    """Nothing is multiplied or added before somebody asks for it."""
+    reference = np.random.default_rng(1).normal(size=100)
+    assert run(Tuner(), reference, 7, {}).tobytes() == reference.tobytes()
+
+
+def test_change_is_a_straight_ramp_to_exactly_what_is_wanted():
+    """Every step is the same, and the end is the wanted value, not one near it."""
+    out = run(Tuner(), np.ones(100), 10, {20: Tuning(0.3, 0.4, 30)})
+    assert (out[:20] == 1.0).all()
+    assert np.diff(out[19:50]) == pytest.approx(np.full(30, -0.3 / 30))
+    assert (out[50:] == 0.3 * 1.0 + 0.4).all()
+
+
+def test_second_change_begins_where_the_first_stands():
+    """A change that overtakes another makes no jump."""
+    out = run(Tuner(), np.ones(100), 5, {10: Tuning(0.0, 0.0, 50), 30: Tuning(1.0, 0.0, 20)})
+    assert np.abs(np.diff(out)).max() == pytest.approx(0.4 / 20)
+    assert (out[50:] == 1.0).all()
+
+
+@given(st.integers(1, 40), st.integers(0, 3), st.integers(1, 60))
+def test_block_cuts_make_no_difference(block, start, samples):
+    """A change comes out the same however the samples are cut into blocks."""
+    reference = np.sin(np.arange(240) / 5.0)
+    begin = start * 40
+    whole, cut = Tuner(), Tuner()
+    expected = run(whole, reference, 40, {begin: Tuning(0.5, 1.0, samples)})
+    out = np.empty_like(reference)
+    at = 0
+    while at < reference.size:
+        stop = min(at + block, reference.size, begin if at < begin else reference.size)
+        if at == begin:
+            cut.move(Tuning(0.5, 1.0, samples))
+        cut.apply(reference[at:stop], out[at:stop])
+        at = stop
+    assert out == pytest.approx(expected, abs=1e-15)
+
+
+@given(
+    st.floats(-1e3, 1e3),
+    st.floats(-1e3, 1e3),
+    st.integers(min_value=1, max_value=10**9),
+)
+def test_length_of_a_change_can_be_read_again(gain, offset, samples):
+    """What a recording says of a change gives the samples it took, whatever the values."""
+    assert tuning_samples(tuning_text(Tuning(gain, offset, samples))) == samples
+
+
+def test_other_texts_tell_no_length():
+    """A recording of another make has nothing to say."""
+    assert tuning_samples("reference gain to 2, over all") == 0

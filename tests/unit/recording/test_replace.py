@@ -1,0 +1,271 @@
+"""Recovery and the files around it: nothing is destroyed, nothing is touched without need."""
+
+import io
+import logging
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+
+from hilctl.analysis.replay import replay
+from hilctl.base.errors import DataError, InputError
+from hilctl.recording.reader import read
+from hilctl.recording.recover import recover_recording
+from hilctl.recording.writer import OutputFile
+
+GOLDEN = Path(__file__).parents[3] / "recordings" / "golden"
+
+
+@pytest.fixture
+def batches(make):
+    return [make.batch(1000 * i, 20, seed=i) for i in range(5)]
+
+
+@pytest.fixture
+def torn(make, batches, tmp_path):
+    """A recording that was killed while it wrote its fourth chunk."""
+    stream = io.BytesIO()
+    make.write(stream, batches[:3], finish=False)
+    path = tmp_path / "run.mcap"
+    path.write_bytes(stream.getvalue() + b"\x06\x00")
+    return path
+
+
+def state(folder):
+    return {path.name: (path.read_bytes(), path.stat().st_mtime_ns) for path in folder.iterdir()}
+
+
+def test_the_bytes_as_they_were_stay(torn):
+    """Each recovery of a torn file keeps it under a name that was free."""
+    bytes_before = torn.read_bytes()
+    assert recover_recording(torn).original == torn.with_name("run.mcap.torn")
+    torn.write_bytes(bytes_before[:-3000])
+    assert recover_recording(torn).original == torn.with_name("run.mcap.torn2")
+    assert torn.with_name("run.mcap.torn").read_bytes() == bytes_before
+    assert torn.with_name("run.mcap.torn2").read_bytes() == bytes_before[:-3000]
+    assert len(list(torn.parent.iterdir())) == 3
+
+
+def test_a_sound_file_is_left_alone(torn):
+    """Nothing is written where nothing is wrong, also the second time."""
+    recover_recording(torn)
+    before = state(torn.parent)
+    recovered = recover_recording(torn)
+    assert recovered.sound
+    assert recovered.reason == "sound: nothing to recover"
+    assert recovered.samples == 3000
+    assert state(torn.parent) == before
+
+
+def test_output_leaves_the_file_where_it_is(torn):
+    """With another file to write to, the old one stays; an existing one is not replaced."""
+    before = torn.read_bytes()
+    output = torn.with_name("whole.mcap")
+    recovered = recover_recording(torn, output=output)
+    assert (recovered.path, recovered.original) == (output, torn)
+    assert torn.read_bytes() == before
+    assert read(output).samples.index.size == 3000
+    whole = output.read_bytes()
+    with pytest.raises(InputError, match="exists already"):
+        recover_recording(torn, output=output)
+    assert output.read_bytes() == whole
+    assert len(list(torn.parent.iterdir())) == 2
+
+
+def test_a_full_disk_changes_nothing(torn, monkeypatch):
+    """Where the new file can't be written, the old one is as it was and nothing is left over."""
+    import hilctl.recording.replace as module
+
+    def full(number):
+        raise OSError(28, "No space left on device")
+
+    before = state(torn.parent)
+    monkeypatch.setattr(module.os, "fsync", full)
+    with pytest.raises(InputError, match="No space left"):
+        recover_recording(torn)
+    assert state(torn.parent) == before
+
+
+def test_without_hard_links_the_old_file_is_renamed(torn, monkeypatch):
+    """On file systems that have none, the old file is kept all the same."""
+    import hilctl.recording.replace as module
+
+    def refuse(self, target):
+        raise OSError(1, "Operation not permitted")
+
+    before = torn.read_bytes()
+    monkeypatch.setattr(module.Path, "hardlink_to", refuse)
+    assert recover_recording(torn).original.read_bytes() == before
+    assert read(torn).samples.index.size == 3000
+
+
+def test_permissions_are_kept(torn):
+    """Who could read the file can read the new one."""
+    torn.chmod(0o640)
+    recover_recording(torn)
+    assert torn.stat().st_mode & 0o777 == 0o640
+
+
+def test_a_link_stays_a_link(torn):
+    """Where the path is a link, the file it leads to is recovered."""
+    link = torn.with_name("latest.mcap")
+    link.symlink_to(torn.name)
+    recover_recording(link)
+    assert link.is_symlink()
+    assert read(link).end["code"] == "recovered"
+
+
+def test_reading_warns_and_writes_nothing(torn, caplog):
+    """Opening says in one line that the file is cut short; the folder stays as it was."""
+    before = state(torn.parent)
+    torn.parent.chmod(0o555)
+    with caplog.at_level(logging.WARNING, logger="hilctl"):
+        samples = read(torn).samples
+    torn.parent.chmod(0o755)
+    assert samples.index.size == 3000
+    assert state(torn.parent) == before
+    (line,) = caplog.messages
+    assert str(torn) in line
+    assert "3000 samples are read ('hilctl recover'" in line
+    caplog.clear()
+    recover_recording(torn)
+    read(torn)
+    assert not caplog.messages
+
+
+def test_torn_and_recovered_read_alike(torn):
+    """Reading a torn file gives the samples, ticks and starts that its recovery gives."""
+    before = read(torn)
+    recover_recording(torn)
+    after = read(torn)
+    for name in ("index", "command", "displacement_um", "flags"):
+        assert np.array_equal(getattr(before.samples, name), getattr(after.samples, name))
+    assert np.array_equal(before.ticks.late_ns, after.ticks.late_ns)
+    assert [each.sample for each in before.starts] == [each.sample for each in after.starts]
+    assert (before.end, after.end["code"]) == ({}, "recovered")
+    assert "after it is unknown" in after.end["reason"]
+
+
+def test_a_gap_in_a_torn_file_is_counted(make, tmp_path):
+    """Samples missing between those that are there count as dropped, end or no end."""
+    path = tmp_path / "run.mcap"
+    with path.open("wb") as stream:
+        make.write(stream, [make.batch(0, 4), make.batch(350, 4, dropped=150)], finish=False)
+    assert read(path).dropped == 150
+
+
+def test_a_recording_in_progress_is_refused(torn, caplog):
+    """What a run still writes to is not recovered, and reading it says so."""
+    whole = torn.read_bytes()
+    claimed = OutputFile(torn, overwrite=True)
+    with pytest.raises(InputError, match="another hilctl is recording"):
+        recover_recording(torn)
+    with pytest.raises(OSError, match="another hilctl is recording"):
+        OutputFile(torn, overwrite=True)
+    read(torn)
+    assert "is still being recorded" in caplog.text
+    claimed.give_back()
+    assert torn.read_bytes() == whole
+    assert not recover_recording(torn).sound
+
+
+def test_absent_and_other_files_are_refused(tmp_path):
+    """What is not there or holds nothing is refused by name, and stays."""
+    path = tmp_path / "x.mcap"
+    with pytest.raises(DataError, match="no such file"):
+        recover_recording(path)
+    path.write_bytes(b"\xff" * 99)
+    with pytest.raises(DataError, match=r"x\.mcap: holds no whole record"):
+        recover_recording(path)
+    assert state(tmp_path).keys() == {"x.mcap"}
+
+
+def test_ring_batches_fill_the_end(torn, batches):
+    """Blocks that the file lacks are added, those it has are left out, bit for bit."""
+    recovered = recover_recording(torn, batches[2:], {"code": "fault", "reason": "killed"})
+    assert (recovered.samples, recovered.added_samples) == (5000, 2000)
+    assert recovered.missing_samples == 0
+    back = read(torn)
+    assert back.samples.index.tolist() == list(range(5000))
+    expected = np.concatenate([b.columns.transpose(1, 0, 2).reshape(6, -1) for b in batches], 1)
+    assert np.array_equal(back.samples.measured, expected[4])
+    assert np.array_equal(back.samples.input_um, expected[5])
+    assert np.array_equal(back.samples.flags, np.concatenate([b.flags.ravel() for b in batches]))
+    assert back.ticks.late_ns.tolist() == np.concatenate([b.heads[:, 5] for b in batches]).tolist()
+    assert (back.end["code"], back.end["reason"]) == ("fault", "killed")
+    assert [start.sample for start in back.starts] == [0]
+    assert "2000 samples added from the ring" in back.events[-1].text
+    with torn.open("rb") as stream:
+        numbers = {}
+        for _, channel, message in make_reader(stream).iter_messages(log_time_order=False):
+            numbers.setdefault(channel.topic, []).append(message.sequence)
+    assert all(each == list(range(len(each))) for each in numbers.values())
+
+
+def test_parts_of_ring_batches_and_gaps(torn, batches, make):
+    """Of a batch that is partly in the file the rest is added; a gap is dropped samples."""
+    straddling = make.batch(2500, 20, seed=9)
+    late = batches[4].rows(slice(4, 20))
+    recovered = recover_recording(torn, [straddling, late], ended_at=6000)
+    assert (recovered.samples, recovered.added_samples) == (4300, 1300)
+    back = read(torn)
+    assert back.samples.index.tolist() == [*range(3500), *range(4200, 5000)]
+    assert recovered.missing_samples == back.dropped == 1700
+    assert [start.sample for start in back.starts] == [0, 4200]
+    assert back.starts[1].state.tolist() == late.states[0, :-1].tolist()
+    assert back.end["recorded_samples"] == "4300"
+
+
+def test_ring_batches_alone(make, batches, tmp_path):
+    """A file of which only the facts were written takes all samples from the ring."""
+    stream = io.BytesIO()
+    make.write(stream, [], finish=False)
+    path = tmp_path / "run.mcap"
+    path.write_bytes(stream.getvalue())
+    recovered = recover_recording(path, batches)
+    assert recovered.added_samples == read(path).samples.index.size == 5000
+
+
+def test_a_sound_file_with_all_of_the_ring_is_left_alone(torn, batches):
+    """Batches that a sound file holds already change nothing."""
+    recover_recording(torn)
+    before = state(torn.parent)
+    assert recover_recording(torn, batches[:3]).sound
+    assert state(torn.parent) == before
+
+
+def test_replay_leaves_out_what_stands_behind_lost_samples(tmp_path):
+    """After a damaged chunk the compensator's memory is not known; what is before it replays."""
+    data = bytearray((GOLDEN / "piezo_compensated.mcap").read_bytes())
+    data[len(data) // 2] ^= 4
+    path = tmp_path / "run.mcap"
+    path.write_bytes(data)
+    for recording in (read(path), read(recover_recording(path).path)):
+        result = replay(recording)
+        assert result.identical
+        assert result.left_out_samples > 0
+        assert result.samples + result.left_out_samples == recording.samples.index.size
+
+
+def test_the_command(torn):
+    """The command line recovers once, says what it did, and then finds nothing to do."""
+
+    def hilctl(*arguments):
+        return subprocess.run(
+            [sys.executable, "-m", "hilctl.cli", *map(str, arguments)],
+            capture_output=True,
+            text=True,
+            timeout=120,
+        )
+
+    reported = hilctl("export", torn, torn.with_name("run.csv"))
+    assert reported.stderr.startswith(f"hilctl: {torn}: ")
+    assert "'hilctl recover' makes it a whole file again" in reported.stderr.splitlines()[0]
+    first = hilctl("recover", torn)
+    assert (first.returncode, first.stderr) == (0, "")
+    assert f"the file as it was: {torn}.torn" in first.stdout
+    second = hilctl("recover", torn)
+    assert second.stdout == f"{torn}: sound: nothing to recover\n"

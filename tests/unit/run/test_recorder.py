@@ -1,0 +1,113 @@
+"""The recorder of a run whose file can't be written to its end: every sample is counted once."""
+
+import io
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hilctl.base.blocks import Batch, Head
+from hilctl.recording.reader import read
+from hilctl.run import recorder
+from hilctl.run.recorder import Recorder, steady_unix_ns
+from hilctl.run.start import checked_experiment
+
+EXPERIMENT = Path(__file__).parents[3] / "configs" / "demo.yaml"
+BLOCK = 10
+END = {"code": "completed", "reason": "waveform completed"}
+
+
+class Disk(io.BytesIO):
+    """A file in memory that refuses to grow beyond ``room`` bytes."""
+
+    room = 10**9
+
+    def write(self, data: bytes) -> int:
+        if self.tell() + len(data) > self.room:
+            raise OSError(28, "No space left on device")
+        return super().write(data)
+
+
+class DiskFile:
+    """What the recorder takes for its file."""
+
+    def __init__(self) -> None:
+        self.stream = Disk()
+
+    def begin(self) -> Disk:
+        return self.stream
+
+
+def batch(first: int, blocks: int, dropped: int = 0) -> Batch:
+    """Return blocks that follow one another, the first behind a gap of ``dropped`` samples."""
+    made = Batch.empty(blocks, BLOCK, 3)
+    made.heads[:, Head.FIRST_SAMPLE] = first + BLOCK * np.arange(blocks)
+    made.heads[:, Head.SAMPLES] = BLOCK
+    made.heads[0, Head.DROPPED_BEFORE] = dropped
+    made.columns[:] = np.random.default_rng(first).normal(size=made.columns.shape)
+    return made
+
+
+@pytest.fixture(scope="module")
+def checked():
+    """An experiment that may start."""
+    return checked_experiment(EXPERIMENT, [])
+
+
+@pytest.fixture
+def begun(checked, monkeypatch, tmp_path):
+    """Return a recorder that has begun, and the disk that it writes to."""
+    file = DiskFile()
+    monkeypatch.setattr(recorder, "OutputFile", lambda path, overwrite: file)
+    made = Recorder(checked, tmp_path / "run.mcap", overwrite=False)
+    made.begin(10**18, {})
+    return made, file.stream
+
+
+def test_what_was_not_flushed_is_lost_with_the_rest(begun, tmp_path):
+    """The chunk that did not fit and all that comes after it are missing; the rest is read."""
+    made, disk = begun
+    made.batch(batch(0, 20))
+    made.flush()
+    content = disk.getvalue()
+    disk.room = disk.tell() + 100
+    made.batch(batch(200, 20))
+    assert (made.samples, made.missing, made.error) == (400, 0, "")
+    made.flush()
+    assert "can't be written: No space left on device" in made.error
+    assert (made.samples, made.missing, made.next_sample) == (200, 200, 400)
+    made.batch(batch(450, 5, dropped=50))
+    assert (made.samples, made.missing, made.next_sample) == (200, 300, 500)
+    made.finish(END, 500)
+    (tmp_path / "cut.mcap").write_bytes(content)
+    assert read(tmp_path / "cut.mcap").samples.index.size == made.samples
+
+
+def test_gaps_are_counted_while_all_is_well(begun):
+    """Samples that the ring had no room for are missing, those written are not."""
+    made, _ = begun
+    made.batch(batch(0, 2))
+    made.batch(batch(50, 3, dropped=30))
+    made.flush()
+    assert (made.samples, made.missing, made.next_sample) == (50, 30, 80)
+
+
+def test_full_disk_at_the_very_end_is_told(begun):
+    """A recording without its end facts is an error, though every sample is in it."""
+    made, disk = begun
+    made.batch(batch(0, 20))
+    made.flush()
+    disk.room = disk.tell()
+    made.finish(END, 200)
+    assert "No space left" in made.error
+    assert (made.samples, made.missing) == (200, 0)
+
+
+def test_times_go_on_when_the_wall_clock_is_set(monkeypatch):
+    """Unix time is taken once; from then on the monotonic clock counts."""
+    wall_ns, passed_ns = 5 * 10**18, 1000
+    monkeypatch.setattr(recorder.time, "time_ns", lambda: wall_ns)
+    monkeypatch.setattr(recorder.time, "monotonic_ns", lambda: passed_ns)
+    unix_ns = steady_unix_ns()
+    wall_ns, passed_ns = wall_ns - 3600 * 10**9, passed_ns + 7
+    assert unix_ns() == 5 * 10**18 + 7
