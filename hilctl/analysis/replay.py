@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from hilctl.base.arrays import F64, U32
 from hilctl.base.errors import DataError
-from hilctl.base.flags import Flag
+from hilctl.base.samples import Flag
 from hilctl.base.yaml.document import Document
 from hilctl.experiment.file import Experiment
 from hilctl.loop.compensator import Compensator

@@ -11,7 +11,7 @@ from hilctl.analysis.steady import SteadyPart, error_um, steady_part, waveform_e
 from hilctl.analysis.table import render
 from hilctl.base.arrays import F64
 from hilctl.base.errors import DataError
-from hilctl.base.flags import Flag
+from hilctl.base.samples import Flag
 from hilctl.base.segments import Segment
 from hilctl.recording.data import Recording
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from hilctl.analysis.metrics import Fold, fold
 from hilctl.base.arrays import F64
-from hilctl.base.flags import Flag
+from hilctl.base.samples import Flag
 from hilctl.base.segments import Segment
 from hilctl.loop.tuning import TUNED, tuning_samples
 from hilctl.recording.data import Recording, Samples

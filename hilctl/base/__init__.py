@@ -5,7 +5,7 @@ device.py    the contract of a device and of a clock
 errors.py    every exception that is raised on purpose
 strict.py    base of every pydantic model
 files.py     text files, read once
-blocks.py    a sample's columns and a block of samples; flags.py  what may be said of a sample
+samples.py   a sample's columns and flags, and blocks of samples
 events.py    what a run tells beside its samples
 segments.py  which samples of a run are judged
 yaml/        plain YAML in, with the line of every value and all problems at once

@@ -1,6 +1,7 @@
 """What a run tells beside its samples."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 
 @dataclass(frozen=True, slots=True)
@@ -12,9 +13,11 @@ class LoopEvent:
         level: ``info``, ``warning`` or ``error``.
         code: Short name for programs.
         text: One line for people.
+        values: Its numbers by name, for programs.
     """
 
     sample: int
     level: str
     code: str
     text: str
+    values: Mapping[str, float] = field(default_factory=dict)

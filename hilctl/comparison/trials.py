@@ -14,7 +14,7 @@ import numpy as np
 from hilctl.analysis.metrics import fold, peak, peak_hysteresis_percent, peak_to_peak, percent, rms
 from hilctl.base.arrays import F64, U32
 from hilctl.base.errors import InputError
-from hilctl.base.flags import Flag
+from hilctl.base.samples import Flag
 from hilctl.comparison.data import Loops
 from hilctl.experiment.load import LoadedExperiment
 from hilctl.loop.compensator import Compensator

@@ -9,7 +9,7 @@ import numpy as np
 
 from hilctl.base.device import CommandUnit
 from hilctl.base.errors import DataError, InputError
-from hilctl.base.flags import Flag
+from hilctl.base.samples import Flag
 from hilctl.identify.cycles import find_cycles, loops_from_recording
 from hilctl.identify.data import History, Record
 from hilctl.identify.fit import Fit

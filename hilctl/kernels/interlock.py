@@ -6,7 +6,7 @@ samples; one that is infinite switches its interlock off.
 """
 
 from hilctl.base.arrays import F64, U32
-from hilctl.base.flags import Flag
+from hilctl.base.samples import Flag
 from hilctl.kernels.jit import kernel
 
 (

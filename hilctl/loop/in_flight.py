@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 from hilctl.base.arrays import F64, I64, U32
-from hilctl.base.blocks import Batch, Head
+from hilctl.base.samples import Batch, Head
 
 _SEQUENCE = int(Head.SEQUENCE)
 
@@ -20,7 +20,7 @@ class SentBlock:
 
     Attributes:
         head: int64[len(Head)], what others see of it while it is on its way.
-        columns: float64[6, B], see :data:`hilctl.base.blocks.COLUMNS`; its rows are below.
+        columns: float64[6, B], see :data:`hilctl.base.samples.COLUMNS`; its rows are below.
         flags: uint32[B].
         state: float64[s], the memory before the block.
         first_sample: Its first sample.

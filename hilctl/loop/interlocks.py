@@ -13,7 +13,7 @@ import numpy as np
 from hilctl.base.arrays import F64, U32
 from hilctl.base.device import CommandUnit
 from hilctl.base.errors import InputError
-from hilctl.base.flags import Flag
+from hilctl.base.samples import Flag
 from hilctl.kernels import interlock as kernels
 
 TripCode: TypeAlias = Literal[

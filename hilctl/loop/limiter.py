@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from hilctl.base.arrays import F64, U32
 from hilctl.base.errors import InputError
-from hilctl.base.flags import Flag
+from hilctl.base.samples import Flag
 from hilctl.kernels.limit import limit_block
 
 

@@ -17,7 +17,7 @@ from hilctl.base.arrays import F64, U32
 from hilctl.base.device import Clock, Device
 from hilctl.base.errors import DeviceError
 from hilctl.base.events import LoopEvent
-from hilctl.base.flags import Flag
+from hilctl.base.samples import Flag
 from hilctl.loop.compensator import Compensator
 from hilctl.loop.feedback import Feedback
 from hilctl.loop.in_flight import DelayLine, SentBlock

@@ -22,7 +22,7 @@ class Samples:
         command: float64[n], command that was put out.
         measured: float64[n], command as the device measured it; empty where it does not.
         displacement_um: float64[n], sampled when ``command`` was put out.
-        flags: uint32[n], bits of :class:`hilctl.base.flags.Flag`.
+        flags: uint32[n], bits of :class:`hilctl.base.samples.Flag`.
         input_um: float64[n], what the compensator was fed: the reference ahead of its time, with
             what is added to it; NaN on the ramp, empty where the reference itself was fed.
     """

@@ -8,9 +8,9 @@ import numpy as np
 from mcap.writer import Writer
 
 from hilctl.base.arrays import F64, U32
-from hilctl.base.blocks import COLUMNS, Batch, Head
 from hilctl.base.device import CommandUnit
 from hilctl.base.errors import DataError
+from hilctl.base.samples import COLUMNS, Batch, Head
 from hilctl.recording import schema
 from hilctl.recording.data import Event
 

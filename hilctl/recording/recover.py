@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 from google.protobuf.message import DecodeError
 
-from hilctl.base.blocks import Batch, Head
 from hilctl.base.errors import DataError, InputError
 from hilctl.base.events import LoopEvent
+from hilctl.base.samples import Batch, Head
 from hilctl.recording.messages import Layout
 from hilctl.recording.replace import Replacement
 from hilctl.recording.rewrite import Resaved, Survey

@@ -7,8 +7,8 @@ from mcap.records import Attachment, Channel, McapRecord, Message, Metadata, Sch
 from mcap.writer import CompressionType, Writer
 
 from hilctl import __version__
-from hilctl.base.blocks import Batch
 from hilctl.base.events import LoopEvent
+from hilctl.base.samples import Batch
 from hilctl.recording import schema
 from hilctl.recording.data import Event
 from hilctl.recording.messages import Layout, MessageMaker, Topics

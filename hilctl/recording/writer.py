@@ -16,8 +16,8 @@ from typing import BinaryIO
 from mcap.writer import CompressionType, Writer
 
 from hilctl import __version__
-from hilctl.base.blocks import Batch
 from hilctl.base.device import CommandUnit
+from hilctl.base.samples import Batch
 from hilctl.base.segments import Segment
 from hilctl.recording.data import Event
 from hilctl.recording.messages import Layout, MessageMaker, Topics

@@ -7,9 +7,9 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from hilctl.base.blocks import Batch, Head
 from hilctl.base.errors import HilctlError
 from hilctl.base.events import LoopEvent
+from hilctl.base.samples import Batch, Head
 from hilctl.loop.plan import Outcome
 from hilctl.recording.recover import recover_recording
 from hilctl.run.ending import end_facts

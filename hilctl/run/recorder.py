@@ -7,9 +7,9 @@ from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 
-from hilctl.base.blocks import Batch, Head
 from hilctl.base.errors import InputError
 from hilctl.base.events import LoopEvent
+from hilctl.base.samples import Batch, Head
 from hilctl.experiment.check import Checked
 from hilctl.experiment.correction import dump_correction
 from hilctl.models.files import dump_model

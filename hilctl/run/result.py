@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from hilctl.base.blocks import Batch
+from hilctl.base.samples import Batch
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,8 +19,7 @@ from typing import Any, Self
 import numpy as np
 
 from hilctl.base.arrays import F64, U32
-from hilctl.base.blocks import ANSWERS, COLUMNS, Batch, Head
-from hilctl.base.flags import Flag
+from hilctl.base.samples import ANSWERS, COLUMNS, Batch, Flag, Head
 from hilctl.run.shared_page import SIZE as _PAGE_SIZE
 from hilctl.run.shared_page import ControlPage, Field
 
@@ -124,9 +123,9 @@ class SampleRing(ControlPage):
         """Put one block in; never waits.
 
         Args:
-            head: Numbers of :class:`~hilctl.base.blocks.Head` after the sequence.
-            state: float64[s], see :class:`~hilctl.base.blocks.Batch`.
-            columns: float64[6, B], see :class:`~hilctl.base.blocks.Batch`.
+            head: Numbers of :class:`~hilctl.base.samples.Head` after the sequence.
+            state: float64[s], see :class:`~hilctl.base.samples.Batch`.
+            columns: float64[6, B], see :class:`~hilctl.base.samples.Batch`.
             flags: uint32[B].
 
         Returns:
@@ -197,7 +196,7 @@ class SampleRing(ControlPage):
                 before it has come out.
 
         Returns:
-            The blocks in order, with :attr:`~hilctl.base.flags.Flag.UNANSWERED` on every sample, or
+            The blocks in order, every sample with :attr:`~hilctl.base.samples.Flag.UNANSWERED`, or
             None. The last may not have reached the device.
         """
         numbers = self.sent.heads[:, Head.SEQUENCE]

@@ -3,7 +3,7 @@
 import numpy as np
 
 from hilctl.base.arrays import F64, I64, U32
-from hilctl.base.blocks import COLUMNS, Batch, Head
+from hilctl.base.samples import COLUMNS, Batch, Head
 from hilctl.recording.data import Samples
 
 _SPARE = 20

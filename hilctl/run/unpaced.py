@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from hilctl.base.arrays import F64, U32
-from hilctl.base.blocks import Batch
 from hilctl.base.errors import InputError
 from hilctl.base.events import LoopEvent
+from hilctl.base.samples import Batch
 from hilctl.experiment.check import Checked
 from hilctl.experiment.feedback import make_feedback
 from hilctl.experiment.interlocks import interlock_limits

@@ -21,7 +21,7 @@ import numpy as np
 import yaml
 from other_reader import NOT_INSTALLED, verdict
 
-from hilctl.base.flags import Flag
+from hilctl.base.samples import Flag
 from hilctl.recording.reader import read
 
 RATE_HZ = 500

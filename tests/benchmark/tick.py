@@ -18,7 +18,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from hilctl.base.blocks import Head
+from hilctl.base.samples import Head
 from hilctl.experiment.load import LoadedExperiment, load_experiment
 from hilctl.loop.compensator import Compensator
 from hilctl.loop.pacer import SystemClock

@@ -6,7 +6,7 @@ import signal
 import numpy as np
 import pytest
 
-from hilctl.base.flags import Flag
+from hilctl.base.samples import Flag
 
 TIMEOUT_S = 0.5
 WATCHDOG_S = 2.0

@@ -13,7 +13,7 @@ import pytest
 import yaml
 
 from hilctl.analysis.replay import replay
-from hilctl.base.flags import Flag
+from hilctl.base.samples import Flag
 from hilctl.recording.reader import read
 from hilctl.run.orphans import recover_orphans
 from hilctl.run.run_folder import base_folder

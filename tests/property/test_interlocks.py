@@ -7,7 +7,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hilctl.base.flags import Flag
+from hilctl.base.samples import Flag
 from hilctl.loop.interlocks import InterlockLimits, Interlocks
 
 RATE_HZ = 100.0

@@ -7,7 +7,7 @@ import pytest
 
 from hilctl.analysis.replay import replay
 from hilctl.analysis.report import summarize
-from hilctl.base.flags import Flag
+from hilctl.base.samples import Flag
 from hilctl.recording.reader import read
 from hilctl.run.start import start_run
 

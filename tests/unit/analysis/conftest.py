@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hilctl.base.arrays import F64, I64, U32
-from hilctl.base.flags import Flag
+from hilctl.base.samples import Flag
 from hilctl.base.segments import Segment
 from hilctl.recording.data import Event, Recording, Samples, Ticks
 

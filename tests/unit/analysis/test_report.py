@@ -11,7 +11,7 @@ from rich.console import Console
 from hilctl.analysis.report import RunReport, render, summarize, worst_segment
 from hilctl.base.arrays import F64
 from hilctl.base.errors import DataError
-from hilctl.base.flags import Flag
+from hilctl.base.samples import Flag
 from hilctl.base.segments import Segment
 from hilctl.recording.data import Recording, Ticks
 

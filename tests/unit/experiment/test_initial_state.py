@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilctl.base.blocks import Batch, Head
 from hilctl.base.errors import DataError
+from hilctl.base.samples import Batch, Head
 from hilctl.experiment.initial_state import Memory, memory_after
 from hilctl.models.published import exponential_integrated, piezo_ppi
 from hilctl.models.staged import FieldLag, StagedModel

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from hilctl.base.flags import Flag
+from hilctl.base.samples import Flag
 from hilctl.kernels import interlock as kernels
 from hilctl.kernels.interlock import heat_block, interlock_block
 

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hilctl.base.blocks import Batch
 from hilctl.base.errors import ConfigError, InputError
+from hilctl.base.samples import Batch
 from hilctl.base.yaml.document import Document
 from hilctl.experiment.check import check
 from hilctl.experiment.feedback import make_feedback

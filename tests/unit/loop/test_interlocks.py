@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hilctl.base.errors import InputError
-from hilctl.base.flags import Flag
+from hilctl.base.samples import Flag
 from hilctl.loop.interlocks import InterlockLimits, Interlocks, Trip, warming
 
 RATE_HZ = 1000.0

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hilctl.base.errors import InputError
-from hilctl.base.flags import Flag
+from hilctl.base.samples import Flag
 from hilctl.loop.limiter import CommandLimits, Limiter
 
 LIMITS = CommandLimits(low=-2.0, high=3.0, slew_per_s=100.0, safe=0.5, ramp_per_s=50.0)

@@ -5,10 +5,9 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from hilctl.base.blocks import Batch, Head
 from hilctl.base.errors import DeviceError
 from hilctl.base.events import LoopEvent
-from hilctl.base.flags import Flag
+from hilctl.base.samples import Batch, Flag, Head
 from hilctl.loop.compensator import Compensator
 from hilctl.loop.in_flight import DelayLine
 from hilctl.loop.interlocks import InterlockLimits, Interlocks

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from hilctl.base.blocks import Batch
+from hilctl.base.samples import Batch
 from hilctl.base.segments import Segment
 from hilctl.recording.data import Event
 from hilctl.recording.writer import RecordingWriter, RunFacts

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilctl.base.blocks import Batch, Head
+from hilctl.base.samples import Batch, Head
 from hilctl.recording.reader import read
 from hilctl.run import recorder
 from hilctl.run.recorder import Recorder, steady_unix_ns

@@ -5,9 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hilctl.base.blocks import Head
 from hilctl.base.events import LoopEvent
-from hilctl.base.flags import Flag
+from hilctl.base.samples import Flag, Head
 from hilctl.run.ring import SampleRing
 from hilctl.run.shared_page import Field
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hilctl.base.blocks import Batch, Head
+from hilctl.base.samples import Batch, Head
 from hilctl.run.tail import Tail
 
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from hilctl.base.arrays import F64
-from hilctl.base.blocks import Batch
 from hilctl.base.errors import DataError, InputError
+from hilctl.base.samples import Batch
 from hilctl.recording.writer import RecordingWriter, RunFacts
 from hilctl.waveforms.build import Reference
 

@@ -7,9 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hilctl.base.blocks import Batch
 from hilctl.base.errors import DeviceError
-from hilctl.base.flags import Flag
+from hilctl.base.samples import Batch, Flag
 from hilctl.loop.compensator import Compensator
 from hilctl.loop.in_flight import DelayLine
 from hilctl.loop.interlocks import InterlockLimits, Interlocks
