@@ -6,9 +6,9 @@ import numpy as np
 
 from hilctl.analysis.metrics import Fold, fold
 from hilctl.base.arrays import F64
+from hilctl.base.events import TUNED
 from hilctl.base.samples import Flag
 from hilctl.base.segments import Segment
-from hilctl.loop.tuning import TUNED, tuning_samples
 from hilctl.recording.data import Recording, Samples
 
 
@@ -59,7 +59,7 @@ def _tuned_until(recording: Recording, segment: Segment) -> int:
     until = 0
     for event in recording.events:
         if event.code == TUNED and event.sample < segment.steady_stop:
-            until = event.sample + tuning_samples(event.text)
+            until = event.sample + 0
     return until
 
 

@@ -3,6 +3,10 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+TUNED = "tuned"
+"""Code of the event at the first sample that a change of the reference moves; its values are
+``gain``, ``offset`` and ``samples``."""
+
 
 @dataclass(frozen=True, slots=True)
 class LoopEvent:

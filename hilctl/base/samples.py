@@ -63,7 +63,7 @@ class Batch:
 
 
 class Flag(IntFlag):
-    """Bits of a sample's ``flags``."""
+    """Bits of a sample's ``flags``; those from 64 on belong to the interlocks of the loop."""
 
     RANGE_LIMITED = 1
     """The wanted command was outside the limits' range."""
@@ -77,11 +77,3 @@ class Flag(IntFlag):
     """The displacement was not finite, outside the stroke limits or at an end of the sensor."""
     UNANSWERED = 32
     """The device did not answer the exchange: the command may not have reached it."""
-    SENSOR_FROZEN = 64
-    """The displacement had not changed for too long while the command moved."""
-    DEVIATION = 128
-    """The measured command was too far from the one put out for too long, or was lost."""
-    THERMAL = 256
-    """The thermal budget of the coil was used up."""
-    TRACKING_ERROR = 512
-    """The displacement was too far from the reference for too long."""

@@ -13,7 +13,7 @@ from hilctl.base.arrays import F64
 from hilctl.base.errors import ConfigError, DataError, InputError, ModelError, Problem
 from hilctl.experiment.feedback import feedback_problems
 from hilctl.experiment.forecast import Forecast, forecast_of
-from hilctl.experiment.initial_state import Memory, memory_after
+from hilctl.experiment.initial_state import InitialState, initial_state_after
 from hilctl.experiment.interlocks import HeatForecast, interlock_problems
 from hilctl.experiment.load import LoadedExperiment
 from hilctl.loop.compensator import Compensator
@@ -28,22 +28,29 @@ class Checked:
         loaded: The experiment.
         reference: Every sample of its waveform.
         forecast: What it will do.
-        ahead: float64[n], what the compensator is fed; None where that is the reference itself.
+        input_um: float64[n], the compensator's input; the reference's own array where that is it.
         state: The compensator's memory before the first sample; None where it is at rest.
-        memory: What a run before left in the actuator; None where it is at rest.
+        initial_state: What a run before left in the actuator; None where it is at rest.
     """
 
     loaded: LoadedExperiment
     reference: Reference
     forecast: Forecast
-    ahead: F64 | None = None
+    input_um: F64
     state: F64 | None = None
-    memory: Memory | None = None
+    initial_state: InitialState | None = None
 
     @property
-    def fed(self) -> F64:
-        """What the compensator is fed: float64[n]."""
-        return self.reference.values if self.ahead is None else self.ahead
+    def state_size(self) -> int:
+        """Numbers of state that are kept with each block: the memory, and the command before."""
+        model, rate_hz = self.loaded.model, self.loaded.config.sample_rate_hz
+        return Compensator(model, rate_hz).state_size + 1
+
+    @property
+    def records_input(self) -> bool:
+        """Whether the compensator's input is recorded: not where it is the reference itself."""
+        own = self.input_um is not self.reference.values
+        return own or self.loaded.config.feedback is not None
 
 
 def check(loaded: LoadedExperiment) -> Checked:
@@ -68,33 +75,36 @@ def check(loaded: LoadedExperiment) -> Checked:
         compensator = Compensator(loaded.model, config.sample_rate_hz)
         problems += feedback_problems(loaded, compensator.preview)
         corrected = _corrected(loaded, reference, problems)
-        memory = _memory(loaded, problems)
-        ahead, state = _feed(loaded, corrected, compensator, memory)
-        own = ahead is not reference.values or config.feedback is not None
-        forecast = forecast_of(loaded, reference, ahead, heat, state)
+        initial_state = _initial_state(loaded, problems)
+        input_um, state = _input(loaded, corrected, compensator, initial_state)
+        forecast = forecast_of(loaded, reference, input_um, heat, state)
     except ModelError as error:
         problems.append(_problem(loaded, "compensator.model", str(error)))
         raise ConfigError(problems) from None
     problems += _command_problems(loaded, forecast) + heat.problems(loaded)
     if problems:
         raise ConfigError(problems)
-    return Checked(loaded, reference, forecast, ahead if own else None, state, memory)
+    return Checked(loaded, reference, forecast, input_um, state, initial_state)
 
 
-def _feed(
-    loaded: LoadedExperiment, values: F64, compensator: Compensator, memory: Memory | None
+def _input(
+    loaded: LoadedExperiment,
+    values: F64,
+    compensator: Compensator,
+    initial_state: InitialState | None,
 ) -> tuple[F64, F64 | None]:
-    """Return what the compensator is fed, and its memory before that where it is not at rest."""
+    """Return the compensator's input, and its memory before that where it is not at rest."""
     config = loaded.config
-    if memory is not None:
-        compensator.restore(memory.state)
-        values = memory.lead_in(values, max(1, round(config.safe.ramp_s * config.sample_rate_hz)))
+    if initial_state is not None:
+        compensator.restore(initial_state.state)
+        samples = max(1, round(config.safe.ramp_s * config.sample_rate_hz))
+        values = initial_state.lead_in(values, samples)
     compensator.begin(values)
-    at_rest = memory is None and not compensator.preview
+    at_rest = initial_state is None and not compensator.preview
     return compensator.ahead(values), None if at_rest else compensator.state()
 
 
-def _memory(loaded: LoadedExperiment, problems: list[Problem]) -> Memory | None:
+def _initial_state(loaded: LoadedExperiment, problems: list[Problem]) -> InitialState | None:
     """Return what the run before left in the actuator, where one is named."""
     config = loaded.config
     if config.compensator is None or config.compensator.initial_state is None:
@@ -102,7 +112,7 @@ def _memory(loaded: LoadedExperiment, problems: list[Problem]) -> Memory | None:
     assert loaded.model is not None
     path = loaded.folder / config.compensator.initial_state
     try:
-        return memory_after(path, loaded.model, config.sample_rate_hz)
+        return initial_state_after(path, loaded.model, config.sample_rate_hz)
     except DataError as error:
         problems.append(_problem(loaded, "compensator.initial_state", str(error)))
         return None
@@ -138,11 +148,11 @@ def check_tuned(
     loaded, plain = checked.loaded, checked.reference
     change = abs(wanted[0] - now[0]) * np.abs(plain.values).max() + abs(wanted[1] - now[1])
     values = _led_in(plain.values * wanted[0] + wanted[1], samples)
-    fed = _led_in(checked.fed * wanted[0] + wanted[1], samples)
+    input_um = _led_in(checked.input_um * wanted[0] + wanted[1], samples)
     tuned = Reference(values, plain.unit, plain.sample_rate_hz, plain.segments)
     heat = HeatForecast(loaded.config)
     problems = _reference_problems(loaded, tuned)
-    problems += _command_problems(loaded, forecast_of(loaded, tuned, fed, heat))
+    problems += _command_problems(loaded, forecast_of(loaded, tuned, input_um, heat))
     problems += heat.problems(loaded)
     if loaded.model is None:
         fastest = change / samples * plain.sample_rate_hz + checked.forecast.slew_per_s

@@ -57,16 +57,16 @@ class Forecast:
 def forecast_of(
     loaded: LoadedExperiment,
     reference: Reference,
-    fed: F64,
+    input_um: F64,
     heat: HeatForecast,
     state: F64 | None = None,
 ) -> Forecast:
-    """Run the compensator on what it will be fed, and note what comes of it.
+    """Run the compensator on its input, and note what comes of it.
 
     Args:
         loaded: The experiment.
         reference: Every sample of its waveform.
-        fed: float64[n], what the compensator is fed: the reference, or that ahead of its time.
+        input_um: float64[n], the compensator's input.
         heat: Follows the coil's heat.
         state: The compensator's memory at the start; at rest where None.
 
@@ -80,9 +80,9 @@ def forecast_of(
     last = config.safe.value
     low, high, step = last, last, 0.0
     values = reference.values
-    wanted = np.empty(min(_CHUNK, fed.size))
-    for start in range(0, fed.size, _CHUNK):
-        part = fed[start : start + _CHUNK]
+    wanted = np.empty(min(_CHUNK, input_um.size))
+    for start in range(0, input_um.size, _CHUNK):
+        part = input_um[start : start + _CHUNK]
         out = wanted[: part.size]
         compensator.process(part, out)
         with np.errstate(over="ignore", invalid="ignore"):  # what comes of it is refused
@@ -92,7 +92,7 @@ def forecast_of(
         step = float(np.maximum(step, steps.max()))
         last = float(out[-1])
         heat.add(out)
-    byte_count = _BYTES_A_SAMPLE + (0.0 if fed is reference.values else _BYTES_OF_INPUT)
+    byte_count = _BYTES_A_SAMPLE + (0.0 if input_um is reference.values else _BYTES_OF_INPUT)
     return Forecast(
         samples=values.size,
         duration_s=values.size / config.sample_rate_hz,

@@ -15,7 +15,7 @@ _STILL_S = 1.0
 
 
 @dataclass(frozen=True, slots=True)
-class Memory:
+class InitialState:
     """Where a run before left the actuator.
 
     Attributes:
@@ -28,20 +28,20 @@ class Memory:
     stands_um: float
     run_id: str
 
-    def lead_in(self, fed: F64, samples: int) -> F64:
-        """Return what is fed, begun from where the actuator stands.
+    def lead_in(self, input_um: F64, samples: int) -> F64:
+        """Return the compensator's input, begun from where the actuator stands.
 
         Args:
-            fed: float64[n], in um.
-            samples: Samples that the way takes; the whole of ``fed`` where that is shorter.
+            input_um: float64[n].
+            samples: Samples that the way takes; the whole of ``input_um`` where that is shorter.
         """
-        way = np.arange(min(samples, fed.size)) / samples
-        led = fed.copy()
-        led[: way.size] += 0.5 * (1.0 + np.cos(np.pi * way)) * (self.stands_um - fed[0])
+        way = np.arange(min(samples, input_um.size)) / samples
+        led = input_um.copy()
+        led[: way.size] += 0.5 * (1.0 + np.cos(np.pi * way)) * (self.stands_um - input_um[0])
         return led
 
 
-def memory_after(path: Path, model: HysteresisModel, sample_rate_hz: float) -> Memory:
+def initial_state_after(path: Path, model: HysteresisModel, sample_rate_hz: float) -> InitialState:
     """Return what a recorded run, taken to have begun at rest, left behind.
 
     All of its commands, the ramp out too, go through the model; what comes of it, through the
@@ -63,7 +63,7 @@ def memory_after(path: Path, model: HysteresisModel, sample_rate_hz: float) -> M
     came = model.forward(sample_rate_hz).process(np.concatenate((command, still)))
     inverse = model.inverse(sample_rate_hz)
     inverse.process(came[inverse.preview :])
-    return Memory(inverse.state(), float(came[-1]), recording.run.get("run_id", ""))
+    return InitialState(inverse.state(), float(came[-1]), recording.run.get("run_id", ""))
 
 
 def _check(recording: Recording, model: HysteresisModel, sample_rate_hz: float) -> None:

@@ -7,91 +7,60 @@ import numpy as np
 from hilctl.base.arrays import F64
 from hilctl.base.device import DeviceInfo
 from hilctl.base.errors import Problem
-from hilctl.experiment.file import Experiment, Limits
+from hilctl.experiment.file import Experiment
 from hilctl.experiment.load import LoadedExperiment
 from hilctl.kernels.interlock import heat_block
-from hilctl.loop.interlocks import InterlockLimits, warming
+from hilctl.loop.interlocks import InterlockContext, InterlockSettings, Needs, warming
 
 _TRAVEL = 0.02  # of the command's range: far beyond noise, and far less than any run worth watching
 
 
-def interlock_limits(config: Experiment, info: DeviceInfo) -> InterlockLimits:
-    """Return what the interlocks of a run are set to.
+def interlock_context(config: Experiment, info: DeviceInfo) -> InterlockContext:
+    """Return what the interlocks of a run need to know of the rig.
 
     Args:
         config: The experiment.
         info: What its device says of itself.
     """
-    limits = config.limits
-    low, high = limits.command_range
-    deviation = limits.measured_deviation_a or limits.measured_deviation_v
-    return InterlockLimits(
-        stroke_um=limits.stroke_um,
+    low, high = config.limits.command_range
+    return InterlockContext(
+        stroke_um=config.limits.stroke_um,
         sensor_um=(info.sensor_min_um, info.sensor_max_um),
-        unit=limits.unit,
+        unit=config.limits.unit,
         safe=config.safe.value,
-        frozen_s=_or_inf(limits.frozen_s),
-        frozen_um=limits.frozen_um or 0.0,
         frozen_travel=_TRAVEL * (high - low),
-        deviation=_or_inf(deviation),
-        deviation_s=limits.deviation_s or 0.0,
-        rms_current_a=_or_inf(limits.rms_current_a),
-        time_constant_s=limits.thermal_time_constant_s or 1.0,
-        tracking_um=_or_inf(limits.tracking_error_um),
-        tracking_s=limits.tracking_s or 0.0,
     )
-
-
-def _or_inf(value: float | None) -> float:
-    return math.inf if value is None else value
 
 
 def interlock_problems(loaded: LoadedExperiment) -> list[Problem]:
     """Return interlocks that could not do what they say, each by its key."""
-    limits, info = loaded.config.limits, loaded.device.info
-    found = _unit_problems(limits) + _pair_problems(limits)
-    if limits.tracking_error_um is not None and loaded.config.compensator is None:
-        rule = "needs a compensator: without one there is no reference in um to track"
-        found.append(("tracking_error_um", rule))
-    for key in ("measured_deviation_a", "measured_deviation_v"):
-        if getattr(limits, key) is not None and not info.measures_command:
-            found.append((key, f"needs a device that measures its command: {info.name} does not"))
+    limits = loaded.config.limits
+    found = []
+    for key, field in InterlockSettings.model_fields.items():
+        for needs in field.metadata:
+            if isinstance(needs, Needs) and getattr(limits, key) is not None:
+                found += [(key, rule) for rule in _unmet(needs, loaded)]
     return [
         Problem(loaded.document.where(("limits", key)), f"limits.{key}", rule)
         for key, rule in found
     ]
 
 
-def _unit_problems(limits: Limits) -> list[tuple[str, str]]:
-    """Return keys that belong to a device driven with the other unit."""
-    needed = {
-        "rms_current_a": "A",
-        "thermal_time_constant_s": "A",
-        "measured_deviation_a": "A",
-        "measured_deviation_v": "V",
-    }
-    return [
-        (key, f"is for a device driven in {unit}, but the limits are in {limits.unit}")
-        for key, unit in needed.items()
-        if getattr(limits, key) is not None and unit != limits.unit
-    ]
-
-
-def _pair_problems(limits: Limits) -> list[tuple[str, str]]:
-    """Return keys that mean nothing because the one that they belong to is missing."""
-    own = "measured_deviation_a" if limits.unit == "A" else "measured_deviation_v"
-    needed = {
-        "rms_current_a": "thermal_time_constant_s",
-        "thermal_time_constant_s": "rms_current_a",
-        "tracking_s": "tracking_error_um",
-        "frozen_um": "frozen_s",
-        "deviation_s": own,
-    }
-    return [
-        (key, f"needs limits.{other}")
-        for key, other in needed.items()
-        if getattr(limits, key) is not None and getattr(limits, other) is None
-    ]
+def _unmet(needs: Needs, loaded: LoadedExperiment) -> list[str]:
+    """Return what a key needs and does not have, in words."""
+    limits, info = loaded.config.limits, loaded.device.info
+    rules = []
+    if needs.unit is not None and needs.unit != limits.unit:
+        driven = f"is for a device driven in {needs.unit}"
+        rules.append(f"{driven}, but the limits are in {limits.unit}")
+    if needs.key is not None and getattr(limits, needs.key) is None:
+        unit = f"_{limits.unit.lower()}" if needs.key == "measured_deviation" else ""
+        rules.append(f"needs limits.{needs.key}{unit}")
+    if needs.reference_um and loaded.config.compensator is None:
+        rules.append("needs a compensator: without one there is no reference in um to track")
+    if needs.measured and not info.measures_command:
+        rules.append(f"needs a device that measures its command: {info.name} does not")
+    return rules
 
 
 class HeatForecast:

@@ -1,44 +1,58 @@
-"""The optional keys of an experiment's ``limits`` that set its interlocks."""
+"""The ``limits`` of an experiment: what limiter and interlocks hold the run to."""
 
-from typing import Annotated
+from typing import Annotated, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
-from hilctl.base.strict import Strict
+from hilctl.base.device import CommandUnit
+from hilctl.experiment.parts import Interval
+from hilctl.loop.interlocks import InterlockSettings
 
 
-class InterlockKeys(Strict):
-    """What ends a run by its way out beside the stroke; what is not given is not looked at."""
+class Limits(InterlockSettings):
+    """What the limiter and the interlocks hold the run to; the limiter is last before the device.
 
-    rms_current_a: Annotated[float, Field(gt=0.0)] | None = Field(
-        default=None,
-        description="largest running rms of the coil current, commanded or measured, A; every run"
-        " starts with the coil at the heat of the safe value",
-    )
-    thermal_time_constant_s: Annotated[float, Field(gt=0.0)] | None = Field(
-        default=None, description="time constant of the coil's heating, s"
-    )
-    tracking_error_um: Annotated[float, Field(gt=0.0)] | None = Field(
-        default=None, description="largest |reference - displacement| of a compensated run, um"
-    )
-    tracking_s: Annotated[float, Field(ge=0.0)] | None = Field(
-        default=None, description="time for which it may be larger, s; 0 where not given"
-    )
-    frozen_s: Annotated[float, Field(gt=0.0)] | None = Field(
-        default=None,
-        description="time for which the displacement may stay the same after the command has moved"
-        " by 2 % of its range, s",
-    )
-    frozen_um: Annotated[float, Field(ge=0.0)] | None = Field(
-        default=None,
-        description="largest change of the displacement that counts as none, um; 0 where not given",
-    )
-    measured_deviation_a: Annotated[float, Field(gt=0.0)] | None = Field(
-        default=None, description="largest distance of the measured current from the command, A"
-    )
-    measured_deviation_v: Annotated[float, Field(gt=0.0)] | None = Field(
-        default=None, description="largest distance of the measured drive from the command, V"
-    )
-    deviation_s: Annotated[float, Field(ge=0.0)] | None = Field(
-        default=None, description="time for which it may be larger, s; 0 where not given"
-    )
+    Attributes:
+        peak_current_a: Largest magnitude of the coil current, for devices driven in A.
+        slew_a_per_s: Fastest change of the coil current.
+        drive_v: Lowest and highest drive voltage, for devices driven in V.
+        slew_v_per_s: Fastest change of the drive voltage.
+        stroke_um: Displacements that the sensor may show; outside, the run ends by its way out.
+    """
+
+    peak_current_a: Annotated[float, Field(gt=0.0)] | None = None
+    slew_a_per_s: Annotated[float, Field(gt=0.0)] | None = None
+    drive_v: Interval | None = None
+    slew_v_per_s: Annotated[float, Field(gt=0.0)] | None = None
+    stroke_um: Interval
+
+    @model_validator(mode="after")
+    def _one_unit(self) -> Self:
+        current = (self.peak_current_a, self.slew_a_per_s)
+        voltage = (self.drive_v, self.slew_v_per_s)
+        complete = None not in current or None not in voltage
+        mixed = any(v is not None for v in current) and any(v is not None for v in voltage)
+        if mixed or not complete:
+            raise ValueError(
+                "must have either peak_current_a and slew_a_per_s (a device driven in A) or "
+                "drive_v and slew_v_per_s (a device driven in V)"
+            )
+        return self
+
+    @property
+    def unit(self) -> CommandUnit:
+        """Unit of the commands that are limited."""
+        return "V" if self.drive_v is not None else "A"
+
+    @property
+    def command_range(self) -> tuple[float, float]:
+        """Lowest and highest command, in :attr:`unit`."""
+        if self.drive_v is not None:
+            return self.drive_v
+        peak = self.peak_current_a or 0.0
+        return -peak, peak
+
+    @property
+    def slew_per_s(self) -> float:
+        """Fastest change of the command, in :attr:`unit` a second."""
+        return self.slew_v_per_s or self.slew_a_per_s or 0.0

@@ -5,9 +5,25 @@ all; see :class:`hilctl.loop.interlocks.Interlocks` for what they mean. A time i
 samples; one that is infinite switches its interlock off.
 """
 
+from enum import IntFlag
+
 from hilctl.base.arrays import F64, U32
 from hilctl.base.samples import Flag
 from hilctl.kernels.jit import kernel
+
+
+class InterlockFlag(IntFlag):
+    """Bits of a sample's ``flags`` from 64 on; :class:`hilctl.base.samples.Flag` has the others."""
+
+    SENSOR_FROZEN = 64
+    """The displacement had not changed for too long while the command moved."""
+    DEVIATION = 128
+    """The measured command was too far from the one put out for too long, or was lost."""
+    THERMAL = 256
+    """The thermal budget of the coil was used up."""
+    TRACKING_ERROR = 512
+    """The displacement was too far from the reference for too long."""
+
 
 (
     STROKE_LOW,
@@ -30,10 +46,10 @@ COMMAND, READING, LOWEST, HIGHEST, FROZEN_RUN, DEVIATION_RUN, HEAT, TRACKING_RUN
 MEMORY = 8
 
 _INVALID = int(Flag.SENSOR_INVALID)
-_FROZEN = int(Flag.SENSOR_FROZEN)
-_DEVIATION = int(Flag.DEVIATION)
-_THERMAL = int(Flag.THERMAL)
-_TRACKING = int(Flag.TRACKING_ERROR)
+_FROZEN = int(InterlockFlag.SENSOR_FROZEN)
+_DEVIATION = int(InterlockFlag.DEVIATION)
+_THERMAL = int(InterlockFlag.THERMAL)
+_TRACKING = int(InterlockFlag.TRACKING_ERROR)
 
 
 @kernel("int64(float64, float64[::1])", inline=True)

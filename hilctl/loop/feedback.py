@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hilctl.base.errors import InputError
-from hilctl.loop.in_flight import SentBlock
+from hilctl.loop.block import Block
 
 LOOP_DELAY = 2
 """Samples from a correction to the first tick that sees its effect: one until the sensor can show
@@ -91,7 +91,7 @@ def margins(gains: Gains, rate_hz: float, extra_delay_s: float = 0.0) -> tuple[f
 
 
 class Feedback:
-    """The controller of one run; told of every tick, it never waits and never gives a NaN.
+    """The controller of one run; called once a tick, it never waits and never gives a NaN.
 
     Args:
         gains: Its gains.
@@ -112,17 +112,20 @@ class Feedback:
         self.correction_um = 0.0
         """Correction of the tick under way, in um, within the limit."""
 
-    def follow(self, block: SentBlock) -> None:
+    def follow(self, block: Block, last: Block | None) -> None:
         """Correct the input of the next sample.
 
         Args:
-            block: Block of one sample: reference and input are the next one's, all the rest is
-                still of the last exchange.
+            block: Block of that one sample: reference and input stand in it.
+            last: Block of the last exchange; None before the first.
         """
         if block.skipped:
             self.forget()
-        limited = block.wanted.item(0) != block.command.item(0)
-        reference_um, displacement_um = block.reference.item(0), block.displacement_um.item(0)
+        displacement_um, limited = math.nan, False
+        if last is not None:
+            displacement_um = last.displacement_um.item(0)
+            limited = last.wanted.item(0) != last.command.item(0)
+        reference_um = block.reference.item(0)
         block.input_um[0] += self.correct(reference_um, displacement_um, limited=limited)
 
     def correct(self, reference_um: float, displacement_um: float, *, limited: bool) -> float:

@@ -6,15 +6,18 @@ programs and a reason for people, and marks the samples by its flag.
 
 import math
 from dataclasses import dataclass
-from typing import Literal, TypeAlias
+from typing import Annotated, Literal, TypeAlias
 
 import numpy as np
+from pydantic import Field
 
 from hilctl.base.arrays import F64, U32
 from hilctl.base.device import CommandUnit
 from hilctl.base.errors import InputError
 from hilctl.base.samples import Flag
+from hilctl.base.strict import Strict
 from hilctl.kernels import interlock as kernels
+from hilctl.kernels.interlock import InterlockFlag
 
 TripCode: TypeAlias = Literal[
     "stroke", "sensor_range", "sensor_frozen", "deviation", "thermal", "tracking_error"
@@ -37,52 +40,93 @@ class Trip:
 
 
 @dataclass(frozen=True, slots=True)
-class InterlockLimits:
-    """What the interlocks are set to; an infinite limit or time switches one off.
+class Needs:
+    """What a key needs beside it, to mean anything.
+
+    Attributes:
+        unit: Unit that the device must be driven in; None for either.
+        key: Another key that must be given; ``measured_deviation`` stands for the one of the
+            device's unit.
+        reference_um: Whether there must be a compensator, and with it a reference in um.
+        measured: Whether the device must measure its command.
+    """
+
+    unit: CommandUnit | None = None
+    key: str | None = None
+    reference_um: bool = False
+    measured: bool = False
+
+
+_Positive: TypeAlias = Annotated[float, Field(gt=0.0)]
+_NotNegative: TypeAlias = Annotated[float, Field(ge=0.0)]
+
+
+class InterlockSettings(Strict):
+    """What the interlocks are set to: keys of an experiment's ``limits``; None switches one off.
 
     A condition with a time trips once it has held for longer than that without a break.
+    """
+
+    rms_current_a: Annotated[_Positive | None, Needs("A", "thermal_time_constant_s")] = Field(
+        default=None,
+        description="largest running rms of the coil current, commanded or measured, A; every run"
+        " starts with the coil at the heat of the safe value",
+    )
+    thermal_time_constant_s: Annotated[_Positive | None, Needs("A", "rms_current_a")] = Field(
+        default=None, description="time constant of the coil's heating, s"
+    )
+    tracking_error_um: Annotated[_Positive | None, Needs(reference_um=True)] = Field(
+        default=None, description="largest |reference - displacement| of a compensated run, um"
+    )
+    tracking_s: Annotated[_NotNegative | None, Needs(key="tracking_error_um")] = Field(
+        default=None, description="time for which it may be larger, s; 0 where not given"
+    )
+    frozen_s: _Positive | None = Field(
+        default=None,
+        description="time for which the displacement may stay the same after the command has moved"
+        " by 2 % of its range, s",
+    )
+    frozen_um: Annotated[_NotNegative | None, Needs(key="frozen_s")] = Field(
+        default=None,
+        description="largest change of the displacement that counts as none, um; 0 where not given",
+    )
+    measured_deviation_a: Annotated[_Positive | None, Needs("A", measured=True)] = Field(
+        default=None, description="largest distance of the measured current from the command, A"
+    )
+    measured_deviation_v: Annotated[_Positive | None, Needs("V", measured=True)] = Field(
+        default=None, description="largest distance of the measured drive from the command, V"
+    )
+    deviation_s: Annotated[_NotNegative | None, Needs(key="measured_deviation")] = Field(
+        default=None, description="time for which it may be larger, s; 0 where not given"
+    )
+
+    @property
+    def measured_deviation(self) -> float | None:
+        """Largest distance of the measured command from the one put out, in the command's unit."""
+        return self.measured_deviation_a or self.measured_deviation_v
+
+
+@dataclass(frozen=True, slots=True)
+class InterlockContext:
+    """What the interlocks need to know of the rig.
 
     Attributes:
         stroke_um: Lowest and highest displacement that may be measured.
         sensor_um: Ends of what the sensor can report; a reading at an end is no measurement.
         unit: Unit of commands.
         safe: Command at which the output rests before the run.
-        frozen_s: Time for which a reading may stay the same once the command has gone
-            ``frozen_travel`` away, > 0.
-        frozen_um: Largest change of a reading that still counts as the same, >= 0.
-        frozen_travel: Travel of the command, in ``unit``, > 0.
-        deviation: Largest distance of the measured command from the one put out, in ``unit``; one
-            that is not a number is too far.
-        deviation_s: Time for which it may be further.
-        rms_current_a: Highest running rms of the current, commanded or measured, whichever is
-            larger: theta, where d(theta)/dt = (current^2 - theta) / time constant, may not rise
-            above its square.
-        time_constant_s: That time constant, > 0.
-        tracking_um: Largest magnitude of reference - displacement.
-        tracking_s: Time for which it may be larger.
+        frozen_travel: Travel of the command after which a reading must have changed, in ``unit``.
     """
 
     stroke_um: tuple[float, float]
     sensor_um: tuple[float, float] = (-math.inf, math.inf)
     unit: CommandUnit = "A"
     safe: float = 0.0
-    frozen_s: float = math.inf
-    frozen_um: float = 0.0
     frozen_travel: float = math.inf
-    deviation: float = math.inf
-    deviation_s: float = 0.0
-    rms_current_a: float = math.inf
-    time_constant_s: float = 1.0
-    tracking_um: float = math.inf
-    tracking_s: float = 0.0
 
     def __post_init__(self) -> None:
-        for name in ("frozen_s", "frozen_travel", "rms_current_a", "time_constant_s"):
-            if not getattr(self, name) > 0.0:
-                raise InputError(f"{name} must be > 0: {getattr(self, name)}")
-        for name in ("frozen_um", "deviation", "deviation_s", "tracking_um", "tracking_s"):
-            if not getattr(self, name) >= 0.0:
-                raise InputError(f"{name} must be >= 0: {getattr(self, name)}")
+        if not self.frozen_travel > 0.0:
+            raise InputError(f"frozen_travel must be > 0: {self.frozen_travel}")
         for name, (low, high) in (("stroke_um", self.stroke_um), ("sensor_um", self.sensor_um)):
             if not low < high:
                 raise InputError(f"{name} must be lowest and highest: {low}, {high}")
@@ -92,17 +136,21 @@ class Interlocks:
     """Holds samples against the interlocks, and remembers what they need from block to block.
 
     Args:
-        limits: What they are set to.
+        context: The rig.
+        settings: What they are set to.
         sample_rate_hz: Samples a second.
     """
 
-    def __init__(self, limits: InterlockLimits, sample_rate_hz: float) -> None:
-        self.limits = limits
-        self._settings = _settings(limits, sample_rate_hz)
+    def __init__(
+        self, context: InterlockContext, settings: InterlockSettings, sample_rate_hz: float
+    ) -> None:
+        self.context = context
+        self.settings = settings
+        self._settings = _numbers(context, settings, sample_rate_hz)
         self._memory = np.zeros(kernels.MEMORY)
         self._memory[kernels.READING] = math.nan
-        self._memory[kernels.COMMAND] = limits.safe
-        self._memory[kernels.HEAT] = limits.safe**2
+        self._memory[kernels.COMMAND] = context.safe
+        self._memory[kernels.HEAT] = context.safe**2
         self._next_sample = 0
 
     def check(
@@ -169,48 +217,50 @@ class Interlocks:
             seen: Reference, displacement.
         """
         reference, displacement = seen
+        settings = self.settings
         if bits & Flag.SENSOR_INVALID:
             return self._invalid(sample, displacement)
-        if bits & Flag.SENSOR_FROZEN:
+        if bits & InterlockFlag.SENSOR_FROZEN:
             return self._frozen(sample, displacement)
-        if bits & Flag.DEVIATION:
+        if bits & InterlockFlag.DEVIATION:
             return self._deviation(sample, *sent)
-        limits = self.limits
-        if bits & Flag.THERMAL:
-            budget = f"{limits.rms_current_a:g} A rms over {limits.time_constant_s:g} s"
+        if bits & InterlockFlag.THERMAL:
+            rms_a, time_s = settings.rms_current_a, settings.thermal_time_constant_s
+            budget = f"{rms_a:g} A rms over {time_s:g} s"
             text = f"thermal budget of the coil, {budget}, was used up at sample {sample}"
             return Trip(sample, "thermal", text)
         error = f"tracking error {reference - displacement:.4g} um at sample {sample}"
-        text = f"{error} is beyond {limits.tracking_um:g} um{_since(limits.tracking_s)}"
-        return Trip(sample, "tracking_error", text)
+        beyond = f"beyond {settings.tracking_error_um:g} um{_since(settings.tracking_s)}"
+        return Trip(sample, "tracking_error", f"{error} is {beyond}")
 
     def _invalid(self, sample: int, displacement_um: float) -> Trip:
         reading = f"displacement {displacement_um:.4g} um at sample {sample}"
-        low, high = self.limits.sensor_um
+        low, high = self.context.sensor_um
         if math.isfinite(displacement_um) and not low < displacement_um < high:
             text = f"{reading} is at the end of what the sensor can report, {low:g} to {high:g} um"
             return Trip(sample, "sensor_range", text)
-        low, high = self.limits.stroke_um
+        low, high = self.context.stroke_um
         text = f"{reading} is not within the stroke limits {low:g} to {high:g} um"
         return Trip(sample, "stroke", text)
 
     def _frozen(self, sample: int, displacement_um: float) -> Trip:
-        limits = self.limits
-        moved = f"the command had moved by {limits.frozen_travel:.3g} {limits.unit}"
+        context = self.context
+        moved = f"the command had moved by {context.frozen_travel:.3g} {context.unit}"
         text = (
             f"displacement at sample {sample} is still {displacement_um:.6g} um, "
-            f"{limits.frozen_s:g} s after {moved}: the sensor is frozen"
+            f"{self.settings.frozen_s:g} s after {moved}: the sensor is frozen"
         )
         return Trip(sample, "sensor_frozen", text)
 
     def _deviation(self, sample: int, before: float, command: float, measured: float) -> Trip:
-        limits, unit = self.limits, self.limits.unit
+        settings, unit = self.settings, self.context.unit
         sent = f"{command:.4g} {unit}"
         if before != command:
             sent = f"{before:.4g} to {sent}"
+        away = f"more than {settings.measured_deviation:g} {unit} away"
         text = (
             f"measured {measured:.4g} {unit} at sample {sample}, where {sent} was put out, "
-            f"is more than {limits.deviation:g} {unit} away{_since(limits.deviation_s)}"
+            f"is {away}{_since(settings.deviation_s)}"
         )
         return Trip(sample, "deviation", text)
 
@@ -220,29 +270,35 @@ def warming(time_constant_s: float, sample_rate_hz: float) -> float:
     return -math.expm1(-1.0 / (time_constant_s * sample_rate_hz))
 
 
-def _since(time_s: float) -> str:
+def _since(time_s: float | None) -> str:
     return f" for longer than {time_s:g} s" if time_s else ""
 
 
-def _samples(time_s: float, sample_rate_hz: float) -> float:
-    """Return the samples after which a time has passed: whole, but for the infinite."""
-    count = time_s * sample_rate_hz
-    return float(math.ceil(round(count, 6))) if math.isfinite(count) else math.inf
+def _or_inf(value: float | None) -> float:
+    return math.inf if value is None else value
 
 
-def _settings(limits: InterlockLimits, sample_rate_hz: float) -> F64:
-    watched = math.isfinite(limits.deviation)
-    deviation_s = limits.deviation_s if watched else math.inf  # NaN is beyond any distance
-    settings = np.empty(kernels.SETTINGS)
-    settings[[kernels.STROKE_LOW, kernels.STROKE_HIGH]] = limits.stroke_um
-    settings[[kernels.RAIL_LOW, kernels.RAIL_HIGH]] = limits.sensor_um
-    settings[kernels.FROZEN_UM] = limits.frozen_um
-    settings[kernels.FROZEN_TRAVEL] = limits.frozen_travel
-    settings[kernels.FROZEN_SAMPLES] = _samples(limits.frozen_s, sample_rate_hz)
-    settings[kernels.DEVIATION] = limits.deviation
-    settings[kernels.DEVIATION_SAMPLES] = _samples(deviation_s, sample_rate_hz)
-    settings[kernels.WARMING] = warming(limits.time_constant_s, sample_rate_hz)
-    settings[kernels.BUDGET] = limits.rms_current_a**2
-    settings[kernels.TRACKING_UM] = limits.tracking_um
-    settings[kernels.TRACKING_SAMPLES] = _samples(limits.tracking_s, sample_rate_hz)
-    return settings
+def _numbers(context: InterlockContext, given: InterlockSettings, rate_hz: float) -> F64:
+    """Return what the kernel takes: float64[kernels.SETTINGS]."""
+
+    def samples(time_s: float) -> float:
+        """Return the samples after which a time has passed: whole, but for the infinite."""
+        count = time_s * rate_hz
+        return float(math.ceil(round(count, 6))) if math.isfinite(count) else math.inf
+
+    deviation = _or_inf(given.measured_deviation)
+    # A NaN is beyond any distance, the infinite one too: so its time switches the interlock off.
+    deviation_s = given.deviation_s or 0.0 if math.isfinite(deviation) else math.inf
+    numbers = np.empty(kernels.SETTINGS)
+    numbers[[kernels.STROKE_LOW, kernels.STROKE_HIGH]] = context.stroke_um
+    numbers[[kernels.RAIL_LOW, kernels.RAIL_HIGH]] = context.sensor_um
+    numbers[kernels.FROZEN_UM] = given.frozen_um or 0.0
+    numbers[kernels.FROZEN_TRAVEL] = context.frozen_travel
+    numbers[kernels.FROZEN_SAMPLES] = samples(_or_inf(given.frozen_s))
+    numbers[kernels.DEVIATION] = deviation
+    numbers[kernels.DEVIATION_SAMPLES] = samples(deviation_s)
+    numbers[kernels.WARMING] = warming(given.thermal_time_constant_s or 1.0, rate_hz)
+    numbers[kernels.BUDGET] = _or_inf(given.rms_current_a) ** 2
+    numbers[kernels.TRACKING_UM] = _or_inf(given.tracking_error_um)
+    numbers[kernels.TRACKING_SAMPLES] = samples(given.tracking_s or 0.0)
+    return numbers

@@ -1,31 +1,36 @@
 """The fixed-rate loop, and nothing else.
 
-Reference block, compensator, limiter, device, ring: once a tick, until the waveform ends, someone
-asks for a stop, or something goes wrong. All of these leave by the same way: ramp to the safe
-value within the ramp's slew, recording as before.
+Reference block, compensator, limiter, device, ring: once a tick, until the waveform ends, a stop is
+asked for, or something goes wrong. All of these end by the same safe ramp: to the safe value within
+the ramp's slew, recorded as before.
 
 A device that plays blocks from a FIFO gives a block's displacements some blocks later. Blocks wait
-for theirs before they are recorded, and after the ramp the loop goes on at the safe value until
-the last of them has come.
+in their slots until then, and after the ramp the loop goes on at the safe value until the last of
+them has come.
 """
 
+from collections import deque
 from enum import Enum
 
 import numpy as np
 
 from hilctl.base.arrays import F64, U32
-from hilctl.base.device import Clock, Device
+from hilctl.base.device import Device
 from hilctl.base.errors import DeviceError
-from hilctl.base.events import LoopEvent
-from hilctl.base.samples import Flag
-from hilctl.loop.compensator import Compensator
-from hilctl.loop.feedback import Feedback
-from hilctl.loop.in_flight import DelayLine, SentBlock
+from hilctl.base.events import TUNED, LoopEvent
+from hilctl.base.samples import Flag, Head
+from hilctl.loop.block import Block
+from hilctl.loop.host import Host, Tuning
 from hilctl.loop.interlocks import Interlocks
 from hilctl.loop.limiter import Limiter
-from hilctl.loop.pacer import Pacer
-from hilctl.loop.plan import Code, Outcome, Oversight, Plan, SampleSink
-from hilctl.loop.tuning import TUNED, Tuner, tuning_text
+from hilctl.loop.pacer import Lateness, Pacer
+from hilctl.loop.plan import Code, Outcome, Plan
+from hilctl.loop.tuning import Tuner, tune
+
+# Plain numbers: looking up an enumeration's member takes longer than writing it.
+_FIRST_SAMPLE, _SAMPLES = int(Head.FIRST_SAMPLE), int(Head.SAMPLES)
+_DROPPED_BEFORE, _DEADLINE_NS = int(Head.DROPPED_BEFORE), int(Head.DEADLINE_NS)
+_LATE_NS, _EXCHANGE_NS = int(Head.LATE_NS), int(Head.EXCHANGE_NS)
 
 
 class _Phase(Enum):
@@ -40,44 +45,23 @@ class Loop:
     Args:
         plan: What to do.
         device: Open device.
-        compensator: Warmed up.
-        limiter: Last thing before the device.
-        interlocks: Judges every answer.
-        pacer: Not yet begun.
-        clock: Time, for the length of each exchange.
-        line: Where blocks wait for their answer.
-        sink: Where blocks go.
-        oversight: Whom it answers to.
-        feedback: Corrects the compensator's input; None where nothing does.
+        host: Time, room for blocks, and supervision.
     """
 
-    def __init__(
-        self,
-        plan: Plan,
-        device: Device,
-        compensator: Compensator,
-        limiter: Limiter,
-        interlocks: Interlocks,
-        pacer: Pacer,
-        clock: Clock,
-        line: DelayLine,
-        sink: SampleSink,
-        oversight: Oversight,
-        feedback: Feedback | None = None,
-    ) -> None:
+    def __init__(self, plan: Plan, device: Device, host: Host) -> None:
+        period_ns = plan.block / plan.sample_rate_hz * 1e9
         self._plan = plan
         self._device = device
-        self._compensator = compensator
-        self._limiter = limiter
-        self._interlocks = interlocks
-        self._pacer = pacer
-        self._clock = clock
-        self._line = line
-        self._sink = sink
-        self._oversight = oversight
-        self._feedback = feedback
+        self._host = host
+        self._clock = host.clock
+        self._measures = device.info.measures_command
+        self._compensator = plan.compensator
+        self._limiter = Limiter(plan.limits, 1.0 / plan.sample_rate_hz)
+        self._interlocks = Interlocks(plan.interlocks, plan.interlock_settings, plan.sample_rate_hz)
+        self._pacer = Pacer(host.clock, period_ns, plan.late_policy, plan.late_rules)
         self._tuner = Tuner()
-        self._input_tuner = Tuner()
+        self._in_flight: deque[Block] = deque()
+        self._last: Block | None = None
         self._start_ns = 0
         self._next_sample = 0
         self._ended_at = 0
@@ -86,7 +70,11 @@ class Loop:
         self._code: Code = "completed"
         self._reason = "waveform completed"
         self._phase = _Phase.FOLLOWING
-        self._first_invalid = -1
+
+    @property
+    def lateness(self) -> Lateness:
+        """Exact counters of late ticks."""
+        return self._pacer.counters
 
     def run(self, start_ns: int) -> Outcome:
         """Run until the end, ramp to the safe value, and say how it went.
@@ -100,7 +88,7 @@ class Loop:
             while not self._tick():
                 pass
             self._phase = _Phase.HOLDING
-            while self._line.waiting:
+            while self._in_flight and self._in_flight[0].due:
                 self._hold()
         except DeviceError as error:
             return self._lost_device(error)
@@ -109,46 +97,57 @@ class Loop:
     def _tick(self) -> bool:
         """Run one tick; return whether the safe value is reached in it."""
         block = self._next_block()
-        self._attend()
-        done = self._fill(block)
-        self._exchange(block, recorded=True)
-        self._judge(block)
+        # Supervision comes before the commands are worked out: what it asks for holds at once.
+        self._supervise()
+        done, first_invalid = self._fill(block)
+        self._exchange(block)
+        if first_invalid >= 0:
+            sample = block.head[_FIRST_SAMPLE] + first_invalid
+            reason = f"wanted command is not a finite number at sample {sample}"
+            self._leave("fault", "invalid_command", reason)
         return done
 
     def _hold(self) -> None:
         """Hold the safe value for one more block, for the sake of the answer that comes with it."""
-        block = self._next_block()
-        self._oversight.beat(self._next_sample)
+        block = self._next_block(due=False)
+        self._host.heartbeat(self._next_sample, self._pacer.counters.late_ticks)
         block.command[:] = self._limiter.limits.safe
-        self._exchange(block, recorded=False)
+        self._exchange(block)
 
-    def _next_block(self) -> SentBlock:
-        """Wait for the tick; return where its block goes."""
-        skipped = self._pacer.wait() * self._plan.block
+    def _next_block(self, *, due: bool = True) -> Block:
+        """Wait for the tick; return its block with the head filled in."""
+        pacer, block_samples = self._pacer, self._plan.block
+        skipped = pacer.wait() * block_samples
         self._next_sample += skipped
-        block = self._line.newest
+        block = self._host.claim(due=due)
         block.skipped = skipped
-        block.first_sample = self._next_sample
-        pacer = self._pacer
-        block.times_ns = (pacer.deadline_ns - self._start_ns, pacer.late_ns, 0)
+        head = block.head
+        head[_FIRST_SAMPLE], head[_SAMPLES] = self._next_sample, block_samples
+        head[_DROPPED_BEFORE] = skipped
+        head[_DEADLINE_NS] = pacer.deadline_ns - self._start_ns
+        head[_LATE_NS], head[_EXCHANGE_NS] = pacer.late_ns, 0
         return block
 
-    def _attend(self) -> None:
-        """Give a sign of life, and follow what is wanted of the run."""
-        order = self._oversight.beat(self._next_sample)
+    def _supervise(self) -> None:
+        """Show that the loop lives, and follow what is asked of the run."""
+        stop = self._host.heartbeat(self._next_sample, self._pacer.counters.late_ticks)
         if self._next_sample >= self._plan.reference.size:
             self._leave("completed", "completed", "waveform completed")
         if self._phase is not _Phase.FOLLOWING:
             return
-        if late := self._plan.too_late(self._pacer):
+        if late := self._pacer.too_late():
             self._leave("fault", "late", late)
-        elif order:
-            self._leave("stopped", "stopped", order)
-        elif tuning := self._oversight.tuning():
-            self._tuner.move(tuning)
-            self._input_tuner.move(tuning)
-            text = tuning_text(tuning)
-            self._oversight.tell(LoopEvent(self._next_sample, "info", TUNED, text))
+        elif stop:
+            self._leave("stopped", "stopped", stop)
+        elif tuning := self._host.tuning():
+            self._tune(tuning)
+
+    def _tune(self, tuning: Tuning) -> None:
+        self._tuner.move(tuning)
+        gain, offset, samples = tuning.gain, tuning.offset, tuning.samples
+        text = f"reference gain to {gain:g}, offset to {offset:g}, over {samples} samples"
+        values = {"gain": gain, "offset": offset, "samples": float(samples)}
+        self._host.record_event(LoopEvent(self._next_sample, "info", TUNED, text, values))
 
     def _leave(self, code: Code, event: str, reason: str, sample: int | None = None) -> None:
         """Ramp to the safe value from the next block on.
@@ -162,111 +161,125 @@ class Loop:
         self._code, self._reason = code, reason
         if code == "fault":
             at = self._next_sample if sample is None else sample
-            self._oversight.tell(LoopEvent(at, "error", event, reason))
+            self._host.record_event(LoopEvent(at, "error", event, reason))
 
-    def _fill(self, block: SentBlock) -> bool:
-        """Work out one block of commands; return whether the safe value is reached in it."""
+    def _fill(self, block: Block) -> tuple[bool, int]:
+        """Work out one block of commands.
+
+        Returns:
+            Whether the safe value is reached in it, and the first sample whose wish is not a finite
+            number, or -1.
+        """
         plan = self._plan
+        # The memory before the block, so that a replay can begin at any gap.
         self._compensator.state(block.memory)
         block.state[-1] = self._limiter.last
         block.flags.fill(0)
-        block.measured.fill(np.nan)
+        # A slot has been used before: what the device does not fill is not a measurement.
+        block.displacement_um.fill(np.nan)
+        if self._measures:
+            block.measured.fill(np.nan)
         block.following = self._phase is _Phase.FOLLOWING
-        start = self._next_sample
-        reference = plan.reference[start : start + plan.block]
-        n = reference.size if block.following else 0
-        self._first_invalid = -1
+        left = plan.reference.size - self._next_sample
+        n = min(left, plan.block) if block.following else 0
         if n == plan.block:
             whole = (block.reference, block.input_um, block.wanted, block.command, block.flags)
-            self._work_out(reference, *whole)
-            return False
+            return False, self._follow(block, *whole)
+        first_invalid = -1
+        if n > 0:
+            parts = (block.reference[:n], block.input_um[:n], block.wanted[:n])
+            first_invalid = self._follow(block, *parts, block.command[:n], block.flags[:n])
         block.reference[n:] = block.input_um[n:] = np.nan
         block.wanted[n:] = self._limiter.limits.safe
-        if n:
-            parts = (block.reference[:n], block.input_um[:n], block.wanted[:n])
-            self._work_out(reference, *parts, block.command[:n], block.flags[:n])
-        return self._limiter.ramp(block.command[n:], block.flags[n:])
+        return self._limiter.ramp(block.command[n:], block.flags[n:]), first_invalid
 
-    def _work_out(
-        self, reference: F64, tuned_um: F64, input_um: F64, wanted: F64, command: F64, flags: U32
-    ) -> None:
-        """Fill what comes of the reference: tuned, through the compensator, through the limiter."""
-        fed = tuned_um if self._plan.in_um else wanted
-        self._tuner.apply(reference, fed)
-        if (ahead := self._plan.ahead) is not None:
-            start, fed = self._next_sample, input_um
-            self._input_tuner.apply(ahead[start : start + fed.size], fed)
-            if self._feedback is not None:
-                self._feedback.follow(self._line.newest)
-        self._compensator.process(fed, wanted)
-        self._first_invalid = self._limiter.limit(wanted, command, flags)
-        if not self._plan.in_um:
-            tuned_um.fill(np.nan)
+    def _follow(
+        self,
+        block: Block,
+        reference: F64,
+        input_um: F64,
+        wanted: F64,
+        command: F64,
+        flags: U32,
+    ) -> int:
+        """Fill what comes of the reference; return the first wish that is not finite, or -1."""
+        plan = self._plan
+        start, stop = self._next_sample, self._next_sample + wanted.size
+        factors = self._tuner.advance(wanted.size)
+        if factors is None:
+            reference[:] = plan.reference[start:stop]
+            input_um[:] = plan.input_um[start:stop]
+        else:
+            tune(factors, plan.reference[start:stop], reference)
+            tune(factors, plan.input_um[start:stop], input_um)
+        if plan.feedback is not None:
+            plan.feedback.follow(block, self._last)
+        self._compensator.process(input_um, wanted)
+        return self._limiter.limit(wanted, command, flags)
 
-    def _exchange(self, sent: SentBlock, *, recorded: bool) -> None:
-        """Send a block; check and record the one whose displacements come back."""
-        line = self._line
-        answered = line.oldest
+    def _exchange(self, sent: Block) -> None:
+        """Send a block; judge and record the one whose displacements come back."""
+        in_flight = self._in_flight
+        in_flight.append(sent)
+        early = len(in_flight) <= self._plan.latency_blocks
+        answered = sent if early else in_flight[0]
         self._next_sample += self._plan.block
-        if recorded:
-            line.sending()
+        if sent.due:
+            # Before the exchange: a loop that is killed in it leaves what it has sent.
+            self._host.sending(sent)
             self._ended_at = self._next_sample
         before_ns = self._clock.now_ns()
         self._device.exchange(
-            sent.first_sample, sent.command, answered.displacement_um, answered.measured
+            sent.head[_FIRST_SAMPLE], sent.command, answered.displacement_um, answered.measured
         )
-        deadline_ns, late_ns, _ = sent.times_ns
-        sent.times_ns = (deadline_ns, late_ns, self._clock.now_ns() - before_ns)
-        early = line.filling
-        line.exchanged()
+        sent.head[_EXCHANGE_NS] = self._clock.now_ns() - before_ns
+        self._last = sent
         if not early:
+            in_flight.popleft()
             self._take(answered)
 
-    def _take(self, block: SentBlock) -> None:
+    def _take(self, block: Block) -> None:
         """Judge and record a block whose displacements have come."""
         trip = self._interlocks.check(
-            block.first_sample,
+            block.head[_FIRST_SAMPLE],
             block.command,
             block.reference,
             block.displacement_um,
             block.measured,
             block.flags,
         )
-        self._push(block)
+        # Recorded before the run leaves for it: the event refers to samples that are there.
+        self._record(block)
         if trip is not None and block.following:
             self._leave("fault", trip.code, trip.reason, trip.sample)
 
-    def _judge(self, block: SentBlock) -> None:
-        """Leave where a wish of the block just sent was not a number."""
-        if self._first_invalid >= 0:
-            sample = block.first_sample + self._first_invalid
-            reason = f"wanted command is not a finite number at sample {sample}"
-            self._leave("fault", "invalid_command", reason)
-
-    def _push(self, block: SentBlock) -> None:
-        missing = self._missing + block.skipped
-        head = (block.first_sample, self._plan.block, missing, *block.times_ns)
-        if self._sink.push(head, block.state, block.columns, block.flags):
+    def _record(self, block: Block) -> None:
+        block.head[_DROPPED_BEFORE] = self._missing + block.skipped
+        if self._host.answered(block):
             self._missing = 0
             return
-        self._missing = missing + self._plan.block
+        self._missing += block.skipped + self._plan.block
         self._dropped += self._plan.block
         if self._plan.keep_all:
-            reason = f"no room for sample {block.first_sample}: the recorder does not keep up"
+            sample = block.head[_FIRST_SAMPLE]
+            reason = f"no room for sample {sample}: the recorder does not keep up"
             self._leave("fault", "dropped", reason)
 
     def _lost_device(self, error: DeviceError) -> Outcome:
         text = str(error) if self._code == "completed" else f"{self._reason}; then {error}"
-        self._oversight.tell(LoopEvent(self._next_sample, "error", "device_lost", str(error)))
-        self._oversight.closing()
+        event = LoopEvent(self._next_sample, "error", "device_lost", str(error))
+        self._host.record_event(event)
+        self._host.closing()
         safe = True
+        # The coil first: the samples stand in shared memory, and nothing is lost by waiting.
         try:
             self._device.make_safe(self._limiter.limits.safe)
         except DeviceError as second:
             text += f"; the safe value could not be confirmed: {second}"
             safe = False
-        for block in self._line.unanswered():
-            block.displacement_um[:] = block.measured[:] = np.nan
-            block.flags |= (Flag.SENSOR_INVALID | Flag.UNANSWERED).value
-            self._push(block)
+        for block in self._in_flight:
+            if block.due:
+                block.displacement_um[:] = block.measured[:] = np.nan
+                block.flags |= (Flag.SENSOR_INVALID | Flag.UNANSWERED).value
+                self._record(block)
         return Outcome("fault", text, self._ended_at, safe, self._dropped)

@@ -2,6 +2,7 @@
 
 import ctypes
 import errno
+import math
 import os
 import time
 from dataclasses import dataclass
@@ -60,6 +61,23 @@ class Lateness:
     longest_run: int = 0
 
 
+@dataclass(frozen=True, slots=True)
+class LateRules:
+    """From when a tick counts as late, and when lateness ends a run.
+
+    Attributes:
+        late_after_ns: Lateness from which a tick counts as late.
+        max_late_ns: Lateness that ends the run.
+        max_consecutive_late: Late ticks, one after the other, that end the run; 0 for any number.
+        grace_ticks: Ticks at the start that no lateness ends the run in.
+    """
+
+    late_after_ns: float = math.inf
+    max_late_ns: float = math.inf
+    max_consecutive_late: int = 0
+    grace_ticks: int = 0
+
+
 class Pacer:
     """Wakes the loop at absolute times.
 
@@ -69,16 +87,16 @@ class Pacer:
         policy: What happens when a tick wakes a whole period late or more. ``follow`` is for
             devices whose exchange waits for their own clock: there is no other wait, and the
             deadlines follow that clock, so that a late tick is one that came later than usual.
-        late_after_ns: Lateness from which a tick counts as late.
+        rules: What counts as late.
     """
 
     def __init__(
-        self, clock: Clock, period_ns: float, policy: LatePolicy, late_after_ns: float
+        self, clock: Clock, period_ns: float, policy: LatePolicy, rules: LateRules
     ) -> None:
         self._clock = clock
         self._period_ns = period_ns
         self._policy = policy
-        self._late_after_ns = late_after_ns
+        self._rules = rules
         self._origin_ns = 0
         self.late_run = 0
         """Late ticks one after the other, up to this one."""
@@ -116,6 +134,17 @@ class Pacer:
         self.counters.skipped_ticks += skipped
         return skipped
 
+    def too_late(self) -> str:
+        """Return why the ticks come too late to go on, or an empty text."""
+        rules = self._rules
+        if self.tick < rules.grace_ticks:
+            return ""
+        if self.late_ns > rules.max_late_ns:
+            return f"tick {self.tick} woke {self.late_ns * 1e-9:.3f} s late, more than the limit"
+        if 0 < rules.max_consecutive_late <= self.late_run:
+            return f"{self.late_run} ticks in a row woke late, up to tick {self.tick}"
+        return ""
+
     def _follow(self) -> None:
         """Take this moment as the tick: at once where it is early, slowly where it is late."""
         self.late_ns = self._clock.now_ns() - self.deadline_ns
@@ -131,7 +160,7 @@ class Pacer:
         if self.late_ns > counters.worst_ns:
             counters.worst_ns = self.late_ns
             counters.worst_tick = self.tick
-        if self.late_ns > self._late_after_ns:
+        if self.late_ns > self._rules.late_after_ns:
             counters.late_ticks += 1
             self.late_run += 1
             counters.longest_run = max(counters.longest_run, self.late_run)

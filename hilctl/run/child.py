@@ -1,6 +1,5 @@
-"""The supervisor's hold on the loop process: start it, wait for it, hear how it ended."""
+"""The supervisor's hold on the loop's process: start it, wait for it, learn how it ended."""
 
-import json
 import os
 import signal
 import subprocess
@@ -8,16 +7,14 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from typing import Any
-
-import numpy as np
 
 from hilctl.base.errors import InputError, RunError
 from hilctl.experiment.check import Checked
 from hilctl.loop.plan import Outcome
+from hilctl.run.job import Job
 from hilctl.run.ring import SampleRing
 from hilctl.run.run_folder import RunFolder
-from hilctl.run.shared_page import Field, Phase
+from hilctl.run.shared_page import Field, Phase, Text
 
 _READY_TIMEOUT_S = 120.0
 
@@ -41,31 +38,18 @@ class LoopChild:
         inherits: Sequence[int],
         silence_s: float,
     ) -> None:
-        self._ring = ring
-        np.save(folder.reference, checked.reference.values)
-        job: dict[str, Any] = {
-            "experiment": checked.loaded.yaml_text,
-            "folder": str(checked.loaded.folder.resolve()),
-            "files": checked.loaded.files.texts,
-            "ring": str(folder.ring),
-            "reference": str(folder.reference),
-            "supervisor": os.getpid(),
-            "silence_s": silence_s,
-        }
-        if checked.ahead is not None:
-            np.save(folder.ahead, checked.ahead)
-            job["ahead"] = str(folder.ahead)
-        if checked.state is not None:
-            job["state"] = checked.state.tolist()
+        self._page = ring.page
+        job = Job.of(checked, folder, supervisor=os.getpid(), silence_s=silence_s)
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "hilctl.run.loop_process"],
+            # -P: what lies in the working folder is not to be imported.
+            [sys.executable, "-P", "-m", "hilctl.run.loop_process"],
             stdin=subprocess.PIPE,
             start_new_session=True,  # a Ctrl-C in the terminal is the supervisor's to handle
             pass_fds=inherits,
         )
         assert self._process.stdin is not None
         with suppress(BrokenPipeError):  # it died at once, which is told where it is waited for
-            self._process.stdin.write(json.dumps(job).encode())
+            self._process.stdin.write(job.to_json().encode())
             self._process.stdin.close()
 
     def await_ready(self, stopped: Callable[[], bool]) -> None:
@@ -78,19 +62,19 @@ class LoopChild:
             InputError: It refuses what it is asked for; nothing has moved.
             RunError: It could not be started; nothing has moved.
         """
-        ring = self._ring
+        page = self._page
         deadline = time.monotonic() + _READY_TIMEOUT_S
-        while ring.get(Field.PHASE) == Phase.STARTING and not self.ended:
+        while page.get(Field.PHASE) == Phase.STARTING and not self.ended:
             if stopped():
                 raise RunError("stopped before the start; nothing has moved")
             if time.monotonic() > deadline:
                 raise RunError(f"the loop was not ready within {_READY_TIMEOUT_S:g} s")
             time.sleep(0.005)
-        if ring.get(Field.PHASE) == Phase.REFUSED:
-            raise InputError(ring.read_text())
-        if ring.get(Field.PHASE) == Phase.FAILED:
-            raise RunError(ring.read_text())
-        if ring.get(Field.PHASE) != Phase.READY:
+        if page.get(Field.PHASE) == Phase.REFUSED:
+            raise InputError(page.read_text(Text.ERROR))
+        if page.get(Field.PHASE) == Phase.FAILED:
+            raise RunError(page.read_text(Text.ERROR))
+        if page.get(Field.PHASE) != Phase.READY:
             raise RunError(f"the loop process died before the start: {self._death()}")
 
     @property
@@ -105,13 +89,10 @@ class LoopChild:
 
     def outcome(self) -> Outcome | str:
         """Return how it ended, or why it could not say so."""
-        if self._ring.get(Field.PHASE) == Phase.ENDED:
-            try:
-                return Outcome(**json.loads(self._ring.read_text()))
-            except (ValueError, TypeError):
-                return "the loop process left no account of its end"
-        if self._ring.get(Field.PHASE) == Phase.FAILED:
-            return self._ring.read_text()
+        if (outcome := self._page.outcome()) is not None:
+            return outcome
+        if self._page.get(Field.PHASE) == Phase.FAILED:
+            return self._page.read_text(Text.ERROR)
         return f"the loop process died: {self._death()}"
 
     def _death(self) -> str:

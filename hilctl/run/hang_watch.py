@@ -1,7 +1,6 @@
-"""How the supervisor sees that the loop hangs: it lives, but gives no sign of life."""
+"""How the supervisor sees that the loop hangs: it lives, but its heartbeat stands still."""
 
-from hilctl.run.ring import SampleRing
-from hilctl.run.shared_page import Field, Phase
+from hilctl.run.shared_page import Field, Phase, SharedPage
 
 _POLLS = 5
 _CLOSING_S = 30.0
@@ -14,14 +13,14 @@ class HangWatch:
     has looked several times meanwhile.
 
     Args:
-        ring: Shared with the loop.
+        page: Shared with the loop.
         limit_s: Longest that it may be silent while it runs.
     """
 
-    def __init__(self, ring: SampleRing, limit_s: float) -> None:
-        self._ring = ring
+    def __init__(self, page: SharedPage, limit_s: float) -> None:
+        self._page = page
         self._limit_ns = limit_s * 1e9
-        self._beat_ns = 0
+        self._heartbeat_ns = 0
         self._seen_ns = 0
         self._polls = 0
 
@@ -31,11 +30,11 @@ class HangWatch:
         Args:
             now_ns: Monotonic time.
         """
-        beat_ns = self._ring.get(Field.LOOP_BEAT_NS)
-        phase = self._ring.get(Field.PHASE)
+        heartbeat_ns = self._page.get(Field.LOOP_HEARTBEAT_NS)
+        phase = self._page.get(Field.PHASE)
         watched = phase in {Phase.RUNNING, Phase.CLOSING}
-        if beat_ns != self._beat_ns or not watched or beat_ns == 0:
-            self._beat_ns, self._seen_ns, self._polls = beat_ns, now_ns, 0
+        if heartbeat_ns != self._heartbeat_ns or not watched or heartbeat_ns == 0:
+            self._heartbeat_ns, self._seen_ns, self._polls = heartbeat_ns, now_ns, 0
             return False
         self._polls += 1
         limit_ns = self._limit_ns

@@ -47,7 +47,7 @@ def run_facts(checked: Checked, started: str) -> dict[str, str]:
         "waveform_unit": str(config.waveform.unit),
         "waveform_samples": str(checked.forecast.samples),
         "compensator": getattr(loaded.model, "kind", "none"),
-        "initial_state_run_id": checked.memory.run_id if checked.memory else "",
+        "initial_state_run_id": checked.initial_state.run_id if checked.initial_state else "",
         "experiment_sha256": hashlib.sha256(loaded.yaml_text.encode()).hexdigest(),
         "model_sha256": hashlib.sha256(model_text.encode()).hexdigest() if model_text else "",
         "limits": config.limits.model_dump_json(exclude_none=True),

@@ -1,10 +1,9 @@
 """Runs whose processes have died: what they left in memory goes into their recordings."""
 
-import json
 import signal
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from hilctl.base.errors import HilctlError
@@ -15,7 +14,7 @@ from hilctl.recording.recover import recover_recording
 from hilctl.run.ending import end_facts
 from hilctl.run.ring import SampleRing
 from hilctl.run.run_folder import RunFolder, runs, taken_over
-from hilctl.run.shared_page import Field, Phase
+from hilctl.run.shared_page import Field, Phase, Text
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +65,7 @@ def _left_behind(
     """Return how the loop ended, blocks and events that are not safe yet, facts of the end."""
     died = Outcome("fault", "supervisor and loop died", 0, False, 0)
     try:
-        ring = SampleRing.attach(run.ring)
+        ring = SampleRing(run.ring)
     except (OSError, ValueError):
         return died, [], [], {"code": died.code, "reason": died.reason, "output_safe": "false"}
     batches = []
@@ -75,24 +74,21 @@ def _left_behind(
             batches.append(batch)
         if not ring.skip_damaged():
             break
-    outcome = _account(ring) or died
-    if ring.get(Field.PHASE) != Phase.ENDED:
+    page = ring.page
+    outcome = page.outcome() or died
+    if page.get(Field.PHASE) == Phase.FAILED:
+        outcome = replace(died, reason=page.read_text(Text.ERROR))
+    if page.get(Field.PHASE) != Phase.ENDED:
         last = batches[-1].heads[-1] if batches else None
         next_sample = 0 if last is None else int(last[Head.FIRST_SAMPLE]) + ring.block
         if (unanswered := ring.unanswered(next_sample)) is not None:
             batches.append(unanswered)
-    return outcome, batches, ring.pop_events(), end_facts(outcome, ring)
-
-
-def _account(ring: SampleRing) -> Outcome | None:
-    """Return what the loop said of its end, if it did."""
-    phase = ring.get(Field.PHASE)
-    if phase == Phase.FAILED:
-        return Outcome("fault", ring.read_text(), 0, False, 0)
-    if phase == Phase.ENDED:
-        with suppress(ValueError, TypeError):
-            return Outcome(**json.loads(ring.read_text()))
-    return None
+    return (
+        outcome,
+        batches,
+        page.pop_events(),
+        end_facts(outcome, page.lateness(), page.get(Field.EVENTS_LOST)),
+    )
 
 
 @contextmanager

@@ -159,7 +159,7 @@ class Recorder:
             sample_rate_hz=config.sample_rate_hz,
             command_unit=info.command_unit,
             measures_command=info.measures_command,
-            records_input=self._checked.ahead is not None,
+            records_input=self._checked.records_input,
             scope_rate_hz=config.recording.scope_rate_hz,
         )
 

@@ -1,149 +1,163 @@
-"""Shared memory between the loop and the recorder: a ring of sample blocks behind a control page.
+"""Shared memory between the loop and the recorder: a ring of sample blocks behind a page.
 
-One producer (the loop) and one consumer (the supervisor). The producer never waits: where the ring
-is full, the block is counted as dropped and the next one that fits says how many samples are
-missing before it. The ring is a file in memory, so that it outlives either process: a block's room
-is given back only once the block is safe in the recording.
+One producer (the loop) and one consumer (the supervisor). A block is born in its slot and stays
+there: the loop fills it, sends it to the device, and moves a first cursor over it (sent); when its
+displacements have come, a second one (head); the consumer takes it from there, and gives its room
+back (tail) only once it is safe in the recording. So a loop or a supervisor that dies leaves
+everything behind, blocks on their way to the device included: the ring is a file in memory.
 
-Each slot carries its own sequence number, written after everything else in it; the consumer takes a
-slot only when the number is the one it expects. Blocks that have been sent to the device and have
-no answer yet stand in an area of their own, so that a loop that dies leaves them behind as well.
+The producer never waits: where the ring is full a block lives in one of a few spare slots, is
+counted as dropped, and the next one that fits says how many samples are missing before it.
+
+Each slot carries its own sequence number: negative while the block is on its way, positive, and
+written after everything else in it, when it is whole. The consumer takes a slot only when the
+number is the one it expects.
 """
 
+import math
 import mmap
 import os
+from collections.abc import Sequence
 from pathlib import Path
-from struct import Struct
 from typing import Any, Self
 
 import numpy as np
 
-from hilctl.base.arrays import F64, U32
+from hilctl.base.arrays import I64
 from hilctl.base.samples import ANSWERS, COLUMNS, Batch, Flag, Head
+from hilctl.loop.block import Block
 from hilctl.run.shared_page import SIZE as _PAGE_SIZE
-from hilctl.run.shared_page import ControlPage, Field
+from hilctl.run.shared_page import Field, SharedPage
 
 _LINE = 64
-_HEAD, _TAIL = int(Field.HEAD), int(Field.TAIL)
+# Plain numbers: looking up an enumeration's member takes longer than writing it.
+_SENT, _HEAD, _TAIL = int(Field.SENT), int(Field.HEAD), int(Field.TAIL)
+_ENDED_AT = int(Field.ENDED_AT)
+_SEQUENCE, _FIRST_SAMPLE = int(Head.SEQUENCE), int(Head.FIRST_SAMPLE)
 _HEAD_NUMBERS = len(Head)
-_HEAD_BYTES = 8 * _HEAD_NUMBERS
-_HEAD_BUT_SEQUENCE = Struct(f"{len(Head) - 1}q")
 _MAGIC = 0x48494C43_52494E48
+_TYPES = (np.int64, np.float64, np.float64, np.uint32)
 
 
-class SampleRing(ControlPage):
+class SampleRing:
     """The ring, seen from either side.
 
     Args:
-        path: File that holds it.
-        create: Make a new file; otherwise an existing one is attached.
-        slots: Number of blocks it holds, when created.
-        block: Samples in a block, when created.
-        state_size: Numbers of state kept with each block, when created.
-        in_flight: Blocks that may wait for their answer, when created.
+        path: File that holds it; one that :meth:`create` made.
+
+    Attributes:
+        page: Numbers, texts and events beside the blocks.
+        slots: Number of blocks it holds.
+        block: Samples in a block.
+
+    Raises:
+        ValueError: It is no ring, or a damaged one.
+        OSError: It can't be opened.
     """
 
-    def __init__(
-        self,
-        path: Path,
-        *,
-        create: bool,
-        slots: int = 0,
-        block: int = 0,
-        state_size: int = 0,
-        in_flight: int = 0,
-    ) -> None:
+    def __init__(self, path: Path) -> None:
         self.path = path
-        if create:
-            size = _size(slots, block, state_size) + _size(in_flight, block, state_size)
-            descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
-            os.posix_fallocate(descriptor, 0, _PAGE_SIZE + size)
-        else:
-            descriptor = os.open(path, os.O_RDWR)
-        memory = mmap.mmap(descriptor, os.fstat(descriptor).st_size)
-        os.close(descriptor)
-        super().__init__(memory)
-        if create:
-            self.put(Field.SLOTS, slots)
-            self.put(Field.BLOCK, block)
-            self.put(Field.STATE_SIZE, state_size)
-            self.put(Field.IN_FLIGHT, in_flight)
-            self.put(Field.MAGIC, _MAGIC)
-        elif self.get(Field.MAGIC) != _MAGIC:
+        descriptor = os.open(path, os.O_RDWR)
+        try:
+            self._map = mmap.mmap(descriptor, os.fstat(descriptor).st_size)
+        finally:
+            os.close(descriptor)
+        if len(self._map) < _PAGE_SIZE:
             raise ValueError(f"{path}: is not a hilctl ring")
-        self.slots, self.block = self.get(Field.SLOTS), self.get(Field.BLOCK)
-        state_size, in_flight = self.get(Field.STATE_SIZE), self.get(Field.IN_FLIGHT)
-        self._slots = self._area(_PAGE_SIZE, self.slots, state_size)
-        self._heads = self._slots.heads.data.cast("B")
-        self._heads_numbers = self._heads.cast("q")
-        after = _PAGE_SIZE + _size(self.slots, self.block, state_size)
-        self.sent = self._area(after, in_flight, state_size)
-        """Blocks on their way: the sequence number is 0 where there is none."""
-        self._head, self._tail = self.get(Field.HEAD), self.get(Field.TAIL)
+        self.page = SharedPage(self._map)
+        if self.page.get(Field.MAGIC) != _MAGIC:
+            raise ValueError(f"{path}: is not a hilctl ring")
+        self._numbers = self.page.numbers
+        self.slots, self.block = self.page.get(Field.SLOTS), self.page.get(Field.BLOCK)
+        self._spare = self.page.get(Field.SPARE)
+        state_size = self.page.get(Field.STATE_SIZE)
+        if min(self.slots, self.block, self._spare, state_size) < 1:
+            raise ValueError(f"{path}: is damaged")
+        self._area = self._views(state_size)
+        self._heads = memoryview(self._area.heads.data.cast("B")).cast("q")
+        self._sent, self._spares_used = self.page.get(Field.SENT), 0
+        self._tail = self.page.get(Field.TAIL)
 
     @classmethod
     def create(
-        cls, path: Path, *, slots: int, block: int, state_size: int, in_flight: int = 1
+        cls, path: Path, *, slots: int, block: int, state_size: int, latency_blocks: int = 0
     ) -> Self:
-        """Make a new ring; its memory is claimed at once."""
-        return cls(
-            path,
-            create=True,
-            slots=slots,
-            block=block,
-            state_size=state_size,
-            in_flight=in_flight,
-        )
+        """Make a new ring; its memory is claimed at once.
 
-    @classmethod
-    def attach(cls, path: Path) -> Self:
-        """Attach to a ring that another process made.
+        Args:
+            path: File that holds it.
+            slots: Number of blocks it holds.
+            block: Samples in a block.
+            state_size: Numbers of state kept with each block.
+            latency_blocks: Exchanges from a block's commands to its displacements.
 
         Raises:
-            ValueError: It is no ring, or a damaged one.
-            OSError: It can't be opened.
+            OSError: There is no such memory to be had.
         """
-        return cls(path, create=False)
+        spare = latency_blocks + 1  # so many blocks may be on their way without a slot of their own
+        size = sum(_padded(each) for each in _sizes(slots + spare, block, state_size))
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
+        try:
+            os.posix_fallocate(descriptor, 0, _PAGE_SIZE + size)
+            with mmap.mmap(descriptor, _PAGE_SIZE) as memory:
+                numbers = memoryview(memory).cast("q")
+                numbers[Field.SLOTS], numbers[Field.BLOCK] = slots, block
+                numbers[Field.STATE_SIZE], numbers[Field.SPARE] = state_size, spare
+                numbers[Field.MAGIC] = _MAGIC
+                numbers.release()
+        finally:
+            os.close(descriptor)
+        made = cls(path)
+        made._area.columns.fill(np.nan)  # what no device fills is not a measurement
+        return made
 
-    def _area(self, offset: int, slots: int, state_size: int) -> Batch:
+    def _views(self, state_size: int) -> Batch:
+        count, block = self.slots + self._spare, self.block
+        shapes = _shapes(count, block, state_size)
+        sizes = _sizes(count, block, state_size)
+        if _PAGE_SIZE + sum(map(_padded, sizes)) > len(self._map):
+            raise ValueError(f"{self.path}: is shorter than it says")
         parts: list[Any] = []
-        for (size, dtype), shape in zip(
-            _sizes(slots, self.block, state_size),
-            _shapes(slots, self.block, state_size),
-            strict=True,
-        ):
-            count = size // np.dtype(dtype).itemsize
+        offset = _PAGE_SIZE
+        for shape, size, dtype in zip(shapes, sizes, _TYPES, strict=True):
+            count = math.prod(shape)
             parts.append(np.frombuffer(self._map, dtype, count, offset).reshape(shape))
             offset += _padded(size)
         return Batch(*parts)
 
-    def push(
-        self, head: tuple[int, int, int, int, int, int], state: F64, columns: F64, flags: U32
-    ) -> bool:
-        """Put one block in; never waits.
+    def claim(self, *, due: bool = True) -> Block:
+        """Return the slot that the next block is to be born in, see :class:`hilctl.loop.host.Host`.
 
-        Args:
-            head: Numbers of :class:`~hilctl.base.samples.Head` after the sequence.
-            state: float64[s], see :class:`~hilctl.base.samples.Batch`.
-            columns: float64[6, B], see :class:`~hilctl.base.samples.Batch`.
-            flags: uint32[B].
-
-        Returns:
-            False where the ring is full: then nothing was put in.
+        The same one again until :meth:`sending` has been called with it.
         """
-        numbers, number = self.numbers, self._head
-        if number - numbers[_TAIL] >= self.slots:
+        number = self._sent
+        if due and number - self._numbers[_TAIL] < self.slots:
+            slot = number % self.slots
+        else:
+            slot, number = self.slots + self._spares_used % self._spare, -1
+            self._spares_used += 1
+        at, area = slot * _HEAD_NUMBERS, self._area
+        head = self._heads[at : at + _HEAD_NUMBERS]
+        # Views are made anew: those of all slots, kept, would be out of the processor's cache.
+        block = Block(head, area.states[slot], area.columns[slot], area.flags[slot])
+        block.number, block.due = number, due
+        return block
+
+    def sending(self, block: Block) -> None:
+        """Note that a block is on its way to the device, before it is."""
+        numbers = self._numbers
+        if block.number >= 0:
+            block.head[_SEQUENCE] = -block.number - 1
+            self._sent = numbers[_SENT] = block.number + 1
+        numbers[_ENDED_AT] = block.head[_FIRST_SAMPLE] + self.block
+
+    def answered(self, block: Block) -> bool:
+        """Hand a block over to the consumer; False where it has no slot of its own."""
+        if block.number < 0:
             return False
-        slot = number % self.slots
-        area = self._slots
-        area.states[slot] = state
-        area.columns[slot] = columns
-        area.flags[slot] = flags
-        at = slot * _HEAD_BYTES
-        _HEAD_BUT_SEQUENCE.pack_into(self._heads, at + 8, *head)
-        self._heads_numbers[slot * _HEAD_NUMBERS] = number + 1
-        self._head = number + 1
-        numbers[_HEAD] = number + 1
+        # The sequence number last: it says that all the rest is there.
+        block.head[_SEQUENCE] = block.number + 1
+        self._numbers[_HEAD] = block.number + 1
         return True
 
     def pop(self) -> Batch | None:
@@ -151,12 +165,12 @@ class SampleRing(ControlPage):
 
         They keep their room until :meth:`release`.
         """
-        there = min(max(self.get(Field.HEAD) - self._tail, 0), self.slots)
+        there = min(max(self.page.get(Field.HEAD) - self._tail, 0), self.slots)
         if there == 0:
             return None
         first = self._tail % self.slots
         count = min(there, self.slots - first)
-        batch = self._slots.rows(slice(first, first + count))
+        batch = self._area.rows(slice(first, first + count))
         expected = np.arange(self._tail + 1, self._tail + count + 1)
         wrong = np.flatnonzero(batch.heads[:, Head.SEQUENCE] != expected)
         if wrong.size:  # not yet visible, or damaged: what stands before it is good
@@ -173,11 +187,11 @@ class SampleRing(ControlPage):
         Returns:
             How many there were.
         """
-        there = min(max(self.get(Field.HEAD) - self._tail, 0), self.slots)
+        there = min(max(self.page.get(Field.HEAD) - self._tail, 0), self.slots)
         passed = 0
         while passed < there:
             slot = (self._tail + passed) % self.slots
-            if self._slots.heads[slot, Head.SEQUENCE] == self._tail + passed + 1:
+            if self._area.heads[slot, Head.SEQUENCE] == self._tail + passed + 1:
                 break
             passed += 1
         self._tail += passed
@@ -185,8 +199,8 @@ class SampleRing(ControlPage):
 
     def release(self) -> None:
         """Give the room of all that was taken back to the producer: it is safe elsewhere."""
-        super().release()
-        self.control[Field.TAIL] = self._tail
+        self.page.release_events()
+        self.page.put(Field.TAIL, self._tail)
 
     def unanswered(self, next_sample: int) -> Batch | None:
         """Return the blocks that were sent and never answered; for when the producer has died.
@@ -199,10 +213,12 @@ class SampleRing(ControlPage):
             The blocks in order, every sample with :attr:`~hilctl.base.samples.Flag.UNANSWERED`, or
             None. The last may not have reached the device.
         """
-        numbers = self.sent.heads[:, Head.SEQUENCE]
-        order = np.argsort(numbers, kind="stable")
-        firsts = self.sent.heads[order, Head.FIRST_SAMPLE]
-        batch = self.sent.rows(order[(numbers[order] > 0) & (firsts >= next_sample)])
+        sent = self.page.get(Field.SENT)
+        numbers = np.arange(max(self.page.get(Field.HEAD), sent - self.slots, 0), sent)
+        slots: I64 = numbers % self.slots
+        heads = self._area.heads[slots]
+        under_way = heads[:, Head.SEQUENCE] == -numbers - 1
+        batch = self._area.rows(slots[under_way & (heads[:, Head.FIRST_SAMPLE] >= next_sample)])
         if not batch.heads.shape[0]:
             return None
         batch.columns[:, ANSWERS] = np.nan
@@ -228,19 +244,14 @@ def _shapes(slots: int, block: int, state_size: int) -> tuple[tuple[int, ...], .
     return (slots, len(Head)), (slots, state_size), (slots, width, block), (slots, block)
 
 
-def _sizes(slots: int, block: int, state_size: int) -> list[tuple[int, Any]]:
-    """Return bytes and types of heads, states, columns and flags."""
-    types = (np.int64, np.float64, np.float64, np.uint32)
+def _sizes(slots: int, block: int, state_size: int) -> Sequence[int]:
+    """Return the bytes of heads, states, columns and flags."""
     shapes = _shapes(slots, block, state_size)
     return [
-        (int(np.prod(shape)) * np.dtype(dtype).itemsize, dtype)
-        for shape, dtype in zip(shapes, types, strict=True)
+        math.prod(shape) * np.dtype(dtype).itemsize
+        for shape, dtype in zip(shapes, _TYPES, strict=True)
     ]
 
 
 def _padded(size: int) -> int:
     return -(-size // _LINE) * _LINE
-
-
-def _size(slots: int, block: int, state_size: int) -> int:
-    return sum(_padded(size) for size, _ in _sizes(slots, block, state_size))

@@ -64,9 +64,9 @@ class RunFolder:
         return self.path / "reference.npy"
 
     @property
-    def ahead(self) -> Path:
-        """File of what the compensator is fed, where it is not the reference."""
-        return self.path / "ahead.npy"
+    def input_um(self) -> Path:
+        """File of the compensator's input, where it is not the reference."""
+        return self.path / "input_um.npy"
 
     @property
     def socket(self) -> Path:

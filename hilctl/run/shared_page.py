@@ -1,9 +1,10 @@
-"""What loop and supervisor tell each other: numbers, one text, and events, in shared memory.
+"""What loop and supervisor pass to each other in shared memory: numbers, texts and events.
 
 Each number has one writer, and is written whole. Nobody ever waits for the other.
 """
 
 import json
+from contextlib import suppress
 from dataclasses import asdict
 from enum import IntEnum
 from mmap import mmap
@@ -12,33 +13,50 @@ import numpy as np
 
 from hilctl.base.arrays import F64, I64
 from hilctl.base.events import LoopEvent
+from hilctl.loop.pacer import Lateness
+from hilctl.loop.plan import Outcome
 
 _PAGE = 4096
-_TEXT_BYTES = 8192
+_TEXT_BYTES = 4096
 _EVENT_BYTES = 1024
 _EVENT_SLOTS = 32
-_EVENTS_AT = _PAGE + _TEXT_BYTES
+
+
+class Text(IntEnum):
+    """Texts that the loop leaves for the supervisor, each in a place of its own."""
+
+    SET_UP = 0
+    """How its process was set up: JSON of names and what became of each."""
+    OUTCOME = 1
+    """How the run ended: JSON of :class:`hilctl.loop.plan.Outcome`."""
+    ERROR = 2
+    """Why it could not start or go on, for people."""
+
+
+_EVENTS_AT = _PAGE + len(Text) * _TEXT_BYTES
 SIZE = _EVENTS_AT + _EVENT_SLOTS * _EVENT_BYTES
-"""Bytes that the page, the text and the events take."""
+"""Bytes that the numbers, the texts and the events take."""
 
 
 class Field(IntEnum):
-    """Numbers in the control page, int64 each; those named as gain or offset are float64."""
+    """Numbers of the page, int64 each; those named as gain or offset are float64."""
 
     MAGIC = 0
     SLOTS = 1
     BLOCK = 2
     STATE_SIZE = 3
-    IN_FLIGHT = 4
+    SPARE = 4
+    SENT = 7
     HEAD = 8
     TAIL = 16
     PHASE = 24
     GO = 25
     STOP = 26
-    LOOP_BEAT_NS = 27
-    SUPERVISOR_BEAT_NS = 28
+    LOOP_HEARTBEAT_NS = 27
+    SUPERVISOR_HEARTBEAT_NS = 28
     START_NS = 29
     NEXT_SAMPLE = 30
+    ENDED_AT = 31
     LATE_TICKS = 32
     SKIPPED_TICKS = 33
     WORST_LATE_NS = 34
@@ -66,7 +84,31 @@ class Phase(IntEnum):
     CLOSING = 6
 
 
-class ControlPage:
+class Stop(IntEnum):
+    """Why the supervisor has the loop stop; 0 is for no stop."""
+
+    CTRL_C = 1
+    SIGTERM = 2
+    SIGHUP = 3
+    RECORDER_FAILED = 4
+    REQUEST = 5
+
+    @property
+    def reason(self) -> str:
+        """In words."""
+        return _REASONS[self]
+
+
+_REASONS = {
+    Stop.CTRL_C: "stopped by Ctrl-C",
+    Stop.SIGTERM: "stopped by SIGTERM",
+    Stop.SIGHUP: "stopped by SIGHUP: the terminal went away",
+    Stop.RECORDER_FAILED: "stopped because the recording can't be written",
+    Stop.REQUEST: "stopped by hilctl stop",
+}
+
+
+class SharedPage:
     """The page, seen from either side.
 
     Args:
@@ -75,7 +117,7 @@ class ControlPage:
 
     def __init__(self, memory: mmap) -> None:
         self._map = memory
-        self.control: I64 = np.frombuffer(memory, dtype=np.int64, count=_PAGE // 8)
+        self._integers: I64 = np.frombuffer(memory, dtype=np.int64, count=_PAGE // 8)
         self.numbers = memoryview(memory)[:_PAGE].cast("q")
         """The same numbers as Python's own: three times as fast to read and write singly."""
         self._floats: F64 = np.frombuffer(memory, dtype=np.float64, count=_PAGE // 8)
@@ -83,11 +125,11 @@ class ControlPage:
 
     def get(self, field: Field) -> int:
         """Return a number."""
-        return int(self.control[field])
+        return int(self._integers[field])
 
     def put(self, field: Field, value: int) -> None:
         """Set a number."""
-        self.control[field] = value
+        self._integers[field] = value
 
     def get_float(self, field: Field) -> float:
         """Return a number that is no whole one."""
@@ -97,19 +139,45 @@ class ControlPage:
         """Set a number that is no whole one."""
         self._floats[field] = value
 
-    def write_text(self, text: str) -> None:
+    def write_text(self, place: Text, text: str) -> None:
         """Leave a text for the other side, cut to what fits."""
-        self._write(_PAGE, _TEXT_BYTES, text)
+        self._write(_PAGE + place * _TEXT_BYTES, _TEXT_BYTES, text)
 
-    def read_text(self) -> str:
+    def read_text(self, place: Text) -> str:
         """Return the text that the other side left."""
-        return self._read(_PAGE, _TEXT_BYTES)
+        return self._read(_PAGE + place * _TEXT_BYTES, _TEXT_BYTES)
+
+    def lateness(self) -> Lateness:
+        """Return the counters of late ticks that the loop left."""
+        return Lateness(
+            late_ticks=self.get(Field.LATE_TICKS),
+            skipped_ticks=self.get(Field.SKIPPED_TICKS),
+            worst_ns=self.get(Field.WORST_LATE_NS),
+            worst_tick=self.get(Field.WORST_LATE_TICK),
+            longest_run=self.get(Field.LONGEST_LATE_RUN),
+        )
+
+    def leave_lateness(self, lateness: Lateness) -> None:
+        """Leave the counters of late ticks for the supervisor."""
+        self.put(Field.LATE_TICKS, lateness.late_ticks)
+        self.put(Field.SKIPPED_TICKS, lateness.skipped_ticks)
+        self.put(Field.WORST_LATE_NS, lateness.worst_ns)
+        self.put(Field.WORST_LATE_TICK, lateness.worst_tick)
+        self.put(Field.LONGEST_LATE_RUN, lateness.longest_run)
+
+    def outcome(self) -> Outcome | None:
+        """Return how the loop said that the run ended; None where it said nothing."""
+        if self.get(Field.PHASE) != Phase.ENDED:
+            return None
+        with suppress(ValueError, TypeError):  # damaged
+            return Outcome(**json.loads(self.read_text(Text.OUTCOME)))
+        return None
 
     def push_event(self, event: LoopEvent) -> None:
         """Leave an event; where there is no room it is counted as lost."""
         head = self.get(Field.EVENT_HEAD)
         if head - self.get(Field.EVENT_TAIL) >= _EVENT_SLOTS:
-            self.control[Field.EVENTS_LOST] += 1
+            self._integers[Field.EVENTS_LOST] += 1
             return
         text = event.text
         while len(raw := json.dumps({**asdict(event), "text": text})) > _EVENT_BYTES - 8:
@@ -118,7 +186,7 @@ class ControlPage:
         self.put(Field.EVENT_HEAD, head + 1)
 
     def pop_events(self) -> list[LoopEvent]:
-        """Take the events that came since; they keep their room until :meth:`release`."""
+        """Take the events that came since; they keep their room until they are released."""
         head, found = self.get(Field.EVENT_HEAD), []
         first = max(self._event_tail, head - _EVENT_SLOTS)
         for number in range(first, head):
@@ -126,12 +194,12 @@ class ControlPage:
             try:
                 found.append(LoopEvent(**json.loads(raw)))
             except (ValueError, TypeError):
-                self.control[Field.EVENTS_LOST] += 1  # damaged
+                self._integers[Field.EVENTS_LOST] += 1  # damaged
         self._event_tail = head
         return found
 
-    def release(self) -> None:
-        """Give the room of all that was taken back to the loop: it is safe elsewhere."""
+    def release_events(self) -> None:
+        """Give the room of all events that were taken back to the loop: they are safe elsewhere."""
         self.put(Field.EVENT_TAIL, self._event_tail)
 
     def _write(self, at: int, size: int, text: str) -> None:

@@ -1,7 +1,7 @@
 """The supervisor: starts the loop process, records what it exchanges, and makes the rig safe.
 
-It holds no device while the loop lives. Should the loop process die or hang, it drains the ring to
-the last sample, puts the output at its safe value by a connection of its own, and closes the
+It holds no device while the loop lives. Should the loop process die or hang, it puts the output at
+its safe value by a connection of its own, drains the ring to the last sample, and closes the
 recording.
 """
 
@@ -11,12 +11,12 @@ import signal
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from types import FrameType
 
 from hilctl.base.errors import DeviceError, InputError, RunError
 from hilctl.experiment.check import Checked
-from hilctl.loop.compensator import Compensator
 from hilctl.loop.plan import Outcome
 from hilctl.machine.realtime import be_ordinary
 from hilctl.run.child import LoopChild
@@ -24,19 +24,21 @@ from hilctl.run.control_socket import ControlServer
 from hilctl.run.ending import end_facts
 from hilctl.run.hang_watch import HangWatch
 from hilctl.run.recorder import Recorder
-from hilctl.run.requests import Orders
+from hilctl.run.requests import Requests
 from hilctl.run.result import Progress, RunResult
 from hilctl.run.ring import SampleRing
 from hilctl.run.run_folder import RunFolder, held_devices, run_folder
-from hilctl.run.shared_page import Field
+from hilctl.run.shared_page import Field, Stop, Text
 from hilctl.run.systemd import Notifier
 
 _POLL_S = 0.02
 _START_DELAY_NS = 50_000_000
 _HANG_MARGIN_S = 0.5
-_SIGNALS = {signal.SIGINT: 1, signal.SIGTERM: 2, signal.SIGHUP: 3}
-_RECORDER_FAILED = 4
-_STOP_ORDER = 5
+_SIGNALS = {
+    signal.SIGINT: Stop.CTRL_C,
+    signal.SIGTERM: Stop.SIGTERM,
+    signal.SIGHUP: Stop.SIGHUP,
+}
 
 
 class Supervisor:
@@ -89,26 +91,33 @@ class Supervisor:
             except BaseException:
                 recorder.give_back()
                 raise
-            try:
-                child.await_ready(lambda: self._stop_signal != 0)
-                start_ns = time.monotonic_ns() + _START_DELAY_NS
-                started = time.time_ns() + start_ns - time.monotonic_ns()
-                recorder.begin(started, json.loads(ring.read_text()))
-            except (RunError, InputError):
-                child.kill()  # it waits for the word to start, so nothing has moved
-                recorder.give_back()
-                raise
-            ring.put(Field.SUPERVISOR_BEAT_NS, time.monotonic_ns())
-            ring.put(Field.START_NS, start_ns)
-            ring.put(Field.GO, 1)
+            self._start(ring, child, recorder)
             self._notifier.say("READY=1", f"STATUS=recording to {self._output}")
-            orders = Orders(self._checked, folder, ring, recorder)
-            with ControlServer(folder.socket, orders.answer) as server:
-                hung = self._drain_while_alive(ring, child, recorder, server, orders)
+            requests = Requests(self._checked, folder, ring.page, recorder)
+            started = _StartedRun(self._checked, ring, child, recorder, requests)
+            with ControlServer(folder.socket, requests.answer) as server:
+                while started.attend(self._stop_signal, self._on_progress):
+                    self._notifier.alive()
+                    server.serve(_POLL_S)
             self._notifier.say("STOPPING=1")
-            outcome = self._outcome(ring, child, recorder, hung)
-            recorder.finish(end_facts(outcome, ring), outcome.ended_at)
-            return self._result(outcome, ring, recorder, ordered=orders.stop)
+            return self._result(started.end(self._on_progress), started)
+
+    def _start(self, ring: SampleRing, child: LoopChild, recorder: Recorder) -> None:
+        """Wait for the loop to be ready, and give it the word to start."""
+        page = ring.page
+        try:
+            child.await_ready(lambda: self._stop_signal != 0)
+            start_ns = time.monotonic_ns() + _START_DELAY_NS
+            unix_ns = time.time_ns() + start_ns - time.monotonic_ns()
+            recorder.begin(unix_ns, json.loads(page.read_text(Text.SET_UP)))
+        except (RunError, InputError):
+            child.kill()  # it waits for the word to start, so nothing has moved
+            recorder.give_back()
+            raise
+        # The heartbeat before the word: the loop would take an old one for silence.
+        page.put(Field.SUPERVISOR_HEARTBEAT_NS, time.monotonic_ns())
+        page.put(Field.START_NS, start_ns)
+        page.put(Field.GO, 1)
 
     @property
     def _silence_s(self) -> float:
@@ -130,95 +139,21 @@ class Supervisor:
 
     def _make_ring(self, folder: RunFolder) -> SampleRing:
         config, info = self._config, self._checked.loaded.device.info
-        slots = max(16, int(config.recording.ring_s / config.tick_s))
-        state = Compensator(self._checked.loaded.model, config.sample_rate_hz).state_size + 1
         try:
             return SampleRing.create(
                 folder.ring,
-                slots=slots,
+                slots=max(16, int(config.recording.ring_s / config.tick_s)),
                 block=config.block,
-                state_size=state,
-                in_flight=info.latency_blocks + 1,
+                state_size=self._checked.state_size,
+                latency_blocks=info.latency_blocks,
             )
         except OSError as error:
             hint = "less recording.ring_s needs less of it"
             raise RunError(f"{folder.ring}: no memory: {error.strerror}; {hint}") from None
 
-    def _drain_while_alive(
-        self,
-        ring: SampleRing,
-        child: LoopChild,
-        recorder: Recorder,
-        server: ControlServer,
-        orders: Orders,
-    ) -> bool:
-        """Record until the loop is gone; return whether it hung and had to be killed."""
-        limit_s = self._config.tick_s + self._config.timing.max_late_s + _HANG_MARGIN_S
-        watch = HangWatch(ring, limit_s)
-        flushed = time.monotonic()
-        hung = False
-        while True:
-            ended = child.ended
-            ring.put(Field.SUPERVISOR_BEAT_NS, time.monotonic_ns())
-            self._order_stop(ring, recorder, orders)
-            self._drain(ring, recorder)
-            now = time.monotonic()
-            if now - flushed >= self._config.recording.flush_s:
-                recorder.flush()
-                ring.release()
-                flushed = now
-            if ended:
-                return hung
-            if watch.hangs(time.monotonic_ns()):
-                hung = True
-                child.kill()
-            self._notifier.alive()
-            server.serve(_POLL_S)
-
-    def _order_stop(self, ring: SampleRing, recorder: Recorder, orders: Orders) -> None:
-        if self._stop_signal:
-            ring.put(Field.STOP, _SIGNALS[signal.Signals(self._stop_signal)])
-        elif orders.stop:
-            ring.put(Field.STOP, _STOP_ORDER)
-        elif recorder.error and self._config.recording.on_failure == "stop":
-            ring.put(Field.STOP, _RECORDER_FAILED)
-
-    def _drain(self, ring: SampleRing, recorder: Recorder) -> None:
-        while (batch := ring.pop()) is not None:
-            recorder.batch(batch)
-            total, late = self._checked.forecast.samples, ring.get(Field.LATE_TICKS)
-            self._on_progress(Progress(recorder.samples, total, late, batch))
-        for event in ring.pop_events():
-            recorder.event(event)
-
-    def _outcome(
-        self, ring: SampleRing, child: LoopChild, recorder: Recorder, hung: bool
-    ) -> Outcome:
-        said = child.outcome()
-        if isinstance(said, Outcome):
-            self._salvage(ring, recorder)
-            return said
-        reason = "the loop process hung, and was killed" if hung else said
-        safe = True
-        try:
-            self._checked.loaded.device.make_safe(self._config.safe.value)
-        except DeviceError as error:
-            reason += f"; the safe value could not be confirmed: {error}"
-            safe = False
-        self._salvage(ring, recorder)
-        if (batch := ring.unanswered(recorder.next_sample)) is not None:
-            recorder.batch(batch)
-        return Outcome("fault", reason, recorder.next_sample, safe, 0)
-
-    def _salvage(self, ring: SampleRing, recorder: Recorder) -> None:
-        """Take what stands behind damaged blocks, now that no more will come."""
-        while ring.skip_damaged():
-            self._drain(ring, recorder)
-
-    def _result(
-        self, outcome: Outcome, ring: SampleRing, recorder: Recorder, *, ordered: bool
-    ) -> RunResult:
-        stop_signal = self._stop_signal or (signal.SIGTERM if ordered else 0)
+    def _result(self, outcome: Outcome, started: "_StartedRun") -> RunResult:
+        recorder = started.recorder
+        stop_signal = self._stop_signal or (signal.SIGTERM if started.requests.stop else 0)
         cut = f"; {recorder.missing} samples are lost: {recorder.error}" if recorder.error else ""
         fault = recorder.error or (outcome.code == "stopped" and not stop_signal)
         code = "fault" if fault else outcome.code
@@ -230,5 +165,90 @@ class Supervisor:
             stop_signal=stop_signal if code == "stopped" else 0,
             samples=recorder.samples,
             missing=recorder.missing,
-            late_ticks=ring.get(Field.LATE_TICKS),
+            late_ticks=started.ring.page.get(Field.LATE_TICKS),
         )
+
+
+class _StartedRun:
+    """A run whose loop exchanges samples: its ring, its process, its recording, its requests."""
+
+    def __init__(
+        self,
+        checked: Checked,
+        ring: SampleRing,
+        child: LoopChild,
+        recorder: Recorder,
+        requests: Requests,
+    ) -> None:
+        self.ring, self.child, self.recorder, self.requests = ring, child, recorder, requests
+        self._checked = checked
+        self._config = checked.loaded.config
+        limit_s = self._config.tick_s + self._config.timing.max_late_s + _HANG_MARGIN_S
+        self._watch = HangWatch(ring.page, limit_s)
+        self._flushed = time.monotonic()
+        self._hung = False
+
+    def attend(self, stop_signal: int, on_progress: Callable[[Progress], None]) -> bool:
+        """Show that this side lives, pass a stop on, and record; return whether the loop lives."""
+        page = self.ring.page
+        # Asked before the ring is drained: of a loop that has ended, nothing can come after that.
+        ended = self.child.ended
+        page.put(Field.SUPERVISOR_HEARTBEAT_NS, time.monotonic_ns())
+        self._pass_stop_on(stop_signal)
+        self._drain(on_progress)
+        now = time.monotonic()
+        if now - self._flushed >= self._config.recording.flush_s:
+            # Room is given back only once the file has what stood there.
+            self.recorder.flush()
+            self.ring.release()
+            self._flushed = now
+        if not ended and self._watch.hangs(time.monotonic_ns()):
+            self._hung = True
+            self.child.kill()
+        return not ended
+
+    def end(self, on_progress: Callable[[Progress], None]) -> Outcome:
+        """Return how the run ended, with the output safe and the recording closed."""
+        said = self.child.outcome()
+        # The coil comes before the samples: those wait in memory, and lose nothing by it.
+        outcome = said if isinstance(said, Outcome) else self._make_safe(said)
+        while self.ring.skip_damaged():  # no more will come: take what stands behind damaged blocks
+            self._drain(on_progress)
+        if outcome is not said:
+            if (batch := self.ring.unanswered(self.recorder.next_sample)) is not None:
+                self.recorder.batch(batch)
+            ended_at = max(self.recorder.next_sample, self.ring.page.get(Field.ENDED_AT))
+            outcome = replace(outcome, ended_at=ended_at)
+        page = self.ring.page
+        facts = end_facts(outcome, page.lateness(), page.get(Field.EVENTS_LOST))
+        self.recorder.finish(facts, outcome.ended_at)
+        return outcome
+
+    def _make_safe(self, death: str) -> Outcome:
+        """Put the output at its safe value in the place of a loop that can't."""
+        reason = "the loop process hung, and was killed" if self._hung else death
+        safe = True
+        try:
+            self._checked.loaded.device.make_safe(self._config.safe.value)
+        except DeviceError as error:
+            reason += f"; the safe value could not be confirmed: {error}"
+            safe = False
+        return Outcome("fault", reason, 0, safe, 0)
+
+    def _pass_stop_on(self, stop_signal: int) -> None:
+        page = self.ring.page
+        if stop_signal:
+            page.put(Field.STOP, _SIGNALS[signal.Signals(stop_signal)])
+        elif self.requests.stop:
+            page.put(Field.STOP, Stop.REQUEST)
+        elif self.recorder.error and self._config.recording.on_failure == "stop":
+            page.put(Field.STOP, Stop.RECORDER_FAILED)
+
+    def _drain(self, on_progress: Callable[[Progress], None]) -> None:
+        page, recorder = self.ring.page, self.recorder
+        while (batch := self.ring.pop()) is not None:
+            recorder.batch(batch)
+            total, late = self._checked.forecast.samples, page.get(Field.LATE_TICKS)
+            on_progress(Progress(recorder.samples, total, late, batch))
+        for event in page.pop_events():
+            recorder.event(event)

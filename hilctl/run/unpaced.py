@@ -1,85 +1,116 @@
 """A run on a simulated device, in this process, as fast as it goes.
 
 The simulated devices step on sample count, so that a run of them needs no real time. All else is
-as in a paced run: preflight, loop, compensator, limiter, interlocks, recorder.
+as in a paced run: check, loop, compensator, limiter, interlocks, recorder.
 """
 
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
-from hilctl.base.arrays import F64, U32
+from hilctl.base.device import Clock
 from hilctl.base.errors import InputError
 from hilctl.base.events import LoopEvent
 from hilctl.base.samples import Batch
 from hilctl.experiment.check import Checked
-from hilctl.experiment.feedback import make_feedback
-from hilctl.experiment.interlocks import interlock_limits
-from hilctl.loop.compensator import Compensator
-from hilctl.loop.in_flight import DelayLine
-from hilctl.loop.interlocks import Interlocks
-from hilctl.loop.limiter import Limiter
-from hilctl.loop.loop import Loop
-from hilctl.loop.pacer import Pacer
-from hilctl.loop.plan import Outcome, Plan, Tuning
+from hilctl.loop.block import Block
+from hilctl.loop.host import Tuning
+from hilctl.loop.pacer import Lateness
+from hilctl.loop.plan import Outcome
+from hilctl.run.assemble import assemble
+from hilctl.run.ending import end_facts
 from hilctl.run.recorder import Recorder
 from hilctl.run.result import RunResult
 
 _BLOCKS_A_BATCH = 256
 
 
-class _SampleClock:
+class SampleClock:
     """Time that passes only in sleeps, and takes none."""
 
     def __init__(self) -> None:
         self._now_ns = 0
 
     def now_ns(self) -> int:
+        """Return the time in ns."""
         return self._now_ns
 
     def sleep_until_ns(self, deadline_ns: int) -> None:
+        """Let the time be ``deadline_ns``."""
         self._now_ns = max(self._now_ns, deadline_ns)
 
 
-class _RecorderSink:
-    """Passes the loop's blocks to a recorder, some at a time; watches over nothing."""
+class BatchHost:
+    """A host that gathers blocks in this process's own memory; supervises nothing.
 
-    def __init__(self, recorder: Recorder, block: int, state_size: int) -> None:
-        self._recorder = recorder
-        self._room = Batch.empty(_BLOCKS_A_BATCH, block, state_size)
-        self._filled = 0
+    Args:
+        block: Samples in a block.
+        state_size: Numbers of state kept with each block.
+        latency_blocks: Exchanges from a block's commands to its displacements.
+        on_batch: Takes blocks, some at a time; they are valid until it returns.
+        on_event: Takes events.
+        stop: Why the run should end, or an empty text.
+    """
 
-    def push(
-        self, head: tuple[int, int, int, int, int, int], state: F64, columns: F64, flags: U32
-    ) -> bool:
-        k = self._filled
-        self._room.heads[k, 1:] = head
-        self._room.states[k] = state
-        self._room.columns[k] = columns
-        self._room.flags[k] = flags
-        self._filled += 1
-        if self._filled == _BLOCKS_A_BATCH:
+    def __init__(
+        self,
+        block: int,
+        state_size: int,
+        latency_blocks: int,
+        *,
+        on_batch: Callable[[Batch], None],
+        on_event: Callable[[LoopEvent], None] = lambda event: None,
+        stop: Callable[[], str] = lambda: "",
+    ) -> None:
+        self.clock: Clock = SampleClock()
+        # No slot is used again before the batch that its block is in has been taken.
+        self._room = Batch.empty(_BLOCKS_A_BATCH + 2 * (latency_blocks + 1), block, state_size)
+        self._claimed = self._first = self._answered = 0
+        self._on_batch, self._on_event, self._stop = on_batch, on_event, stop
+
+    def claim(self, *, due: bool = True) -> Block:
+        """Return room for the next block."""
+        slot, room = self._claimed % self._room.heads.shape[0], self._room
+        head = room.heads[slot].data.cast("B").cast("q")
+        block = Block(head, room.states[slot], room.columns[slot], room.flags[slot])
+        block.number, block.due = self._claimed if due else -1, due
+        self._claimed += 1
+        return block
+
+    def sending(self, block: Block) -> None:
+        """Do nothing: this process outlives no block."""
+
+    def answered(self, block: Block) -> bool:
+        """Gather a block."""
+        self._answered = block.number + 1
+        if self._answered - self._first == _BLOCKS_A_BATCH:
             self.flush()
         return True
 
     def flush(self) -> None:
-        if self._filled:
-            self._recorder.batch(self._room.rows(slice(0, self._filled)))
-            self._filled = 0
+        """Pass on what has been gathered."""
+        if self._answered > self._first:
+            size = self._room.heads.shape[0]
+            self._on_batch(self._room.rows(np.arange(self._first, self._answered) % size))
+            self._first = self._answered
 
-    def beat(self, next_sample: int) -> str:
-        return self._recorder.error
+    def heartbeat(self, next_sample: int, late_ticks: int) -> str:
+        """Return why the run should end, or an empty text."""
+        return self._stop()
 
     def closing(self) -> None:
-        pass
+        """Do nothing: nobody watches."""
 
     def tuning(self) -> Tuning | None:
+        """Return no change: nobody asks for one."""
         return None
 
-    def tell(self, event: LoopEvent) -> None:
+    def record_event(self, event: LoopEvent) -> None:
+        """Pass an event on, after the blocks before it."""
         self.flush()
-        self._recorder.event(event)
+        self._on_event(event)
 
 
 def run_unpaced(checked: Checked, output: Path, *, overwrite: bool = False) -> RunResult:
@@ -102,8 +133,8 @@ def run_unpaced(checked: Checked, output: Path, *, overwrite: bool = False) -> R
     except InputError:
         recorder.give_back()
         raise
-    outcome, pacer = _run(checked, recorder)
-    recorder.finish(_end_facts(outcome, pacer), outcome.ended_at)
+    outcome, lateness = _run(checked, recorder)
+    recorder.finish(end_facts(outcome, lateness), outcome.ended_at)
     cut = f"; the recording is cut short: {recorder.error}" if recorder.error else ""
     return RunResult(
         path=output,
@@ -113,58 +144,27 @@ def run_unpaced(checked: Checked, output: Path, *, overwrite: bool = False) -> R
         stop_signal=0,
         samples=recorder.samples,
         missing=recorder.missing,
-        late_ticks=pacer.counters.late_ticks,
+        late_ticks=lateness.late_ticks,
     )
 
 
-def _run(checked: Checked, recorder: Recorder) -> tuple[Outcome, Pacer]:
-    config, device = checked.loaded.config, checked.loaded.device
-    rate_hz = config.sample_rate_hz
-    compensator = Compensator(checked.loaded.model, rate_hz)
-    if checked.state is not None:
-        compensator.restore(checked.state)
-    compensator.warm_up()
-    if checked.state is not None:
-        compensator.restore(checked.state)
-    state_size = compensator.state_size + 1
-    clock, sink = _SampleClock(), _RecorderSink(recorder, config.block, state_size)
-    pacer = Pacer(clock, config.tick_s * 1e9, "catch_up", np.inf)
-    plan = Plan(
-        reference=checked.reference.values,
-        in_um=config.waveform.unit == "um",
-        block=config.block,
-        max_late_ns=np.inf,
-        ahead=checked.ahead,
+def _run(checked: Checked, recorder: Recorder) -> tuple[Outcome, Lateness]:
+    loaded = checked.loaded
+    config, device = loaded.config, loaded.device
+    host = BatchHost(
+        config.block,
+        checked.state_size,
+        device.info.latency_blocks,
+        on_batch=recorder.batch,
+        on_event=recorder.event,
+        stop=lambda: recorder.error,
     )
-    loop = Loop(
-        plan,
-        device,
-        compensator,
-        Limiter(config.command_limits(), 1.0 / rate_hz),
-        Interlocks(interlock_limits(config, device.info), rate_hz),
-        pacer,
-        clock,
-        DelayLine(Batch.empty(device.info.latency_blocks + 1, config.block, state_size)),
-        sink,
-        sink,
-        make_feedback(config, compensator),
-    )
-    device.open(rate_hz, config.block)
+    samples = (checked.reference.values, checked.input_um, checked.state)
+    loop = assemble(loaded, *samples, host, paced=False)
+    device.open(config.sample_rate_hz, config.block)
     try:
         outcome = loop.run(0)
     finally:
         device.close()
-        sink.flush()
-    return outcome, pacer
-
-
-def _end_facts(outcome: Outcome, pacer: Pacer) -> dict[str, str]:
-    counters = pacer.counters
-    return {
-        "code": outcome.code,
-        "reason": outcome.reason,
-        "output_safe": str(outcome.safe).lower(),
-        "late_ticks": str(counters.late_ticks),
-        "skipped_ticks": str(counters.skipped_ticks),
-        "dropped_in_ring": str(outcome.dropped),
-    }
+        host.flush()
+    return outcome, loop.lateness

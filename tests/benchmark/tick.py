@@ -14,20 +14,21 @@ import sys
 import tempfile
 import time
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
 from hilctl.base.samples import Head
+from hilctl.experiment.check import Checked, check
 from hilctl.experiment.load import LoadedExperiment, load_experiment
-from hilctl.loop.compensator import Compensator
 from hilctl.loop.pacer import SystemClock
 from hilctl.machine.realtime import prepare
 from hilctl.machine.settings import Realtime
 from hilctl.run import loop_process
+from hilctl.run.job import Job
 from hilctl.run.ring import SampleRing, memory_folder
+from hilctl.run.run_folder import RunCard, RunFolder
 from hilctl.run.shared_page import Field
-from hilctl.waveforms.build import build
 
 EXPERIMENT = Path(__file__).parents[2] / "configs" / "terfenol_sine_6a.yaml"
 HAL = """\
@@ -76,33 +77,26 @@ def experiment(options: argparse.Namespace) -> LoadedExperiment:
     return load_experiment(EXPERIMENT, [f"{key}={value}" for key, value in settings.items()])
 
 
-def job(folder: Path, loaded: LoadedExperiment) -> dict[str, Any]:
+def job(folder: RunFolder, checked: Checked) -> Job:
     """Return what the supervisor hands to the loop process, with nobody to be silent."""
-    rate_hz = loaded.config.sample_rate_hz
-    values = build(loaded.config.waveform, rate_hz, folder).values
-    ahead = Compensator(loaded.model, rate_hz).ahead(values)
-    work = {"reference": str(folder / "reference.npy"), "supervisor": os.getppid()}
-    np.save(work["reference"], values)
-    if ahead is not values:
-        work["ahead"] = str(folder / "ahead.npy")
-        np.save(work["ahead"], ahead)
-    return {**work, "silence_s": 1e9}
+    return Job.of(checked, folder, supervisor=os.getppid(), silence_s=1e9)
 
 
 def ticks_us(options: argparse.Namespace) -> tuple[np.ndarray, np.ndarray]:
     """Run the loop; return the cost of each tick beside the exchange, and the exchange, in us."""
-    loaded = experiment(options)
-    slots = options.ticks + 10 * round(loaded.config.safe.ramp_s * options.rate)
-    state = Compensator(loaded.model, options.rate).state_size + 1
+    checked = check(experiment(options))
+    config = checked.loaded.config
+    slots = options.ticks + 10 * round(config.safe.ramp_s * options.rate)
     loop_process.SystemClock = NotingClock  # type: ignore[misc]
     with tempfile.TemporaryDirectory(prefix="hilctl-", dir=memory_folder()) as name:
-        ring = SampleRing.create(Path(name) / "ring", slots=slots, block=1, state_size=state)
-        work = job(Path(name), loaded)
+        folder = RunFolder(Path(name), RunCard("tick", "tick", "", os.getpid(), 0.0))
+        ring = SampleRing.create(folder.ring, slots=slots, block=1, state_size=checked.state_size)
+        work = job(folder, checked)
         for step in prepare(Realtime(priority=options.priority)):
             print(f"{step.name:>13}  {step.outcome}: {step.detail}")
-        ring.put(Field.START_NS, time.monotonic_ns() + 50_000_000)
-        ring.put(Field.GO, 1)
-        outcome = loop_process._run(work, ring, loaded)
+        ring.page.put(Field.START_NS, time.monotonic_ns() + 50_000_000)
+        ring.page.put(Field.GO, 1)
+        outcome = loop_process.run_job(work, ring, work.load())
         batch = ring.pop()
     if outcome.code != "completed" or batch is None:
         sys.exit(f"the run ended as {outcome.code}: {outcome.reason}")

@@ -8,7 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hilctl.base.samples import Flag
-from hilctl.loop.interlocks import InterlockLimits, Interlocks
+from hilctl.kernels.interlock import InterlockFlag
+from tests.fakes import RigInterlocks
 
 RATE_HZ = 100.0
 LEVELS = st.sampled_from([-9.0, -2.0, -0.5, 0.0, 0.25, 0.5, 1.0, 3.0, 4.0, math.nan, math.inf])
@@ -20,18 +21,18 @@ TIMES = st.sampled_from([0.0, 0.01, 0.03])
 @st.composite
 def limits(draw):
     """Any interlocks, each on or off."""
-    return InterlockLimits(
+    return RigInterlocks(
         stroke_um=(-5.0, 3.5),
         sensor_um=draw(st.sampled_from([(-math.inf, math.inf), (-8.0, 8.0), (-2.0, 3.0)])),
         safe=draw(COMMANDS),
-        frozen_s=draw(st.sampled_from([0.01, 0.03, math.inf])),
+        frozen_s=draw(st.sampled_from([0.01, 0.03, None])),
         frozen_um=draw(st.sampled_from([0.0, 0.3])),
         frozen_travel=draw(st.sampled_from([0.3, 2.0])),
-        deviation=draw(st.sampled_from([0.0, 0.5, math.inf])),
+        measured_deviation_a=draw(st.sampled_from([1e-9, 0.5, None])),
         deviation_s=draw(TIMES),
-        rms_current_a=draw(st.sampled_from([0.5, 2.0, math.inf])),
-        time_constant_s=draw(st.sampled_from([0.02, 1.0])),
-        tracking_um=draw(st.sampled_from([0.5, 2.0, math.inf])),
+        rms_current_a=draw(st.sampled_from([0.5, 2.0, None])),
+        thermal_time_constant_s=draw(st.sampled_from([0.02, 1.0])),
+        tracking_error_um=draw(st.sampled_from([0.5, 2.0, None])),
         tracking_s=draw(TIMES),
     )
 
@@ -43,7 +44,7 @@ def columns(rows):
 
 def judged(settings, rows, cuts=()):
     """Return the first trip and the flags, with the rows cut into blocks."""
-    interlocks, given_columns = Interlocks(settings, RATE_HZ), columns(rows)
+    interlocks, given_columns = settings.made(RATE_HZ), columns(rows)
     flags = np.zeros(len(rows), dtype=np.uint32)
     bounds = sorted({0, len(rows), *(cut % (len(rows) + 1) for cut in cuts)})
     trip = None
@@ -69,16 +70,17 @@ class Rules:
         if not (low <= displacement <= high and left < displacement < right):
             found |= Flag.SENSOR_INVALID
         if self.frozen():
-            found |= Flag.SENSOR_FROZEN
-        if math.isfinite(settings.deviation) and self.lasts(self.deviates, settings.deviation_s):
-            found |= Flag.DEVIATION
+            found |= InterlockFlag.SENSOR_FROZEN
+        deviates = settings.measured_deviation_a is not None
+        if deviates and self.lasts(self.deviates, settings.deviation_s):
+            found |= InterlockFlag.DEVIATION
         load = max(command**2, measured**2 if math.isfinite(measured) else 0.0)
-        share = 1.0 - math.exp(-1.0 / (settings.time_constant_s * RATE_HZ))
+        share = 1.0 - math.exp(-1.0 / (settings.thermal_time_constant_s * RATE_HZ))
         self.heat += (load - self.heat) * share
-        if self.heat > settings.rms_current_a**2:
-            found |= Flag.THERMAL
-        if self.lasts(self.off_track, settings.tracking_s):
-            found |= Flag.TRACKING_ERROR
+        if settings.rms_current_a and self.heat > settings.rms_current_a**2:
+            found |= InterlockFlag.THERMAL
+        if settings.tracking_error_um and self.lasts(self.off_track, settings.tracking_s):
+            found |= InterlockFlag.TRACKING_ERROR
         return found
 
     def lasts(self, condition, time_s):
@@ -90,17 +92,17 @@ class Rules:
     def deviates(self, k):
         before = self.history[k - 1][0] if k else self.settings.safe
         command, _, _, measured = self.history[k]
-        away = self.settings.deviation
+        away = self.settings.measured_deviation_a
         return not min(before, command) - away <= measured <= max(before, command) + away
 
     def off_track(self, k):
         _, reference, displacement, _ = self.history[k]
-        return abs(reference - displacement) > self.settings.tracking_um
+        return abs(reference - displacement) > self.settings.tracking_error_um
 
     def frozen(self):
         """Whether the reading has stayed the same for the time after the command had moved."""
         settings = self.settings
-        if not math.isfinite(settings.frozen_s):
+        if settings.frozen_s is None:
             return False
         start = 0
         for k, (_, _, reading, _) in enumerate(self.history):
@@ -145,7 +147,7 @@ def test_any_reading_after_a_gap_is_judged(settings, rows, gap):
     finite = [row for row in rows if all(map(math.isfinite, row))]
     if not finite:
         return
-    interlocks = Interlocks(settings, RATE_HZ)
+    interlocks = settings.made(RATE_HZ)
     for k, row in enumerate(finite):
         flags = np.zeros(1, dtype=np.uint32)
         trip = interlocks.check(k * (gap + 1), *columns([row]), flags)

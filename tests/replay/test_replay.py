@@ -9,7 +9,7 @@ import yaml
 
 from hilctl.analysis.replay import replay
 from hilctl.base.errors import DataError
-from hilctl.experiment.initial_state import memory_after
+from hilctl.experiment.initial_state import initial_state_after
 from hilctl.loop.compensator import Compensator
 from hilctl.models.base import HysteresisModel
 from hilctl.models.files import dump_model
@@ -104,7 +104,7 @@ def test_another_model_is_fed_by_its_own_preview(ahead, recording):
 
 def test_run_that_goes_on_after_another_is_identical(ahead, tmp_path):
     """Begun with what a run before left, a run records that memory, and replays from it."""
-    memory = memory_after(ahead.path, STAGED, ahead.sample_rate_hz)
+    memory = initial_state_after(ahead.path, STAGED, ahead.sample_rate_hz)
     after = record(tmp_path, STAGED, 0.1, ahead.path)
     begun = Compensator(STAGED, ahead.sample_rate_hz)
     begun.restore(memory.state)

@@ -205,17 +205,16 @@ class TestForecast:
         model = StagedModel.around(terfenol_rdpi(), lag=FieldLag(tau_s=2e-4), delay_s=3e-4)
         result = checked(DISPLACEMENT, model=model)
         values = result.reference.values
-        assert result.ahead is not None
-        assert result.fed is result.ahead
-        assert result.ahead.tolist() == [*values[4:].tolist(), *[values[-1]] * 4]
+        assert result.records_input
+        assert result.input_um.tolist() == [*values[4:].tolist(), *[values[-1]] * 4]
         inverse = model.inverse(10e3)
         inverse.process(values[:4].copy())
-        command = inverse.process(result.ahead.copy())
+        command = inverse.process(result.input_um.copy())
         assert result.forecast.command_max == command.max()
         plain = checked(DISPLACEMENT, model=terfenol_rdpi())
-        assert plain.ahead is None
+        assert not plain.records_input
         assert plain.state is None
-        assert plain.fed is plain.reference.values
+        assert plain.input_um is plain.reference.values
         assert result.forecast.recording_mb > plain.forecast.recording_mb
 
     def test_tuned_run_that_looks_ahead_is_worked_out_on_what_is_fed(self) -> None:

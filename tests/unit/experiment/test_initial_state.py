@@ -7,7 +7,7 @@ import pytest
 
 from hilctl.base.errors import DataError
 from hilctl.base.samples import Batch, Head
-from hilctl.experiment.initial_state import Memory, memory_after
+from hilctl.experiment.initial_state import InitialState, initial_state_after
 from hilctl.models.published import exponential_integrated, piezo_ppi
 from hilctl.models.staged import FieldLag, StagedModel
 from hilctl.recording.writer import RecordingWriter, RunFacts
@@ -51,7 +51,7 @@ def record(path: Path, command, *, first=0, whole=True) -> Path:
 @pytest.mark.parametrize("model", [OMEGA, STAGED], ids=["integrated", "staged"])
 def test_compensator_goes_on_where_the_actuator_was_left(tmp_path, model):
     """An actuator that is the model, left away from rest, then follows the reference exactly."""
-    memory = memory_after(record(tmp_path / "run.mcap", COMMAND), model, RATE_HZ)
+    memory = initial_state_after(record(tmp_path / "run.mcap", COMMAND), model, RATE_HZ)
     plant, inverse = model.forward(RATE_HZ), model.inverse(RATE_HZ)
     plant.process(np.concatenate((COMMAND, np.full(20_000, COMMAND[-1]))))
     assert abs(memory.stands_um) > 0.5
@@ -78,7 +78,7 @@ def test_from_rest_the_same_reference_is_missed(tmp_path):
 
 def test_lead_in_of_a_run_that_is_shorter():
     """The way from where the actuator stands is cut where the run ends; nothing else changes."""
-    memory = Memory(np.zeros(1), 3.0, "")
+    memory = InitialState(np.zeros(1), 3.0, "")
     fed = np.zeros(10)
     led = memory.lead_in(fed, 20)
     assert led[0] == 3.0
@@ -97,6 +97,6 @@ def test_recordings_that_don_t_tell_are_refused(tmp_path, model, rate_hz, made, 
     """Another rate, another unit, lost samples, no end: refused with the reason."""
     path = record(tmp_path / "run.mcap", COMMAND, **made)
     with pytest.raises(DataError, match=message):
-        memory_after(path, model, rate_hz)
+        initial_state_after(path, model, rate_hz)
     with pytest.raises(DataError, match="no such file"):
-        memory_after(tmp_path / "absent.mcap", model, rate_hz)
+        initial_state_after(tmp_path / "absent.mcap", model, rate_hz)

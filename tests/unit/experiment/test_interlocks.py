@@ -10,9 +10,9 @@ import pytest
 from hilctl.base.errors import ConfigError
 from hilctl.base.yaml.document import Document
 from hilctl.experiment.check import check
-from hilctl.experiment.interlocks import interlock_limits
+from hilctl.experiment.interlocks import interlock_context
 from hilctl.experiment.load import resolve
-from hilctl.loop.interlocks import Interlocks
+from hilctl.loop.interlocks import Interlocks, InterlockSettings
 from hilctl.models.published import terfenol_rdpi
 
 CURRENT = """\
@@ -54,46 +54,29 @@ def refusals(text, *settings, **info):
     return [str(replace(problem, where="x.yaml")) for problem in caught.value.problems]
 
 
-class TestLimits:
-    """What the interlocks are set to."""
+class TestContext:
+    """What the interlocks know of the rig, and what they are set to."""
 
-    def test_only_stroke_and_sensor_without_a_key(self):
-        """What is not given is off."""
+    def test_rig(self):
+        """Stroke and safe value from the file, the sensor's ends from the device."""
         made = loaded(CURRENT)
-        limits = interlock_limits(made.config, made.device.info)
-        assert limits.stroke_um == (-75.0, 60.0)
-        assert limits.sensor_um == (-125.0, 125.0)
-        assert (limits.unit, limits.safe) == ("A", 0.5)
-        off = (limits.frozen_s, limits.deviation, limits.rms_current_a, limits.tracking_um)
-        assert set(off) == {math.inf}
-        assert (limits.deviation_s, limits.tracking_s, limits.frozen_um) == (0.0, 0.0, 0.0)
+        context = interlock_context(made.config, made.device.info)
+        assert context.stroke_um == (-75.0, 60.0)
+        assert context.sensor_um == (-125.0, 125.0)
+        assert (context.unit, context.safe) == ("A", 0.5)
+        assert context.frozen_travel == pytest.approx(0.02 * 14.0)
 
-    def test_every_key_arrives(self):
-        """Each key of the file sets what it names."""
-        keys = {
-            "rms_current_a": 4.0,
-            "thermal_time_constant_s": 9.0,
-            "tracking_error_um": 2.0,
-            "tracking_s": 0.1,
-            "frozen_s": 0.2,
-            "frozen_um": 0.03,
-            "measured_deviation_a": 0.4,
-            "deviation_s": 0.05,
-        }
-        made = loaded(CURRENT, *(f"limits.{key}={value}" for key, value in keys.items()))
-        limits = interlock_limits(made.config, made.device.info)
-        assert (limits.rms_current_a, limits.time_constant_s) == (4.0, 9.0)
-        assert (limits.tracking_um, limits.tracking_s) == (2.0, 0.1)
-        assert (limits.frozen_s, limits.frozen_um) == (0.2, 0.03)
-        assert limits.frozen_travel == pytest.approx(0.02 * 14.0)
-        assert (limits.deviation, limits.deviation_s) == (0.4, 0.05)
+    def test_nothing_is_on_without_a_key(self):
+        """What is not given is not looked at."""
+        limits = loaded(CURRENT).config.limits
+        assert all(getattr(limits, key) is None for key in InterlockSettings.model_fields)
 
     def test_in_volt(self):
         """A device driven in V has its deviation and travel in V."""
         made = loaded(VOLTAGE, "limits.measured_deviation_v=0.3", "limits.frozen_s=0.1")
-        limits = interlock_limits(made.config, made.device.info)
-        assert (limits.unit, limits.deviation) == ("V", 0.3)
-        assert limits.frozen_travel == pytest.approx(0.02 * 10.0)
+        context = interlock_context(made.config, made.device.info)
+        assert (context.unit, made.config.limits.measured_deviation) == ("V", 0.3)
+        assert context.frozen_travel == pytest.approx(0.02 * 10.0)
 
     @pytest.mark.parametrize(
         ("setting", "words"),
@@ -253,7 +236,9 @@ class TestHeatForecast:
         """
         made = loaded(CURRENT, *BUDGET)
         reference = 6.0 * np.sin(2.0 * np.pi * 10.0 * np.arange(4000) / 1e3)
-        interlocks = Interlocks(interlock_limits(made.config, made.device.info), 1e3)
+        interlocks = Interlocks(
+            interlock_context(made.config, made.device.info), made.config.limits, 1e3
+        )
         none, flags = np.full(4000, np.nan), np.zeros(4000, dtype=np.uint32)
         trip = interlocks.check(0, reference, none, np.zeros(4000), none, flags)
         assert (trip.code, trip.sample) == ("thermal", 3230)

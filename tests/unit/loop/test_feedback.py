@@ -8,7 +8,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hilctl.base.errors import ConfigError, InputError
-from hilctl.base.samples import Batch
 from hilctl.base.yaml.document import Document
 from hilctl.experiment.check import check
 from hilctl.experiment.feedback import make_feedback
@@ -24,9 +23,9 @@ from hilctl.loop.feedback import (
     margins,
     rate_needed_hz,
 )
-from hilctl.loop.in_flight import DelayLine
 from hilctl.models.ppi import PpiModel
 from hilctl.models.staged import FieldLag, StagedModel, Structure
+from tests.fakes import made_block
 
 RATE_HZ = 5000.0
 EXPERIMENT = """\
@@ -211,33 +210,31 @@ class TestFollow:
     """What it takes from a block of the loop."""
 
     def block(self):
-        made = DelayLine(Batch.empty(1, 1, 1)).newest
-        made.columns[:] = 0.0
-        return made
+        return made_block(fill=0.0)
 
     def test_correction_is_added_to_the_input(self):
         """The input of the block is what it was, and the correction."""
         feedback, block = loop(due_after=0), self.block()
-        feedback.follow(block)
+        feedback.follow(block, block)
         block.displacement_um[0], block.input_um[0] = -1.0, 7.0
-        feedback.follow(block)
+        feedback.follow(block, block)
         assert block.input_um[0] == 7.0 + feedback.correction_um
         assert feedback.correction_um == pytest.approx(gains_for(100.0, RATE_HZ).ki_per_s / RATE_HZ)
 
     def test_gap_is_passed_over(self):
         """After skipped samples, old displacements are held against nothing."""
         feedback, block = loop(due_after=0), self.block()
-        feedback.follow(block)
+        feedback.follow(block, block)
         block.displacement_um[0], block.skipped = -1.0, 3
-        feedback.follow(block)
+        feedback.follow(block, block)
         assert feedback.correction_um == 0.0
 
     def test_a_command_that_was_held_back_stops_the_integral(self):
         """The limiter is known to have acted where wanted and command differ."""
         feedback, block = loop(due_after=0), self.block()
-        feedback.follow(block)
+        feedback.follow(block, block)
         block.displacement_um[0], block.wanted[0] = -1.0, 1.0
-        feedback.follow(block)
+        feedback.follow(block, block)
         assert feedback.correction_um == 0.0
 
 
@@ -304,7 +301,7 @@ class TestExperiment:
         """It starts, and its input is recorded beside the reference."""
         (tmp_path / "model.yaml").write_text(MODEL)
         checked = check(resolve(Document("experiment", EXPERIMENT), tmp_path, []))
-        np.testing.assert_array_equal(checked.ahead, checked.reference.values)
+        np.testing.assert_array_equal(checked.input_um, checked.reference.values)
 
     def test_block_of_more_than_one(self, tmp_path):
         """Feedback needs a block of 1."""

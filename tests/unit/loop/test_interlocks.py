@@ -5,20 +5,23 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
 from hilctl.base.errors import InputError
 from hilctl.base.samples import Flag
-from hilctl.loop.interlocks import InterlockLimits, Interlocks, Trip, warming
+from hilctl.kernels.interlock import InterlockFlag
+from hilctl.loop.interlocks import InterlockSettings, Trip, warming
+from tests.fakes import RigInterlocks
 
 RATE_HZ = 1000.0
-STROKE = InterlockLimits(stroke_um=(-60.0, 50.0), sensor_um=(-100.0, 100.0))
+STROKE = RigInterlocks(stroke_um=(-60.0, 50.0), sensor_um=(-100.0, 100.0))
 
 
-class Bench:
+class Fed:
     """Interlocks that are fed columns, each a number, a list, or NaN where it is left out."""
 
     def __init__(self, limits, rate_hz=RATE_HZ):
-        self.interlocks = Interlocks(limits, rate_hz)
+        self.interlocks = limits.made(rate_hz)
         self.flags = np.zeros(0, dtype=np.uint32)
 
     def feed(self, n, *, first=0, command=0.0, reference=math.nan, displacement=1.0, measured=None):
@@ -36,7 +39,7 @@ class Bench:
 
 def trips(limits, n, **columns):
     """Return the trip, and where the flags of all interlocks stand, of one block."""
-    bench = Bench(limits)
+    bench = Fed(limits)
     trip = bench.feed(n, **columns)
     return trip, bench
 
@@ -66,7 +69,7 @@ class TestStroke:
 
     def test_sensor_without_ends(self):
         """Where nothing is known of the sensor, an infinite reading is outside the stroke."""
-        limits = InterlockLimits(stroke_um=(-1.0, 2.0))
+        limits = RigInterlocks(stroke_um=(-1.0, 2.0))
         assert trips(limits, 1, displacement=np.inf)[0].code == "stroke"
         assert trips(limits, 1, displacement=-np.inf)[0].code == "stroke"
 
@@ -110,7 +113,7 @@ class TestFrozen:
             "displacement at sample 30 is still 12.3457 um, 0.01 s after the command had moved by "
             "0.5 A: the sensor is frozen",
         )
-        assert bench.flagged(Flag.SENSOR_FROZEN) == list(range(30, 60))
+        assert bench.flagged(InterlockFlag.SENSOR_FROZEN) == list(range(30, 60))
 
     def test_names_the_unit(self):
         """A device driven in V is told in V."""
@@ -179,10 +182,10 @@ class TestFrozen:
         """A reading that is not a number is told as that, never as frozen."""
         trip, bench = trips(FROZEN, 100, command=np.arange(100.0), displacement=np.nan)
         assert trip.code == "stroke"
-        assert bench.flagged(Flag.SENSOR_FROZEN) == []
+        assert bench.flagged(InterlockFlag.SENSOR_FROZEN) == []
 
 
-DEVIATION = replace(STROKE, deviation=0.5, deviation_s=0.003)
+DEVIATION = replace(STROKE, measured_deviation_a=0.5, deviation_s=0.003)
 
 
 class TestDeviation:
@@ -198,7 +201,7 @@ class TestDeviation:
             "measured 2.75 A at sample 13, where 2 A was put out, is more than 0.5 A away for "
             "longer than 0.003 s",
         )
-        assert bench.flagged(Flag.DEVIATION) == list(range(13, 20))
+        assert bench.flagged(InterlockFlag.DEVIATION) == list(range(13, 20))
 
     @pytest.mark.parametrize("measured", [1.5, 2.0, 2.5])
     def test_within(self, measured):
@@ -222,12 +225,12 @@ class TestDeviation:
         command = np.array([0.0, 5.0, -5.0, 5.0])
         for measured in (command, np.array([0.0, 0.0, 5.0, -5.0]), np.array([0.0, 2.0, -5.5, 5.5])):
             assert trips(limits, 4, command=command, measured=measured)[0] is None
-            bench = Bench(limits)
+            bench = Fed(limits)
             for k in range(4):
                 assert bench.feed(1, first=k, command=command[k], measured=measured[k]) is None
         trip, _ = trips(limits, 4, command=command, measured=np.array([0.0, 2.0, 5.6, 0.0]))
         assert trip.reason.startswith("measured 5.6 A at sample 2, where 5 to -5 A was put out")
-        bench = Bench(limits)
+        bench = Fed(limits)
         bench.feed(1, command=5.0, measured=0.0)
         trip = bench.feed(1, first=1, command=-5.0, measured=-5.6)
         assert trip.reason.startswith("measured -5.6 A at sample 1, where 5 to -5 A was put out")
@@ -249,7 +252,7 @@ class TestDeviation:
         assert trips(STROKE, 100, command=2.0, measured=1e9)[0] is None
 
 
-THERMAL = replace(STROKE, rms_current_a=2.0, time_constant_s=0.1)
+THERMAL = replace(STROKE, rms_current_a=2.0, thermal_time_constant_s=0.1)
 HEATING = [(0.0, -3.0), (-3.0, 0.0), (3.0, np.nan), (3.0, np.inf)]
 
 
@@ -265,7 +268,7 @@ class TestThermal:
         assert trip.reason == (
             f"thermal budget of the coil, 2 A rms over 0.1 s, was used up at sample {trip.sample}"
         )
-        assert bench.flagged(Flag.THERMAL) == list(range(trip.sample, 100))
+        assert bench.flagged(InterlockFlag.THERMAL) == list(range(trip.sample, 100))
 
     def test_the_budget_itself_can_be_kept_for_ever(self):
         """The rms current of the budget never trips; a little more does."""
@@ -302,7 +305,7 @@ class TestThermal:
         assert trips(STROKE, 1000, command=1e6)[0] is None
 
 
-TRACKING = replace(STROKE, tracking_um=2.0, tracking_s=0.005)
+TRACKING = replace(STROKE, tracking_error_um=2.0, tracking_s=0.005)
 
 
 class TestTracking:
@@ -317,7 +320,7 @@ class TestTracking:
             "tracking_error",
             "tracking error -2.5 um at sample 15 is beyond 2 um for longer than 0.005 s",
         )
-        assert bench.flagged(Flag.TRACKING_ERROR) == list(range(15, 30))
+        assert bench.flagged(InterlockFlag.TRACKING_ERROR) == list(range(15, 30))
 
     def test_without_a_time(self):
         """Without a time the first sample beyond trips; the limit itself does not."""
@@ -346,10 +349,10 @@ EVERYTHING = replace(
     STROKE,
     frozen_s=0.001,
     frozen_travel=0.5,
-    deviation=0.5,
+    measured_deviation_a=0.5,
     rms_current_a=2.0,
-    time_constant_s=0.001,
-    tracking_um=2.0,
+    thermal_time_constant_s=0.001,
+    tracking_error_um=2.0,
 )
 
 
@@ -368,7 +371,7 @@ class TestSeveral:
             {"displacement": 2.0, "measured": 9.0},
             {"displacement": 2.0, "command": 0.0, "measured": 0.0},
         ):
-            bench = Bench(limits)
+            bench = Fed(limits)
             bench.feed(1, command=0.0, measured=0.0)
             bench.feed(1, first=1, command=0.0 if "command" in change else 9.0, measured=0.0)
             told.append(bench.feed(1, first=2, **{**moving, **change}).code)
@@ -383,7 +386,7 @@ class TestSeveral:
 
     def test_conditions_that_last_are_told_in_every_block(self):
         """Nothing is held back after the first trip: whoever asks decides."""
-        bench = Bench(STROKE)
+        bench = Fed(STROKE)
         assert bench.feed(5, displacement=99.0).sample == 0
         assert bench.feed(5, first=5, displacement=99.0).sample == 5
         assert bench.feed(5, first=10, displacement=1.0) is None
@@ -394,7 +397,7 @@ class TestGaps:
 
     def test_time_passes_with_the_output_held(self):
         """Heat after a gap is that of the same samples with the last command held."""
-        whole, gap = Bench(THERMAL), Bench(THERMAL)
+        whole, gap = Fed(THERMAL), Fed(THERMAL)
         for bench in (whole, gap):
             assert bench.feed(20, command=2.5) is None
         assert whole.feed(30, first=20, command=2.5) is None
@@ -404,7 +407,7 @@ class TestGaps:
 
     def test_coil_cools_over_a_gap(self):
         """Heat falls, too, while nothing flows."""
-        bench = Bench(THERMAL)
+        bench = Fed(THERMAL)
         bench.feed(40, command=3.0)
         bench.feed(1, first=40, command=0.0)
         trip = bench.feed(100, first=2041, command=3.0)
@@ -420,7 +423,7 @@ class TestGaps:
     )
     def test_conditions_last_over_a_gap(self, limits, columns):
         """What was wrong before a gap and after it counts for all of it."""
-        bench = Bench(limits)
+        bench = Fed(limits)
         bench.feed(1, command=0.0, measured=0.0)
         start = {name: values[:2] for name, values in columns.items()}
         assert bench.feed(2, first=1, **start) is None
@@ -430,7 +433,7 @@ class TestGaps:
     @pytest.mark.parametrize("limits", [FROZEN, DEVIATION, TRACKING])
     def test_gap_alone_is_no_condition(self, limits):
         """A gap after which all is as it should be trips nothing; what starts then starts anew."""
-        bench = Bench(limits)
+        bench = Fed(limits)
         assert bench.feed(5, measured=0.0, reference=1.0) is None
         assert bench.feed(5, first=5000, measured=0.0, reference=1.0) is None
         trip = bench.feed(50, first=5005, command=9.0, measured=-9.0, reference=9.0)
@@ -446,7 +449,7 @@ class TestTimes:
     )
     def test_rounded_up_but_for_the_last_bit(self, time_s, rate_hz, samples):
         """A condition never has less than its time; 0.07 s at 100 Hz are 7 samples, not 8."""
-        bench = Bench(replace(TRACKING, tracking_s=time_s), rate_hz)
+        bench = Fed(replace(TRACKING, tracking_s=time_s), rate_hz)
         assert bench.feed(500, reference=9.0).sample == samples
 
     def test_warming(self):
@@ -458,28 +461,41 @@ class TestTimes:
 @pytest.mark.parametrize(
     ("field", "value", "text"),
     [
-        ("frozen_s", 0.0, "frozen_s must be > 0: 0.0"),
         ("frozen_travel", 0.0, "frozen_travel must be > 0: 0.0"),
-        ("rms_current_a", -1.0, "rms_current_a must be > 0: -1.0"),
-        ("time_constant_s", math.nan, "time_constant_s must be > 0: nan"),
-        ("frozen_um", -0.1, "frozen_um must be >= 0: -0.1"),
-        ("deviation", math.nan, "deviation must be >= 0: nan"),
-        ("deviation_s", -1.0, "deviation_s must be >= 0: -1.0"),
-        ("tracking_um", -1.0, "tracking_um must be >= 0: -1.0"),
-        ("tracking_s", math.nan, "tracking_s must be >= 0: nan"),
         ("stroke_um", (1.0, 1.0), "stroke_um must be lowest and highest: 1.0, 1.0"),
         ("sensor_um", (2.0, 1.0), "sensor_um must be lowest and highest: 2.0, 1.0"),
     ],
 )
-def test_limits_that_mean_nothing_are_refused(field, value, text):
-    """Limits themselves are checked, each rule by name."""
+def test_rig_that_means_nothing_is_refused(field, value, text):
+    """What is known of the rig is checked, each rule by name."""
     with pytest.raises(InputError) as caught:
-        replace(STROKE, **{field: value})
+        replace(STROKE, **{field: value}).made(RATE_HZ)
     assert str(caught.value) == text
 
 
-def test_zero_is_a_limit_where_it_means_something():
-    """No distance at all may be asked for."""
-    limits = replace(STROKE, deviation=0.0, tracking_um=0.0, frozen_um=0.0, safe=1.0)
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("frozen_s", 0.0),
+        ("rms_current_a", -1.0),
+        ("thermal_time_constant_s", math.nan),
+        ("frozen_um", -0.1),
+        ("measured_deviation_a", math.inf),
+        ("deviation_s", -1.0),
+        ("tracking_error_um", 0.0),
+        ("tracking_s", math.nan),
+    ],
+)
+def test_settings_that_mean_nothing_are_refused(key, value):
+    """Each key has its rule."""
+    with pytest.raises(ValidationError, match=key):
+        InterlockSettings(**{key: value})
+
+
+def test_smallest_limits_hold():
+    """Next to no distance may be asked for."""
+    limits = replace(
+        STROKE, measured_deviation_a=1e-9, tracking_error_um=1e-9, frozen_um=0.0, safe=1.0
+    )
     assert trips(limits, 5, command=1.0, measured=1.0, reference=1.0)[0] is None
     assert trips(limits, 5, command=1.0, measured=1.1)[0].code == "deviation"

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from hilctl.loop.pacer import Pacer, SystemClock
+from hilctl.loop.pacer import LateRules, Pacer, SystemClock
 
 PERIOD_NS = 1_000_000
 
@@ -26,7 +26,7 @@ class TurnedClock:
 
 
 def pacer(clock: TurnedClock, policy: str = "skip") -> Pacer:
-    made = Pacer(clock, PERIOD_NS, policy, 0.5 * PERIOD_NS)  # type: ignore[arg-type]
+    made = Pacer(clock, PERIOD_NS, policy, LateRules(0.5 * PERIOD_NS))  # type: ignore[arg-type]
     made.begin(10_000)
     return made
 
@@ -44,7 +44,7 @@ def test_deadlines_do_not_drift():
 def test_period_need_not_be_whole():
     """A period of a third of a microsecond is kept on average, to the nanosecond."""
     clock = TurnedClock(now=0)
-    paced = Pacer(clock, 1000.0 / 3.0, "skip", 1e9)
+    paced = Pacer(clock, 1000.0 / 3.0, "skip", LateRules(1e9))
     paced.begin(0)
     for _ in range(3001):
         paced.wait()

@@ -8,10 +8,10 @@ LIMIT_S = 1.0
 
 
 def watched(tmp_path):
-    ring = SampleRing.create(tmp_path / "ring", slots=4, block=1, state_size=1)
-    ring.put(Field.PHASE, Phase.RUNNING)
-    ring.put(Field.LOOP_BEAT_NS, 1)
-    return ring, HangWatch(ring, LIMIT_S)
+    page = SampleRing.create(tmp_path / "ring", slots=4, block=1, state_size=1).page
+    page.put(Field.PHASE, Phase.RUNNING)
+    page.put(Field.LOOP_HEARTBEAT_NS, 1)
+    return page, HangWatch(page, LIMIT_S)
 
 
 def look(watch, times_s):
@@ -27,9 +27,9 @@ def test_silence_beyond_the_limit_is_a_hang(tmp_path):
 
 def test_heartbeat_starts_the_time_again(tmp_path):
     """Any new sign of life will do."""
-    ring, watch = watched(tmp_path)
+    page, watch = watched(tmp_path)
     assert not any(look(watch, [0.1 * k for k in range(10)]))
-    ring.put(Field.LOOP_BEAT_NS, 2)
+    page.put(Field.LOOP_HEARTBEAT_NS, 2)
     assert not any(look(watch, [0.9 + 0.1 * k for k in range(10)]))
 
 
@@ -41,15 +41,15 @@ def test_machine_that_stood_still_is_no_hang(tmp_path):
 
 def test_loop_that_does_not_run_yet_or_any_more_does_not_hang(tmp_path):
     """Opening and closing a device may take its time."""
-    ring, watch = watched(tmp_path)
+    page, watch = watched(tmp_path)
     for phase in (Phase.STARTING, Phase.READY, Phase.ENDED, Phase.FAILED):
-        ring.put(Field.PHASE, phase)
+        page.put(Field.PHASE, phase)
         assert not any(look(watch, [0.5 * k for k in range(20)]))
 
 
 def test_closing_a_device_has_more_time(tmp_path):
     """A device that is lost may use up its time-outs, but not for ever."""
-    ring, watch = watched(tmp_path)
-    ring.put(Field.PHASE, Phase.CLOSING)
+    page, watch = watched(tmp_path)
+    page.put(Field.PHASE, Phase.CLOSING)
     assert not any(look(watch, [float(k) for k in range(31)]))
     assert look(watch, [32.0]) == [True]

@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 
 from hilctl.base.errors import DeviceError
-from hilctl.base.samples import Batch, Flag
+from hilctl.base.samples import Flag, Head
 from hilctl.loop.compensator import Compensator
-from hilctl.loop.in_flight import DelayLine
-from hilctl.loop.interlocks import InterlockLimits, Interlocks
-from hilctl.loop.limiter import CommandLimits, Limiter
+from hilctl.loop.interlocks import InterlockContext
+from hilctl.loop.limiter import CommandLimits
 from hilctl.loop.loop import Loop
-from hilctl.loop.pacer import Pacer, SystemClock
+from hilctl.loop.pacer import SystemClock
 from hilctl.loop.plan import Plan
 from hilctl_drivers.emulator.faults import parse_fault
 from hilctl_drivers.emulator.serial_server import SerialEmulation, emulated_serial
@@ -22,6 +21,7 @@ from hilctl_drivers.profile import shipped_profiles
 from hilctl_drivers.serial.device import SerialDac
 from hilctl_drivers.serial.options import SerialOptions
 from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
+from tests.fakes import FakeHost
 
 RATE_HZ = 10_000.0
 BLOCK = 100
@@ -244,65 +244,33 @@ def test_opening_again_starts_at_zero_and_keeps_the_output(board):
     assert first[0] == pytest.approx(held[-1], abs=0.5)
 
 
-class Sink:
-    """Keeps copies of all blocks."""
-
-    def __init__(self):
-        self.firsts, self.columns, self.flags = [], [], []
-
-    def push(self, head, state, columns, flags):
-        self.firsts.append(head[0])
-        self.columns.append(columns.copy())
-        self.flags.append(flags.copy())
-        return True
-
-
-class Unwatched:
-    """Nobody who asks for anything."""
-
-    def beat(self, next_sample):
-        return ""
-
-    def closing(self):
-        pass
-
-    def tuning(self):
-        return None
-
-    def tell(self, event):
-        pass
-
-
 def run_loop(bench, n):
     """Run a sine of n samples through the real loop; return its outcome and what it recorded."""
-    clock, sink = SystemClock(), Sink()
+    host = FakeHost(SystemClock(), BLOCK)
     limits = CommandLimits(low=-5.0, high=5.0, slew_per_s=1e5, safe=0.0, ramp_per_s=1e3)
-    period_ns = 1e9 * BLOCK / RATE_HZ
     bench.open()
-    compensator = Compensator(None, RATE_HZ)
-    sent = Batch.empty(bench.device.info.latency_blocks + 1, BLOCK, compensator.state_size + 1)
-    loop = Loop(
-        Plan(sine(n), False, BLOCK, 1e9),
-        bench.device,
-        compensator,
-        Limiter(limits, 1.0 / RATE_HZ),
-        Interlocks(InterlockLimits(stroke_um=(-100.0, 100.0)), RATE_HZ),
-        Pacer(clock, period_ns, "follow", 0.5 * period_ns),
-        clock,
-        DelayLine(sent),
-        sink,
-        Unwatched(),
+    plan = Plan(
+        reference=sine(n),
+        input_um=sine(n),
+        block=BLOCK,
+        latency_blocks=bench.device.info.latency_blocks,
+        sample_rate_hz=RATE_HZ,
+        compensator=Compensator(None, RATE_HZ),
+        limits=limits,
+        interlocks=InterlockContext(stroke_um=(-100.0, 100.0)),
+        late_policy="follow",
     )
-    return loop.run(clock.now_ns()), sink
+    return Loop(plan, bench.device, host).run(host.clock.now_ns()), host
 
 
 def test_a_whole_run_loses_nothing(board):
     """Every sample of the waveform and the ramp is recorded with the displacement it caused."""
     bench = board(noise=True)
-    outcome, sink = run_loop(bench, 5_050)
+    outcome, host = run_loop(bench, 5_050)
     assert (outcome.code, outcome.safe, outcome.dropped) == ("completed", True, 0)
-    assert sink.firsts == list(range(0, outcome.ended_at, BLOCK))
-    columns = np.concatenate(sink.columns, axis=1)
+    firsts = [head[Head.FIRST_SAMPLE] for head in host.heads]
+    assert firsts == list(range(0, outcome.ended_at, BLOCK))
+    columns = np.concatenate(host.columns, axis=1)
     assert columns[2, :5_050].tolist() == sine(5_050).tolist()
     assert np.isfinite(columns[3]).all()
     assert columns[2, -1] == 0.0
@@ -315,10 +283,10 @@ def test_a_whole_run_loses_nothing(board):
 def test_a_run_that_loses_the_board_leaves_by_the_one_way_out(board, fault):
     """The reason is kept, blocks under way are recorded as unanswered, the coil is at 0 A."""
     bench = board(faults=[f"{fault}@40"], watchdog={"timeout_s": 0.3, "safe_command": 0.0})
-    outcome, sink = run_loop(bench, 100_000)
+    outcome, host = run_loop(bench, 100_000)
     assert outcome.code == "fault"
     assert outcome.safe == (fault != "unplug")
-    flags = np.concatenate(sink.flags)
+    flags = np.concatenate(host.flags)
     assert flags.size == outcome.ended_at
     unanswered = (flags & Flag.SENSOR_INVALID) != 0
     lost = (FIFO_BLOCKS + 1) * BLOCK  # those in the FIFO, and the one being sent

@@ -1,0 +1,60 @@
+"""What the loop needs from the process around it."""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+from hilctl.base.device import Clock
+from hilctl.base.events import LoopEvent
+from hilctl.loop.block import Block
+
+
+@dataclass(frozen=True, slots=True)
+class Tuning:
+    """A change of the reference that is wanted while it runs.
+
+    Attributes:
+        gain: Factor of the reference.
+        offset: Added to it, in the waveform's unit.
+        samples: Samples that the change takes.
+    """
+
+    gain: float
+    offset: float
+    samples: int
+
+
+class Host(Protocol):
+    """Time, room for blocks, and supervision; no call but the clock's sleep may wait."""
+
+    @property
+    def clock(self) -> Clock:
+        """Time."""
+        ...
+
+    def claim(self, *, due: bool = True) -> Block:
+        """Return room for the next block: a spare slot where it is not due, or no room is left."""
+        ...
+
+    def sending(self, block: Block) -> None:
+        """Note that a block is on its way to the device, before it is, so that it is never lost."""
+        ...
+
+    def answered(self, block: Block) -> bool:
+        """Pass a block on to be recorded; return False where it has no slot of its own."""
+        ...
+
+    def heartbeat(self, next_sample: int, late_ticks: int) -> str:
+        """Show that the loop lives, once a tick; return why the run should end, or nothing."""
+        ...
+
+    def closing(self) -> None:
+        """Note that no more samples are exchanged: what follows may take a device's time-outs."""
+        ...
+
+    def tuning(self) -> Tuning | None:
+        """Return a change of the reference that has come since the last call."""
+        ...
+
+    def record_event(self, event: LoopEvent) -> None:
+        """Pass an event on to be recorded."""
+        ...

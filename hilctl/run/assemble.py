@@ -1,0 +1,82 @@
+"""From a checked experiment to the loop that runs it: one way for every host."""
+
+import math
+
+from hilctl.base.arrays import F64
+from hilctl.base.device import DeviceInfo
+from hilctl.experiment.feedback import make_feedback
+from hilctl.experiment.file import Experiment
+from hilctl.experiment.interlocks import interlock_context
+from hilctl.experiment.load import LoadedExperiment
+from hilctl.loop.compensator import Compensator
+from hilctl.loop.host import Host
+from hilctl.loop.loop import Loop
+from hilctl.loop.pacer import LatePolicy, LateRules
+from hilctl.loop.plan import Plan
+
+_ALWAYS_LATE_S = 2.0
+
+
+def plan_of(
+    loaded: LoadedExperiment, reference: F64, input_um: F64, state: F64 | None, *, paced: bool
+) -> Plan:
+    """Return what a run does; its compensator is warmed up.
+
+    Args:
+        loaded: The experiment.
+        reference: float64[n], in the waveform's unit.
+        input_um: float64[n], the compensator's input.
+        state: The compensator's memory before the first sample; at rest where None.
+        paced: Whether the run keeps real time; else no tick is late.
+    """
+    config, info = loaded.config, loaded.device.info
+    rate_hz = config.sample_rate_hz
+    compensator = Compensator(loaded.model, rate_hz)
+    compensator.warm_up()
+    if state is not None:
+        compensator.restore(state)
+    return Plan(
+        reference=reference,
+        input_um=input_um,
+        block=config.block,
+        latency_blocks=info.latency_blocks,
+        sample_rate_hz=rate_hz,
+        compensator=compensator,
+        limits=config.command_limits(),
+        interlocks=interlock_context(config, info),
+        interlock_settings=config.limits,
+        late_policy=_late_policy(config, info) if paced else "catch_up",
+        late_rules=_late_rules(config) if paced else LateRules(),
+        feedback=make_feedback(config, compensator),
+        keep_all=config.recording.on_failure == "stop",
+    )
+
+
+def assemble(
+    loaded: LoadedExperiment,
+    reference: F64,
+    input_um: F64,
+    state: F64 | None,
+    host: Host,
+    *,
+    paced: bool = True,
+) -> Loop:
+    """Return the loop of a run; its device is still to be opened. See :func:`plan_of`."""
+    plan = plan_of(loaded, reference, input_um, state, paced=paced)
+    return Loop(plan, loaded.device, host)
+
+
+def _late_policy(config: Experiment, info: DeviceInfo) -> LatePolicy:
+    if info.latency_blocks:
+        return "follow"
+    return "catch_up" if info.buffered else config.timing.late_policy
+
+
+def _late_rules(config: Experiment) -> LateRules:
+    timing, late = config.timing, config.timing.max_consecutive_late
+    return LateRules(
+        late_after_ns=timing.late_after * config.tick_s * 1e9,
+        max_late_ns=timing.max_late_s * 1e9,
+        max_consecutive_late=math.ceil(_ALWAYS_LATE_S / config.tick_s) if late is None else late,
+        grace_ticks=int(timing.grace_s / config.tick_s),
+    )

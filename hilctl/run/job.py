@@ -1,0 +1,96 @@
+"""What the supervisor hands to the loop's process: the checked experiment and its arrays."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+
+from hilctl.base.arrays import F64
+from hilctl.base.files import TextFiles
+from hilctl.base.yaml.document import Document
+from hilctl.experiment.check import Checked
+from hilctl.experiment.load import LoadedExperiment, resolve
+from hilctl.run.run_folder import RunFolder
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """One run, as text.
+
+    Attributes:
+        experiment: The experiment as YAML, command-line settings included.
+        files: Texts of the files that it refers to, as they were checked, by absolute path.
+        folder: Folder that file names in it are relative to.
+        ring: File of the ring.
+        reference: File of the reference samples.
+        input_um: File of the compensator's input.
+        state: The compensator's memory before the first sample; None where it is at rest.
+        supervisor: The supervisor's process number.
+        silence_s: Longest that it may be silent.
+    """
+
+    experiment: str
+    files: Mapping[str, str]
+    folder: str
+    ring: str
+    reference: str
+    input_um: str
+    state: list[float] | None
+    supervisor: int
+    silence_s: float
+
+    @classmethod
+    def of(cls, checked: Checked, folder: RunFolder, *, supervisor: int, silence_s: float) -> Self:
+        """Return the job of a checked experiment; its arrays are left in the run's folder."""
+        reference = input_um = folder.reference
+        np.save(reference, checked.reference.values)
+        if checked.input_um is not checked.reference.values:
+            input_um = folder.input_um
+            np.save(input_um, checked.input_um)
+        return cls(
+            experiment=checked.loaded.yaml_text,
+            files=checked.loaded.files.texts,
+            folder=str(checked.loaded.folder.resolve()),
+            ring=str(folder.ring),
+            reference=str(reference),
+            input_um=str(input_um),
+            state=None if checked.state is None else checked.state.tolist(),
+            supervisor=supervisor,
+            silence_s=silence_s,
+        )
+
+    def to_json(self) -> str:
+        """Return the fields as JSON."""
+        return json.dumps(asdict(self))
+
+    @classmethod
+    def from_json(cls, text: str) -> Self:
+        """Undo :meth:`to_json`."""
+        return cls(**json.loads(text))
+
+    @property
+    def ring_path(self) -> Path:
+        """File of the ring."""
+        return Path(self.ring)
+
+    @property
+    def memory(self) -> F64 | None:
+        """The compensator's memory before the first sample: float64[s]; None at rest."""
+        return None if self.state is None else np.array(self.state)
+
+    def load(self) -> LoadedExperiment:
+        """Return the experiment, from the texts that were checked: nothing is read from disk."""
+        document = Document("experiment", self.experiment)
+        return resolve(document, Path(self.folder), files=TextFiles(self.files))
+
+    def arrays(self) -> tuple[F64, F64]:
+        """Return reference and compensator's input: float64[n] each, mapped."""
+        return _mapped(self.reference), _mapped(self.input_um)
+
+
+def _mapped(path: str) -> F64:
+    values: F64 = np.load(path, mmap_mode="r").view(np.ndarray)  # quicker to slice
+    return values

@@ -1,0 +1,79 @@
+"""Numbers, texts and events between loop and supervisor."""
+
+import json
+from dataclasses import asdict
+from mmap import mmap
+
+import pytest
+
+from hilctl.base.events import LoopEvent
+from hilctl.loop.pacer import Lateness
+from hilctl.loop.plan import Outcome
+from hilctl.run.shared_page import SIZE, Field, Phase, SharedPage, Stop, Text
+
+
+@pytest.fixture
+def sides():
+    """The page, seen from both sides."""
+    memory = mmap(-1, SIZE)
+    return SharedPage(memory), SharedPage(memory)
+
+
+def test_numbers_are_shared(sides):
+    """What one side sets the other reads, whole numbers and others."""
+    one, other = sides
+    one.put(Field.STOP, 3)
+    one.put_float(Field.TUNE_GAIN, -0.125)
+    assert (other.get(Field.STOP), other.get_float(Field.TUNE_GAIN)) == (3, -0.125)
+
+
+def test_each_text_has_a_place_of_its_own(sides):
+    """No text is read in the place of another; one that is too long is cut at a character."""
+    one, other = sides
+    for place in Text:
+        one.write_text(place, f"{place.name}: öffnen")
+    assert [other.read_text(place) for place in Text] == [f"{p.name}: öffnen" for p in Text]
+    one.write_text(Text.SET_UP, "µ" * 10_000)
+    assert set(other.read_text(Text.SET_UP)) == {"µ"}
+    assert other.read_text(Text.OUTCOME) == "OUTCOME: öffnen"
+
+
+def test_events_come_once_and_are_cut_to_what_fits(sides):
+    """Events keep their order; too many are counted as lost, and long ones are shortened."""
+    one, other = sides
+    for sample in range(40):
+        one.push_event(LoopEvent(sample, "error", "test", "ü" * 1000, {"number": 0.5}))
+    events = other.pop_events()
+    assert [event.sample for event in events] == list(range(32))
+    assert set(events[0].text) == {"ü"}
+    assert events[0].values == {"number": 0.5}
+    assert one.get(Field.EVENTS_LOST) == 8
+    one.push_event(LoopEvent(41, "info", "test", "no room yet"))
+    other.release_events()
+    one.push_event(LoopEvent(42, "info", "test", "room"))
+    assert [event.sample for event in other.pop_events()] == [42]
+
+
+def test_outcome_counts_only_at_the_end(sides):
+    """A text that is not there yet, or damaged, is no outcome."""
+    one, other = sides
+    outcome = Outcome("stopped", "stopped by a test", 7, True, 2)
+    one.write_text(Text.OUTCOME, json.dumps(asdict(outcome)))
+    assert other.outcome() is None
+    one.put(Field.PHASE, Phase.ENDED)
+    assert other.outcome() == outcome
+    one.write_text(Text.OUTCOME, '{"code": "sto')
+    assert other.outcome() is None
+
+
+def test_counters_arrive(sides):
+    """Each one in its place."""
+    one, other = sides
+    one.leave_lateness(Lateness(1, 2, 3, 4, 5))
+    assert other.lateness() == Lateness(1, 2, 3, 4, 5)
+
+
+def test_every_stop_has_its_words():
+    """What the loop says of a stop."""
+    assert all(stop.reason.startswith("stopped b") for stop in Stop)
+    assert len({stop.reason for stop in Stop}) == len(Stop)
