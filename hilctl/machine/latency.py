@@ -108,7 +108,7 @@ def measure(
 def _ask(job: str, seconds: float, on_progress: Callable[[float], None]) -> str:
     started = time.monotonic()
     with subprocess.Popen(
-        [sys.executable, "-m", "hilctl.machine.latency"],
+        [sys.executable, "-P", "-m", "hilctl.machine.latency"],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
