@@ -77,3 +77,5 @@ class Flag(IntFlag):
     """The displacement was not finite, outside the stroke limits or at an end of the sensor."""
     UNANSWERED = 32
     """The device did not answer the exchange: the command may not have reached it."""
+    AFTER_SKIPPED = 1 << 16
+    """In the first block after skipped ticks: the output had been held, and has to catch up."""

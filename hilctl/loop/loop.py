@@ -31,6 +31,7 @@ from hilctl.loop.tuning import Tuner, tune
 _FIRST_SAMPLE, _SAMPLES = int(Head.FIRST_SAMPLE), int(Head.SAMPLES)
 _DROPPED_BEFORE, _DEADLINE_NS = int(Head.DROPPED_BEFORE), int(Head.DEADLINE_NS)
 _LATE_NS, _EXCHANGE_NS = int(Head.LATE_NS), int(Head.EXCHANGE_NS)
+_SKIPPED = int(Flag.AFTER_SKIPPED)
 
 
 class _Phase(Enum):
@@ -118,7 +119,8 @@ class Loop:
         """Wait for the tick; return its block with the head filled in."""
         pacer, block_samples = self._pacer, self._plan.block
         skipped = pacer.wait() * block_samples
-        self._next_sample += skipped
+        if skipped:
+            self._pass_over(skipped)
         block = self._host.claim(due=due)
         block.skipped = skipped
         head = block.head
@@ -127,6 +129,24 @@ class Loop:
         head[_DEADLINE_NS] = pacer.deadline_ns - self._start_ns
         head[_LATE_NS], head[_EXCHANGE_NS] = pacer.late_ns, 0
         return block
+
+    def _pass_over(self, skipped: int) -> None:
+        """Let references go by that no tick was in time for.
+
+        The compensator follows them, though nothing is put out: a jump of its input would come out
+        as a command of its own, the more so the more of a lead it gives.
+        """
+        plan, start = self._plan, self._next_sample
+        self._next_sample += skipped
+        if self._phase is not _Phase.FOLLOWING:
+            return
+        passed = plan.input_um[start : self._next_sample].copy()
+        factors = self._tuner.advance(passed.size)
+        if factors is not None:
+            tune(factors, passed, passed)
+        if plan.feedback is not None:
+            passed += plan.feedback.correction_um
+        self._compensator.process(passed, np.empty_like(passed))
 
     def _supervise(self) -> None:
         """Show that the loop lives, and follow what is asked of the run."""
@@ -174,7 +194,7 @@ class Loop:
         # The memory before the block, so that a replay can begin at any gap.
         self._compensator.state(block.memory)
         block.state[-1] = self._limiter.last
-        block.flags.fill(0)
+        block.flags.fill(_SKIPPED if block.skipped else 0)
         # A slot has been used before: what the device does not fill is not a measurement.
         block.displacement_um.fill(np.nan)
         if self._measures:

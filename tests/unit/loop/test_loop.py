@@ -1,5 +1,7 @@
 """The loop, with a device and a clock that the test makes."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -11,6 +13,7 @@ from hilctl.loop.limiter import CommandLimits
 from hilctl.loop.loop import Loop
 from hilctl.loop.pacer import LateRules
 from hilctl.loop.plan import Plan
+from hilctl.models.files import load_model
 from hilctl.models.published import terfenol_rdpi
 from tests.fakes import FakeClock, FakeDevice, FakeFifoDevice, FakeHost
 
@@ -464,3 +467,41 @@ def test_recorder_that_does_not_keep_up_ends_the_run():
     outcome = rig.run()
     assert (outcome.code, outcome.dropped) == ("fault", 10)
     assert outcome.reason == "no room for sample 50: the recorder does not keep up"
+
+
+CONFIGS = Path(__file__).parents[3] / "configs" / "models"
+MODELS = ["terfenol_rdpi", "terfenol_omega", "terfenol_staged", "terfenol_staged_preisach"]
+
+
+@pytest.mark.parametrize("late", [1, 3, 20])
+@pytest.mark.parametrize("frequency_hz", [1.0, 50.0, 250.0])
+@pytest.mark.parametrize("name", MODELS)
+def test_command_after_skipped_ticks_is_the_one_that_was_due(name, frequency_hz, late):
+    """However late a tick comes, its command is that of a run in which no tick was late."""
+    model = load_model(CONFIGS / f"{name}.yaml")
+    reference = 8.0 * np.sin(2 * np.pi * frequency_hz / RATE_HZ * np.arange(200))
+    plain = Rig(reference, model=model)
+    plain.run()
+    rig = Rig(reference, model=model, clock=FakeClock(stall_ns={60: late * 1_000_000}))
+    rig.run()
+    firsts = [head[Head.FIRST_SAMPLE] for head in rig.host.heads]
+    at = firsts.index(60 + late)
+    assert rig.host.columns[at][1][0] == plain.host.columns[60 + late][1][0]
+    assert (
+        rig.host.column(1)[at:140].tolist() == plain.host.column(1)[60 + late : 140 + late].tolist()
+    )
+    assert rig.host.flags[at][0] & Flag.AFTER_SKIPPED
+    assert not any(flags[0] & Flag.AFTER_SKIPPED for flags in rig.host.flags[:at])
+
+
+def test_skipped_ticks_move_a_tuning_on():
+    """A change takes the samples that it was given, whether they were put out or not."""
+    rig = Rig(
+        np.full(200, 2.0),
+        model=terfenol_rdpi(),
+        tunings={40: Tuning(0.5, 0.0, 40)},
+        clock=FakeClock(stall_ns={50: 10_000_000}),
+    )
+    rig.run()
+    at = [head[Head.FIRST_SAMPLE] for head in rig.host.heads].index(60)
+    assert rig.host.columns[at][0][0] == pytest.approx(2.0 * (1.0 - 0.5 * 21 / 40))
