@@ -8,14 +8,15 @@ import json
 from pathlib import Path
 from typing import Any, TypeAlias
 
-import yaml
 from pydantic import ValidationError
 from pydantic.json_schema import models_json_schema
 
 from hilctl.base.errors import ConfigError, InputError, Problem
+from hilctl.base.files import read_text
+from hilctl.base.yaml.document import Document
+from hilctl.base.yaml.messages import broken_rules, loc_of
 from hilctl_drivers.board.profile import FrameProfile
 from hilctl_drivers.modbus.profile import ModbusProfile
-from hilctl_drivers.profile_problems import read_yaml, rules_broken, value_at
 from hilctl_drivers.text.profile import AsciiProfile
 
 Profile: TypeAlias = ModbusProfile | AsciiProfile | FrameProfile
@@ -54,13 +55,7 @@ def load_profile(name_or_path: str) -> Profile:
             f"no profile '{name_or_path}' is shipped: take one of {', '.join(shipped)},"
             " or give the path of a .yaml file"
         )
-    try:
-        text = path.read_text(encoding="utf-8")
-    except UnicodeDecodeError:
-        raise InputError(f"{path}: is not UTF-8 text") from None
-    except OSError as error:
-        raise InputError(f"{path}: can't be read: {error.strerror}") from None
-    return parse_profile(text, str(path))
+    return parse_profile(read_text(path), str(path))
 
 
 def parse_profile(text: str, where: str) -> Profile:
@@ -73,35 +68,28 @@ def parse_profile(text: str, where: str) -> Profile:
     Raises:
         ConfigError: It breaks rules; all are listed.
     """
-    try:
-        data = read_yaml(text)
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        hint = " ".join(str(error).split())
-        raise ConfigError([Problem(where, "", "is not readable YAML", hint=hint)]) from None
-    if not isinstance(data, dict):
-        raise ConfigError([Problem(where, "", "must hold a mapping of keys to values")])
-    kind = value_at(data, ("link", "kind"))
+    document = Document(where, text)
+    link = document.data.get("link")
+    kind = link.get("kind") if isinstance(link, dict) else None
     if not isinstance(kind, str) or kind not in _CLASSES:
         rule = f"must be one of {', '.join(_CLASSES)}"
-        raise ConfigError(
-            [Problem(where, "link.kind", rule, "nothing" if kind is None else repr(kind))]
+        value = "nothing" if kind is None else repr(kind)
+        place = document.where(("link", "kind"))
+        raise ConfigError([Problem(place, "link.kind", rule, value)])
+    profile = document.validate(_CLASSES[kind])
+    problems = [
+        Problem(
+            document.where(("unverified", index)),
+            "unverified",
+            "must name keys that are in this file",
+            key,
         )
-    try:
-        profile = _CLASSES[kind].model_validate(data)
-    except ValidationError as error:
-        raise ConfigError(rules_broken(error, data, where, _known_keys(kind))) from None
-    missing = [key for key in profile.unverified if value_at(data, key.split(".")) is None]
-    if missing:
-        rule = "must name keys that are in this file"
-        problems = [Problem(where, "unverified", rule, key) for key in missing]
+        for index, key in enumerate(profile.unverified)
+        if not document.holds(loc_of(key))
+    ]
+    if problems:
         raise ConfigError(problems)
     return profile
-
-
-def _known_keys(kind: str) -> set[str]:
-    schema = _CLASSES[kind].model_json_schema()
-    parts = (schema, *schema["$defs"].values())
-    return {name for part in parts for name in part.get("properties", {})}
 
 
 def with_link(profile: Profile, **changes: Any) -> Profile:
@@ -115,7 +103,7 @@ def with_link(profile: Profile, **changes: Any) -> Profile:
     try:
         return type(profile).model_validate(data)
     except ValidationError as error:
-        problems = rules_broken(error, data, profile.title, _known_keys(profile.link.kind))
+        problems = broken_rules(error, type(profile), lambda _: profile.title)
         raise InputError("\n".join(str(problem) for problem in problems)) from None
 
 

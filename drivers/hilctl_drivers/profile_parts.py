@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping
 from typing import Annotated, Literal, Self, TypeAlias
 
-from pydantic import BeforeValidator, Field, StringConstraints, model_validator
+from pydantic import Field, StringConstraints, model_validator
 
 from hilctl.base.device import DeviceOptions
 from hilctl.base.errors import InputError
@@ -17,8 +17,6 @@ AddressBase: TypeAlias = Literal[0, 1, "modicon"]
 Text: TypeAlias = Annotated[str, StringConstraints(min_length=1)]
 Name: TypeAlias = Annotated[str, StringConstraints(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
 
-_YES_NO: dict[object, str] = {True: "yes", False: "no"}
-"""YAML 1.1 reads a bare yes and no as truth values."""
 READ_FUNCTION: dict[str, int] = {"coil": 1, "discrete": 2, "holding": 3, "input": 4}
 
 
@@ -176,9 +174,9 @@ class BaseProfile(Part):
     vendor: Text
     model: Text = Field(description="model, as ordered")
     source: tuple[Text, ...] = Field(min_length=1, description="documents this was taken from")
-    verified: Annotated[
-        Literal["yes", "partly", "no"], BeforeValidator(lambda v: _YES_NO.get(v, v))
-    ] = Field(description="whether the source was seen to say all, some or none of this")
+    verified: Literal["yes", "partly", "no"] = Field(
+        description="whether the source was seen to say all, some or none of this"
+    )
     unverified: tuple[Text, ...] = Field(
         default=(), description="dotted keys of this file that no document was seen for"
     )

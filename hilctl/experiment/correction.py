@@ -12,7 +12,6 @@ from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
-import yaml
 from pydantic import Field, model_validator
 
 from hilctl.base.arrays import F64
@@ -20,7 +19,8 @@ from hilctl.base.errors import InputError
 from hilctl.base.files import TextFiles
 from hilctl.base.segments import Segment
 from hilctl.base.strict import Strict
-from hilctl.base.yaml.document import Document, load_document
+from hilctl.base.yaml.document import load_document
+from hilctl.base.yaml.plain import dump
 from hilctl.models.base import HysteresisModel
 from hilctl.models.files import dump_model
 from hilctl.waveforms.build import Reference
@@ -219,16 +219,7 @@ def load_correction(path: Path, files: TextFiles | None = None) -> Correction:
     return load_document(path, files).validate(CorrectionFile).correction
 
 
-def parse_correction(name: str, text: str) -> Correction:
-    """Read a correction from a YAML text, for example a recording's attachment.
-
-    Raises:
-        ConfigError: See :func:`load_correction`.
-    """
-    return Document(name, text).validate(CorrectionFile).correction
-
-
 def dump_correction(correction: Correction) -> str:
     """Return a correction as YAML; reading it back gives the same one, bit for bit."""
     mapping: dict[str, Any] = correction.model_dump(mode="json", exclude_none=True)
-    return yaml.safe_dump({"correction": mapping}, sort_keys=False, width=100)
+    return dump({"correction": mapping})

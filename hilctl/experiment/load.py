@@ -1,16 +1,15 @@
 """From an experiment file to the experiment with all that the file refers to."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeVar
-
-import yaml
+from typing import TypeVar
 
 from hilctl.base.device import Device
 from hilctl.base.errors import ConfigError, InputError, Problem
 from hilctl.base.files import TextFiles
 from hilctl.base.yaml.document import Document, load_document
+from hilctl.base.yaml.plain import dump
 from hilctl.experiment.correction import Correction, load_correction
 from hilctl.experiment.file import Experiment
 from hilctl.experiment.registry import device_class, known_devices
@@ -82,7 +81,7 @@ def resolve(
         problems += _joint_problems(config, document)
     if problems or config is None or device is None:
         raise ConfigError(problems)
-    yaml_text = yaml.safe_dump(_plain(document.data), sort_keys=False, width=100)
+    yaml_text = dump(document.data)
     return LoadedExperiment(config, device, model, folder, yaml_text, document, correction, files)
 
 
@@ -160,11 +159,3 @@ class _NamedFiles:
         except InputError as error:
             where = self.document.where(("compensator", key))
             raise ConfigError([Problem(where, f"compensator.{key}", str(error))]) from None
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {key: _plain(inner) for key, inner in value.items()}
-    if isinstance(value, tuple):
-        return [_plain(inner) for inner in value]
-    return value

@@ -3,12 +3,12 @@
 from pathlib import Path
 from typing import Annotated, TypeAlias
 
-import yaml
 from pydantic import Field
 
 from hilctl.base.files import TextFiles
 from hilctl.base.strict import Strict
 from hilctl.base.yaml.document import Document, load_document
+from hilctl.base.yaml.plain import dump
 from hilctl.models.base import HysteresisModel
 from hilctl.models.bouc_wen import BoucWenModel
 from hilctl.models.butterfly import ButterflyModel
@@ -80,4 +80,4 @@ def parse_model(name: str, text: str) -> HysteresisModel:
 def dump_model(model: HysteresisModel) -> str:
     """Return a model as YAML; reading it back gives the same model, bit for bit."""
     mapping = {"model": {"kind": getattr(model, "kind"), **model.to_mapping()}}  # noqa: B009
-    return yaml.safe_dump(mapping, sort_keys=False, width=100)
+    return dump(mapping)

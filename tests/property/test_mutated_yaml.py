@@ -1,14 +1,16 @@
-"""Ten thousand damaged experiment files: each is accepted, or refused in words."""
+"""Ten thousand damaged experiments, a thousand damaged profiles: accepted, or refused in words."""
 
 import random
+import re
 from pathlib import Path
 
 import pytest
 
-from hilctl.base.errors import InputError
+from hilctl.base.errors import ConfigError, InputError, Problem
 from hilctl.base.yaml.document import Document
 from hilctl.experiment.check import check
 from hilctl.experiment.load import resolve
+from hilctl_drivers.profile import FOLDER, parse_profile
 
 FILES = 10_000
 MODEL = """\
@@ -110,3 +112,21 @@ def test_damaged_experiments_are_refused_in_words(tmp_path: Path, part: int) -> 
         rules = [problem.rule for problem in getattr(error, "problems", ())] or [str(error)]
         assert all(rules), error
     assert [each.name for each in tmp_path.iterdir()] == ["model.yaml"]
+
+
+@pytest.mark.parametrize("name", ["adam_4024", "adam_4024_ascii", "cobs_board", "labjack_t7"])
+def test_damaged_profiles_are_refused_in_words(name: str) -> None:
+    """No crash and no hang; every refusal has a line, a rule, and no word of pydantic's types."""
+    good = (FOLDER / f"{name}.yaml").read_text(encoding="utf-8")
+    chance = random.Random(name)
+    problems: list[Problem] = []
+    for _ in range(FILES // 40):
+        try:
+            parse_profile(mutated(good, chance), "profile.yaml")
+        except ConfigError as error:
+            problems += error.problems
+    assert len(problems) > FILES // 120
+    for problem in problems:
+        assert re.fullmatch(r"profile\.yaml:\d+", problem.where), problem
+        assert problem.rule
+        assert not re.search(r"function-|literal\[|tagged-union", problem.key), problem

@@ -1,6 +1,6 @@
-"""YAML as hilctl reads it: the plain part, strictly.
+"""YAML as hilctl reads and writes it: the plain part of YAML 1.2, strictly.
 
-plain.py     what of YAML is read, and what a scalar is
-document.py  a file with the line of every value; settings over it; validation
+plain.py     what of YAML is read, what a scalar is, and plain data as YAML
 messages.py  broken rules in words
+document.py  a file with the line of every value; settings over it; validation
 """

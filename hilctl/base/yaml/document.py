@@ -4,23 +4,20 @@ A document remembers where each value stands, so that a broken rule is reported 
 ``file:line: key: rule, got value (what to do)``.
 """
 
-import types
-import typing
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, TypeAlias, TypeVar
+from typing import Any, TypeVar
 
 import yaml
 from pydantic import BaseModel, ValidationError
-from pydantic_core import ErrorDetails
 
 from hilctl.base.errors import ConfigError, Problem
 from hilctl.base.files import TextFiles
-from hilctl.base.yaml.messages import hint_of, rule_of, value_of
+from hilctl.base.yaml.messages import Loc, broken_rules, dotted
 from hilctl.base.yaml.plain import MAX_DEPTH, compose, scalar
 
-Loc: TypeAlias = tuple[str | int, ...]
 Model = TypeVar("Model", bound=BaseModel)
+_UNREADABLE = "is not readable YAML"
 
 
 class Document:
@@ -40,8 +37,10 @@ class Document:
         self._duplicates: list[Problem] = []
         try:
             node = compose(text)
-        except yaml.YAMLError as error:
-            raise ConfigError([_syntax_problem(name, error)]) from None
+        except yaml.MarkedYAMLError as error:
+            line = error.problem_mark.line + 1 if error.problem_mark else 1
+            problem = Problem(f"{name}:{line}", "", _UNREADABLE, hint=str(error.problem))
+            raise ConfigError([problem]) from None
         if not isinstance(node, yaml.MappingNode):
             rule = "must hold a mapping of keys to values"
             raise ConfigError([Problem(f"{name}:1", "", rule)])
@@ -83,9 +82,8 @@ class Document:
             raise ConfigError([Problem(where, "", "must be dotted.key=value")])
         try:
             node = compose(text)
-        except yaml.YAMLError as error:
-            hint = _syntax_problem("", error).hint
-            problem = Problem(where, key, "is not readable YAML", repr(text), hint)
+        except yaml.MarkedYAMLError as error:
+            problem = Problem(where, key, _UNREADABLE, repr(text), str(error.problem))
             raise ConfigError([problem]) from None
         self.data = _replaced(
             self.data, parts, lambda loc: self._set_value(node, loc, where), where
@@ -105,6 +103,10 @@ class Document:
             self._places[place] = where
         self._places[loc] = where
         return value
+
+    def holds(self, loc: Loc) -> bool:
+        """Return whether something stands at a location."""
+        return loc in self._places
 
     def where(self, loc: Loc) -> str:
         """Return ``file:line`` of a value, or of the nearest thing around it."""
@@ -140,16 +142,7 @@ class Document:
         try:
             return model.model_validate(data, context=context)
         except ValidationError as error:
-            details = error.errors(include_url=False)
-            raise ConfigError([self._problem(model, detail, at) for detail in details]) from None
-
-    def _problem(self, model: type[BaseModel], detail: ErrorDetails, at: Loc) -> Problem:
-        loc, parent = _plain_loc(model, detail["loc"])
-        loc = (*at, *loc)
-        if detail["type"] == "union_tag_invalid":
-            loc = (*loc, "kind")
-        hint = hint_of(detail, list(parent.model_fields) if parent else [])
-        return Problem(self.where(loc), dotted(loc), rule_of(detail), value_of(detail), hint)
+            raise ConfigError(broken_rules(error, model, self.where, at)) from None
 
 
 def load_document(path: Path, files: TextFiles | None = None) -> Document:
@@ -166,20 +159,9 @@ def load_document(path: Path, files: TextFiles | None = None) -> Document:
     return Document(str(path), (files or TextFiles()).read(path))
 
 
-def dotted(loc: Loc) -> str:
-    """Return a location as a dotted key, list indices included."""
-    return ".".join(str(part) for part in loc)
-
-
-def _syntax_problem(name: str, error: yaml.YAMLError) -> Problem:
-    where, hint = name, " ".join(str(error).split())
-    if isinstance(error, yaml.MarkedYAMLError):
-        line = error.problem_mark.line + 1 if error.problem_mark else 1
-        where, hint = f"{name}:{line}", str(error.problem)
-    return Problem(where, "", "is not readable YAML", hint=hint)
-
-
-def _replaced(data: Any, parts: list[str], make: Any, where: str, loc: Loc = ()) -> Any:
+def _replaced(
+    data: Any, parts: list[str], make: Callable[[Loc], Any], where: str, loc: Loc = ()
+) -> Any:
     """Return a copy of nested mappings and tuples with one place made anew."""
     head, rest = parts[0], parts[1:]
     if isinstance(data, tuple) and head in map(str, range(len(data))):
@@ -194,34 +176,3 @@ def _replaced(data: Any, parts: list[str], make: Any, where: str, loc: Loc = ())
     if isinstance(data, tuple):
         return (*data[: int(head)], new, *data[int(head) + 1 :])
     return {**data, head: new}
-
-
-def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        yield annotation
-    elif isinstance(annotation, types.GenericAlias) or typing.get_origin(annotation) is not None:
-        for inner in typing.get_args(annotation):
-            yield from _models_in(inner)
-
-
-def _tags(model: type[BaseModel]) -> tuple[Any, ...]:
-    field = model.model_fields.get("kind")
-    return typing.get_args(field.annotation) if field else ()
-
-
-def _plain_loc(model: type[BaseModel], loc: Loc) -> tuple[Loc, type[BaseModel] | None]:
-    """Drop union tags from a pydantic location; also return the model that the last key is in."""
-    plain: list[str | int] = []
-    candidates = [model]
-    parent: type[BaseModel] | None = model
-    for part in loc:
-        chosen = [c for c in candidates if part in _tags(c)] if len(candidates) > 1 else []
-        if chosen:
-            candidates = chosen
-            continue
-        plain.append(part)
-        parent = candidates[0] if candidates else None
-        if isinstance(part, str):
-            field = parent.model_fields.get(part) if parent else None
-            candidates = list(_models_in(field.annotation)) if field else []
-    return tuple(plain), parent

@@ -1,10 +1,21 @@
-"""What is said of a value that breaks a rule: the rule, the value, and what to do."""
+"""Broken rules in words: where, key, rule, value, and what to do about it."""
 
 import difflib
-import math
-from typing import Any
+import re
+import types
+import typing
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any, TypeAlias
 
+from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
+
+from hilctl.base.errors import Problem
+from hilctl.base.yaml.plain import is_number
+
+Loc: TypeAlias = tuple[str | int, ...]
+"""Keys and list indices that lead to a value."""
 
 _RULES = {
     "missing": "is required",
@@ -21,69 +32,102 @@ _RULES = {
     "finite_number": "must be a finite number",
     "union_tag_not_found": "needs a 'kind'",
 }
+_BOUNDS = {"greater_than": ("> ", "gt"), "greater_than_equal": (">= ", "ge"),
+           "less_than": ("< ", "lt"), "less_than_equal": ("<= ", "le")}  # fmt: skip
 _WITHOUT_VALUE = {"missing", "value_error", "extra_forbidden", "union_tag_not_found"}
+_NUMBERS = {"float_type", "int_type", "int_from_float"}
+_SPOKEN_BOOLEANS = {"yes", "no", "on", "off", "y", "n"}
 
 
-def rule_of(detail: ErrorDetails) -> str:
-    """Return the broken rule in words."""
-    return _RULES.get(detail["type"]) or _worded_rule(detail)
+def dotted(loc: Loc) -> str:
+    """Return a location as a dotted key, list indices included."""
+    return ".".join(str(part) for part in loc)
 
 
-def value_of(detail: ErrorDetails) -> str:
-    """Return the offending value, short enough for one line; empty where the rule has it."""
-    if detail["type"] == "union_tag_invalid":
-        return repr(detail.get("ctx", {})["tag"])
-    if detail["type"] in _WITHOUT_VALUE:
-        return ""
-    text = _plain(detail["input"])
-    return text if len(text) <= 60 else text[:57] + "..."
+def loc_of(key: str) -> Loc:
+    """Return a dotted key as a location; what looks like a number is a list index."""
+    return tuple(int(part) if part.isdecimal() else part for part in key.split("."))
 
 
-def _plain(value: Any) -> str:
-    if value is None:
-        return "nothing"
-    return repr(list(value)) if isinstance(value, tuple) else repr(value)
-
-
-def hint_of(detail: ErrorDetails, known: list[str]) -> str:
-    """Return what to do about it, or an empty text.
+def broken_rules(
+    error: ValidationError, model: type[BaseModel], where: Callable[[Loc], str], at: Loc = ()
+) -> list[Problem]:
+    """Return all that pydantic says of a file, one problem a value.
 
     Args:
-        detail: What pydantic says.
-        known: Keys that would have been right beside it.
+        error: What pydantic says.
+        model: What it tried to build.
+        where: Gives the ``file:line`` of a location, or of the nearest thing around it.
+        at: Where in the file the model's data stand.
     """
-    value, kind = detail["input"], detail["type"]
-    if kind == "extra_forbidden":
-        return did_you_mean(str(detail["loc"][-1]), known)
-    if kind in {"float_type", "int_type"} and isinstance(value, str):
-        return _number_hint(value)
-    if isinstance(value, bool) and kind in {"float_type", "int_type", "string_type"}:
-        what = "put the text in quotes" if kind == "string_type" else "write a number"
-        return f"YAML reads yes, no, on and off as true and false: {what}"
-    return ""
+    broken = [_located(model, detail) for detail in error.errors(include_url=False)]
+    # A choice that was not meant says nothing, where another one says what is wrong within it.
+    meant = {
+        each.loc[:n] for each in broken if not each.of_choice for n in range(len(each.loc) + 1)
+    }
+    groups: dict[Loc, list[_Broken]] = {}
+    for index, each in enumerate(broken):
+        if not (each.of_choice and each.loc in meant):
+            groups.setdefault(each.loc if each.of_choice else (index, *each.loc), []).append(each)
+    return [_problem(group, where, at) for group in groups.values()]
 
 
-def did_you_mean(word: str, known: list[str]) -> str:
+@dataclass(frozen=True, slots=True)
+class _Broken:
+    """One thing that pydantic says, with the keys that stand in the file.
+
+    Attributes:
+        detail: What it says.
+        loc: Keys and indices, without pydantic's names of choices.
+        parent: The model that the last key is in, where it is in one.
+        of_choice: Whether a value is not of the type of one choice of several.
+    """
+
+    detail: ErrorDetails
+    loc: Loc
+    parent: type[BaseModel] | None
+    of_choice: bool
+
+
+def _problem(group: list[_Broken], where: Callable[[Loc], str], at: Loc) -> Problem:
+    first = group[0]
+    loc = (*at, *first.loc)
+    rule = ", or ".join([_rule(first.detail), *(_choice(each.detail) for each in group[1:])])
+    place = loc
+    if first.detail["type"] == "value_error":  # a rule of several keys names the one it is about
+        place = (*loc, *loc_of(rule.split(" ", 1)[0]))
+    known = list(first.parent.model_fields) if first.parent else []
+    hints = (_hint(each.detail, known) for each in group)
+    hint = next(filter(None, hints), "")
+    return Problem(where(place), dotted(loc), rule, _value(first.detail), hint)
+
+
+def _choice(detail: ErrorDetails) -> str:
+    return _rule(detail).removeprefix("must be ")
+
+
+def did_you_mean(word: str, known: Iterable[str]) -> str:
     """Return a hint with the closest known name, or with all of them."""
-    close = difflib.get_close_matches(word, known, n=1)
+    names = sorted(known)
+    close = difflib.get_close_matches(word, names, n=1)
     if close:
         return f"did you mean '{close[0]}'?"
-    return f"known: {', '.join(sorted(known))}" if known else ""
+    return f"known: {', '.join(names)}" if names else ""
 
 
-def _worded_rule(detail: ErrorDetails) -> str:
-    context = detail.get("ctx", {})
-    kind = detail["type"]
+def _rule(detail: ErrorDetails) -> str:
+    kind, context = detail["type"], detail.get("ctx", {})
+    if kind in _RULES:
+        return _RULES[kind]
     if kind == "value_error":
         return str(context["error"])
-    bounds = {"greater_than": ("> ", "gt"), "greater_than_equal": (">= ", "ge"),
-              "less_than": ("< ", "lt"), "less_than_equal": ("<= ", "le")}  # fmt: skip
-    if kind in bounds:
-        sign, name = bounds[kind]
+    if kind in _BOUNDS:
+        sign, name = _BOUNDS[kind]
         return f"must be {sign}{context[name]}"
     if kind in {"literal_error", "union_tag_invalid"}:
-        expected = context.get("expected") or context.get("expected_tags")
-        return f"must be one of {expected}"
+        expected = str(context.get("expected") or context.get("expected_tags"))
+        several = " or " in expected or ", " in expected
+        return f"must be one of {expected}" if several else f"must be {expected}"
     if kind in {"too_short", "too_long"}:
         name = "at least" if kind == "too_short" else "at most"
         length = context.get("min_length", context.get("max_length"))
@@ -92,16 +136,105 @@ def _worded_rule(detail: ErrorDetails) -> str:
     return message[0].lower() + message[1:]
 
 
+def _value(detail: ErrorDetails) -> str:
+    """Return the offending value, short enough for one line; empty where the rule has it."""
+    if detail["type"] == "union_tag_invalid":
+        return repr(detail.get("ctx", {})["tag"])
+    if detail["type"] in _WITHOUT_VALUE:
+        return ""
+    text = _as_written(detail["input"])
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def _as_written(value: Any) -> str:
+    if value is None or isinstance(value, bool):
+        return {None: "nothing", True: "true", False: "false"}[value]
+    return repr(list(value)) if isinstance(value, tuple) else repr(value)
+
+
+def _hint(detail: ErrorDetails, known: Iterable[str]) -> str:
+    value, kind = detail["input"], detail["type"]
+    if kind == "extra_forbidden":
+        return did_you_mean(str(detail["loc"][-1]), known)
+    if kind in _NUMBERS and isinstance(value, str):
+        return _number_hint(value)
+    if kind in _NUMBERS and isinstance(value, float) and value.is_integer():
+        return f"write {value:.0f}"
+    if kind == "bool_type" and str(value).lower() in _SPOKEN_BOOLEANS:
+        return "write true or false"
+    if kind == "string_type" and isinstance(value, bool | int | float):
+        return "put it in quotes"
+    return ""
+
+
 def _number_hint(text: str) -> str:
-    try:
-        number = float(text)
-    except ValueError:
-        return ""
-    if not math.isfinite(number):
-        return ""
-    mantissa, e, exponent = text.lower().partition("e")
-    if e:
-        dot = mantissa if "." in mantissa else mantissa + ".0"
-        sign = "" if exponent[0] in "+-" else "+"
-        return f"YAML reads this as text: write {number!r} or {dot}e{sign}{exponent}"
-    return "remove the quotes"
+    if is_number(text):
+        return "remove the quotes"
+    if is_number(text.replace(",", ".")):
+        return "write a decimal point"
+    if text[:1] in set("+-.0123456789"):
+        return "write a plain number, such as 1000, 0.5 or 1e-3"
+    return ""
+
+
+def _located(model: type[BaseModel], detail: ErrorDetails) -> _Broken:
+    """Follow pydantic's location through the types, and leave out its names of choices."""
+    choices: list[Any] = [model]
+    parent: type[BaseModel] | None = None
+    plain: list[str | int] = []
+    chose = False
+    for part in detail["loc"]:
+        chose = len(choices) > 1
+        if chose:
+            choices = [choice for choice in choices if _is_named(choice, part)]
+        elif part != "[key]":
+            plain.append(part)
+            parent = choices[0] if choices and _is_model(choices[0]) else None
+            choices = _choices(_inner(choices[0], part)) if choices else []
+    kind = detail["type"]
+    if kind == "union_tag_invalid":
+        plain.append("kind")
+    of_choice = chose and (kind == "literal_error" or kind.endswith("_type"))
+    return _Broken(detail, tuple(plain), parent, of_choice)
+
+
+def _is_model(annotation: Any) -> bool:
+    return isinstance(annotation, type) and issubclass(annotation, BaseModel)
+
+
+def _is_named(choice: Any, name: str | int) -> bool:
+    """Return whether pydantic calls a choice so: by its kind, or by its class.
+
+    The class may stand within its validators: ``function-after[_fits(), Flag]``.
+    """
+    if not _is_model(choice):
+        return False
+    if re.search(rf"\b{choice.__name__}\]*$", str(name)):
+        return True
+    kind = choice.model_fields.get("kind")
+    return kind is not None and name in typing.get_args(kind.annotation)
+
+
+def _inner(annotation: Any, part: str | int) -> Any:
+    """Return the type of what stands at a key or an index; None where it is not known."""
+    if _is_model(annotation):
+        field = annotation.model_fields.get(part)
+        return field.annotation if field else None
+    origin, inner = typing.get_origin(annotation), typing.get_args(annotation)
+    if origin in {dict, Mapping}:
+        return inner[1]
+    if origin is not tuple:
+        return None
+    if inner[-1] is Ellipsis:
+        return inner[0]
+    return inner[part] if isinstance(part, int) and part < len(inner) else None
+
+
+def _choices(annotation: Any) -> list[Any]:
+    """Return what a value may be: several types where pydantic's location names the choice."""
+    origin = typing.get_origin(annotation)
+    if origin is Annotated:
+        return _choices(typing.get_args(annotation)[0])
+    if origin in {typing.Union, types.UnionType}:
+        return [each for each in typing.get_args(annotation) if each is not type(None)]
+    return [annotation]

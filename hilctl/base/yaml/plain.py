@@ -1,40 +1,72 @@
-"""The plain part of YAML: mappings with text keys, lists, numbers, true, false, null and text.
+r"""The plain part of YAML 1.2: mappings with text keys, lists, and the scalars of its core schema.
+
+A scalar without quotes is, as the core schema says (YAML 1.2.2, section 10.3.2):
+
+    null     ``null``, ``Null``, ``NULL``, ``~``, or nothing at all
+    boolean  ``true``, ``True``, ``TRUE``, ``false``, ``False``, ``FALSE``
+    integer  ``[-+]?[0-9]+`` (``010`` is ten), ``0o[0-7]+``, ``0x[0-9a-fA-F]+``
+    float    ``[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?``, ``[-+]?.inf``, ``.nan``
+             (also ``.Inf``, ``.INF``, ``.NaN``, ``.NAN``)
+    text     everything else: ``yes``, ``on``, ``1:30``, ``1_000``, ``2026-11-21``
 
 Aliases and tags can make loops, and values that are neither numbers nor text; a configuration needs
-neither, so they are refused. A date is text, as in YAML 1.2.
+neither, so they are refused.
 """
 
 import math
+import re
 from typing import Any
 
 import yaml
-import yaml.composer
-import yaml.constructor
+from yaml.composer import ComposerError
 
 MAX_DEPTH = 32
 """Levels of nesting that are read; an experiment has about five."""
+
+_TAG = "tag:yaml.org,2002:"
+_INT = r"[-+]?[0-9]+|0o[0-7]+|0x[0-9a-fA-F]+"
+_FLOAT = (
+    r"[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?"
+    r"|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)"
+)
+_CORE = {
+    "null": re.compile(r"(?:null|Null|NULL|~|)\Z"),
+    "bool": re.compile(r"(?:true|True|TRUE|false|False|FALSE)\Z"),
+    "int": re.compile(rf"(?:{_INT})\Z"),
+    "float": re.compile(rf"(?:{_FLOAT})\Z"),
+}
 
 
 class _PlainLoader(yaml.SafeLoader):
     """Refuses what is not plain as it reads."""
 
+    yaml_implicit_resolvers = {}  # noqa: RUF012  PyYAML's own way; filled below
     _depth = 0
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
         event: Any = self.peek_event()  # type: ignore[no-untyped-call] # not in the stubs
         is_key = isinstance(parent, yaml.MappingNode) and index is None
         if problem := _not_plain(event, is_key=is_key, depth=self._depth):
-            raise yaml.composer.ComposerError(None, None, problem, event.start_mark)
+            raise ComposerError(None, None, problem, event.start_mark)
         self._depth += 1
         node = super().compose_node(parent, index)
         self._depth -= 1
         return node
 
 
-_PlainLoader.yaml_implicit_resolvers = {
-    first: [(tag, pattern) for tag, pattern in resolvers if not tag.endswith(":timestamp")]
-    for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
-}
+class _PlainDumper(yaml.SafeDumper):
+    """Writes no aliases, and quotes every text that YAML 1.1 or 1.2 would read as something else.
+
+    PyYAML's resolvers, which are those of 1.1, stay, so that other programs read the same.
+    """
+
+    def ignore_aliases(self, data: Any) -> bool:
+        return True
+
+
+for _name, _pattern in _CORE.items():
+    _PlainLoader.add_implicit_resolver(_TAG + _name, _pattern, None)
+    _PlainDumper.add_implicit_resolver(_TAG + _name, _pattern, None)
 
 
 def _not_plain(event: yaml.Event, *, is_key: bool, depth: int) -> str:
@@ -59,12 +91,20 @@ def compose(text: str) -> yaml.Node | None:
     """Return the text's tree, or None where it holds nothing.
 
     Raises:
-        yaml.YAMLError: It is not YAML, or more than the plain part of it.
+        yaml.MarkedYAMLError: It is not YAML, or more than the plain part of it; says where.
     """
     try:
-        return yaml.compose(text, Loader=_PlainLoader)
-    except (ValueError, OverflowError) as error:  # an escape that names no character
-        raise yaml.YAMLError(str(error)) from None
+        loader = _PlainLoader(text)
+    except yaml.reader.ReaderError as error:
+        line = text.count("\n", 0, error.position)
+        mark = yaml.Mark("", error.position, line, 0, None, 0)
+        problem = f"the character U+{ord(text[error.position]):04X} is not allowed"
+        raise yaml.MarkedYAMLError(problem=problem, problem_mark=mark) from None
+    try:
+        return loader.get_single_node()
+    except (ValueError, OverflowError):
+        problem = "an escape names no character"
+        raise yaml.MarkedYAMLError(problem=problem, problem_mark=loader.get_mark()) from None
 
 
 def scalar(node: yaml.Node) -> Any:
@@ -72,11 +112,41 @@ def scalar(node: yaml.Node) -> Any:
 
     A whole number of more than 64 bits is a float: Python won't write out very long ones.
     """
+    text: str = node.value
+    match node.tag.removeprefix(_TAG):
+        case "null":
+            return None
+        case "bool":
+            return text.lower() == "true"
+        case "int":
+            return _whole(text)
+        case "float":
+            return float(text.lower().replace(".inf", "inf").replace(".nan", "nan"))
+    return text
+
+
+def _whole(text: str) -> int | float:
+    base = {"0o": 8, "0x": 16}.get(text[:2], 10)
     try:
-        value = yaml.constructor.SafeConstructor().construct_object(node)
-        too_long = isinstance(value, int) and value.bit_length() > 64
-        return float(value) if too_long else value
-    except OverflowError:
-        return math.inf
-    except (ValueError, yaml.YAMLError):
-        return node.value
+        number = int(text, base)
+        return number if number.bit_length() <= 64 else float(number)
+    except (ValueError, OverflowError):  # thousands of digits
+        return -math.inf if text.startswith("-") else math.inf
+
+
+def is_number(text: str) -> bool:
+    """Return whether a text without quotes would be a number."""
+    return any(_CORE[name].match(text) is not None for name in ("int", "float"))
+
+
+def dump(data: Any) -> str:
+    """Return plain data as YAML; read back it is the same, bit for bit, lists as tuples.
+
+    Args:
+        data: Mappings with text keys, lists and tuples, text, None, booleans, floats, and whole
+            numbers of up to 64 bits.
+
+    Raises:
+        yaml.YAMLError: It holds anything else.
+    """
+    return yaml.dump(data, Dumper=_PlainDumper, sort_keys=False, width=100)

@@ -116,9 +116,9 @@ BROKEN: list[tuple[str, str, str]] = [
     ),
     (
         "number that YAML reads as text",
-        GOOD.replace("sample_rate_hz: 1000", "sample_rate_hz: 1e3"),
-        "x.yaml:3: sample_rate_hz: must be a number, got '1e3' (YAML reads this as text: write "
-        "1000.0 or 1.0e+3)",
+        GOOD.replace("sample_rate_hz: 1000", "sample_rate_hz: 1_000"),
+        "x.yaml:3: sample_rate_hz: must be a number, got '1_000' (write a plain number, such as "
+        "1000, 0.5 or 1e-3)",
     ),
     (
         "not a number",

@@ -3,14 +3,14 @@
 from typing import get_args
 
 import pytest
-import yaml
 
+from hilctl.base.yaml.document import load_document
+from hilctl.base.yaml.messages import loc_of
 from hilctl_drivers.board.profile import FrameProfile
 from hilctl_drivers.modbus.pdu import read_pdu, rtu_adu, write_single_pdu
 from hilctl_drivers.modbus.profile import ModbusProfile
 from hilctl_drivers.modbus.steps import EnsureStep, RegisterStep
 from hilctl_drivers.profile import FOLDER, Profile, load_profile, shipped_profiles
-from hilctl_drivers.profile_problems import value_at
 from hilctl_drivers.text.profile import AsciiProfile, SendStep, fields_of
 
 NAMES = (
@@ -153,11 +153,11 @@ class TestEach:
     def test_provenance(self, name: str) -> None:
         """Documents are named, and what is unverified is in the file and named once."""
         profile = load_profile(name)
-        raw = yaml.safe_load((FOLDER / f"{name}.yaml").read_text(encoding="utf-8"))
+        document = load_document(FOLDER / f"{name}.yaml")
         assert profile.verified in {"partly", "no"}
         assert len(set(profile.unverified)) == len(profile.unverified)
         assert profile.unverified or profile.verified == "no"
-        assert all(value_at(raw, key.split(".")) is not None for key in profile.unverified)
+        assert all(document.holds(loc_of(key)) for key in profile.unverified)
 
     def test_no_sensor_is_said_so(self, name: str) -> None:
         """A device that reads no sensor says in its notes that another one must."""

@@ -13,7 +13,6 @@ from hilctl.experiment.correction import (
     evaluate,
     load_correction,
     model_sha256,
-    parse_correction,
     signature,
 )
 from hilctl.models.published import terfenol_rdpi
@@ -48,9 +47,9 @@ def test_a_file_gives_back_the_same_correction(tmp_path):
     made = reference(sine(), tmp_path)
     correction = correction_for(made, made.segments[0])
     text = dump_correction(correction)
-    assert parse_correction("x", text) == correction
     (tmp_path / "c.yaml").write_text(text)
     back = load_correction(tmp_path / "c.yaml")
+    assert back == correction
     assert np.array_equal(back.cycles[0].coefficients, COEFFICIENTS)
 
 
@@ -130,8 +129,10 @@ def test_a_file_with_unequal_coefficients_is_refused(tmp_path):
     text = dump_correction(correction_for(made, made.segments[0]))
     broken = text.replace("    sine_um:\n    - 0.0\n", "    sine_um:\n")
     assert broken != text
+    path = tmp_path / "c.yaml"
+    path.write_text(broken)
     with pytest.raises(ConfigError, match="one value a value of cosine_um: 3 for 4"):
-        parse_correction("c.yaml", broken)
+        load_correction(path)
 
 
 def test_evaluation_drops_what_a_coarse_grid_can_not_show():

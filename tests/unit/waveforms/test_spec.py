@@ -154,7 +154,7 @@ def test_unit_in_a_part() -> None:
         "    - {kind: hold, unit: A, level: 1.0, duration_s: 1.0}\n"
         "    - {kind: hold, unit: um, level: 1.0, duration_s: 1.0}\n"
     )
-    assert found == ["x.yaml:7: waveform.parts: 1.unit must be that of the sequence, A: um"]
+    assert found == ["x.yaml:9: waveform.parts: 1.unit must be that of the sequence, A: um"]
 
 
 def test_sequence_in_a_sequence() -> None:

@@ -1,0 +1,74 @@
+"""Words of broken rules: names that are near, and values that may be of several types."""
+
+from collections.abc import Mapping
+from typing import Annotated, Literal
+
+import pytest
+from pydantic import Field, model_validator
+
+from hilctl.base.errors import ConfigError
+from hilctl.base.strict import Strict
+from hilctl.base.yaml.document import Document
+from hilctl.base.yaml.messages import did_you_mean, dotted, loc_of
+
+
+class Guard(Strict):
+    timeout_s: float
+    kick: Literal["any", "write"] = "any"
+
+    @model_validator(mode="after")
+    def _not_both(self) -> "Guard":
+        if self.timeout_s > 1.0 and self.kick == "any":
+            raise ValueError("kick must be write where timeout_s is above 1")
+        return self
+
+
+class Several(Strict):
+    guard: Guard | Literal["none"] = "none"
+    base: Literal[0, 1, "modicon"] | None = None
+    level: float | Literal["safe"] = 0.0
+    guards: Mapping[str, Guard | Literal["none"]] = Field(default_factory=dict)
+    span: tuple[float, Annotated[int, Field(ge=0)]] = (0.0, 0)
+    names: dict[Annotated[str, Field(pattern="^[a-z]+$")], float] = Field(default_factory=dict)
+
+
+@pytest.mark.parametrize(("text", "problems"), [
+    ("guard: off", ["x:1: guard: must be a mapping of keys to values, or 'none', got 'off'"]),
+    ("guard: [1]", ["x:1: guard: must be a mapping of keys to values, or 'none', got [1]"]),
+    ("guard:\n  timeout: 1",
+     ["x:1: guard.timeout_s: is required",
+      "x:2: guard.timeout: unknown key (did you mean 'timeout_s'?)"]),
+    ("guard:\n  timeout_s: 2\n  kick: any",
+     ["x:3: guard: kick must be write where timeout_s is above 1"]),
+    ("guard:\n  timeout_s: 2",
+     ["x:1: guard: kick must be write where timeout_s is above 1"]),
+    ("guard: {timeout_s: 2, kick: x}",
+     ["x:1: guard.kick: must be one of 'any' or 'write', got 'x'"]),
+    ("base: 2", ["x:1: base: must be one of 0, 1 or 'modicon', got 2"]),
+    ("level: high", ["x:1: level: must be a number, or 'safe', got 'high'"]),
+    ("level: '1e3'", ["x:1: level: must be a number, or 'safe', got '1e3' (remove the quotes)"]),
+    ("level: .nan", ["x:1: level: must be a finite number, got nan"]),
+    ("guards:\n  a: {timeout_s: x}\n  b: off",
+     ["x:2: guards.a.timeout_s: must be a number, got 'x'",
+      "x:3: guards.b: must be a mapping of keys to values, or 'none', got 'off'"]),
+    ("span: [x, -1]",
+     ["x:1: span.0: must be a number, got 'x'",
+      "x:1: span.1: must be >= 0, got -1"]),
+    ("names: {A1: 1.0}",
+     ["x:1: names.A1: string should match pattern '^[a-z]+$', got 'A1'"]),
+])  # fmt: skip
+def test_what_may_be_of_several_types(text: str, problems: list[str]) -> None:
+    """One problem a value, with every choice; the choice that was meant speaks alone."""
+    with pytest.raises(ConfigError) as caught:
+        Document("x", text).validate(Several)
+    assert [str(each) for each in caught.value.problems] == problems
+
+
+def test_keys_and_suggestions() -> None:
+    """Dotted keys there and back, and suggestions."""
+    assert dotted(("a", 0, "b")) == "a.0.b"
+    assert loc_of("a.0.b") == ("a", 0, "b")
+    assert loc_of("a.².b") == ("a", "²", "b")
+    assert did_you_mean("slwo", ["slow", "fast"]) == "did you mean 'slow'?"
+    assert did_you_mean("zzz", ["slow", "fast"]) == "known: fast, slow"
+    assert did_you_mean("zzz", []) == ""

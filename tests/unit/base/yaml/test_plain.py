@@ -1,0 +1,211 @@
+"""Scalars of YAML 1.2's core schema, read alike by every reader; plain data as YAML."""
+
+import math
+import struct
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hilctl.base.errors import ConfigError
+from hilctl.base.yaml.document import Document
+from hilctl.base.yaml.plain import dump
+from hilctl.experiment.load import resolve
+from hilctl.models.files import load_model, parse_model
+from hilctl_drivers.profile import FOLDER, load_profile, parse_profile
+
+INF, NAN = math.inf, math.nan
+
+SCALARS: list[tuple[str, Any]] = [
+    ("1", 1), ("+1", 1), ("-1", -1), ("0", 0), ("-0", 0), ("010", 10), ("007", 7), ("089", 89),
+    ("0o10", 8), ("0x1F", 31), ("0xfe", 254), ("1e3", 1000.0), ("1E3", 1000.0), ("1e-3", 0.001),
+    ("1.0e+3", 1000.0), ("2.5e3", 2500.0), (".5", 0.5), ("-.5", -0.5), ("1.", 1.0), ("+1.5", 1.5),
+    ("01.5", 1.5), ("-0.0", -0.0), ("1e999", INF), (".inf", INF), ("-.INF", -INF), ("+.Inf", INF),
+    (".nan", NAN), (".NaN", NAN), ("true", True), ("True", True), ("TRUE", True), ("false", False),
+    ("null", None), ("Null", None), ("NULL", None), ("~", None), ("", None),
+]  # fmt: skip
+TEXTS = [
+    "yes", "no", "on", "off", "y", "n", "Yes", "OFF", "tRUE", "1:30", "190:20:30", "1_000", "0x_1",
+    "0b101", "0o8", "-0x1F", "+0o7", "1,5", "1e", "e3", ".", "+", "1.2.3", "inf", "nan", "+.nan",
+    "2026-11-21", "2026-11-21T10:00:00Z", "=", "<<", "none", "0x", "--1", "1e3.5", "\u0661",
+]  # fmt: skip
+
+
+def same(a: Any, b: Any) -> bool:
+    """Return whether values have the same type and the same bits."""
+    if isinstance(a, float) and isinstance(b, float):
+        return struct.pack("d", a) == struct.pack("d", b) or (math.isnan(a) and math.isnan(b))
+    return type(a) is type(b) and bool(a == b)
+
+
+@pytest.mark.parametrize(("text", "value"), [*SCALARS, *((text, text) for text in TEXTS)])
+def test_scalars_are_those_of_the_core_schema(text: str, value: Any) -> None:
+    """Numbers, booleans and nothing as YAML 1.2 has them; quotes make any of them text."""
+    data = Document("x.yaml", f"bare: {text}\nlist:\n- {text}\nquoted: '{text}'\n").data
+    assert same(data["bare"], value)
+    assert same(data["list"][0], value)
+    assert data["quoted"] == text
+
+
+EXPERIMENT = """\
+name: tiny
+device: {kind: simulated_terfenol}
+sample_rate_hz: 1000
+waveform: {kind: hold, unit: A, level: 1.0, duration_s: 1.0}
+compensator: none
+limits: {peak_current_a: 2.0, slew_a_per_s: 5000.0, stroke_um: [-75.0, 60.0]}
+description: DESCRIPTION
+safe:
+  ramp_s: NUMBER
+"""
+MODEL = """\
+model:
+  kind: rdpi
+  direct: 2.7
+  weights: [2.3]
+  thresholds: [0.3]
+  output_offset_um: NUMBER
+  provenance:
+    method: DESCRIPTION
+"""
+PROFILE = (FOLDER / "generic_float32.yaml").read_text(encoding="utf-8")
+PROFILE = PROFILE.replace("vendor: ", "vendor: DESCRIPTION  # ", 1)
+PROFILE = "\n".join(
+    "max_rate_hz: NUMBER" if line.startswith("max_rate_hz:") else line
+    for line in PROFILE.splitlines()
+)
+
+
+def read_experiment(text: str) -> tuple[Any, Any]:
+    config = resolve(Document("x.yaml", text), Path()).config
+    return config.description, config.safe.ramp_s
+
+
+def read_model(text: str) -> tuple[Any, Any]:
+    model = parse_model("x.yaml", text)
+    return model.provenance.method, model.output_offset_um
+
+
+def read_profile(text: str) -> tuple[Any, Any]:
+    profile = parse_profile(text, "x.yaml")
+    return profile.vendor, profile.max_rate_hz
+
+
+def outcome(read: Callable[[str], Any], text: str) -> Any:
+    """Return what is read, or why it is refused."""
+    try:
+        return read(text)
+    except ConfigError as error:
+        return error
+
+
+READERS = [(read_experiment, EXPERIMENT), (read_model, MODEL), (read_profile, PROFILE)]
+
+
+@pytest.mark.parametrize(("read", "template"), READERS)
+@pytest.mark.parametrize(("text", "value"), [*SCALARS, *((text, text) for text in TEXTS)])
+def test_every_reader_reads_the_same(
+    read: Callable[[str], tuple[Any, Any]], template: str, text: str, value: Any
+) -> None:
+    """What is text or a number to one reader is so to all; the rest is refused with its line."""
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    for place, filler, wanted in (("DESCRIPTION", "1.0", str), ("NUMBER", "words", float)):
+        other = {"DESCRIPTION": "NUMBER", "NUMBER": "DESCRIPTION"}[place]
+        full = template.replace(place, text).replace(other, filler)
+        line = next(i for i, row in enumerate(template.splitlines(), 1) if place in row)
+        fits = isinstance(value, str) if wanted is str else is_number
+        found = outcome(read, full)
+        if isinstance(found, ConfigError):
+            assert not fits or not math.isfinite(value) or value <= 0.0
+            assert [each.where for each in found.problems] == [f"x.yaml:{line}"]
+        else:
+            assert fits
+            assert found[0 if wanted is str else 1] == value
+
+
+@pytest.mark.parametrize(("read", "template"), READERS)
+@pytest.mark.parametrize(("number", "reason"), [
+    ("*x", "aliases"), ("!!float 1", "tags"), ("{? [1] : 2}", "a key must be text"),
+    ("[" * 40, "nested more than 32"), ('"\\ud800"', "half a character"), ("[1", "expected"),
+    ("\x07", "U+0007"),
+])  # fmt: skip
+def test_every_reader_refuses_the_same(
+    read: Callable[[str], tuple[Any, Any]], template: str, number: str, reason: str
+) -> None:
+    """Aliases, tags and broken YAML are refused by all, with the line and the reason."""
+    text = template.replace("NUMBER", number).replace("DESCRIPTION", "words")
+    with pytest.raises(ConfigError) as caught:
+        read(text)
+    (problem,) = caught.value.problems
+    assert problem.where.startswith("x.yaml:")
+    assert int(problem.where.removeprefix("x.yaml:")) > 1
+    assert problem.rule == "is not readable YAML"
+    assert reason in problem.hint
+
+
+@pytest.mark.parametrize("load", [load_model, lambda path: load_profile(str(path))])
+def test_files_that_can_not_be_read_are_refused_alike(load: Any, tmp_path: Path) -> None:
+    """Models and profiles say the same of a file that is not text."""
+    path = tmp_path / "x.yaml"
+    path.write_bytes(b"\xff\xfe")
+    with pytest.raises(Exception, match=r"x\.yaml: is not UTF-8 text"):
+        load(path)
+
+
+TEXT = st.text(st.characters(exclude_categories=["Cs"]), max_size=200)
+LOOKALIKE = st.from_regex(r"[-+]?[0-9._:,eExXoOabfin]{0,12}", fullmatch=True)
+SCALAR = st.one_of(
+    st.none(), st.booleans(), st.integers(-(2**63), 2**64 - 1), st.floats(), TEXT, LOOKALIKE,
+    st.sampled_from(TEXTS), st.sampled_from([text for text, _ in SCALARS]),
+)  # fmt: skip
+DATA = st.dictionaries(
+    st.one_of(TEXT, LOOKALIKE),
+    st.recursive(
+        SCALAR,
+        lambda inner: st.one_of(
+            st.lists(inner, max_size=4).map(tuple), st.dictionaries(TEXT, inner, max_size=4)
+        ),
+        max_leaves=12,
+    ),
+    max_size=5,
+)
+
+
+def alike(a: Any, b: Any) -> bool:
+    """Return whether nested data are the same, order, types and bits included."""
+    if isinstance(a, dict) and isinstance(b, dict):
+        return list(a) == list(b) and all(alike(a[key], b[key]) for key in a)
+    if isinstance(a, tuple) and isinstance(b, tuple):
+        return len(a) == len(b) and all(map(alike, a, b))
+    return same(a, b)
+
+
+@given(DATA)
+def test_what_is_dumped_reads_back_the_same(data: dict[str, Any]) -> None:
+    """Every text, number and nesting comes back, bit for bit."""
+    assert alike(Document("x.yaml", dump(data)).data, data)
+
+
+@given(st.one_of(TEXT, LOOKALIKE, st.floats(allow_nan=False), st.integers(-(2**63), 2**64 - 1)))
+def test_other_programs_read_what_is_dumped(value: Any) -> None:
+    """A reader of YAML 1.1 finds the same scalar: what it would take for another is quoted."""
+    assert same(yaml.safe_load(dump({"a": value}))["a"], value)
+
+
+def test_dumped_lists_that_are_one_object_stand_twice() -> None:
+    """No aliases are written: they would be refused on reading."""
+    weights = (0.5, 0.25)
+    text = dump({"a": weights, "b": weights, "c": [weights]})
+    assert Document("x.yaml", text).data == {"a": weights, "b": weights, "c": (weights,)}
+
+
+def test_dumped_text_is_as_people_write_it() -> None:
+    """Plain words stay bare; what one of the YAMLs reads as something else is quoted."""
+    data = {"a": "words", "b": "on", "c": "1e3", "d": "0o10", "e": 1e-05, "f": 1e22, "g": "1:30"}
+    assert dump(data) == (
+        "a: words\nb: 'on'\nc: '1e3'\nd: '0o10'\ne: 1.0e-05\nf: 1.0e+22\ng: '1:30'\n"
+    )
