@@ -6,7 +6,6 @@ place for the facts of the run.
 
 import json
 import math
-import os
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO, TypeAlias
@@ -15,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hilctl.base.errors import DataError, InputError
+from hilctl.base.files import refuse_existing, write_file
 from hilctl.recording.data import Recording
 
 Columns: TypeAlias = Mapping[str, npt.NDArray[Any]]
@@ -62,10 +62,9 @@ def export(
     if write is None:
         known = ", ".join(_FORMATS)
         raise InputError(f"{path}: the suffix must be one of {known}: got {path.suffix!r}")
-    if path.exists() and not overwrite:
-        raise InputError(f"{path}: exists already (choose another name, or allow overwriting)")
+    refuse_existing(path, overwrite=overwrite)
     table = columns(recording, t0, t1)
-    _write_whole(path, lambda stream: write(stream, table, facts(recording)))
+    write_file(path, lambda stream: write(stream, table, facts(recording)), overwrite=overwrite)
     return int(table["sample"].size)
 
 
@@ -130,20 +129,6 @@ def _first_at_or_after(t_s: float, rate_hz: float) -> int:
 
 def _seconds(t_s: float | None, otherwise: str) -> str:
     return otherwise if t_s is None else f"{t_s:g} s"
-
-
-def _write_whole(path: Path, write: Callable[[BinaryIO], None]) -> None:
-    """Write beside the file first, so that no half of it is ever seen under its name."""
-    beside = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        try:
-            with beside.open("wb") as stream:
-                write(stream)
-            beside.replace(path)
-        finally:
-            beside.unlink(missing_ok=True)
-    except OSError as error:
-        raise InputError(f"{path}: can't be written: {error.strerror or error}") from None
 
 
 def _write_csv(stream: BinaryIO, table: Columns, _facts: Facts) -> None:

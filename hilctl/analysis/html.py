@@ -2,7 +2,6 @@
 
 import base64
 import html
-import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
@@ -10,7 +9,7 @@ from matplotlib.figure import Figure
 
 from hilctl.analysis import canvas, loops, plots, table
 from hilctl.analysis.report import RunReport, worst_segment
-from hilctl.base.errors import InputError
+from hilctl.base.files import write_text
 from hilctl.recording.data import Event, Recording
 
 _MOST_EVENTS = 200
@@ -62,15 +61,7 @@ def write_page(text: str, path: Path) -> None:
     Raises:
         InputError: It can't be written.
     """
-    beside = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        try:
-            beside.write_text(text, encoding="utf-8")
-            beside.replace(path)
-        finally:
-            beside.unlink(missing_ok=True)
-    except OSError as error:
-        raise InputError(f"{path}: can't be written: {error.strerror}") from None
+    write_text(path, text, overwrite=True)
 
 
 def page(recording: Recording, report: RunReport) -> str:

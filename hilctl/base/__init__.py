@@ -4,7 +4,7 @@ arrays.py    array types
 device.py    the contract of a device and of a clock
 errors.py    every exception that is raised on purpose
 strict.py    base of every pydantic model
-files.py     text files, read once
+files.py     texts, each read once; files written whole or not at all
 samples.py   a sample's columns and flags, and blocks of samples
 events.py    what a run tells beside its samples
 segments.py  which samples of a run are judged

@@ -1,8 +1,13 @@
-"""Text files that an experiment refers to, each read once and carried to whoever needs it."""
+"""Files in and out: texts, each read once and carried to whoever needs it; files written whole."""
 
+import errno
 import os
-from collections.abc import Mapping
+import secrets
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
+from types import TracebackType
+from typing import BinaryIO, Self
 
 from hilctl.base.errors import InputError
 
@@ -55,3 +60,125 @@ def read_text(path: Path) -> str:
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise InputError(f"{path}: can't be read: {reason}") from None
+
+
+class AtomicFile:
+    """A file that stands under its name whole or not at all; one not committed leaves nothing.
+
+    It is written beside its place, with the permissions of any new file.
+
+    Args:
+        path: Its place; where it may be replaced and is a link, the file that the link leads to.
+        overwrite: Whether a file of that name may be replaced.
+
+    Attributes:
+        stream: The new file, open for writing.
+        final: Where it goes.
+
+    Raises:
+        FileExistsError: A file of that name exists and may not be replaced.
+        OSError: The folder can't be written, or what stands there is no regular file.
+    """
+
+    def __init__(self, path: Path, *, overwrite: bool) -> None:
+        self._overwrite = overwrite
+        self.final = path.resolve() if overwrite else path
+        if not overwrite and os.path.lexists(path):
+            raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path))
+        if self.final.exists() and not self.final.is_file():  # a rename would replace /dev/null
+            raise OSError(errno.EINVAL, "Not a regular file", str(path))
+        self._beside = self.final.with_name(f".{self.final.name[:40]}-{secrets.token_hex(4)}.tmp")
+        self.stream: BinaryIO = self._beside.open("xb")
+
+    def secure(self) -> None:
+        """Bring what was written to the disk, so that a committed file outlives a power cut."""
+        self.stream.flush()
+        os.fsync(self.stream.fileno())
+
+    def commit(self) -> None:
+        """Bring the file to the disk and put it in its place, in one step for everybody else.
+
+        Raises:
+            FileExistsError: Somebody has made a file of that name, and it may not be replaced.
+            OSError: It can't be written to its end.
+        """
+        self.secure()
+        if self._overwrite:
+            self._beside.replace(self.final)
+        else:
+            self._link()
+        folder = os.open(self.final.parent, os.O_RDONLY)
+        try:
+            os.fsync(folder)  # the name is on the disk only once its folder is
+        finally:
+            os.close(folder)
+
+    def _link(self) -> None:
+        try:
+            self.final.hardlink_to(self._beside)  # refuses a name that is taken; a rename doesn't
+        except FileExistsError:
+            raise
+        except OSError:  # no hard links here: claim the name, then fill it
+            self.final.touch(exist_ok=False)
+            try:
+                self._beside.replace(self.final)
+            except OSError:
+                self.final.unlink()
+                raise
+
+    def close(self) -> None:
+        """Close the file; where it was not committed, nothing of it is left."""
+        with suppress(OSError):  # what can't be written has been reported before
+            self.stream.close()
+        self._beside.unlink(missing_ok=True)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+
+def write_file(path: Path, write: Callable[[BinaryIO], object], *, overwrite: bool) -> None:
+    """Write a file that appears whole or not at all.
+
+    Args:
+        path: The file.
+        write: Writes its content to a stream.
+        overwrite: Replace a file of that name.
+
+    Raises:
+        InputError: A file of that name exists, or it can't be written.
+    """
+    try:
+        with AtomicFile(path, overwrite=overwrite) as file:
+            write(file.stream)
+            file.commit()
+    except FileExistsError:
+        raise _exists_already(path) from None
+    except OSError as error:
+        raise InputError(f"{path}: can't be written: {error.strerror or error}") from None
+
+
+def write_text(path: Path, text: str, *, overwrite: bool) -> None:
+    """Write a UTF-8 text file that appears whole or not at all, see :func:`write_file`."""
+    write_file(path, lambda stream: stream.write(text.encode()), overwrite=overwrite)
+
+
+def refuse_existing(path: Path, *, overwrite: bool) -> None:
+    """Refuse a name that is taken, before work is done that would be in vain.
+
+    Raises:
+        InputError: There is something of that name, and it may not be replaced.
+    """
+    if not overwrite and os.path.lexists(path):
+        raise _exists_already(path)
+
+
+def _exists_already(path: Path) -> InputError:
+    return InputError(f"{path}: exists already: give another name, or --overwrite")

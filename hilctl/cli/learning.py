@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from hilctl.base.errors import InputError
+from hilctl.base.files import refuse_existing
 from hilctl.cli.options import (
     AsJson,
     ExperimentFile,
@@ -37,10 +38,10 @@ def learn(
     as_json: AsJson = False,
 ) -> None:
     """Learn a correction for a reference that repeats: run, correct, and run again."""
-    from hilctl.learning.session import Session, paced, unpaced, write_correction
+    from hilctl.experiment.correction import write_correction
+    from hilctl.learning.session import Session, paced, unpaced
 
-    if output.exists() and not overwrite:
-        raise InputError(f"{output}: exists already: give another --output, or --overwrite")
+    refuse_existing(output, overwrite=overwrite)
     chosen = folder or output.with_name(f"{output.stem}-runs")
     if not overwrite and any(chosen.glob("run-*.mcap")):
         raise InputError(f"{chosen}: holds runs already: give another --folder, or --overwrite")

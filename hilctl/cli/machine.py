@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from hilctl.base.errors import InputError
+from hilctl.base.files import write_text
 from hilctl.cli.options import (
     AsJson,
     ExperimentFile,
@@ -59,10 +59,7 @@ def schema(
     if output is None:
         print(schema_text(), end="")
         return
-    try:
-        output.write_text(schema_text(), encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{output}: can't be written: {error.strerror}") from None
+    write_text(output, schema_text(), overwrite=True)
 
 
 @devices_app.callback(invoke_without_command=True)

@@ -7,6 +7,7 @@ import scipy
 
 import hilctl
 from hilctl.base.errors import InputError
+from hilctl.base.files import write_text
 from hilctl.comparison.compare import Comparison, Row
 from hilctl.models.base import Provenance
 from hilctl.models.files import dump_model
@@ -52,7 +53,7 @@ def save_models(
             model = row.model.model_copy(
                 update={"provenance": _provenance(comparison, row, created)}
             )
-            path.write_text(dump_model(model), encoding="utf-8")
+            write_text(path, dump_model(model), overwrite=overwrite)
             paths.append(path)
     except OSError as error:
         raise InputError(f"{folder}: can't be written: {error.strerror}") from None

@@ -16,7 +16,7 @@ from pydantic import Field, model_validator
 
 from hilctl.base.arrays import F64
 from hilctl.base.errors import InputError
-from hilctl.base.files import TextFiles
+from hilctl.base.files import TextFiles, write_text
 from hilctl.base.segments import Segment
 from hilctl.base.strict import Strict
 from hilctl.base.yaml.document import load_document
@@ -223,3 +223,12 @@ def dump_correction(correction: Correction) -> str:
     """Return a correction as YAML; reading it back gives the same one, bit for bit."""
     mapping: dict[str, Any] = correction.model_dump(mode="json", exclude_none=True)
     return dump({"correction": mapping})
+
+
+def write_correction(path: Path, correction: Correction, *, overwrite: bool) -> None:
+    """Write a correction file; it appears whole or not at all.
+
+    Raises:
+        InputError: It exists and may not be replaced, or can't be written.
+    """
+    write_text(path, dump_correction(correction), overwrite=overwrite)

@@ -9,6 +9,7 @@ import numpy as np
 
 from hilctl.base.device import CommandUnit
 from hilctl.base.errors import DataError, InputError
+from hilctl.base.files import write_text
 from hilctl.base.samples import Flag
 from hilctl.identify.cycles import find_cycles, loops_from_recording
 from hilctl.identify.data import History, Record
@@ -124,10 +125,4 @@ def write_model(fit: Fit, path: Path, *, overwrite: bool) -> None:
     Raises:
         InputError: The file exists or can't be written.
     """
-    try:
-        with path.open("w" if overwrite else "x", encoding="utf-8") as stream:
-            stream.write(dump_model(fit.model))
-    except FileExistsError:
-        raise InputError(f"{path}: exists already: give another --output, or --overwrite") from None
-    except OSError as error:
-        raise InputError(f"{path}: can't be written: {error.strerror}") from None
+    write_text(path, dump_model(fit.model), overwrite=overwrite)

@@ -14,9 +14,9 @@ from hilctl.experiment.correction import (
     C128,
     Correction,
     LearnedCycle,
-    dump_correction,
     model_sha256,
     signature,
+    write_correction,
 )
 from hilctl.learning.cycle import cycle_error
 from hilctl.learning.repeating import beginning, repeating
@@ -132,7 +132,7 @@ class Session:
             self._cycle(segment, each)
             for segment, each in zip(self._segments, coefficients, strict=True)
         ]
-        _write(file, self._whole(cycles))
+        write_correction(file, self._whole(cycles), overwrite=True)
         settings = [*self._settings, f"compensator.correction={file.resolve()}"]
         settings += self._other_noise(number)
         result = self._run(self._experiment, settings, self._folder / f"{name}.mcap")
@@ -213,21 +213,3 @@ class Session:
             cycles=tuple(cycles),
             provenance=provenance,
         )
-
-
-def write_correction(path: Path, correction: Correction, *, overwrite: bool) -> None:
-    """Write a correction file.
-
-    Raises:
-        InputError: It exists, or can't be written.
-    """
-    if path.exists() and not overwrite:
-        raise InputError(f"{path}: exists already: give another --output, or --overwrite")
-    _write(path, correction)
-
-
-def _write(path: Path, correction: Correction) -> None:
-    try:
-        path.write_text(dump_correction(correction), encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{path}: can't be written: {error.strerror}") from None

@@ -1,11 +1,9 @@
 """Put a new file in the place of an old one, and keep the old one."""
 
 import os
-import shutil
-import tempfile
-from contextlib import suppress
 from pathlib import Path
-from typing import BinaryIO
+
+from hilctl.base.files import AtomicFile
 
 
 class Replacement:
@@ -27,15 +25,10 @@ class Replacement:
     def __init__(self, path: Path, output: Path | None) -> None:
         self._old = path.resolve()
         self._in_place = output is None
-        self.final = self._old if output is None else output
-        if output is not None and os.path.lexists(output):
-            raise FileExistsError(17, "exists already", str(output))
-        number, name = tempfile.mkstemp(
-            prefix=f".{self.final.name}-", suffix=".tmp", dir=self.final.parent
-        )
-        self._made = Path(name)
-        self.stream: BinaryIO = os.fdopen(number, "wb")
-        shutil.copymode(self._old, self._made)
+        self._file = AtomicFile(self._old if output is None else output, overwrite=output is None)
+        self.final = self._file.final
+        self.stream = self._file.stream
+        os.fchmod(self.stream.fileno(), self._old.stat().st_mode)
 
     def put(self) -> Path:
         """Move the new file, safe on the disk, to its place; return where the old one is now.
@@ -43,22 +36,14 @@ class Replacement:
         There is a whole file under the old name at every moment; on file systems without hard
         links there is none for as long as one renaming takes.
         """
-        self.stream.flush()
-        os.fsync(self.stream.fileno())
+        self._file.secure()  # before the old file is touched: a full disk must change nothing
         kept = self._keep() if self._in_place else self._old
-        self._made.replace(self.final)
-        folder = os.open(self.final.parent, os.O_RDONLY)
-        try:
-            os.fsync(folder)
-        finally:
-            os.close(folder)
+        self._file.commit()
         return kept
 
     def close(self) -> None:
         """Close the new file; remove it where it was not put."""
-        with suppress(OSError):  # what can't be written was told before
-            self.stream.close()
-        self._made.unlink(missing_ok=True)
+        self._file.close()
 
     def _keep(self) -> Path:
         number = 1

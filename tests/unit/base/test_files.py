@@ -1,9 +1,12 @@
-"""Text files are read once, and not at all once the texts are given."""
+"""Text files are read once, and not at all once the texts are given; files are written whole."""
+
+import os
+from pathlib import Path
 
 import pytest
 
 from hilctl.base.errors import InputError
-from hilctl.base.files import TextFiles
+from hilctl.base.files import TextFiles, refuse_existing, write_file, write_text
 
 
 def test_file_is_read_once(tmp_path):
@@ -49,3 +52,124 @@ def test_unreadable_files_are_told(tmp_path, make, message):
     make(path)
     with pytest.raises(InputError, match=f"thing: {message}"):
         TextFiles().read(path)
+
+
+class TestWriting:
+    """Files that appear whole or not at all."""
+
+    def test_new_file(self, tmp_path):
+        """It has its content, the permissions of any new file, and nothing stands beside it."""
+        path = tmp_path / "out.txt"
+        plain = tmp_path / "plain"
+        plain.touch()
+        write_text(path, "prüf μm\n", overwrite=False)
+        assert path.read_bytes() == "prüf μm\n".encode()
+        assert path.stat().st_mode == plain.stat().st_mode
+        assert sorted(tmp_path.iterdir()) == [path, plain]
+
+    def test_what_exists_is_kept_or_replaced(self, tmp_path):
+        """As the caller says; a link stays a link, to the file that was replaced."""
+        path = tmp_path / "out.txt"
+        path.write_text("precious")
+        link = tmp_path / "link"
+        link.symlink_to(path.name)
+        for name in (path, link):
+            with pytest.raises(InputError, match="exists already: give another name, or --overw"):
+                write_text(name, "new", overwrite=False)
+            with pytest.raises(InputError, match="exists already"):
+                refuse_existing(name, overwrite=False)
+            refuse_existing(name, overwrite=True)
+        assert path.read_text() == "precious"
+        write_text(link, "new", overwrite=True)
+        assert path.read_text() == "new"
+        assert link.is_symlink()
+        assert sorted(tmp_path.iterdir()) == [link, path]
+
+    @pytest.mark.parametrize("links", [True, False])
+    def test_a_file_made_meanwhile_is_kept(self, tmp_path, monkeypatch, links):
+        """A name that was free when writing began may be taken when it ends: nothing is lost."""
+        path = tmp_path / "out.txt"
+        if not links:
+            monkeypatch.setattr(Path, "hardlink_to", _refuse)
+
+        def write(stream):
+            stream.write(b"mine")
+            path.write_text("theirs")
+
+        with pytest.raises(InputError, match=r"out\.txt: exists already"):
+            write_file(path, write, overwrite=False)
+        assert path.read_text() == "theirs"
+        assert list(tmp_path.iterdir()) == [path]
+
+    def test_without_hard_links(self, tmp_path, monkeypatch):
+        """Where the file system has none, the file is written all the same."""
+        monkeypatch.setattr(Path, "hardlink_to", _refuse)
+        write_text(tmp_path / "out.txt", "text", overwrite=False)
+        assert (tmp_path / "out.txt").read_text() == "text"
+        monkeypatch.setattr(Path, "replace", _refuse)
+        with pytest.raises(InputError, match=r"other\.txt: can't be written: Operation not perm"):
+            write_text(tmp_path / "other.txt", "text", overwrite=False)
+        assert [each.name for each in tmp_path.iterdir()] == ["out.txt"]
+
+    @pytest.mark.parametrize("overwrite", [True, False])
+    @pytest.mark.parametrize(
+        "error", [OSError(28, "No space left"), KeyboardInterrupt(), ValueError()]
+    )
+    def test_what_breaks_off_leaves_nothing(self, tmp_path, overwrite, error):
+        """Half a file is never seen under the name, nor left beside it; the old one stays."""
+        path = tmp_path / "out.txt"
+        if overwrite:
+            path.write_text("precious")
+
+        def write(stream):
+            stream.write(b"half of it")
+            stream.flush()
+            assert path.exists() == overwrite
+            raise error
+
+        wanted = InputError if isinstance(error, OSError) else type(error)
+        with pytest.raises(wanted) as caught:
+            write_file(path, write, overwrite=overwrite)
+        if wanted is InputError:
+            assert str(caught.value) == f"{path}: can't be written: No space left"
+        left = [each.read_text() for each in tmp_path.iterdir()]
+        assert left == (["precious"] if overwrite else [])
+
+    def test_a_disk_that_fails_at_the_end(self, tmp_path, monkeypatch):
+        """What can't be brought to the disk does not take the name."""
+        monkeypatch.setattr(os, "fsync", _refuse)
+        with pytest.raises(
+            InputError, match=r"out\.txt: can't be written: Operation not permitted"
+        ):
+            write_text(tmp_path / "out.txt", "text", overwrite=False)
+        assert list(tmp_path.iterdir()) == []
+
+    def test_what_is_no_regular_file_is_not_replaced(self, tmp_path):
+        """A folder, a pipe or a device such as /dev/null never gives way to a file."""
+        os.mkfifo(tmp_path / "pipe")
+        for path in (tmp_path, tmp_path / "pipe"):
+            with pytest.raises(InputError, match="can't be written: Not a regular file"):
+                write_text(path, "text", overwrite=True)
+        assert (tmp_path / "pipe").is_fifo()
+
+    @pytest.mark.parametrize(
+        ("name", "reason"),
+        [("lost/out.txt", "No such file or directory"), ("plain/out.txt", "Not a directory"),
+         ("x" * 300, "File name too long")],
+    )  # fmt: skip
+    @pytest.mark.parametrize("overwrite", [True, False])
+    def test_places_that_can_not_be_written(self, tmp_path, name, reason, overwrite):
+        """The message has the path and the reason."""
+        (tmp_path / "plain").touch()
+        with pytest.raises(InputError, match=f"can't be written: {reason}") as caught:
+            write_text(tmp_path / name, "text", overwrite=overwrite)
+        assert str(caught.value).startswith(str(tmp_path / name))
+
+    def test_long_names(self, tmp_path):
+        """A name may be as long as the file system allows."""
+        write_text(tmp_path / ("x" * 255), "text", overwrite=False)
+        write_text(tmp_path / ("x" * 255), "again", overwrite=True)
+
+
+def _refuse(*_arguments):
+    raise PermissionError(1, "Operation not permitted")
