@@ -43,15 +43,29 @@ class TextFiles:
         return self.texts[key]
 
 
-def read_text(path: Path) -> str:
+MAX_TEXT_BYTES = 16 * 1024**2
+"""Largest text that is read; a model of ten thousand parameters has a fiftieth of it."""
+
+
+def read_text(path: Path, max_bytes: int = MAX_TEXT_BYTES) -> str:
     """Return a file's text.
 
+    Args:
+        path: The file.
+        max_bytes: Its largest size; looked at before any of it is read.
+
     Raises:
-        InputError: It can't be read, or is no UTF-8 text.
+        InputError: It can't be read, is too large, or is no UTF-8 text.
     """
     try:
         if path.exists() and not path.is_file():
             raise InputError(f"{path}: is not a file")
+        size = path.stat().st_size
+        if size > max_bytes:
+            limit = f"{max_bytes / 1e6:.0f} MB"
+            raise InputError(
+                f"{path}: has {size / 1e6:.0f} MB, more than the {limit} that are read"
+            )
         return path.read_text(encoding="utf-8")
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None

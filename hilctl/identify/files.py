@@ -11,11 +11,12 @@ from hilctl.base.device import CommandUnit
 from hilctl.base.errors import DataError, InputError
 from hilctl.base.files import write_text
 from hilctl.base.samples import Flag
+from hilctl.base.text_table import Column
 from hilctl.identify.cycles import find_cycles, loops_from_recording
 from hilctl.identify.data import History, Record
 from hilctl.identify.fit import Fit
 from hilctl.identify.settings import Kind
-from hilctl.identify.tables import Column, read_table
+from hilctl.identify.tables import read_table
 from hilctl.models.files import dump_model
 from hilctl.recording.data import Recording
 from hilctl.recording.reader import read

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from hilctl.base.errors import InputError
-from hilctl.base.files import TextFiles, refuse_existing, write_file, write_text
+from hilctl.base.files import TextFiles, read_text, refuse_existing, write_file, write_text
 
 
 def test_file_is_read_once(tmp_path):
@@ -52,6 +52,17 @@ def test_unreadable_files_are_told(tmp_path, make, message):
     make(path)
     with pytest.raises(InputError, match=f"thing: {message}"):
         TextFiles().read(path)
+
+
+def test_a_text_too_large_is_not_read(tmp_path):
+    """A recording that is named by mistake is refused by its size."""
+    path = tmp_path / "run.mcap"
+    with path.open("wb") as stream:
+        stream.truncate(20_000_000)
+    with pytest.raises(
+        InputError, match=r"run\.mcap: has 20 MB, more than the 17 MB that are read"
+    ):
+        read_text(path)
 
 
 class TestWriting:
