@@ -9,14 +9,14 @@ import numpy.typing as npt
 
 from hilctl.base.arrays import F64, U32
 from hilctl.base.errors import DataError
-from hilctl.base.samples import Flag
+from hilctl.base.samples import Flag, Samples
 from hilctl.base.yaml.document import Document
 from hilctl.experiment.file import Experiment
 from hilctl.loop.compensator import Compensator
 from hilctl.loop.limiter import Limiter
 from hilctl.models.base import HysteresisModel
 from hilctl.models.files import parse_model
-from hilctl.recording.data import Recording, Samples, Start
+from hilctl.recording.data import Recording, ReplayStart
 
 _LIMIT_BITS = int(Flag.RANGE_LIMITED | Flag.SLEW_LIMITED | Flag.INVALID | Flag.RAMP)
 
@@ -79,6 +79,7 @@ def replay(recording: Recording, model: HysteresisModel | None = None) -> Replay
     compensator = Compensator(chosen, recording.sample_rate_hz)
     limiter = Limiter(config.command_limits(), 1.0 / recording.sample_rate_hz)
     samples = recording.samples
+    recorded = samples.input_um if recording.compensated else samples.wanted
     wanted = np.empty_like(samples.wanted)
     command = np.empty_like(samples.command)
     flags = np.zeros_like(samples.flags)
@@ -91,7 +92,8 @@ def replay(recording: Recording, model: HysteresisModel | None = None) -> Replay
         elif rows.start == 0:
             compensator.begin(samples.reference_um[rows])
         for part in _alike(samples.flags, rows):
-            fed = _fed(samples, part, compensator, as_recorded=model is None)
+            # Another model than the recorded one is fed by its own preview.
+            fed = compensator.ahead(samples.reference_um[part]) if model else recorded[part]
             _recompute(samples, part, fed, compensator, limiter, (wanted, command, flags))
     return _compare(recording, known, (wanted, command, flags))
 
@@ -102,7 +104,7 @@ def _recorded_model(recording: Recording) -> HysteresisModel | None:
     return parse_model(f"{recording.path}: model.yaml", recording.model_yaml)
 
 
-def _stretches(recording: Recording) -> list[tuple[Start, slice]]:
+def _stretches(recording: Recording) -> list[tuple[ReplayStart, slice]]:
     """Return where each gapless stretch starts, and its rows.
 
     Blocks lost from a damaged file leave gaps that no start stands behind: what follows them, up to
@@ -124,16 +126,6 @@ def _alike(flags: U32, rows: slice) -> list[slice]:
     cuts = np.flatnonzero(np.diff(ramp)) + rows.start + 1
     bounds = [rows.start, *cuts.tolist(), rows.stop]
     return [slice(a, b) for a, b in pairwise(bounds) if b > a]
-
-
-def _fed(samples: Samples, rows: slice, compensator: Compensator, *, as_recorded: bool) -> F64:
-    """Return what the compensator is fed; another one than the recorded has its own preview."""
-    reference = samples.reference_um[rows]
-    if bool(np.isnan(reference).all()):
-        return samples.wanted[rows]
-    if not as_recorded:
-        return compensator.ahead(reference)
-    return samples.input_um[rows] if samples.input_um.size else reference
 
 
 def _recompute(

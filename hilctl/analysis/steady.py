@@ -6,10 +6,10 @@ import numpy as np
 
 from hilctl.analysis.metrics import Fold, fold
 from hilctl.base.arrays import F64
-from hilctl.base.samples import Flag
+from hilctl.base.samples import Flag, Samples
 from hilctl.base.segments import Segment
 from hilctl.loop.tuning import TUNED, tuning_samples
-from hilctl.recording.data import Recording, Samples
+from hilctl.recording.data import Recording
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +48,9 @@ def steady_samples(recording: Recording, segment: Segment) -> tuple[Samples, int
     end = min(segment.steady_stop, waveform_end(recording.samples))
     known = replace(segment, steady_start=begin, steady_stop=max(end, begin))
     start, stop, cycles = known.steady_cycles()
-    return _trusted(recording.samples.part(start, stop)), cycles
+    samples = recording.samples.part(start, stop)
+    trusted = (samples.flags & Flag.SENSOR_INVALID) == 0
+    return samples.rows(trusted), cycles
 
 
 def _tuned_until(recording: Recording, segment: Segment) -> int:
@@ -61,22 +63,6 @@ def _tuned_until(recording: Recording, segment: Segment) -> int:
         if event.code == TUNED and event.sample < segment.steady_stop:
             until = event.sample + tuning_samples(event.text)
     return until
-
-
-def _trusted(samples: Samples) -> Samples:
-    keep = (samples.flags & Flag.SENSOR_INVALID) == 0
-    if keep.all():
-        return samples
-    return Samples(
-        index=samples.index[keep],
-        reference_um=samples.reference_um[keep],
-        wanted=samples.wanted[keep],
-        command=samples.command[keep],
-        measured=samples.measured[keep] if samples.measured.size else samples.measured,
-        displacement_um=samples.displacement_um[keep],
-        flags=samples.flags[keep],
-        input_um=samples.input_um[keep] if samples.input_um.size else samples.input_um,
-    )
 
 
 def steady_part(recording: Recording, segment: Segment) -> SteadyPart:

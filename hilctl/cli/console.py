@@ -90,8 +90,9 @@ def measuring(seconds: float, *, quiet: bool) -> Iterator[Callable[[float], None
 
 
 def _live_text(progress: RunProgress) -> str:
-    reference, _, command, displacement_um = progress.batch.columns[-1][:4]
-    error_um = displacement_um - reference
+    newest = progress.batch.samples(slice(-1, None))
+    command, displacement_um = newest.command, newest.displacement_um
+    error_um = displacement_um - newest.reference_um
     error = f"error {error_um[-1]:+7.2f} um  " if np.isfinite(error_um[-1]) else ""
     return (
         f"{error}x {displacement_um[-1]:+8.2f} um  command {command[-1]:+7.3f}  "

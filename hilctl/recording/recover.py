@@ -18,7 +18,7 @@ from google.protobuf.message import DecodeError
 from hilctl.base.errors import DataError, InputError
 from hilctl.base.events import LoopEvent
 from hilctl.base.samples import Batch, Head
-from hilctl.recording.messages import Layout
+from hilctl.recording.messages import RecordingLayout
 from hilctl.recording.replace import Replacement
 from hilctl.recording.rewrite import Resaved, Survey
 from hilctl.recording.salvage import Damage, Salvage
@@ -139,14 +139,14 @@ def _sound(path: Path, survey: Survey) -> Recovered:
     return Recovered(path, None, text, survey.samples, 0, missing, ())
 
 
-def _check(path: Path, survey: Survey, more: list[Batch]) -> Layout | None:
+def _check(path: Path, survey: Survey, more: list[Batch]) -> RecordingLayout | None:
     """Refuse what nothing can be made of; return how to add what is to be added."""
     if not survey.records:
         raise DataError(f"{path}: holds no whole record: there is nothing to recover")
     if not more:
         return None
     try:
-        return Layout.from_facts(survey.run)
+        return RecordingLayout.from_facts(survey.run)
     except DataError as error:
         raise DataError(f"{path}: samples can't be added: {error}") from None
 

@@ -11,7 +11,7 @@ from hilctl.base.events import LoopEvent
 from hilctl.base.samples import Batch
 from hilctl.recording import schema
 from hilctl.recording.data import Event
-from hilctl.recording.messages import Layout, MessageMaker, Topics
+from hilctl.recording.messages import MessageMaker, RecordingLayout, Topics, event_message
 from hilctl.recording.salvage import Salvage
 
 _UNKNOWN_END = (
@@ -144,14 +144,15 @@ class Resaved:
             number, record.log_time, record.data, record.publish_time, record.sequence
         )
 
-    def tell(self, events: Iterable[LoopEvent], layout: Layout) -> None:
+    def tell(self, events: Iterable[LoopEvent], layout: RecordingLayout) -> None:
         """Add events of the loop that the old file does not hold."""
         for told in events:
-            time_ns = layout.start_unix_ns + round(told.sample * 1e9 / layout.sample_rate_hz)
-            event = Event(time_ns, told.sample, told.level, told.code, told.text)
-            self._topics.add(MessageMaker.event(event))
+            event = Event(
+                layout.time_ns(told.sample), told.sample, told.level, told.code, told.text
+            )
+            self._topics.add(event_message(event))
 
-    def add(self, batches: Iterable[Batch], layout: Layout) -> None:
+    def add(self, batches: Iterable[Batch], layout: RecordingLayout) -> None:
         """Add batches that the old file does not hold, in order."""
         maker = MessageMaker(layout)
         maker.samples = self.samples
@@ -181,7 +182,7 @@ class Resaved:
         reason = self._reason(last, known=known)
         level = "info" if known and not self.missing else "warning"
         event = Event(self._last_time_ns, max(0, last), level, "recovered", reason)
-        self._topics.add(MessageMaker.event(event))
+        self._topics.add(event_message(event))
         facts = own or end or {"code": "recovered", "reason": f"recovered: {reason}"}
         counted = {
             "recorded_samples": str(self.samples),

@@ -9,6 +9,7 @@ from google.protobuf.message import DecodeError
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, McapRecord, Message, Schema
 
+from hilctl.base.samples import RECORDED_FIELDS
 from hilctl.recording import schema
 from hilctl.recording.records import FRAME, LARGEST_BYTES, contents, inflate, split
 
@@ -16,7 +17,7 @@ _CHUNK = struct.Struct("<QQQII")
 _LENGTH = struct.Struct("<Q")
 _WINDOW_BYTES = 4 * 2**20
 _IN_CHUNKS = {Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE}
-_COLUMNS = {"t_rel", "reference_um", "displacement_um", "flags", "input_um"}
+_PER_SAMPLE = {"t_rel", "flags", *(each.name for each in RECORDED_FIELDS)}
 # Lengths are little-endian and far below 2**40, so their three highest bytes are 0.
 _LIKELY = re.compile(
     rb"\x06.{5}\0{3}.{16}.{5}\0{3}.{4}(?:\x04\0{3}zstd|\x03\0{3}lz4|\0{4}).{5}\0{3}"
@@ -136,7 +137,7 @@ def _decodes(message: Message) -> bool:
         decoded.ParseFromString(message.data)
     except DecodeError:
         return False
-    columns = [values for field, values in decoded.ListFields() if field.name in _COLUMNS]
+    columns = [values for field, values in decoded.ListFields() if field.name in _PER_SAMPLE]
     return name != "SampleBlock" or all(len(each) == decoded.n for each in columns)
 
 

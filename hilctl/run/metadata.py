@@ -11,13 +11,14 @@ import numba
 import numpy as np
 
 from hilctl import __version__
+from hilctl.base.samples import COLUMNS
 from hilctl.experiment.check import Checked
 from hilctl.machine.diagnosis import machine_facts
 from hilctl.models.files import dump_model
 
 
 def run_facts(checked: Checked, started: str) -> dict[str, str]:
-    """Return identity, versions, device, rates and units, as text.
+    """Return identity, versions, device and units, as text; the layout says the rates.
 
     Args:
         checked: The experiment that runs.
@@ -26,6 +27,7 @@ def run_facts(checked: Checked, started: str) -> dict[str, str]:
     loaded = checked.loaded
     config, info = loaded.config, loaded.device.info
     model_text = dump_model(loaded.model) if loaded.model else ""
+    recorded = [column.field(info.command_unit) for column in COLUMNS.values()]
     facts = {
         "run_id": str(uuid.uuid4()),
         "name": config.name,
@@ -41,10 +43,7 @@ def run_facts(checked: Checked, started: str) -> dict[str, str]:
         "device_description": info.description,
         "buffered": str(info.buffered).lower(),
         "fifo_depth": str(info.fifo_depth),
-        "command_unit": info.command_unit,
-        "sample_rate_hz": repr(config.sample_rate_hz),
         "block": str(config.block),
-        "waveform_unit": str(config.waveform.unit),
         "waveform_samples": str(checked.forecast.samples),
         "compensator": getattr(loaded.model, "kind", "none"),
         "initial_state_run_id": checked.memory.run_id if checked.memory else "",
@@ -52,16 +51,7 @@ def run_facts(checked: Checked, started: str) -> dict[str, str]:
         "model_sha256": hashlib.sha256(model_text.encode()).hexdigest() if model_text else "",
         "limits": config.limits.model_dump_json(exclude_none=True),
         "safe_value": repr(config.safe.value),
-        "units": json.dumps(
-            {
-                "t_rel": "s",
-                "reference_um": "um",
-                "input_um": "um",
-                "displacement_um": "um",
-                "wanted_a, current_a, measured_a": "A",
-                "wanted_v, drive_v, measured_v": "V",
-            }
-        ),
+        "units": json.dumps({"t_rel": "s"} | {each.name: each.unit for each in recorded}),
     }
     facts |= machine_facts(config.realtime, Path(config.recording.folder))
     return facts | {f"device.{key}": value for key, value in info.details.items()}

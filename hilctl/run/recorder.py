@@ -14,6 +14,7 @@ from hilctl.experiment.check import Checked
 from hilctl.experiment.correction import dump_correction
 from hilctl.models.files import dump_model
 from hilctl.recording.data import Event
+from hilctl.recording.messages import RecordingLayout
 from hilctl.recording.writer import OutputFile, RecordingWriter, RunFacts
 from hilctl.run.metadata import run_facts
 from hilctl.run.tail import Tail
@@ -71,9 +72,8 @@ class Recorder:
         self._start_unix_ns = start_unix_ns
         self._unix_ns = steady_unix_ns()
         try:
-            self._writer = RecordingWriter(
-                self._file.begin(), self._facts(start_unix_ns, set_up), start_unix_ns
-            )
+            facts = self._facts(start_unix_ns, set_up)
+            self._writer = RecordingWriter(self._file.begin(), facts)
         except OSError as error:
             raise self._unwritable(error) from None
 
@@ -156,11 +156,15 @@ class Recorder:
             experiment_yaml=loaded.yaml_text,
             model_yaml=dump_model(loaded.model) if loaded.model else "",
             correction_yaml=dump_correction(loaded.correction) if loaded.correction else "",
-            sample_rate_hz=config.sample_rate_hz,
-            command_unit=info.command_unit,
-            measures_command=info.measures_command,
-            records_input=self._checked.ahead is not None,
-            scope_rate_hz=config.recording.scope_rate_hz,
+            layout=RecordingLayout(
+                sample_rate_hz=config.sample_rate_hz,
+                command_unit=info.command_unit,
+                measures_command=info.measures_command,
+                scope_rate_hz=config.recording.scope_rate_hz,
+                start_unix_ns=start_unix_ns,
+                records_input=self._checked.ahead is not None,
+                waveform_unit=self._checked.reference.unit,
+            ),
         )
 
 

@@ -100,19 +100,8 @@ class TestSteadyPeriodicRun:
         keep = np.ones(8000, dtype=bool)
         for cycle in range(1, 8):
             keep[1000 * cycle + 90 * cycle : 1000 * cycle + 90 * cycle + 150] = False
-        index = np.flatnonzero(keep).astype(np.int64)
         recording = lagging(cycles=8)
-        samples = whole.samples
-        kept = replace(
-            samples,
-            index=index,
-            reference_um=samples.reference_um[keep],
-            wanted=samples.wanted[keep],
-            command=samples.command[keep],
-            displacement_um=samples.displacement_um[keep],
-            flags=samples.flags[keep],
-        )
-        report = summarize(replace(recording, samples=kept, dropped=1050))
+        report = summarize(replace(recording, samples=whole.samples.rows(keep), dropped=1050))
         check_loop(report)
         assert report.dropped == 1050
         assert report.steady_samples == 7000 - 1050
