@@ -11,7 +11,8 @@ from matplotlib.figure import Figure
 from hilctl.analysis import canvas, loops, plots, table
 from hilctl.analysis.report import RunReport, worst_segment
 from hilctl.base.errors import InputError
-from hilctl.recording.data import Event, Recording
+from hilctl.base.events import Event
+from hilctl.recording.data import Recording
 
 _MOST_EVENTS = 200
 

@@ -6,9 +6,9 @@ import numpy as np
 
 from hilctl.analysis.metrics import Fold, fold
 from hilctl.base.arrays import F64
+from hilctl.base.events import TUNED
 from hilctl.base.samples import Flag, Samples
 from hilctl.base.segments import Segment
-from hilctl.loop.tuning import TUNED, tuning_samples
 from hilctl.recording.data import Recording
 
 
@@ -61,7 +61,8 @@ def _tuned_until(recording: Recording, segment: Segment) -> int:
     until = 0
     for event in recording.events:
         if event.code == TUNED and event.sample < segment.steady_stop:
-            until = event.sample + tuning_samples(event.text)
+            # Where a recording does not say how long it took, nothing behind it is judged.
+            until = event.sample + int(event.values.get("samples", segment.steady_stop))
     return until
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from hilctl.base.arrays import F64, I64
 from hilctl.base.device import CommandUnit
+from hilctl.base.events import Event
 from hilctl.base.samples import Samples
 from hilctl.base.segments import Segment
 
@@ -29,27 +30,6 @@ class Ticks:
 
 TICK_COLUMNS = tuple(field.name for field in fields(Ticks))
 """Their names, which are those of a block's head as well."""
-
-
-@dataclass(frozen=True, slots=True)
-class Event:
-    """Something worth telling that happened during a run.
-
-    Attributes:
-        time_ns: Unix time in ns.
-        sample: Sample index it belongs to.
-        level: ``info``, ``warning`` or ``error``.
-        code: Short name for programs, for example ``run_ended``.
-        text: One line for people.
-        before: The last samples up to it; None where they are not told.
-    """
-
-    time_ns: int
-    sample: int
-    level: str
-    code: str
-    text: str
-    before: Samples | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,7 +1,7 @@
 """From ring batches and events to the messages of a recording's topics."""
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -10,9 +10,10 @@ from mcap.writer import Writer
 from hilctl.base.arrays import F64
 from hilctl.base.device import CommandUnit
 from hilctl.base.errors import DataError
+from hilctl.base.events import Event
 from hilctl.base.samples import COLUMNS, Batch, Head, RecordedField, SampleColumn, Samples
 from hilctl.recording import schema
-from hilctl.recording.data import TICK_COLUMNS, Event
+from hilctl.recording.data import TICK_COLUMNS
 
 _MAX_BLOCK = 500
 
@@ -109,6 +110,8 @@ def event_message(event: Event, before: Iterable[tuple[RecordedField, F64]] = ()
     out = schema.message("Event")
     for name in ("sample", "level", "code", "text"):
         setattr(out, name, getattr(event, name))
+    out.value_names.extend(event.values.keys())
+    out.values.extend(event.values.values())
     if event.before is not None:
         out.before_sample.extend(event.before.index.tolist())
         out.before_flags.extend(event.before.flags.tolist())
@@ -136,6 +139,8 @@ class MessageMaker:
 
     def event(self, event: Event) -> Encoded:
         """Return the message of one event."""
+        if not event.time_ns:
+            event = replace(event, time_ns=self._layout.time_ns(event.sample))
         before = self._layout.recorded(event.before) if event.before is not None else ()
         return event_message(event, before)
 

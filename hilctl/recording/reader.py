@@ -13,10 +13,11 @@ from mcap.records import Attachment, Channel, Message, Metadata
 from hilctl.base.arrays import F64, I64
 from hilctl.base.device import CommandUnit
 from hilctl.base.errors import DataError
+from hilctl.base.events import Event
 from hilctl.base.samples import COLUMNS, Samples
 from hilctl.base.segments import Segment
 from hilctl.recording import schema
-from hilctl.recording.data import TICK_COLUMNS, Event, Recording, ReplayStart, Ticks
+from hilctl.recording.data import TICK_COLUMNS, Recording, ReplayStart, Ticks
 from hilctl.recording.salvage import Salvage
 from hilctl.recording.writer import is_being_recorded
 
@@ -79,7 +80,15 @@ def _event(time_ns: int, decoded: Any, unit: CommandUnit) -> Event:
             unit,
             lambda name: np.array(getattr(decoded, f"before_{name}"), dtype=np.float64),
         )
-    return Event(time_ns, decoded.sample, decoded.level, decoded.code, decoded.text, before)
+    return Event(
+        sample=decoded.sample,
+        level=decoded.level,
+        code=decoded.code,
+        text=decoded.text,
+        values=dict(zip(decoded.value_names, decoded.values, strict=False)),
+        time_ns=time_ns,
+        before=before,
+    )
 
 
 class _Contents:

@@ -16,7 +16,7 @@ import numpy as np
 from google.protobuf.message import DecodeError
 
 from hilctl.base.errors import DataError, InputError
-from hilctl.base.events import LoopEvent
+from hilctl.base.events import Event
 from hilctl.base.samples import Batch, Head
 from hilctl.recording.messages import RecordingLayout
 from hilctl.recording.replace import Replacement
@@ -72,7 +72,7 @@ def recover_recording(
     extra: Iterable[Batch] = (),
     end: Mapping[str, str] | None = None,
     *,
-    events: Sequence[LoopEvent] = (),
+    events: Sequence[Event] = (),
     ended_at: int = 0,
     output: Path | None = None,
 ) -> Recovered:
@@ -88,7 +88,7 @@ def recover_recording(
             dropped. A block is in a file as a whole or not at all.
         end: Facts of the run's end where the file has none of its own, with ``code`` and
             ``reason``; else the code is ``recovered``.
-        events: Events of the loop that were perhaps not written; told where anything is added.
+        events: Events of the loop that were perhaps not written; added with the batches.
         ended_at: Index after the last sample that was exchanged; 0 where that is not known.
         output: Put the sound file here instead, and leave the old one where it is.
 
@@ -109,8 +109,7 @@ def recover_recording(
                 saved = Resaved(replacement.stream, survey)
                 saved.copy(Salvage(stream).records())
                 if layout:
-                    saved.add(more, layout)
-                    saved.tell(events, layout)
+                    saved.add(more, events, layout)
                 reason = saved.finish(end, ended_at)
                 kept = replacement.put()
     except FileNotFoundError as error:

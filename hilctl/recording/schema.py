@@ -75,6 +75,9 @@ _MESSAGES: dict[str, _Fields] = {
         "before_sample": (5, _UINT64, True),
         "before_flags": (10, _UINT32, True),
         **_columns("before", "before_"),
+        # Its numbers by name.
+        "value_names": (13, _STRING, True),
+        "values": (14, _DOUBLE, True),
     },
 }
 

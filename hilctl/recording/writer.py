@@ -16,9 +16,9 @@ from typing import BinaryIO
 from mcap.writer import CompressionType, Writer
 
 from hilctl import __version__
+from hilctl.base.events import Event
 from hilctl.base.samples import Batch
 from hilctl.base.segments import Segment
-from hilctl.recording.data import Event
 from hilctl.recording.messages import MessageMaker, RecordingLayout, Topics
 
 _CHUNK_BYTES = 8 << 20  # each chunk's index stays in memory until the end of the run

@@ -3,17 +3,17 @@
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 
 from hilctl.base.errors import InputError
-from hilctl.base.events import LoopEvent
+from hilctl.base.events import Event
 from hilctl.base.samples import Batch, Head
 from hilctl.experiment.check import Checked
 from hilctl.experiment.correction import dump_correction
 from hilctl.models.files import dump_model
-from hilctl.recording.data import Event
 from hilctl.recording.messages import RecordingLayout
 from hilctl.recording.writer import OutputFile, RecordingWriter, RunFacts
 from hilctl.run.metadata import run_facts
@@ -43,7 +43,6 @@ class Recorder:
         self._flushed = 0
         self._checked = checked
         self._writer: RecordingWriter | None = None
-        self._start_unix_ns = 0
         self._unix_ns = steady_unix_ns()
         self._tail = Tail(_SAMPLES_BEFORE)
         try:
@@ -69,7 +68,6 @@ class Recorder:
         Raises:
             InputError: The file can't be written.
         """
-        self._start_unix_ns = start_unix_ns
         self._unix_ns = steady_unix_ns()
         try:
             facts = self._facts(start_unix_ns, set_up)
@@ -87,13 +85,10 @@ class Recorder:
         self._tail.add(batch)
         self._write(partial(self._begun.batch, batch))
 
-    def event(self, event: LoopEvent) -> None:
-        """Write what the loop told."""
-        rate_hz = self._checked.loaded.config.sample_rate_hz
-        time_ns = self._start_unix_ns + round(event.sample * 1e9 / rate_hz)
-        before = self._tail.up_to(event.sample)
-        told = Event(time_ns, event.sample, event.level, event.code, event.text, before)
-        self._write(partial(self._begun.event, told))
+    def event(self, event: Event) -> None:
+        """Write an event of the loop, with the samples that led to it."""
+        led_there = replace(event, before=self._tail.up_to(event.sample))
+        self._write(partial(self._begun.event, led_there))
 
     def flush(self) -> None:
         """Hand all that was written to the kernel."""
@@ -111,7 +106,8 @@ class Recorder:
         self._next_sample = max(self._next_sample, ended_at)
         now_ns = self._unix_ns()
         level = "info" if end["code"] == "completed" else "error"
-        event = Event(now_ns, max(0, ended_at - 1), level, "run_ended", end["reason"])
+        last = max(0, ended_at - 1)
+        event = Event(last, level, "run_ended", end["reason"], time_ns=now_ns)
         self._write(partial(self._begun.event, event))
         self._write(partial(self._begun.finish, {**end, "ended": iso_time(now_ns)}, ended_at))
         if self.error:

@@ -6,9 +6,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from hilctl.base.events import Event
 from hilctl.base.samples import COLUMNS, Batch, Head, Samples
 from hilctl.base.segments import Segment
-from hilctl.recording.data import Event
 from hilctl.recording.messages import RecordingLayout
 from hilctl.recording.writer import RecordingWriter, RunFacts
 
@@ -16,6 +16,7 @@ RATE_HZ = 50_000.0
 START_NS = 1_800_000_000_000_000_000
 BLOCK = 50
 SEGMENT = Segment("sine", 0, 5000, 100, 4900, 200.0)
+ENDED = Event(17, "info", "run_ended", "waveform completed", time_ns=START_NS + 5)
 
 
 def batch(first, blocks, *, dropped=0, seed=0):
@@ -62,7 +63,7 @@ def write(
         writer.flush()
     for each in events:
         writer.event(each)
-    writer.event(Event(START_NS + 5, 17, "info", "run_ended", "waveform completed"))
+    writer.event(ENDED)
     if finish:
         writer.finish({"code": "completed", "late_ticks": "3"}, ended_at)
     return writer
@@ -78,5 +79,5 @@ def make():
     """What recordings are made with: batches, the writer, and the constants they go by."""
     return SimpleNamespace(
         batch=batch, samples=samples, write=write, rate_hz=RATE_HZ, start_ns=START_NS, block=BLOCK,
-        segment=SEGMENT,
+        segment=SEGMENT, ended=ENDED,
     )  # fmt: skip

@@ -4,6 +4,7 @@ import io
 import logging
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from mcap.reader import make_reader
 
 from hilctl.analysis.replay import replay
 from hilctl.base.errors import DataError, InputError
+from hilctl.base.events import Event
 from hilctl.base.samples import COLUMNS, Head
 from hilctl.recording.reader import read
 from hilctl.recording.recover import recover_recording
@@ -186,7 +188,9 @@ def test_absent_and_other_files_are_refused(tmp_path):
 
 def test_ring_batches_fill_the_end(torn, batches, make):
     """Blocks that the file lacks are added, those it has are left out, bit for bit."""
-    recovered = recover_recording(torn, batches[2:], {"code": "fault", "reason": "killed"})
+    killed = {"code": "fault", "reason": "killed"}
+    tuned = Event(3100, "info", "tuned", "gain to 2", {"samples": 20.0})
+    recovered = recover_recording(torn, batches[2:], killed, events=[tuned])
     assert (recovered.samples, recovered.added_samples) == (5000, 2000)
     assert recovered.missing_samples == 0
     back = read(torn)
@@ -198,6 +202,8 @@ def test_ring_batches_fill_the_end(torn, batches, make):
     assert back.ticks.late_ns.tolist() == late_ns.tolist()
     assert (back.end["code"], back.end["reason"]) == ("fault", "killed")
     assert [start.sample for start in back.starts] == [0]
+    due_ns = make.start_ns + 3100 * 20_000
+    assert back.events[-2] == replace(tuned, time_ns=due_ns)
     assert "2000 samples added from the ring" in back.events[-1].text
     with torn.open("rb") as stream:
         numbers = {}

@@ -14,9 +14,9 @@ from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
 from hilctl.base.errors import DataError
+from hilctl.base.events import Event
 from hilctl.base.samples import COLUMNS, Head
 from hilctl.recording import schema
-from hilctl.recording.data import Event
 from hilctl.recording.reader import read
 
 
@@ -51,7 +51,7 @@ def test_everything_comes_back(recorded, make):
     for name in ("first_sample", "deadline_ns", "late_ns", "exchange_ns"):
         heads = np.concatenate([b.heads[:, Head[name.upper()]] for b in batches])
         assert np.array_equal(getattr(back.ticks, name), heads), name
-    assert back.events == (Event(make.start_ns + 5, 17, "info", "run_ended", "waveform completed"),)
+    assert back.events == (make.ended,)
     assert back.segments == (make.segment,)
     assert (back.experiment_yaml, back.model_yaml) == ("name: x\n", "model: y\n")
     assert back.end["recorded_samples"] == "1850"
@@ -69,7 +69,7 @@ def test_what_is_written_is_read(make, unit, measures, own_input, values):
     one = make.batch(0, 3)
     one.columns[:] = values
     written = one.samples()
-    stop = Event(0, 20, "error", "stroke", "text", before=written.part(10, 21))
+    stop = Event(20, "error", "stroke", "text", before=written.part(10, 21))
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "run.mcap"
         with path.open("wb") as stream:
@@ -90,7 +90,7 @@ def test_what_is_written_is_read(make, unit, measures, own_input, values):
 def test_reference_that_is_no_displacement_is_not_recorded(tmp_path, make, unit):
     """Where the waveform is a command, the columns in um say that there is none."""
     path, one = tmp_path / "run.mcap", make.batch(0, 3)
-    trip = Event(0, 20, "error", "late", "text", before=one.samples().part(10, 21))
+    trip = Event(20, "error", "late", "text", before=one.samples().part(10, 21))
     with path.open("wb") as stream:
         make.write(stream, [one], unit=unit, own_input=False, waveform_unit=unit, events=[trip])
     with path.open("rb") as stream:
@@ -118,11 +118,22 @@ def test_field_numbers_stay():
         "drive_v",
         "Event": "sample level code text before_sample before_reference_um before_wanted_a "
         "before_current_a before_displacement_um before_flags before_wanted_v before_drive_v "
-        "before_measured_a before_measured_v before_input_um",
+        "value_names values before_measured_a before_measured_v before_input_um",
     }
     assert list(numbers["SampleBlock"]) == list(range(1, 17))
     assert list(numbers["Sample"]) == list(range(1, 10))
-    assert list(numbers["Event"]) == [*range(1, 13), 15, 16, 17]
+    assert list(numbers["Event"]) == list(range(1, 18))
+
+
+def test_event_has_its_numbers_and_its_time(tmp_path, make):
+    """Values come back by name; an event of the loop has the time of its sample."""
+    path = tmp_path / "run.mcap"
+    values = {"gain": 1.5, "offset": -0.1, "samples": 250.0}
+    with path.open("wb") as stream:
+        make.write(stream, [], events=[Event(100, "info", "tuned", "text", values)])
+    due_ns = make.start_ns + 100 * 20_000
+    tuned = Event(100, "info", "tuned", "text", values, time_ns=due_ns)
+    assert read(path).events == (tuned, make.ended)
 
 
 def test_samples_lost_at_the_very_end_are_counted(tmp_path, make):
