@@ -9,7 +9,8 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from hilctl.analysis import canvas, loops, plots, table
-from hilctl.analysis.report import RunReport, worst_segment
+from hilctl.analysis.figures import RunReport
+from hilctl.analysis.report import worst_segment
 from hilctl.base.errors import InputError
 from hilctl.base.events import Event
 from hilctl.recording.data import Recording

@@ -8,14 +8,11 @@ import numpy as np
 from hilctl.analysis import metrics, noise, timing
 from hilctl.analysis.figures import RunReport, SegmentReport
 from hilctl.analysis.steady import SteadyPart, error_um, steady_part, waveform_end
-from hilctl.analysis.table import render
 from hilctl.base.arrays import F64
 from hilctl.base.errors import DataError
 from hilctl.base.samples import Flag
 from hilctl.base.segments import Segment
 from hilctl.recording.data import Recording
-
-__all__ = ["RunReport", "SegmentReport", "judge", "render", "summarize", "worst_segment"]
 
 _WORST = (
     "peak_hysteresis_percent",

@@ -14,7 +14,8 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemaining
 from rich.table import Table
 
 from hilctl.analysis.replay import ReplayResult
-from hilctl.analysis.report import render, summarize
+from hilctl.analysis.report import summarize
+from hilctl.cli.report_view import render
 from hilctl.experiment.check import Checked
 from hilctl.experiment.inventory import Inventory, Probed
 from hilctl.recording.reader import read

@@ -12,7 +12,7 @@ from hilctl.base.events import LoopEvent
 from hilctl.base.samples import Batch, Head
 from hilctl.loop.plan import Outcome
 from hilctl.recording.recover import recover_recording
-from hilctl.run.ending import end_facts
+from hilctl.run.metadata import shared_end_facts
 from hilctl.run.ring import SampleRing
 from hilctl.run.run_folder import RunFolder, runs, taken_over
 from hilctl.run.shared_page import Field, Phase
@@ -81,7 +81,7 @@ def _left_behind(
         next_sample = 0 if last is None else int(last[Head.FIRST_SAMPLE]) + ring.block
         if (unanswered := ring.unanswered(next_sample)) is not None:
             batches.append(unanswered)
-    return outcome, batches, ring.pop_events(), end_facts(outcome, ring)
+    return outcome, batches, ring.pop_events(), shared_end_facts(outcome, ring)
 
 
 def _account(ring: SampleRing) -> Outcome | None:

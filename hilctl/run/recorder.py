@@ -8,18 +8,20 @@ from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+
 from hilctl.base.errors import InputError
 from hilctl.base.events import Event
-from hilctl.base.samples import Batch, Head
+from hilctl.base.samples import Batch, Head, Samples
 from hilctl.experiment.check import Checked
 from hilctl.experiment.correction import dump_correction
 from hilctl.models.files import dump_model
 from hilctl.recording.messages import RecordingLayout
 from hilctl.recording.writer import OutputFile, RecordingWriter, RunFacts
 from hilctl.run.metadata import run_facts
-from hilctl.run.tail import Tail
 
 _SAMPLES_BEFORE = 50
+_SPARE = 20
 
 
 class Recorder:
@@ -146,11 +148,12 @@ class Recorder:
     def _facts(self, start_unix_ns: int, set_up: Mapping[str, str]) -> RunFacts:
         loaded = self._checked.loaded
         config, info = loaded.config, loaded.device.info
+        model_yaml = dump_model(loaded.model) if loaded.model else ""
         return RunFacts(
-            facts={**run_facts(self._checked, iso_time(start_unix_ns)), **set_up},
+            facts={**run_facts(self._checked, iso_time(start_unix_ns), model_yaml), **set_up},
             segments=self._checked.reference.segments,
             experiment_yaml=loaded.yaml_text,
-            model_yaml=dump_model(loaded.model) if loaded.model else "",
+            model_yaml=model_yaml,
             correction_yaml=dump_correction(loaded.correction) if loaded.correction else "",
             layout=RecordingLayout(
                 sample_rate_hz=config.sample_rate_hz,
@@ -162,6 +165,34 @@ class Recorder:
                 waveform_unit=self._checked.reference.unit,
             ),
         )
+
+
+class Tail:
+    """Keeps at least the last samples, however they came.
+
+    Args:
+        samples: How many to record with an event.
+    """
+
+    def __init__(self, samples: int) -> None:
+        self._samples = samples
+        self._newest: Samples | None = None
+
+    def add(self, batch: Batch) -> None:
+        """Take the newest samples of a batch; more of them than are asked for, for late events."""
+        kept = _SPARE * self._samples
+        blocks = -(-kept // batch.flags.shape[1])
+        newest = batch.samples(slice(-blocks, None))
+        if self._newest is not None:
+            newest = self._newest.followed_by(newest)
+        self._newest = newest.rows(slice(-kept, None))
+
+    def up_to(self, sample: int) -> Samples | None:
+        """Return the last samples up to and with ``sample``; None where none is left."""
+        if self._newest is None:
+            return None
+        stop = int(np.searchsorted(self._newest.index, sample, side="right"))
+        return self._newest.rows(slice(max(0, stop - self._samples), stop)) if stop else None
 
 
 def steady_unix_ns() -> Callable[[], int]:

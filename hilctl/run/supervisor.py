@@ -21,8 +21,8 @@ from hilctl.loop.plan import Outcome
 from hilctl.machine.realtime import be_ordinary
 from hilctl.run.child import LoopChild
 from hilctl.run.control_socket import ControlServer
-from hilctl.run.ending import end_facts
 from hilctl.run.hang_watch import HangWatch
+from hilctl.run.metadata import shared_end_facts
 from hilctl.run.recorder import Recorder
 from hilctl.run.requests import Orders
 from hilctl.run.result import Progress, RunResult
@@ -107,7 +107,7 @@ class Supervisor:
                 hung = self._drain_while_alive(ring, child, recorder, server, orders)
             self._notifier.say("STOPPING=1")
             outcome = self._outcome(ring, child, recorder, hung)
-            recorder.finish(end_facts(outcome, ring), outcome.ended_at)
+            recorder.finish(shared_end_facts(outcome, ring), outcome.ended_at)
             return self._result(outcome, ring, recorder, ordered=orders.stop)
 
     @property

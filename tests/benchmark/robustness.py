@@ -16,7 +16,8 @@ from pathlib import Path
 
 import numpy as np
 
-from hilctl.analysis.report import SegmentReport, judge
+from hilctl.analysis.figures import SegmentReport
+from hilctl.analysis.report import judge
 from hilctl.base.errors import InputError
 from hilctl.base.samples import Samples
 from hilctl.experiment.load import LoadedExperiment, load_experiment

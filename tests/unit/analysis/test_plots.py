@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from matplotlib.collections import FillBetweenPolyCollection
 
-from hilctl.analysis import canvas, loops, plots, traces
+from hilctl.analysis import canvas, loops, plots
 from hilctl.base.segments import Segment
 from hilctl.recording.data import Recording, Ticks
 
@@ -63,7 +63,7 @@ class TestTimeHistory:
         for figure in (plots.time_history(recording), plots.error(recording)):
             for axes in figure.axes:
                 for line in axes.get_lines():
-                    assert line.get_xdata().size <= traces.MAX_POINTS
+                    assert line.get_xdata().size <= canvas.MAX_POINTS
 
     def test_spike_stays_visible(self, run) -> None:
         """One odd reading in half a million is drawn."""
