@@ -4,7 +4,7 @@ The fields of :class:`Samples` are the one table of the columns: ring, messages,
 units are made from it. A new column is one more field there, and whoever fills it.
 """
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from enum import IntEnum, IntFlag
 from typing import Annotated, Literal, Self, TypeAlias, get_type_hints
 
@@ -66,6 +66,10 @@ class SampleColumn:
         return self.recorded_as if unit == "A" else self.recorded_in_v or self.recorded_as
 
 
+def _empty() -> F64:
+    return np.empty(0)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Samples:
     """Samples in order; each array has one row a sample.
@@ -75,7 +79,8 @@ class Samples:
         flags: uint32[n], bits of :class:`Flag`.
 
     The columns are float64[n] each, the commands among them in the command unit; one that is not
-    recorded and equals no other is empty. Their order is that of the rows of a block.
+    recorded and equals no other is empty, and so is a new one in older recordings. Their order is
+    that of the rows of a block.
     """
 
     index: I64
@@ -120,7 +125,7 @@ class Samples:
             when="measured",
             answered=True,
         ),
-    ]
+    ] = field(default_factory=_empty)
     input_um: Annotated[
         F64,
         SampleColumn(
@@ -163,7 +168,7 @@ class Samples:
 
     def followed_by(self, later: "Samples") -> "Samples":
         """Return these rows and others after them."""
-        names = [field.name for field in fields(self)]
+        names = [each.name for each in fields(self)]
         return Samples(
             **{name: np.concatenate((getattr(self, name), getattr(later, name))) for name in names}
         )

@@ -53,7 +53,6 @@ def make_recording() -> MakeRecording:
             reference_um=wanted_um,
             wanted=put_out,
             command=put_out,
-            measured=np.empty(0),
             displacement_um=displacement_um,
             input_um=wanted_um,
             flags=flags,

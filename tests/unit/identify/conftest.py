@@ -64,7 +64,6 @@ def recording_of() -> Callable[..., Recording]:
             reference_um=np.full(n, np.nan),
             wanted=command,
             command=command,
-            measured=np.zeros(0),
             displacement_um=displacement_um,
             input_um=np.full(n, np.nan),
             flags=np.zeros(n, dtype=np.uint32),

@@ -30,7 +30,6 @@ def recording(period, cycles, error_um, noise_um=0.0, delay=0.0, seed=1) -> Reco
         wanted=nothing,
         command=nothing,
         displacement_um=moved,
-        measured=np.empty(0),
         input_um=wanted,
         flags=nothing.astype(np.uint32),
     )
