@@ -59,7 +59,7 @@ def png(figure: Figure, dpi: int = 110) -> bytes:
 def pieces(recording: Recording) -> list[tuple[int, int, float]]:
     """Cut a run where its waveform changes: start, stop and period of each piece, in samples.
 
-    What lies outside all segments, such as the ramp out, has period 0.
+    What lies outside all segments, such as the safe ramp, has period 0.
     """
     index = recording.samples.index
     if index.size == 0:

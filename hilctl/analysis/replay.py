@@ -1,4 +1,4 @@
-"""Recompute a recording's commands from what was fed, by the code that made them."""
+"""Recompute a recording's commands from the compensator's input, by the code that made them."""
 
 from dataclasses import asdict, dataclass
 from itertools import pairwise
@@ -62,8 +62,8 @@ def replay(recording: Recording, model: HysteresisModel | None = None) -> Replay
 
     Args:
         recording: What was recorded.
-        model: Another model to invert instead of the recorded one; it starts from rest, is fed the
-            reference by its own preview, and the limits stay as recorded.
+        model: Another model to invert instead of the recorded one; it starts from rest, its
+            input is the reference ahead by its own preview, and the limits stay as recorded.
 
     Raises:
         DataError: The recording holds no samples or not what a replay needs, or ``model`` does not
@@ -92,9 +92,9 @@ def replay(recording: Recording, model: HysteresisModel | None = None) -> Replay
         elif rows.start == 0:
             compensator.begin(samples.reference_um[rows])
         for part in _alike(samples.flags, rows):
-            # Another model than the recorded one is fed by its own preview.
-            fed = compensator.ahead(samples.reference_um[part]) if model else recorded[part]
-            _recompute(samples, part, fed, compensator, limiter, (wanted, command, flags))
+            # Another model than the recorded one looks ahead by its own preview.
+            inputs = compensator.ahead(samples.reference_um[part]) if model else recorded[part]
+            _recompute(samples, part, inputs, compensator, limiter, (wanted, command, flags))
     return _compare(recording, known, (wanted, command, flags))
 
 
@@ -131,7 +131,7 @@ def _alike(flags: U32, rows: slice) -> list[slice]:
 def _recompute(
     samples: Samples,
     rows: slice,
-    fed: F64,
+    inputs: F64,
     compensator: Compensator,
     limiter: Limiter,
     out: tuple[F64, F64, U32],
@@ -141,7 +141,7 @@ def _recompute(
         wanted[:] = limiter.limits.safe
         limiter.ramp(command, flags)
         return
-    compensator.process(fed, wanted)
+    compensator.process(inputs, wanted)
     limiter.limit(wanted, command, flags)
 
 

@@ -143,14 +143,14 @@ def _counts(recording: Recording) -> dict[str, Any]:
         "recorded_samples": samples.index.size,
         "duration_s": span / recording.sample_rate_hz,
         "dropped": recording.dropped,
-        "skipped_ticks": _told(recording, "skipped_ticks", None),
+        "skipped_ticks": _counter(recording, "skipped_ticks", None),
         "limited_samples": int(np.count_nonzero(flags & limited)),
         "sensor_invalid_samples": int(np.count_nonzero(flags & Flag.SENSOR_INVALID)),
-        "late_ticks": _told(recording, "late_ticks", timing.late_ticks(recording.ticks)),
+        "late_ticks": _counter(recording, "late_ticks", timing.late_ticks(recording.ticks)),
     }
 
 
-def _told(recording: Recording, name: str, otherwise: int | None) -> int | None:
+def _counter(recording: Recording, name: str, otherwise: int | None) -> int | None:
     """Return a counter from the record of the end, or what was counted here."""
     if name not in recording.end:
         return otherwise

@@ -33,7 +33,10 @@ def run_rows(report: RunReport) -> list[tuple[str, str]]:
     return [
         ("device", f"{report.device or MISSING}{simulated}"),
         ("ended", f"{report.reason or MISSING}{'' if report.complete else ' (NOT complete)'}"),
-        ("samples", f"{report.samples:,} of the waveform, {report.ramp_samples:,} of the ramp out"),
+        (
+            "samples",
+            f"{report.samples:,} of the waveform, {report.ramp_samples:,} of the safe ramp",
+        ),
         ("missing samples", f"{report.dropped:,}"),
         ("rate, length", f"{report.sample_rate_hz:g} Hz, {report.duration_s:.6g} s"),
         ("loop", f"displacement against {held_against}"),

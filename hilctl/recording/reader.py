@@ -65,9 +65,8 @@ def _samples(index: I64, flags: F64, unit: CommandUnit, field: Callable[[str], F
     columns: dict[str, F64] = {}
     for name, column in COLUMNS.items():
         values = field(column.field(unit).name)
-        columns[name] = (
-            columns[column.otherwise] if column.otherwise and not values.size else values
-        )
+        left_out = column.otherwise and not values.size
+        columns[name] = columns[column.otherwise] if left_out else values
     return Samples(index=index, flags=flags.astype(np.uint32), **columns)
 
 
@@ -85,7 +84,7 @@ def _event(time_ns: int, decoded: Any, unit: CommandUnit) -> Event:
         level=decoded.level,
         code=decoded.code,
         text=decoded.text,
-        values=dict(zip(decoded.value_names, decoded.values, strict=False)),
+        values=dict(zip(decoded.value_names, decoded.values, strict=True)),
         time_ns=time_ns,
         before=before,
     )

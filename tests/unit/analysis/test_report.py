@@ -306,7 +306,7 @@ class TestWholeRun:
             summarize(lagging(end={"late_ticks": "many"}))
 
     def test_limited_samples_are_those_of_the_waveform(self, lagging) -> None:
-        """Range, slew and invalid count once a sample; the ramp out does not count."""
+        """Range, slew and invalid count once a sample; the safe ramp does not count."""
         recording = lagging(ramp=100)
         recording.samples.flags[10] |= (Flag.RANGE_LIMITED | Flag.SLEW_LIMITED).value
         recording.samples.flags[11] |= Flag.INVALID.value
