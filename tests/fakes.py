@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, field
 import numpy as np
 
 from hilctl.base.errors import DeviceError
-from hilctl.base.events import LoopEvent
+from hilctl.base.events import Event
 from hilctl.base.samples import COLUMNS, Head
 from hilctl.loop.block import Block
 from hilctl.loop.host import Tuning
@@ -128,7 +128,7 @@ class FakeHost:
         self.clock, self._shape = clock, (block, state_size)
         self.full, self.stop, self.tunings = full, stop, tunings or {}
         self.heads, self.columns, self.flags, self.states = [], [], [], []
-        self.events: list[LoopEvent] = []
+        self.events: list[Event] = []
         self.heartbeats: list[int] = []
         self.sent: list[tuple[int, list[float]]] = []
         self.closed = False

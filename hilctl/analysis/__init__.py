@@ -6,8 +6,7 @@ timing.py   pure: lateness percentiles, late ticks
 steady.py   which part of a recording is judged, and its average cycle
 figures.py  what a report holds
 report.py   from a recording to a report
-table.py    a report for people, in a terminal
-traces.py   pure: long signals reduced to what a plot can show
+table.py    a report for people, as rows of text
 canvas.py   what all plots share: style, colours, signals over time, PNG
 plots.py    plots over time: history, error, lateness
 loops.py    the hysteresis loop

@@ -15,16 +15,13 @@ import numpy.typing as npt
 
 from hilctl.base.errors import DataError, InputError
 from hilctl.base.files import refuse_existing, write_file
+from hilctl.base.samples import COLUMNS
 from hilctl.recording.data import Recording
 
 Columns: TypeAlias = Mapping[str, npt.NDArray[Any]]
 Facts: TypeAlias = Mapping[str, str]
 Write: TypeAlias = Callable[[BinaryIO, Columns, Facts], None]
 
-_COMMAND_COLUMNS = {
-    "A": ("wanted_a", "current_a", "measured_a"),
-    "V": ("wanted_v", "drive_v", "measured_v"),
-}
 _ROWS_AT_ONCE = 20_000
 
 
@@ -38,10 +35,10 @@ def export(
 ) -> int:
     """Write samples to a file whose suffix says the format; it appears whole or not at all.
 
-    Columns are ``sample``, ``t_s`` (since the start of the run), ``reference_um``, ``wanted_a``,
-    ``current_a``, ``displacement_um``, ``flags`` and, where the device measures it,
-    ``measured_a``; for devices driven in volt ``wanted_v``, ``drive_v`` and ``measured_v``. NPZ,
-    Parquet and MATLAB files also hold the facts of the run and the experiment and model as YAML.
+    Columns are ``sample``, ``t_s`` (since the start of the run), those of
+    :class:`hilctl.base.samples.Samples` under the names they are recorded by, and ``flags``.
+    ``measured_a`` or ``measured_v`` is there where the device measures it. NPZ, Parquet and MATLAB
+    files also hold the facts of the run and the experiment and model as YAML.
 
     Args:
         recording: The run.
@@ -85,21 +82,13 @@ def columns(recording: Recording, t0: float | None = None, t1: float | None = No
             f"{recording.path}: holds no sample from {_seconds(t0, 'its start')} to "
             f"{_seconds(t1, 'its end')}; it has {first / rate_hz:g} s to {end / rate_hz:g} s"
         )
-    wanted, command, measured = _COMMAND_COLUMNS[recording.command_unit]
-    table: dict[str, npt.NDArray[Any]] = {
-        "sample": samples.index,
-        "t_s": samples.index / rate_hz,
-        "reference_um": samples.reference_um,
-        wanted: samples.wanted,
-        command: samples.command,
-        "displacement_um": samples.displacement_um,
-        "flags": samples.flags,
+    named = {
+        COLUMNS[name].field(recording.command_unit).name: values
+        for name, values in samples.columns().items()
+        if values.size
     }
-    if samples.measured.size:
-        table[measured] = samples.measured
-    if samples.input_um.size:
-        table["input_um"] = samples.input_um
-    return table
+    times_s = samples.index / rate_hz
+    return {"sample": samples.index, "t_s": times_s, **named, "flags": samples.flags}
 
 
 def facts(recording: Recording) -> Facts:

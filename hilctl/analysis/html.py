@@ -8,9 +8,11 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from hilctl.analysis import canvas, loops, plots, table
-from hilctl.analysis.report import RunReport, worst_segment
+from hilctl.analysis.figures import RunReport
+from hilctl.analysis.report import worst_segment
+from hilctl.base.events import Event
 from hilctl.base.files import write_text
-from hilctl.recording.data import Event, Recording
+from hilctl.recording.data import Recording
 
 _MOST_EVENTS = 200
 

@@ -24,8 +24,9 @@ from hilctl.analysis.canvas import (
 )
 from hilctl.analysis.steady import SteadyPart, steady_part, steady_samples
 from hilctl.base.arrays import F64, I64
+from hilctl.base.samples import Samples
 from hilctl.base.segments import Segment
-from hilctl.recording.data import Recording, Samples
+from hilctl.recording.data import Recording
 
 _ZOOM_CYCLES = 2
 _MOST_DOTS = 10_000

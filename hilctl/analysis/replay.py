@@ -1,4 +1,4 @@
-"""Recompute a recording's commands from what was fed, by the code that made them."""
+"""Recompute a recording's commands from the compensator's input, by the code that made them."""
 
 from dataclasses import asdict, dataclass
 from itertools import pairwise
@@ -9,14 +9,14 @@ import numpy.typing as npt
 
 from hilctl.base.arrays import F64, U32
 from hilctl.base.errors import DataError
-from hilctl.base.samples import Flag
+from hilctl.base.samples import Flag, Samples
 from hilctl.base.yaml.document import Document
 from hilctl.experiment.file import Experiment
 from hilctl.loop.compensator import Compensator
 from hilctl.loop.limiter import Limiter
 from hilctl.models.base import HysteresisModel
 from hilctl.models.files import parse_model
-from hilctl.recording.data import Recording, Samples, Start
+from hilctl.recording.data import Recording, ReplayStart
 
 _LIMIT_BITS = int(Flag.RANGE_LIMITED | Flag.SLEW_LIMITED | Flag.INVALID | Flag.RAMP)
 
@@ -62,8 +62,8 @@ def replay(recording: Recording, model: HysteresisModel | None = None) -> Replay
 
     Args:
         recording: What was recorded.
-        model: Another model to invert instead of the recorded one; it starts from rest, is fed the
-            reference by its own preview, and the limits stay as recorded.
+        model: Another model to invert instead of the recorded one; it starts from rest, its
+            input is the reference ahead by its own preview, and the limits stay as recorded.
 
     Raises:
         DataError: The recording holds no samples or not what a replay needs, or ``model`` does not
@@ -79,6 +79,7 @@ def replay(recording: Recording, model: HysteresisModel | None = None) -> Replay
     compensator = Compensator(chosen, recording.sample_rate_hz)
     limiter = Limiter(config.command_limits(), 1.0 / recording.sample_rate_hz)
     samples = recording.samples
+    recorded = samples.input_um if recording.compensated else samples.wanted
     wanted = np.empty_like(samples.wanted)
     command = np.empty_like(samples.command)
     flags = np.zeros_like(samples.flags)
@@ -91,8 +92,9 @@ def replay(recording: Recording, model: HysteresisModel | None = None) -> Replay
         elif rows.start == 0:
             compensator.begin(samples.reference_um[rows])
         for part in _alike(samples.flags, rows):
-            fed = _fed(samples, part, compensator, as_recorded=model is None)
-            _recompute(samples, part, fed, compensator, limiter, (wanted, command, flags))
+            # Another model than the recorded one looks ahead by its own preview.
+            inputs = compensator.ahead(samples.reference_um[part]) if model else recorded[part]
+            _recompute(samples, part, inputs, compensator, limiter, (wanted, command, flags))
     return _compare(recording, known, (wanted, command, flags))
 
 
@@ -102,7 +104,7 @@ def _recorded_model(recording: Recording) -> HysteresisModel | None:
     return parse_model(f"{recording.path}: model.yaml", recording.model_yaml)
 
 
-def _stretches(recording: Recording) -> list[tuple[Start, slice]]:
+def _stretches(recording: Recording) -> list[tuple[ReplayStart, slice]]:
     """Return where each gapless stretch starts, and its rows.
 
     Blocks lost from a damaged file leave gaps that no start stands behind: what follows them, up to
@@ -126,20 +128,10 @@ def _alike(flags: U32, rows: slice) -> list[slice]:
     return [slice(a, b) for a, b in pairwise(bounds) if b > a]
 
 
-def _fed(samples: Samples, rows: slice, compensator: Compensator, *, as_recorded: bool) -> F64:
-    """Return what the compensator is fed; another one than the recorded has its own preview."""
-    reference = samples.reference_um[rows]
-    if bool(np.isnan(reference).all()):
-        return samples.wanted[rows]
-    if not as_recorded:
-        return compensator.ahead(reference)
-    return samples.input_um[rows] if samples.input_um.size else reference
-
-
 def _recompute(
     samples: Samples,
     rows: slice,
-    fed: F64,
+    inputs: F64,
     compensator: Compensator,
     limiter: Limiter,
     out: tuple[F64, F64, U32],
@@ -149,7 +141,7 @@ def _recompute(
         wanted[:] = limiter.limits.safe
         limiter.ramp(command, flags)
         return
-    compensator.process(fed, wanted)
+    compensator.process(inputs, wanted)
     limiter.limit(wanted, command, flags)
 
 

@@ -8,14 +8,11 @@ import numpy as np
 from hilctl.analysis import metrics, noise, timing
 from hilctl.analysis.figures import RunReport, SegmentReport
 from hilctl.analysis.steady import SteadyPart, error_um, steady_part, waveform_end
-from hilctl.analysis.table import render
 from hilctl.base.arrays import F64
 from hilctl.base.errors import DataError
 from hilctl.base.samples import Flag
 from hilctl.base.segments import Segment
 from hilctl.recording.data import Recording
-
-__all__ = ["RunReport", "SegmentReport", "judge", "render", "summarize", "worst_segment"]
 
 _WORST = (
     "peak_hysteresis_percent",
@@ -146,14 +143,14 @@ def _counts(recording: Recording) -> dict[str, Any]:
         "recorded_samples": samples.index.size,
         "duration_s": span / recording.sample_rate_hz,
         "dropped": recording.dropped,
-        "skipped_ticks": _told(recording, "skipped_ticks", None),
+        "skipped_ticks": _counter(recording, "skipped_ticks", None),
         "limited_samples": int(np.count_nonzero(flags & limited)),
         "sensor_invalid_samples": int(np.count_nonzero(flags & Flag.SENSOR_INVALID)),
-        "late_ticks": _told(recording, "late_ticks", timing.late_ticks(recording.ticks)),
+        "late_ticks": _counter(recording, "late_ticks", timing.late_ticks(recording.ticks)),
     }
 
 
-def _told(recording: Recording, name: str, otherwise: int | None) -> int | None:
+def _counter(recording: Recording, name: str, otherwise: int | None) -> int | None:
     """Return a counter from the record of the end, or what was counted here."""
     if name not in recording.end:
         return otherwise

@@ -7,9 +7,9 @@ import numpy as np
 from hilctl.analysis.metrics import Fold, fold
 from hilctl.base.arrays import F64
 from hilctl.base.events import TUNED
-from hilctl.base.samples import Flag
+from hilctl.base.samples import Flag, Samples
 from hilctl.base.segments import Segment
-from hilctl.recording.data import Recording, Samples
+from hilctl.recording.data import Recording
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +32,7 @@ class SteadyPart:
 
 
 def waveform_end(samples: Samples) -> int:
-    """Return the index after the last sample that is not of the ramp out; 0 without any."""
+    """Return the index after the last sample that is not of the safe ramp; 0 without any."""
     waveform = samples.index[(samples.flags & Flag.RAMP) == 0]
     return int(waveform[-1]) + 1 if waveform.size else 0
 
@@ -48,7 +48,9 @@ def steady_samples(recording: Recording, segment: Segment) -> tuple[Samples, int
     end = min(segment.steady_stop, waveform_end(recording.samples))
     known = replace(segment, steady_start=begin, steady_stop=max(end, begin))
     start, stop, cycles = known.steady_cycles()
-    return _trusted(recording.samples.part(start, stop)), cycles
+    samples = recording.samples.part(start, stop)
+    trusted = (samples.flags & Flag.SENSOR_INVALID) == 0
+    return samples.rows(trusted), cycles
 
 
 def _tuned_until(recording: Recording, segment: Segment) -> int:
@@ -59,24 +61,9 @@ def _tuned_until(recording: Recording, segment: Segment) -> int:
     until = 0
     for event in recording.events:
         if event.code == TUNED and event.sample < segment.steady_stop:
-            until = event.sample + 0
+            # Where a recording does not say how long it took, nothing behind it is judged.
+            until = event.sample + int(event.values.get("samples", segment.steady_stop))
     return until
-
-
-def _trusted(samples: Samples) -> Samples:
-    keep = (samples.flags & Flag.SENSOR_INVALID) == 0
-    if keep.all():
-        return samples
-    return Samples(
-        index=samples.index[keep],
-        reference_um=samples.reference_um[keep],
-        wanted=samples.wanted[keep],
-        command=samples.command[keep],
-        measured=samples.measured[keep] if samples.measured.size else samples.measured,
-        displacement_um=samples.displacement_um[keep],
-        flags=samples.flags[keep],
-        input_um=samples.input_um[keep] if samples.input_um.size else samples.input_um,
-    )
 
 
 def steady_part(recording: Recording, segment: Segment) -> SteadyPart:

@@ -1,10 +1,4 @@
-"""A report for people: rows of text, and a compact table of them for a terminal."""
-
-from collections.abc import Sequence
-
-from rich.console import Group
-from rich.table import Table
-from rich.text import Text
+"""A report for people, as rows of text."""
 
 from hilctl.analysis.figures import RunReport, SegmentReport
 
@@ -23,7 +17,6 @@ _SEGMENT_HEADINGS = (
     "rms err. %",
     "loop area",
 )
-_PAGE_ONLY = {"cycles", "start s", "freq. Hz", "floor %", "loop area"}  # a terminal has 80 columns
 
 
 def number(value: float | None, unit: str = "") -> str:
@@ -40,7 +33,10 @@ def run_rows(report: RunReport) -> list[tuple[str, str]]:
     return [
         ("device", f"{report.device or MISSING}{simulated}"),
         ("ended", f"{report.reason or MISSING}{'' if report.complete else ' (NOT complete)'}"),
-        ("samples", f"{report.samples:,} of the waveform, {report.ramp_samples:,} of the ramp out"),
+        (
+            "samples",
+            f"{report.samples:,} of the waveform, {report.ramp_samples:,} of the safe ramp",
+        ),
         ("missing samples", f"{report.dropped:,}"),
         ("rate, length", f"{report.sample_rate_hz:g} Hz, {report.duration_s:.6g} s"),
         ("loop", f"displacement against {held_against}"),
@@ -98,48 +94,6 @@ def _segment_cells(segment: SegmentReport) -> list[str]:
         number(segment.rms_error_percent),
         number(segment.loop_area),
     ]
-
-
-def render(report: RunReport) -> Group:
-    """Return a report as tables for a terminal; that of the segments where there are several."""
-    title = report.name or "run"
-    quality = _two_columns(title, quality_rows(report))
-    parts = [quality, _two_columns("", run_rows(report))]
-    if len(report.segments) > 1:
-        parts.append(_segments(report))
-    if len(report.lateness_by_minute) > 1:
-        parts.append(_minutes(report))
-    return Group(*parts)
-
-
-def _two_columns(title: str, rows: Sequence[tuple[str, str]]) -> Table:
-    # Text, not str: names and labels come from files and must not be read as markup.
-    table = Table(title=Text(title) if title else None, show_header=False, title_justify="left")
-    table.add_column(style="bold", no_wrap=True)
-    table.add_column(overflow="fold")
-    for name, value in rows:
-        table.add_row(Text(name), Text(value))
-    return table
-
-
-def _segments(report: RunReport) -> Table:
-    table = Table(title="by segment, worst above", title_justify="left")
-    headings, rows = segment_table(report)
-    shown = [i for i, heading in enumerate(headings) if heading not in _PAGE_ONLY]
-    for i in shown:
-        table.add_column(headings[i], justify="right" if i else "left", no_wrap=True)
-    for cells in rows:
-        table.add_row(*(Text(cells[i]) for i in shown))
-    return table
-
-
-def _minutes(report: RunReport) -> Table:
-    table = Table(title="lateness by minute, us", title_justify="left")
-    for heading in report.lateness_by_minute[0]:
-        table.add_column(heading, justify="right", no_wrap=True)
-    for minute in report.lateness_by_minute:
-        table.add_row(*(f"{value:.4g}" for value in minute.values()))
-    return table
 
 
 def _range(low: float | None, high: float | None, unit: str) -> str:

@@ -1,23 +1,30 @@
-"""What a run tells beside its samples."""
+"""What a run records beside its samples."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from hilctl.base.samples import Samples
+
 TUNED = "tuned"
-"""Code of the event at the first sample that a change of the reference moves; its values are
-``gain``, ``offset`` and ``samples``."""
+"""Code of the event of a change of the reference, at the first sample that it moves.
+
+Its values are ``gain``, ``offset`` and ``samples``, the number of samples that the change takes.
+"""
 
 
 @dataclass(frozen=True, slots=True)
-class LoopEvent:
-    """Something that the loop has to tell.
+class Event:
+    """Something that happened during a run.
 
     Attributes:
         sample: Sample index it belongs to.
         level: ``info``, ``warning`` or ``error``.
-        code: Short name for programs.
+        code: Short name for programs, for example ``run_ended``.
         text: One line for people.
         values: Its numbers by name, for programs.
+        time_ns: Unix time in ns; 0 in the loop, which does not know it: then it is recorded with
+            the time at which its sample was due.
+        before: The last samples up to it; None where they are not recorded with it.
     """
 
     sample: int
@@ -25,3 +32,5 @@ class LoopEvent:
     code: str
     text: str
     values: Mapping[str, float] = field(default_factory=dict)
+    time_ns: int = 0
+    before: Samples | None = None

@@ -1,16 +1,192 @@
-"""What a sample is: its columns, its flags, and blocks of samples from the loop to the recorder."""
+"""What a sample is: its columns, its flags, and blocks of samples from the loop to the recorder.
 
-from dataclasses import dataclass
+The fields of :class:`Samples` are the one table of the columns: ring, messages, reader, export and
+units are made from it. A new column is one more field there, and whoever fills it.
+"""
+
+from dataclasses import dataclass, field, fields, replace
 from enum import IntEnum, IntFlag
+from typing import Annotated, Literal, Self, TypeAlias, get_type_hints
 
 import numpy as np
+import numpy.typing as npt
 
 from hilctl.base.arrays import F64, I64, U32
+from hilctl.base.device import CommandUnit
 
-COLUMNS = ("reference", "wanted", "command", "displacement_um", "measured", "input_um")
-"""Rows of a block's columns; ``input_um`` is of no meaning where the reference is the input."""
-ANSWERS = slice(COLUMNS.index("displacement_um"), COLUMNS.index("measured") + 1)
-"""Those that the device fills."""
+WhenRecorded: TypeAlias = Literal["always", "measured", "own_input"]
+"""``measured``: where the device measures its command; ``own_input``: where the compensator's input
+is other than the reference."""
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedField:
+    """The protobuf field of a column. Its numbers are for ever: none is used a second time.
+
+    Attributes:
+        name: With its unit; in events ``before_`` stands before it.
+        unit: Unit of its values.
+        block: Its number in ``hilctl.SampleBlock``.
+        before: Its number in ``hilctl.Event``, for the samples before the event.
+        scope: Its number in ``hilctl.Sample``; 0 where that leaves it out.
+    """
+
+    name: str
+    unit: str
+    block: int
+    before: int
+    scope: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class SampleColumn:
+    """One float64 a sample.
+
+    Attributes:
+        meaning: One line for people.
+        recorded_as: Its field; where commands are in volt, ``recorded_in_v`` if there is one.
+        recorded_in_v: Its field where commands are in volt; None where its unit is not theirs.
+        when: When it is recorded.
+        otherwise: Column that it equals where it is not recorded; without one it is empty there.
+        answered: Whether the device answers with it.
+        in_waveform_unit: Whether the loop's blocks hold it in the waveform's unit. Where that is
+            not um, NaN is recorded.
+    """
+
+    meaning: str
+    recorded_as: RecordedField
+    recorded_in_v: RecordedField | None = None
+    when: WhenRecorded = "always"
+    otherwise: str = ""
+    answered: bool = False
+    in_waveform_unit: bool = False
+
+    def field(self, unit: CommandUnit) -> RecordedField:
+        """Return its field in a recording whose commands are in ``unit``."""
+        return self.recorded_as if unit == "A" else self.recorded_in_v or self.recorded_as
+
+
+def _empty() -> F64:
+    return np.empty(0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Samples:
+    """Samples in order; each array has one row a sample.
+
+    Attributes:
+        index: int64[n], sample index since the start of the run; a jump is a gap.
+        flags: uint32[n], bits of :class:`Flag`.
+
+    The columns are float64[n] each, the commands among them in the command unit; one that is not
+    recorded and equals no other is empty, and so is a new one in older recordings. Their order is
+    that of the rows of a block.
+    """
+
+    index: I64
+    reference_um: Annotated[
+        F64,
+        SampleColumn(
+            "wanted displacement; NaN where there is none (current runs, ramp)",
+            RecordedField("reference_um", "um", block=5, before=6, scope=3),
+            in_waveform_unit=True,
+        ),
+    ]
+    wanted: Annotated[
+        F64,
+        SampleColumn(
+            "command before the limiter",
+            RecordedField("wanted_a", "A", block=6, before=7, scope=4),
+            RecordedField("wanted_v", "V", block=11, before=11, scope=8),
+        ),
+    ]
+    command: Annotated[
+        F64,
+        SampleColumn(
+            "command that was put out",
+            RecordedField("current_a", "A", block=7, before=8, scope=5),
+            RecordedField("drive_v", "V", block=12, before=12, scope=9),
+        ),
+    ]
+    displacement_um: Annotated[
+        F64,
+        SampleColumn(
+            "displacement, sampled when the command was put out",
+            RecordedField("displacement_um", "um", block=8, before=9, scope=6),
+            answered=True,
+        ),
+    ]
+    measured: Annotated[
+        F64,
+        SampleColumn(
+            "command as the device measured it",
+            RecordedField("measured_a", "A", block=10, before=15),
+            RecordedField("measured_v", "V", block=13, before=16),
+            when="measured",
+            answered=True,
+        ),
+    ] = field(default_factory=_empty)
+    input_um: Annotated[
+        F64,
+        SampleColumn(
+            "the compensator's input: the reference ahead of its time, and what is added to it",
+            RecordedField("input_um", "um", block=16, before=17),
+            when="own_input",
+            otherwise="reference_um",
+            in_waveform_unit=True,
+        ),
+    ]
+    flags: U32
+
+    @classmethod
+    def of(cls, index: I64, values: F64, flags: U32) -> Self:
+        """Return samples by the rows of a block's columns; nothing is copied.
+
+        Args:
+            index: int64[n].
+            values: float64[len(COLUMNS), n].
+            flags: uint32[n].
+        """
+        return cls(index=index, flags=flags, **dict(zip(COLUMNS, values, strict=True)))
+
+    def columns(self) -> dict[str, F64]:
+        """Return the columns by name, in order."""
+        return {name: getattr(self, name) for name in COLUMNS}
+
+    def rows(self, chosen: slice | npt.NDArray[np.bool_]) -> Self:
+        """Return some rows of all that is there."""
+        columns = {
+            name: values[chosen] if values.size else values
+            for name, values in self.columns().items()
+        }
+        return replace(self, index=self.index[chosen], flags=self.flags[chosen], **columns)
+
+    def part(self, start: int, stop: int) -> Self:
+        """Return the rows whose sample index lies in [start, stop)."""
+        low, high = np.searchsorted(self.index, (start, stop))
+        return self.rows(slice(int(low), int(high)))
+
+    def followed_by(self, later: "Samples") -> "Samples":
+        """Return these rows and others after them."""
+        names = [each.name for each in fields(self)]
+        return Samples(
+            **{name: np.concatenate((getattr(self, name), getattr(later, name))) for name in names}
+        )
+
+
+COLUMNS: dict[str, SampleColumn] = {
+    name: hint.__metadata__[0]
+    for name, hint in get_type_hints(Samples, include_extras=True).items()
+    if hasattr(hint, "__metadata__")
+}
+"""The columns by name; their order is that of the rows of a block's columns."""
+RECORDED_FIELDS = tuple(
+    dict.fromkeys(each.field(unit) for each in COLUMNS.values() for unit in ("A", "V"))
+)
+"""The fields of all columns, whatever the unit of the commands."""
+ANSWERS = [row for row, each in enumerate(COLUMNS.values()) if each.answered]
+"""Rows of a block's columns that the device fills."""
+_ALL = slice(None)
 
 
 class Head(IntEnum):
@@ -33,7 +209,7 @@ class Batch:
         heads: int64[k, len(Head)].
         states: float64[k, s]: the compensator's memory before each block, then the command
             before it.
-        columns: float64[k, 6, B], see :data:`COLUMNS`.
+        columns: float64[k, len(COLUMNS), B], see :data:`COLUMNS`.
         flags: uint32[k, B].
     """
 
@@ -61,6 +237,14 @@ class Batch:
             self.flags[chosen].copy(),
         )
 
+    def samples(self, blocks: slice = _ALL) -> Samples:
+        """Return the samples of some blocks, one after the other."""
+        flags = self.flags[blocks]
+        firsts = self.heads[blocks, Head.FIRST_SAMPLE]
+        index = (firsts[:, None] + np.arange(flags.shape[1])).ravel()
+        values = self.columns[blocks].transpose(1, 0, 2).reshape(len(COLUMNS), -1)
+        return Samples.of(index, values, flags.ravel())
+
 
 class Flag(IntFlag):
     """Bits of a sample's ``flags``; those from 64 on belong to the interlocks of the loop."""
@@ -72,7 +256,7 @@ class Flag(IntFlag):
     INVALID = 4
     """The wanted command was not finite; the last command was held."""
     RAMP = 8
-    """On the way out: the ramp to the safe value, without a reference."""
+    """The safe ramp, which has no reference."""
     SENSOR_INVALID = 16
     """The displacement was not finite, outside the stroke limits or at an end of the sensor."""
     UNANSWERED = 32

@@ -14,7 +14,8 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemaining
 from rich.table import Table
 
 from hilctl.analysis.replay import ReplayResult
-from hilctl.analysis.report import render, summarize
+from hilctl.analysis.report import summarize
+from hilctl.cli.report_view import render
 from hilctl.experiment.check import Checked
 from hilctl.experiment.inventory import Inventory, Probed
 from hilctl.recording.reader import read
@@ -90,8 +91,9 @@ def measuring(seconds: float, *, quiet: bool) -> Iterator[Callable[[float], None
 
 
 def _live_text(progress: RunProgress) -> str:
-    reference, _, command, displacement_um = progress.batch.columns[-1][:4]
-    error_um = displacement_um - reference
+    newest = progress.batch.samples(slice(-1, None))
+    command, displacement_um = newest.command, newest.displacement_um
+    error_um = displacement_um - newest.reference_um
     error = f"error {error_um[-1]:+7.2f} um  " if np.isfinite(error_um[-1]) else ""
     return (
         f"{error}x {displacement_um[-1]:+8.2f} um  command {command[-1]:+7.3f}  "

@@ -30,8 +30,9 @@ def report(
     as_json: AsJson = False,
 ) -> None:
     """Judge a recording: hysteresis, error, noise, lateness."""
-    from hilctl.analysis.report import render, summarize
+    from hilctl.analysis.report import summarize
     from hilctl.cli.console import print_rich
+    from hilctl.cli.report_view import render
     from hilctl.recording.reader import read
 
     finish_orphans()

@@ -12,7 +12,7 @@ fit.py           what was found, and how far a model is from data
 describe.py      what a model file says of how its model was found
 model_size.py      number of plays by loops held out; lag of a table
 workers.py       independent fits over threads, processes or a Dask cluster
-geometry.py      area and peak hysteresis of loops; weights by hysteresis
+geometry.py      weights by hysteresis
 
 Weights that are searched, from several starts:
 bench.py         all data ready for the kernels

@@ -9,7 +9,7 @@ from hilctl.base.arrays import F64
 from hilctl.base.errors import DataError
 from hilctl.base.segments import Segment
 from hilctl.identify.data import FEWEST_POINTS, History, Loop
-from hilctl.identify.period import steady_part
+from hilctl.identify.period import find_period
 from hilctl.recording.data import Recording
 
 
@@ -120,7 +120,7 @@ def find_cycles(history: History, points: int = 300) -> Loop:
     """
     command = history.command[history.ignore :]
     displacement_um = history.displacement_um[history.ignore :]
-    period, start, stop = steady_part(history.label, command)
+    period, start, stop = find_period(history.label, command)
     cycles = max(int((stop - start) / period + 1e-9) - 1, 1)
     start = max(stop - round(cycles * period), start)
     phase = np.arange(stop - start) / period

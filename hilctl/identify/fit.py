@@ -5,10 +5,10 @@ from typing import Any
 
 import numpy as np
 
+from hilctl.analysis.metrics import loop_area
 from hilctl.base.arrays import F64
 from hilctl.identify.bench import Bench
 from hilctl.identify.data import Loop, Record, Records
-from hilctl.identify.geometry import loop_area
 from hilctl.identify.search import StartOutcome
 from hilctl.identify.staged_bench import StagedBench
 from hilctl.identify.staged_model import response_um

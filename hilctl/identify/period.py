@@ -36,7 +36,7 @@ def similarity(signal: F64) -> F64:
     return np.asarray(products / scale, dtype=np.float64)
 
 
-def steady_part(label: str, command: F64) -> tuple[float, int, int]:
+def find_period(label: str, command: F64) -> tuple[float, int, int]:
     """Find the shortest period with which a command repeats at full amplitude, and where it does.
 
     Returns:

@@ -4,7 +4,8 @@ from hilctl.base.arrays import F64, U32
 from hilctl.base.samples import COLUMNS
 
 REFERENCE, WANTED, COMMAND, DISPLACEMENT_UM, MEASURED, INPUT_UM = map(
-    COLUMNS.index, ("reference", "wanted", "command", "displacement_um", "measured", "input_um")
+    [*COLUMNS].index,
+    ("reference_um", "wanted", "command", "displacement_um", "measured", "input_um"),
 )
 
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from hilctl.base.device import Clock
-from hilctl.base.events import LoopEvent
+from hilctl.base.events import Event
 from hilctl.loop.block import Block
 
 
@@ -55,6 +55,6 @@ class Host(Protocol):
         """Return a change of the reference that has come since the last call."""
         ...
 
-    def record_event(self, event: LoopEvent) -> None:
+    def record_event(self, event: Event) -> None:
         """Pass an event on to be recorded."""
         ...

@@ -17,7 +17,7 @@ import numpy as np
 from hilctl.base.arrays import F64, U32
 from hilctl.base.device import Device
 from hilctl.base.errors import DeviceError
-from hilctl.base.events import TUNED, LoopEvent
+from hilctl.base.events import TUNED, Event
 from hilctl.base.samples import Flag, Head
 from hilctl.loop.block import Block
 from hilctl.loop.host import Host, Tuning
@@ -167,7 +167,7 @@ class Loop:
         gain, offset, samples = tuning.gain, tuning.offset, tuning.samples
         text = f"reference gain to {gain:g}, offset to {offset:g}, over {samples} samples"
         values = {"gain": gain, "offset": offset, "samples": float(samples)}
-        self._host.record_event(LoopEvent(self._next_sample, "info", TUNED, text, values))
+        self._host.record_event(Event(self._next_sample, "info", TUNED, text, values))
 
     def _leave(self, code: Code, event: str, reason: str, sample: int | None = None) -> None:
         """Ramp to the safe value from the next block on.
@@ -181,7 +181,7 @@ class Loop:
         self._code, self._reason = code, reason
         if code == "fault":
             at = self._next_sample if sample is None else sample
-            self._host.record_event(LoopEvent(at, "error", event, reason))
+            self._host.record_event(Event(at, "error", event, reason))
 
     def _fill(self, block: Block) -> tuple[bool, int]:
         """Work out one block of commands.
@@ -287,7 +287,7 @@ class Loop:
 
     def _lost_device(self, error: DeviceError) -> Outcome:
         text = str(error) if self._code == "completed" else f"{self._reason}; then {error}"
-        event = LoopEvent(self._next_sample, "error", "device_lost", str(error))
+        event = Event(self._next_sample, "error", "device_lost", str(error))
         self._host.record_event(event)
         self._host.closing()
         safe = True

@@ -1,55 +1,14 @@
 """A recording in memory: arrays and facts, however they were stored."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, fields
 from pathlib import Path
 
-import numpy as np
-
-from hilctl.base.arrays import F64, I64, U32
+from hilctl.base.arrays import F64, I64
 from hilctl.base.device import CommandUnit
+from hilctl.base.events import Event
+from hilctl.base.samples import Samples
 from hilctl.base.segments import Segment
-
-
-@dataclass(frozen=True, slots=True)
-class Samples:
-    """All samples of a run, one row of each array a sample.
-
-    Attributes:
-        index: int64[n], sample index since the start of the run; a jump is a gap.
-        reference_um: float64[n], wanted displacement; NaN where there is none (current runs, ramp).
-        wanted: float64[n], command before the limiter, in the recording's command unit.
-        command: float64[n], command that was put out.
-        measured: float64[n], command as the device measured it; empty where it does not.
-        displacement_um: float64[n], sampled when ``command`` was put out.
-        flags: uint32[n], bits of :class:`hilctl.base.samples.Flag`.
-        input_um: float64[n], what the compensator was fed: the reference ahead of its time, with
-            what is added to it; NaN on the ramp, empty where the reference itself was fed.
-    """
-
-    index: I64
-    reference_um: F64
-    wanted: F64
-    command: F64
-    measured: F64
-    displacement_um: F64
-    flags: U32
-    input_um: F64 = field(default_factory=lambda: np.empty(0))
-
-    def part(self, start: int, stop: int) -> "Samples":
-        """Return the rows whose sample index lies in [start, stop)."""
-        low, high = np.searchsorted(self.index, (start, stop))
-        rows = slice(int(low), int(high))
-        return Samples(
-            self.index[rows],
-            self.reference_um[rows],
-            self.wanted[rows],
-            self.command[rows],
-            self.measured[rows],
-            self.displacement_um[rows],
-            self.flags[rows],
-            self.input_um[rows],
-        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,29 +28,12 @@ class Ticks:
     exchange_ns: I64
 
 
-@dataclass(frozen=True, slots=True)
-class Event:
-    """Something worth telling that happened during a run.
-
-    Attributes:
-        time_ns: Unix time in ns.
-        sample: Sample index it belongs to.
-        level: ``info``, ``warning`` or ``error``.
-        code: Short name for programs, for example ``run_ended``.
-        text: One line for people.
-        before: The last samples up to it; None where they are not told.
-    """
-
-    time_ns: int
-    sample: int
-    level: str
-    code: str
-    text: str
-    before: Samples | None = None
+TICK_COLUMNS = tuple(field.name for field in fields(Ticks))
+"""Their names, which are those of a block's head as well."""
 
 
 @dataclass(frozen=True, slots=True)
-class Start:
+class ReplayStart:
     """Where a replay can begin: the first block, and every block after a gap.
 
     Attributes:
@@ -140,5 +82,5 @@ class Recording:
     events: tuple[Event, ...]
     experiment_yaml: str
     model_yaml: str
-    starts: tuple[Start, ...] = ()
+    starts: tuple[ReplayStart, ...] = ()
     correction_yaml: str = ""

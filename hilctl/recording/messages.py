@@ -1,23 +1,20 @@
 """From ring batches and events to the messages of a recording's topics."""
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
-from typing import NamedTuple, Self
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from mcap.writer import Writer
 
-from hilctl.base.arrays import F64, U32
+from hilctl.base.arrays import F64
 from hilctl.base.device import CommandUnit
 from hilctl.base.errors import DataError
-from hilctl.base.samples import COLUMNS, Batch, Head
+from hilctl.base.events import Event
+from hilctl.base.samples import COLUMNS, Batch, Head, RecordedField, SampleColumn, Samples
 from hilctl.recording import schema
-from hilctl.recording.data import Event
+from hilctl.recording.data import TICK_COLUMNS
 
-_COLUMNS = {
-    "A": ("wanted_a", "current_a", "measured_a"),
-    "V": ("wanted_v", "drive_v", "measured_v"),
-}
 _MAX_BLOCK = 500
 
 
@@ -30,7 +27,7 @@ class Encoded(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Layout:
+class RecordingLayout:
     """What messages are made by; a recording's facts say it, so that more can be made later.
 
     Attributes:
@@ -40,6 +37,7 @@ class Layout:
         scope_rate_hz: Highest rate of ``/scope``.
         start_unix_ns: Unix time of sample 0 in ns.
         records_input: Whether the compensator's input is other than the reference.
+        waveform_unit: ``um``, or the command unit where nothing compensates.
     """
 
     sample_rate_hz: float
@@ -48,12 +46,32 @@ class Layout:
     scope_rate_hz: float
     start_unix_ns: int
     records_input: bool = False
+    waveform_unit: str = "um"
+
+    def records(self, column: SampleColumn) -> bool:
+        """Return whether a column is recorded."""
+        given = {"measured": self.measures_command, "own_input": self.records_input}
+        return given.get(column.when, True)
+
+    def recorded(self, samples: Samples) -> Iterator[tuple[RecordedField, F64]]:
+        """Yield field and values of each column that is recorded."""
+        for name, values in samples.columns().items():
+            column = COLUMNS[name]
+            if self.records(column):
+                elsewhere = column.in_waveform_unit and self.waveform_unit != "um"
+                known = np.full_like(values, np.nan) if elsewhere else values
+                yield column.field(self.command_unit), known
+
+    def time_ns(self, sample: int) -> int:
+        """Return the Unix time at which a sample was due, in ns."""
+        return self.start_unix_ns + round(sample * 1e9 / self.sample_rate_hz)
 
     def to_facts(self) -> dict[str, str]:
         """Return the fields as text, for a recording's metadata."""
         return {
             "sample_rate_hz": repr(self.sample_rate_hz),
             "command_unit": self.command_unit,
+            "waveform_unit": self.waveform_unit,
             "measures_command": str(self.measures_command).lower(),
             "records_input": str(self.records_input).lower(),
             "scope_rate_hz": repr(self.scope_rate_hz),
@@ -72,12 +90,34 @@ class Layout:
                 sample_rate_hz=float(facts["sample_rate_hz"]),
                 command_unit="V" if facts["command_unit"] == "V" else "A",
                 measures_command=facts["measures_command"] == "true",
-                records_input=facts.get("records_input") == "true",  # older recordings have none
                 scope_rate_hz=float(facts["scope_rate_hz"]),
                 start_unix_ns=int(facts["start_unix_ns"]),
+                # Older recordings do not have these.
+                records_input=facts.get("records_input") == "true",
+                waveform_unit=facts.get("waveform_unit", "um"),
             )
         except (KeyError, ValueError) as error:
             raise DataError(f"metadata hilctl.run: missing or damaged: {error}") from None
+
+
+def event_message(event: Event, before: Iterable[tuple[RecordedField, F64]] = ()) -> Encoded:
+    """Return the message of one event.
+
+    Args:
+        event: What happened, with its time.
+        before: Field and values of each column of the samples before it.
+    """
+    out = schema.message("Event")
+    for name in ("sample", "level", "code", "text"):
+        setattr(out, name, getattr(event, name))
+    out.value_names.extend(event.values.keys())
+    out.values.extend(event.values.values())
+    if event.before is not None:
+        out.before_sample.extend(event.before.index.tolist())
+        out.before_flags.extend(event.before.flags.tolist())
+    for field, values in before:
+        getattr(out, f"before_{field.name}").extend(values.tolist())
+    return Encoded("/events", event.time_ns, out.SerializeToString())
 
 
 class MessageMaker:
@@ -91,32 +131,18 @@ class MessageMaker:
         missing: Samples known to be missing between them.
     """
 
-    def __init__(self, layout: Layout) -> None:
+    def __init__(self, layout: RecordingLayout) -> None:
         self._layout = layout
         self._stride = max(1, int(np.ceil(layout.sample_rate_hz / layout.scope_rate_hz)))
         self.samples = 0
         self.missing = 0
 
-    @staticmethod
-    def event(event: Event, unit: CommandUnit = "A") -> Encoded:
-        """Return the message of one event; ``unit`` is that of the commands told with it."""
-        out = schema.message("Event")
-        out.sample, out.level, out.code, out.text = (
-            event.sample,
-            event.level,
-            event.code,
-            event.text,
-        )
-        if event.before is not None:
-            wanted, command, _ = _COLUMNS[unit]
-            before = event.before
-            out.before_sample.extend(before.index.tolist())
-            out.before_reference_um.extend(before.reference_um.tolist())
-            getattr(out, f"before_{wanted}").extend(before.wanted.tolist())
-            getattr(out, f"before_{command}").extend(before.command.tolist())
-            out.before_displacement_um.extend(before.displacement_um.tolist())
-            out.before_flags.extend(before.flags.tolist())
-        return Encoded("/events", event.time_ns, out.SerializeToString())
+    def event(self, event: Event) -> Encoded:
+        """Return the message of one event."""
+        if not event.time_ns:
+            event = replace(event, time_ns=self._layout.time_ns(event.sample))
+        before = self._layout.recorded(event.before) if event.before is not None else ()
+        return event_message(event, before)
 
     def batch(self, batch: Batch) -> Iterator[Encoded]:
         """Yield the messages of all samples and ticks of a batch."""
@@ -134,55 +160,43 @@ class MessageMaker:
         yield self._ticks(batch)
 
     def _block(self, batch: Batch, row: int, stop: int) -> Iterator[Encoded]:
-        rows = slice(row, stop)
+        samples = batch.samples(slice(row, stop))
+        columns = list(self._layout.recorded(samples))
         first = int(batch.heads[row, Head.FIRST_SAMPLE])
-        flags = batch.flags[rows].ravel()
-        columns = batch.columns[rows].transpose(1, 0, 2).reshape(len(COLUMNS), -1)
         dropped = int(batch.heads[row, Head.DROPPED_BEFORE])
-        t_rel = (first + np.arange(flags.size)) / self._layout.sample_rate_hz
-        wanted, command, measured = _COLUMNS[self._layout.command_unit]
         out = schema.message("SampleBlock")
-        out.tick0, out.n, out.dropped = first, flags.size, dropped
-        out.t_rel.extend(t_rel.tolist())
-        out.flags.extend(flags.tolist())
-        out.reference_um.extend(columns[0].tolist())
-        getattr(out, wanted).extend(columns[1].tolist())
-        getattr(out, command).extend(columns[2].tolist())
-        out.displacement_um.extend(columns[3].tolist())
-        if self._layout.measures_command:
-            getattr(out, measured).extend(columns[4].tolist())
-        if self._layout.records_input:
-            out.input_um.extend(columns[5].tolist())
+        out.tick0, out.n, out.dropped = first, samples.index.size, dropped
+        out.t_rel.extend((samples.index / self._layout.sample_rate_hz).tolist())
+        out.flags.extend(samples.flags.tolist())
+        for field, values in columns:
+            getattr(out, field.name).extend(values.tolist())
         if self.samples == 0 or dropped:
             out.state.extend(batch.states[row, :-1].tolist())
             out.previous_command.append(float(batch.states[row, -1]))
-        yield Encoded("/samples", self._time_ns(first), out.SerializeToString())
-        self.samples += flags.size
+        yield Encoded("/samples", self._layout.time_ns(first), out.SerializeToString())
+        self.samples += samples.index.size
         self.missing += dropped
-        yield from self._scope(first, t_rel, columns, flags)
+        yield from self._scope(samples, columns)
 
-    def _scope(self, first: int, t_rel: F64, columns: F64, flags: U32) -> Iterator[Encoded]:
-        wanted, command, _ = _COLUMNS[self._layout.command_unit]
-        for k in range(-first % self._stride, flags.size, self._stride):
-            out = schema.message("Sample")
-            out.sample, out.t_rel, out.flags = first + k, t_rel[k], int(flags[k])
-            out.reference_um, out.displacement_um = columns[0, k], columns[3, k]
-            setattr(out, wanted, columns[1, k])
-            setattr(out, command, columns[2, k])
-            yield Encoded("/scope", self._time_ns(first + k), out.SerializeToString())
+    def _scope(
+        self, samples: Samples, columns: list[tuple[RecordedField, F64]]
+    ) -> Iterator[Encoded]:
+        first = int(samples.index[0])
+        shown = [(field.name, values) for field, values in columns if field.scope]
+        for k in range(-first % self._stride, samples.index.size, self._stride):
+            out: Any = schema.message("Sample")
+            out.sample, out.flags = first + k, int(samples.flags[k])
+            out.t_rel = out.sample / self._layout.sample_rate_hz
+            for name, values in shown:
+                setattr(out, name, values[k])
+            yield Encoded("/scope", self._layout.time_ns(first + k), out.SerializeToString())
 
     def _ticks(self, batch: Batch) -> Encoded:
         out = schema.message("TickBlock")
-        heads = batch.heads
-        out.first_sample.extend(heads[:, Head.FIRST_SAMPLE].tolist())
-        out.deadline_ns.extend(heads[:, Head.DEADLINE_NS].tolist())
-        out.late_ns.extend(heads[:, Head.LATE_NS].tolist())
-        out.exchange_ns.extend(heads[:, Head.EXCHANGE_NS].tolist())
-        first = int(heads[0, Head.FIRST_SAMPLE])
-        return Encoded("/ticks", self._time_ns(first), out.SerializeToString())
-
-    def _time_ns(self, sample: int) -> int:
-        return self._layout.start_unix_ns + round(sample * 1e9 / self._layout.sample_rate_hz)
+        for name in TICK_COLUMNS:
+            getattr(out, name).extend(batch.heads[:, Head[name.upper()]].tolist())
+        first = int(batch.heads[0, Head.FIRST_SAMPLE])
+        return Encoded("/ticks", self._layout.time_ns(first), out.SerializeToString())
 
 
 class Topics:

@@ -2,6 +2,7 @@
 
 import json
 import logging
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -9,11 +10,14 @@ import numpy as np
 from google.protobuf.message import DecodeError
 from mcap.records import Attachment, Channel, Message, Metadata
 
-from hilctl.base.arrays import F64
+from hilctl.base.arrays import F64, I64
+from hilctl.base.device import CommandUnit
 from hilctl.base.errors import DataError
+from hilctl.base.events import Event
+from hilctl.base.samples import COLUMNS, Samples
 from hilctl.base.segments import Segment
 from hilctl.recording import schema
-from hilctl.recording.data import Event, Recording, Samples, Start, Ticks
+from hilctl.recording.data import TICK_COLUMNS, Recording, ReplayStart, Ticks
 from hilctl.recording.salvage import Salvage
 from hilctl.recording.writer import is_being_recorded
 
@@ -56,21 +60,34 @@ def _warn(recording: Recording, problem: str, *, live: bool) -> None:
     _log.warning("%s: %s; %d samples are read%s", recording.path, problem, samples, advice)
 
 
-def _event(time_ns: int, decoded: Any) -> Event:
+def _samples(index: I64, flags: F64, unit: CommandUnit, field: Callable[[str], F64]) -> Samples:
+    """Return samples by their fields' values; of those that are left out, what stands for them."""
+    columns: dict[str, F64] = {}
+    for name, column in COLUMNS.items():
+        values = field(column.field(unit).name)
+        left_out = column.otherwise and not values.size
+        columns[name] = columns[column.otherwise] if left_out else values
+    return Samples(index=index, flags=flags.astype(np.uint32), **columns)
+
+
+def _event(time_ns: int, decoded: Any, unit: CommandUnit) -> Event:
     before = None
     if decoded.before_sample:
-        small = "v" if decoded.before_drive_v else "a"
-        command = decoded.before_drive_v or decoded.before_current_a
-        before = Samples(
-            index=np.array(decoded.before_sample, dtype=np.int64),
-            reference_um=np.array(decoded.before_reference_um),
-            wanted=np.array(getattr(decoded, f"before_wanted_{small}")),
-            command=np.array(command),
-            measured=np.empty(0),
-            displacement_um=np.array(decoded.before_displacement_um),
-            flags=np.array(decoded.before_flags, dtype=np.uint32),
+        before = _samples(
+            np.array(decoded.before_sample, dtype=np.int64),
+            np.array(decoded.before_flags),
+            unit,
+            lambda name: np.array(getattr(decoded, f"before_{name}"), dtype=np.float64),
         )
-    return Event(time_ns, decoded.sample, decoded.level, decoded.code, decoded.text, before)
+    return Event(
+        sample=decoded.sample,
+        level=decoded.level,
+        code=decoded.code,
+        text=decoded.text,
+        values=dict(zip(decoded.value_names, decoded.values, strict=True)),
+        time_ns=time_ns,
+        before=before,
+    )
 
 
 class _Contents:
@@ -83,7 +100,7 @@ class _Contents:
         self._topics: dict[int, str] = {}
         self._blocks: list[Any] = []
         self._ticks: list[Any] = []
-        self._events: list[Event] = []
+        self._events: list[tuple[int, Any]] = []
 
     def take(self, record: Any) -> None:
         match record:
@@ -108,7 +125,7 @@ class _Contents:
         elif topic == "/ticks":
             self._ticks.append(decoded)
         else:
-            self._events.append(_event(record.log_time, decoded))
+            self._events.append((record.log_time, decoded))
 
     def recording(self, path: Path) -> Recording:
         """Put it together.
@@ -123,26 +140,26 @@ class _Contents:
             raise DataError(text) from None
 
     def _recording(self, path: Path) -> Recording:
-        unit = "V" if self.run.get("command_unit") == "V" else "A"
+        unit: CommandUnit = "V" if self.run.get("command_unit") == "V" else "A"
         return Recording(
             path=path,
             run=self.run,
             end=self.end,
             sample_rate_hz=float(self.run["sample_rate_hz"]),
-            command_unit="V" if unit == "V" else "A",
+            command_unit=unit,
             compensated=self.run.get("compensator", "none") != "none",
             segments=tuple(
                 Segment.from_mapping(each) for each in json.loads(self.run.get("segments", "[]"))
             ),
-            samples=self._samples(unit),
+            samples=_samples(self._index(), self._column("flags"), unit, self._column),
             dropped=self._dropped(),
             ticks=self._all_ticks(),
-            events=tuple(self._events),
+            events=tuple(_event(time_ns, each, unit) for time_ns, each in self._events),
             experiment_yaml=self._texts.get("experiment.yaml", ""),
             model_yaml=self._texts.get("model.yaml", ""),
             correction_yaml=self._texts.get("correction.yaml", ""),
             starts=tuple(
-                Start(block.tick0, np.array(block.state), block.previous_command[0])
+                ReplayStart(block.tick0, np.array(block.state), block.previous_command[0])
                 for block in self._blocks
                 if block.previous_command
             ),
@@ -154,32 +171,18 @@ class _Contents:
         gaps = last.tick0 + last.n - recorded if last else 0
         return max(gaps, int(self.end.get("missing_samples", "0")))
 
-    def _samples(self, unit: str) -> Samples:
-        small = unit.lower()
-        command = "current_a" if unit == "A" else "drive_v"
+    def _index(self) -> I64:
         ranges = [np.arange(b.tick0, b.tick0 + b.n, dtype=np.int64) for b in self._blocks]
-        return Samples(
-            index=np.concatenate(ranges) if ranges else np.empty(0, dtype=np.int64),
-            reference_um=self._column("reference_um"),
-            wanted=self._column(f"wanted_{small}"),
-            command=self._column(command),
-            measured=self._column(f"measured_{small}"),
-            displacement_um=self._column("displacement_um"),
-            flags=self._column("flags").astype(np.uint32),
-            input_um=self._column("input_um"),
-        )
+        return np.concatenate(ranges) if ranges else np.empty(0, dtype=np.int64)
 
     def _column(self, name: str) -> F64:
         parts = [np.array(getattr(block, name), dtype=np.float64) for block in self._blocks]
         return np.concatenate(parts) if parts else np.empty(0)
 
     def _all_ticks(self) -> Ticks:
-        names = ("first_sample", "deadline_ns", "late_ns", "exchange_ns")
-        columns = [
-            np.concatenate(
-                [np.array(getattr(tick, name), dtype=np.int64) for tick in self._ticks]
-                or [np.empty(0, dtype=np.int64)]
-            )
-            for name in names
-        ]
-        return Ticks(*columns)
+        nothing = np.empty(0, dtype=np.int64)
+        parts = {
+            name: [np.array(getattr(each, name), dtype=np.int64) for each in self._ticks]
+            for name in TICK_COLUMNS
+        }
+        return Ticks(**{name: np.concatenate([nothing, *each]) for name, each in parts.items()})

@@ -1,18 +1,21 @@
-"""Single MCAP records and chunks, taken apart with suspicion.
+"""Single MCAP records and chunks, taken apart with suspicion, and what is left of broken ones.
 
 A record counts as whole only where writing it again gives the same bytes: then every length in it
 is right, and so is an attachment's checksum. A chunk counts as whole where its checksum is right.
 """
 
+import re
 import struct
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cache
 from io import BytesIO
-from typing import Any
+from typing import Any, BinaryIO
 
 import lz4.frame
 import zstandard
+from google.protobuf.message import DecodeError
 from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
@@ -33,6 +36,9 @@ from mcap.records import (
     Statistics,
     SummaryOffset,
 )
+
+from hilctl.base.samples import RECORDED_FIELDS
+from hilctl.recording import schema
 
 FRAME = struct.Struct("<BQ")
 """Opcode and length before every record."""
@@ -56,6 +62,21 @@ _KINDS: dict[int, Any] = {
     Opcode.SUMMARY_OFFSET: SummaryOffset,
     Opcode.DATA_END: DataEnd,
 }
+_CHUNK = struct.Struct("<QQQII")
+_LENGTH = struct.Struct("<Q")
+_WINDOW_BYTES = 4 * 2**20
+_IN_CHUNKS = {Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE}
+_PER_SAMPLE = {"t_rel", "flags", *(each.name for each in RECORDED_FIELDS)}
+# Lengths are little-endian and far below 2**40, so their three highest bytes are 0.
+_LIKELY = re.compile(
+    rb"\x06.{5}\0{3}.{16}.{5}\0{3}.{4}(?:\x04\0{3}zstd|\x03\0{3}lz4|\0{4}).{5}\0{3}"
+    rb"|\x0c.{5}\0{3}.\0{3}hilctl\."
+    rb"|\x09.{5}\0{3}.{16}.\0{3}(?:experiment|model|correction)\.yaml"
+    rb"|\x0f\x04\0{7}.{4}[\x02\x03\x04\x0b]",
+    re.DOTALL,
+)
+_LIKELY_BYTES = 64
+_SECTOR = bytes(512)
 
 
 def parse(opcode: int, body: bytes) -> McapRecord | None:
@@ -169,3 +190,127 @@ def contents(chunk: Chunk) -> Contents | None:
 
 def _index(channel_id: int, entries: list[int]) -> bytes:
     return struct.pack(f"<HI{len(entries)}Q", channel_id, 8 * len(entries), *entries)
+
+
+def next_likely(stream: BinaryIO, at: int, size: int) -> int:
+    """Return the offset of what looks like a record from ``at`` on, or ``size``."""
+    for start in range(at, size, _WINDOW_BYTES):
+        stream.seek(start)
+        found = _LIKELY.search(stream.read(_WINDOW_BYTES + _LIKELY_BYTES))
+        if found:
+            return start + found.start()
+    return size
+
+
+def tail_kind(stream: BinaryIO, at: int, size: int) -> str:
+    """Return what a tail that holds no record is: ``zeros`` or ``unreadable bytes``."""
+    for start in range(at, size, _WINDOW_BYTES):
+        stream.seek(start)
+        if stream.read(_WINDOW_BYTES).strip(b"\0"):
+            return "unreadable bytes"
+    return "zeros"
+
+
+def take_chunk(raw: bytes, *, last: bool) -> tuple[list[McapRecord], str]:
+    """Take what can be had of a chunk that is not whole.
+
+    Args:
+        raw: The chunk from its opcode on, up to the next readable record.
+        last: Whether the file ends with these bytes.
+
+    Returns:
+        Records, and what the stretch is (see :class:`hilctl.recording.salvage.Damage`).
+    """
+    chunk = _as_far_as_it_goes(raw)
+    if chunk is None:
+        return [], "torn chunk" if last else "damaged chunk"
+    inside = contents(chunk)
+    if inside is not None:  # only the frame around it is damaged
+        return list(inside.records), "index"
+    if not last or not _is_cut(chunk, raw):
+        return [], "damaged chunk"
+    data = inflate(chunk.compression, _before_zeros(chunk), chunk.uncompressed_size)
+    return _believable(data), "torn chunk"
+
+
+def _before_zeros(chunk: Chunk) -> bytes:
+    """Return data up to where a failing power left zeros; values of 0.0 at the cut go with them."""
+    data = chunk.data
+    if chunk.compression and _SECTOR in data:  # a compressed stream has no such stretch
+        data = data[: data.index(_SECTOR)]
+    return data.rstrip(b"\0")
+
+
+def _as_far_as_it_goes(raw: bytes) -> Chunk | None:
+    """Return a chunk by the length of its data, not of the record; its data ends with ``raw``."""
+    start = FRAME.size + _CHUNK.size
+    if len(raw) < start:
+        return None
+    first, last, size, crc, name_length = _CHUNK.unpack_from(raw, FRAME.size)
+    name = raw[start : start + name_length]
+    begin = start + name_length + _LENGTH.size
+    if name not in {b"", b"lz4", b"zstd"} or len(raw) < begin or size > LARGEST_BYTES:
+        return None
+    (length,) = _LENGTH.unpack_from(raw, begin - _LENGTH.size)
+    return Chunk(
+        compression=name.decode(),
+        data=raw[begin : begin + length],
+        message_end_time=last,
+        message_start_time=first,
+        uncompressed_crc=crc,
+        uncompressed_size=size,
+    )
+
+
+def _is_cut(chunk: Chunk, raw: bytes) -> bool:
+    """Return whether a chunk ends early, with the file or in zeros, rather than being wrong."""
+    length = FRAME.unpack_from(raw)[1]
+    return len(raw) < FRAME.size + length or chunk.data.endswith(b"\0")
+
+
+def _believable(data: bytes) -> list[McapRecord]:
+    """Return records that no checksum covers, up to the first that is not hilctl's.
+
+    Where nonsense follows rather than the beginning of one more record, the last record may have
+    some of it in its own last bytes, and is left out.
+    """
+    records: list[McapRecord] = []
+    end = 0
+    for at, record in split(data):
+        if isinstance(record, Message) and not _decodes(record):
+            return records[:-1]
+        records.append(record)
+        end = at + FRAME.size + FRAME.unpack_from(data, at)[1]
+    rest = data[end:]
+    if len(rest) >= FRAME.size:
+        opcode, length = FRAME.unpack_from(rest)
+        begun = opcode in _IN_CHUNKS and len(rest) - FRAME.size < length <= LARGEST_BYTES
+        return records if begun else records[:-1]
+    return records if not rest or rest[0] in _IN_CHUNKS else records[:-1]
+
+
+def _decodes(message: Message) -> bool:
+    own = own_channels().get(message.channel_id)
+    if own is None:
+        return False
+    name = schema.TOPICS[own[1].topic]
+    decoded = schema.message(name)
+    try:
+        decoded.ParseFromString(message.data)
+    except DecodeError:
+        return False
+    columns = [values for field, values in decoded.ListFields() if field.name in _PER_SAMPLE]
+    return name != "SampleBlock" or all(len(each) == decoded.n for each in columns)
+
+
+@cache
+def own_channels() -> dict[int, tuple[Schema, Channel]]:
+    """Return the schema and channel of each of hilctl's channel ids, in order."""
+    descriptors = schema.descriptor_set()
+    return {
+        number: (
+            Schema(number, descriptors, "protobuf", f"hilctl.{name}"),
+            Channel(number, topic, "protobuf", {}, number),
+        )
+        for number, (topic, name) in enumerate(schema.TOPICS.items(), start=1)
+    }

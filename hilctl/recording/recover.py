@@ -16,9 +16,9 @@ import numpy as np
 from google.protobuf.message import DecodeError
 
 from hilctl.base.errors import DataError, InputError
-from hilctl.base.events import LoopEvent
+from hilctl.base.events import Event
 from hilctl.base.samples import Batch, Head
-from hilctl.recording.messages import Layout
+from hilctl.recording.messages import RecordingLayout
 from hilctl.recording.replace import Replacement
 from hilctl.recording.rewrite import Resaved, Survey
 from hilctl.recording.salvage import Damage, Salvage
@@ -72,7 +72,7 @@ def recover_recording(
     extra: Iterable[Batch] = (),
     end: Mapping[str, str] | None = None,
     *,
-    events: Sequence[LoopEvent] = (),
+    events: Sequence[Event] = (),
     ended_at: int = 0,
     output: Path | None = None,
 ) -> Recovered:
@@ -88,7 +88,7 @@ def recover_recording(
             dropped. A block is in a file as a whole or not at all.
         end: Facts of the run's end where the file has none of its own, with ``code`` and
             ``reason``; else the code is ``recovered``.
-        events: Events of the loop that were perhaps not written; told where anything is added.
+        events: Events of the loop that were perhaps not written; added with the batches.
         ended_at: Index after the last sample that was exchanged; 0 where that is not known.
         output: Put the sound file here instead, and leave the old one where it is.
 
@@ -109,8 +109,7 @@ def recover_recording(
                 saved = Resaved(replacement.stream, survey)
                 saved.copy(Salvage(stream).records())
                 if layout:
-                    saved.add(more, layout)
-                    saved.tell(events, layout)
+                    saved.add(more, events, layout)
                 reason = saved.finish(end, ended_at)
                 kept = replacement.put()
     except FileNotFoundError as error:
@@ -139,14 +138,14 @@ def _sound(path: Path, survey: Survey) -> Recovered:
     return Recovered(path, None, text, survey.samples, 0, missing, ())
 
 
-def _check(path: Path, survey: Survey, more: list[Batch]) -> Layout | None:
+def _check(path: Path, survey: Survey, more: list[Batch]) -> RecordingLayout | None:
     """Refuse what nothing can be made of; return how to add what is to be added."""
     if not survey.records:
         raise DataError(f"{path}: holds no whole record: there is nothing to recover")
     if not more:
         return None
     try:
-        return Layout.from_facts(survey.run)
+        return RecordingLayout.from_facts(survey.run)
     except DataError as error:
         raise DataError(f"{path}: samples can't be added: {error}") from None
 

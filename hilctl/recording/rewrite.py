@@ -7,11 +7,10 @@ from mcap.records import Attachment, Channel, McapRecord, Message, Metadata, Sch
 from mcap.writer import CompressionType, Writer
 
 from hilctl import __version__
-from hilctl.base.events import LoopEvent
+from hilctl.base.events import Event
 from hilctl.base.samples import Batch
 from hilctl.recording import schema
-from hilctl.recording.data import Event
-from hilctl.recording.messages import Layout, MessageMaker, Topics
+from hilctl.recording.messages import MessageMaker, RecordingLayout, Topics, event_message
 from hilctl.recording.salvage import Salvage
 
 _UNKNOWN_END = (
@@ -144,21 +143,18 @@ class Resaved:
             number, record.log_time, record.data, record.publish_time, record.sequence
         )
 
-    def tell(self, events: Iterable[LoopEvent], layout: Layout) -> None:
-        """Add events of the loop that the old file does not hold."""
-        for told in events:
-            time_ns = layout.start_unix_ns + round(told.sample * 1e9 / layout.sample_rate_hz)
-            event = Event(time_ns, told.sample, told.level, told.code, told.text)
-            self._topics.add(MessageMaker.event(event))
-
-    def add(self, batches: Iterable[Batch], layout: Layout) -> None:
-        """Add batches that the old file does not hold, in order."""
+    def add(
+        self, batches: Iterable[Batch], events: Iterable[Event], layout: RecordingLayout
+    ) -> None:
+        """Add batches and events that the old file does not hold, in order."""
         maker = MessageMaker(layout)
         maker.samples = self.samples
         for batch in batches:
             for message in maker.batch(batch):
                 self._topics.add(message)
                 self._last_time_ns = max(self._last_time_ns, message.time_ns)
+        for event in events:
+            self._topics.add(maker.event(event))
         self.added = maker.samples - self.samples
         self.samples = maker.samples
         self.missing += maker.missing
@@ -180,8 +176,8 @@ class Resaved:
         known = bool(ended_at or exchanged)
         reason = self._reason(last, known=known)
         level = "info" if known and not self.missing else "warning"
-        event = Event(self._last_time_ns, max(0, last), level, "recovered", reason)
-        self._topics.add(MessageMaker.event(event))
+        event = Event(max(0, last), level, "recovered", reason, time_ns=self._last_time_ns)
+        self._topics.add(event_message(event))
         facts = own or end or {"code": "recovered", "reason": f"recovered: {reason}"}
         counted = {
             "recorded_samples": str(self.samples),

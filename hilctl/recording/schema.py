@@ -1,13 +1,16 @@
 """Protobuf messages of a recording's topics, and the descriptors that make a file self-describing.
 
-Field numbers are for ever: a number that was used once is not used again.
+Field numbers are for ever: a number that was used once is not used again. Those of the columns
+stand with them, in :class:`hilctl.base.samples.Samples`.
 """
 
 from functools import cache
-from typing import Any
+from typing import Any, TypeAlias
 
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from google.protobuf.message import Message
+
+from hilctl.base.samples import RECORDED_FIELDS
 
 _FILE = "hilctl/recording.proto"
 _PACKAGE = "hilctl"
@@ -26,27 +29,30 @@ TOPICS: dict[str, str] = {
 }
 """Topic to message name; all are of package ``hilctl``."""
 
-# name: (number, type, repeated); units are in the names, V replacing A for voltage-driven devices
-_MESSAGES: dict[str, dict[str, tuple[int, Any, bool]]] = {
+# name: (number, type, repeated); units are in the names
+_Fields: TypeAlias = dict[str, tuple[int, Any, bool]]
+
+
+def _columns(message: str, prefix: str = "", *, repeated: bool = True) -> _Fields:
+    """Return the fields of the columns, numbered by that attribute of theirs; 0 is none."""
+    numbered = {each.name: getattr(each, message) for each in RECORDED_FIELDS}
+    return {
+        prefix + name: (number, _DOUBLE, repeated) for name, number in numbered.items() if number
+    }
+
+
+_MESSAGES: dict[str, _Fields] = {
     "SampleBlock": {
         "tick0": (1, _UINT64, False),  # index of the first sample since the start of the run
         "n": (2, _UINT32, False),
         "dropped": (3, _UINT64, False),  # samples missing before this block
         "t_rel": (4, _DOUBLE, True),  # s since the start of the run
-        "reference_um": (5, _DOUBLE, True),
-        "wanted_a": (6, _DOUBLE, True),  # before the limiter
-        "current_a": (7, _DOUBLE, True),  # put out
-        "displacement_um": (8, _DOUBLE, True),
         "flags": (9, _UINT32, True),
-        "measured_a": (10, _DOUBLE, True),
-        "wanted_v": (11, _DOUBLE, True),
-        "drive_v": (12, _DOUBLE, True),
-        "measured_v": (13, _DOUBLE, True),
         # Where a block stands first or after a gap: the compensator's memory before it, and the
         # command before it, so that it can be replayed by itself.
         "state": (14, _DOUBLE, True),
         "previous_command": (15, _DOUBLE, True),
-        "input_um": (16, _DOUBLE, True),  # what the compensator was fed, where not the reference
+        **_columns("block"),
     },
     "TickBlock": {
         "first_sample": (1, _UINT64, True),
@@ -57,13 +63,8 @@ _MESSAGES: dict[str, dict[str, tuple[int, Any, bool]]] = {
     "Sample": {
         "sample": (1, _UINT64, False),
         "t_rel": (2, _DOUBLE, False),
-        "reference_um": (3, _DOUBLE, False),
-        "wanted_a": (4, _DOUBLE, False),
-        "current_a": (5, _DOUBLE, False),
-        "displacement_um": (6, _DOUBLE, False),
         "flags": (7, _UINT32, False),
-        "wanted_v": (8, _DOUBLE, False),
-        "drive_v": (9, _DOUBLE, False),
+        **_columns("scope", repeated=False),
     },
     "Event": {
         "sample": (1, _UINT64, False),
@@ -72,13 +73,11 @@ _MESSAGES: dict[str, dict[str, tuple[int, Any, bool]]] = {
         "text": (4, _STRING, False),
         # The last samples up to it, so that one message tells what led there.
         "before_sample": (5, _UINT64, True),
-        "before_reference_um": (6, _DOUBLE, True),
-        "before_wanted_a": (7, _DOUBLE, True),
-        "before_current_a": (8, _DOUBLE, True),
-        "before_displacement_um": (9, _DOUBLE, True),
         "before_flags": (10, _UINT32, True),
-        "before_wanted_v": (11, _DOUBLE, True),
-        "before_drive_v": (12, _DOUBLE, True),
+        **_columns("before", "before_"),
+        # Its numbers by name.
+        "value_names": (13, _STRING, True),
+        "values": (14, _DOUBLE, True),
     },
 }
 
@@ -89,7 +88,7 @@ def file_descriptor() -> descriptor_pb2.FileDescriptorProto:
     file = descriptor_pb2.FileDescriptorProto(name=_FILE, package=_PACKAGE, syntax="proto3")
     for message_name, fields in _MESSAGES.items():
         message = file.message_type.add(name=message_name)
-        for name, (number, kind, repeated) in fields.items():
+        for name, (number, kind, repeated) in sorted(fields.items(), key=lambda each: each[1]):
             field = message.field.add(name=name, number=number, type=kind)
             labels = descriptor_pb2.FieldDescriptorProto
             field.label = labels.LABEL_REPEATED if repeated else labels.LABEL_OPTIONAL

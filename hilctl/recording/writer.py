@@ -16,11 +16,10 @@ from typing import BinaryIO
 from mcap.writer import CompressionType, Writer
 
 from hilctl import __version__
-from hilctl.base.device import CommandUnit
+from hilctl.base.events import Event
 from hilctl.base.samples import Batch
 from hilctl.base.segments import Segment
-from hilctl.recording.data import Event
-from hilctl.recording.messages import Layout, MessageMaker, Topics
+from hilctl.recording.messages import MessageMaker, RecordingLayout, Topics
 
 _CHUNK_BYTES = 8 << 20  # each chunk's index stays in memory until the end of the run
 
@@ -34,11 +33,7 @@ class RunFacts:
         segments: The stretches of the run.
         experiment_yaml: The experiment as it runs.
         model_yaml: The compensator's model, or empty.
-        sample_rate_hz: Samples a second.
-        command_unit: ``A`` or ``V``.
-        measures_command: Whether the device measures its command.
-        scope_rate_hz: Highest rate of ``/scope``.
-        records_input: Whether the compensator's input is other than the reference.
+        layout: What messages are made by.
         correction_yaml: What had been learned and was added to the reference, or empty.
     """
 
@@ -46,23 +41,8 @@ class RunFacts:
     segments: tuple[Segment, ...]
     experiment_yaml: str
     model_yaml: str
-    sample_rate_hz: float
-    command_unit: CommandUnit
-    measures_command: bool
-    scope_rate_hz: float
-    records_input: bool = False
+    layout: RecordingLayout
     correction_yaml: str = ""
-
-    def layout(self, start_unix_ns: int) -> Layout:
-        """Return what the run's messages are made by."""
-        return Layout(
-            sample_rate_hz=self.sample_rate_hz,
-            command_unit=self.command_unit,
-            measures_command=self.measures_command,
-            records_input=self.records_input,
-            scope_rate_hz=self.scope_rate_hz,
-            start_unix_ns=start_unix_ns,
-        )
 
 
 class RecordingWriter:
@@ -71,28 +51,26 @@ class RecordingWriter:
     Args:
         stream: Open binary file; the writer does not close it.
         run: Facts of the run.
-        start_unix_ns: Unix time of sample 0 in ns.
     """
 
-    def __init__(self, stream: BinaryIO, run: RunFacts, start_unix_ns: int) -> None:
+    def __init__(self, stream: BinaryIO, run: RunFacts) -> None:
         self._writer = Writer(stream, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
         self._topics = Topics(self._writer)
-        layout = run.layout(start_unix_ns)
-        self._maker = MessageMaker(layout)
-        self._unit = layout.command_unit
+        self._maker = MessageMaker(run.layout)
         self._late_missing = 0
-        self._begin(run, layout)
+        self._begin(run)
 
-    def _begin(self, run: RunFacts, layout: Layout) -> None:
+    def _begin(self, run: RunFacts) -> None:
         self._writer.start(profile="", library=f"hilctl {__version__}")
         segments = json.dumps([segment.to_mapping() for segment in run.segments])
-        facts = {**run.facts, **layout.to_facts(), "segments": segments}
+        facts = {**run.facts, **run.layout.to_facts(), "segments": segments}
         self._writer.add_metadata("hilctl.run", facts)
-        self._attach("experiment.yaml", run.experiment_yaml, layout.start_unix_ns)
+        start_unix_ns = run.layout.start_unix_ns
+        self._attach("experiment.yaml", run.experiment_yaml, start_unix_ns)
         if run.model_yaml:
-            self._attach("model.yaml", run.model_yaml, layout.start_unix_ns)
+            self._attach("model.yaml", run.model_yaml, start_unix_ns)
         if run.correction_yaml:
-            self._attach("correction.yaml", run.correction_yaml, layout.start_unix_ns)
+            self._attach("correction.yaml", run.correction_yaml, start_unix_ns)
         self._topics.register()
         self._writer.flush()
 
@@ -128,7 +106,7 @@ class RecordingWriter:
 
     def event(self, event: Event) -> None:
         """Write one event."""
-        self._topics.add(self._maker.event(event, self._unit))
+        self._topics.add(self._maker.event(event))
 
     def batch(self, batch: Batch) -> None:
         """Write all samples and ticks of a batch."""

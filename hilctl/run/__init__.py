@@ -5,7 +5,7 @@ supervisor.py      starts the loop's process, records, makes the rig safe
 child.py           its hold on that process; hang_watch.py  whether it hangs
 loop_process.py    the loop's process
 ring.py            sample blocks in shared memory, behind shared_page.py
-recorder.py        into the recording; tail.py, metadata.py and ending.py what it says there
+recorder.py        into the recording; metadata.py what it says of the run
 run_folder.py      runs that are going on, and who holds a device
 requests.py        what a run may be asked, over control_socket.py; client.py asks
 systemd.py         readiness and watchdog of a service

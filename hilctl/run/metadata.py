@@ -1,31 +1,41 @@
-"""What a recording says of its run before the first sample."""
+"""What a recording says of its run: before the first sample, and at its end.
+
+Commands that only finish what a dead run left import this too: they have no time for numba, which
+takes seconds.
+"""
 
 import hashlib
 import json
 import platform
 import sys
 import uuid
+from importlib.metadata import version
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import numba
 import numpy as np
 
 from hilctl import __version__
-from hilctl.experiment.check import Checked
+from hilctl.base.samples import COLUMNS
+from hilctl.loop.pacer import Lateness
+from hilctl.loop.plan import Outcome
 from hilctl.machine.diagnosis import machine_facts
-from hilctl.models.files import dump_model
+
+if TYPE_CHECKING:
+    from hilctl.experiment.check import Checked
 
 
-def run_facts(checked: Checked, started: str) -> dict[str, str]:
-    """Return identity, versions, device, rates and units, as text.
+def run_facts(checked: "Checked", started: str, model_yaml: str) -> dict[str, str]:
+    """Return identity, versions, device and units, as text; the layout says the rates.
 
     Args:
         checked: The experiment that runs.
         started: Scheduled time of sample 0, ISO 8601.
+        model_yaml: The compensator's model, or empty.
     """
     loaded = checked.loaded
     config, info = loaded.config, loaded.device.info
-    model_text = dump_model(loaded.model) if loaded.model else ""
+    recorded = [column.field(info.command_unit) for column in COLUMNS.values()]
     facts = {
         "run_id": str(uuid.uuid4()),
         "name": config.name,
@@ -34,34 +44,48 @@ def run_facts(checked: Checked, started: str) -> dict[str, str]:
         "hilctl": __version__,
         "python": sys.version.split()[0],
         "numpy": np.__version__,
-        "numba": numba.__version__,
+        "numba": version("numba"),
         "host": platform.node(),
         "kernel": f"{platform.system()} {platform.release()} {platform.machine()}",
         "device": info.name,
         "device_description": info.description,
         "buffered": str(info.buffered).lower(),
         "fifo_depth": str(info.fifo_depth),
-        "command_unit": info.command_unit,
-        "sample_rate_hz": repr(config.sample_rate_hz),
         "block": str(config.block),
-        "waveform_unit": str(config.waveform.unit),
         "waveform_samples": str(checked.forecast.samples),
         "compensator": getattr(loaded.model, "kind", "none"),
         "initial_state_run_id": checked.initial_state.run_id if checked.initial_state else "",
-        "experiment_sha256": hashlib.sha256(loaded.yaml_text.encode()).hexdigest(),
-        "model_sha256": hashlib.sha256(model_text.encode()).hexdigest() if model_text else "",
+        "experiment_sha256": _sha256(loaded.yaml_text),
+        "model_sha256": _sha256(model_yaml) if model_yaml else "",
         "limits": config.limits.model_dump_json(exclude_none=True),
         "safe_value": repr(config.safe.value),
-        "units": json.dumps(
-            {
-                "t_rel": "s",
-                "reference_um": "um",
-                "input_um": "um",
-                "displacement_um": "um",
-                "wanted_a, current_a, measured_a": "A",
-                "wanted_v, drive_v, measured_v": "V",
-            }
-        ),
+        "units": json.dumps({"t_rel": "s"} | {each.name: each.unit for each in recorded}),
     }
     facts |= machine_facts(config.realtime, Path(config.recording.folder))
     return facts | {f"device.{key}": value for key, value in info.details.items()}
+
+
+def _sha256(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def end_facts(outcome: Outcome, counters: Lateness, lost_events: int = 0) -> dict[str, str]:
+    """Return the loop's own account of a run's end and the exact counters, as text.
+
+    Args:
+        outcome: How the run ended.
+        counters: Its late ticks.
+        lost_events: Events that found no room on their way to the recorder.
+    """
+    return {
+        "code": outcome.code,
+        "reason": outcome.reason,
+        "output_safe": str(outcome.safe).lower(),
+        "late_ticks": str(counters.late_ticks),
+        "skipped_ticks": str(counters.skipped_ticks),
+        "worst_late_ns": str(counters.worst_ns),
+        "worst_late_tick": str(counters.worst_tick),
+        "longest_late_run": str(counters.longest_run),
+        "dropped_in_ring": str(outcome.dropped),
+        "lost_events": str(lost_events),
+    }

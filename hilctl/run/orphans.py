@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from hilctl.base.errors import HilctlError
-from hilctl.base.events import LoopEvent
+from hilctl.base.events import Event
 from hilctl.base.samples import Batch, Head
 from hilctl.loop.plan import Outcome
 from hilctl.recording.recover import recover_recording
-from hilctl.run.ending import end_facts
+from hilctl.run.metadata import end_facts
 from hilctl.run.ring import SampleRing
 from hilctl.run.run_folder import RunFolder, runs, taken_over
 from hilctl.run.shared_page import Field, Phase, Text
@@ -61,7 +61,7 @@ def _recover(run: RunFolder) -> Orphan:
 
 def _left_behind(
     run: RunFolder,
-) -> tuple[Outcome, list[Batch], list[LoopEvent], dict[str, str]]:
+) -> tuple[Outcome, list[Batch], list[Event], dict[str, str]]:
     """Return how the loop ended, blocks and events that are not safe yet, facts of the end."""
     died = Outcome("fault", "supervisor and loop died", 0, False, 0)
     try:

@@ -3,22 +3,25 @@
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+
 from hilctl.base.errors import InputError
-from hilctl.base.events import LoopEvent
-from hilctl.base.samples import Batch, Head
+from hilctl.base.events import Event
+from hilctl.base.samples import Batch, Head, Samples
 from hilctl.experiment.check import Checked
 from hilctl.experiment.correction import dump_correction
 from hilctl.models.files import dump_model
-from hilctl.recording.data import Event
+from hilctl.recording.messages import RecordingLayout
 from hilctl.recording.writer import OutputFile, RecordingWriter, RunFacts
 from hilctl.run.metadata import run_facts
-from hilctl.run.tail import Tail
 
 _SAMPLES_BEFORE = 50
+_SPARE = 20
 
 
 class Recorder:
@@ -42,7 +45,6 @@ class Recorder:
         self._flushed = 0
         self._checked = checked
         self._writer: RecordingWriter | None = None
-        self._start_unix_ns = 0
         self._unix_ns = steady_unix_ns()
         self._tail = Tail(_SAMPLES_BEFORE)
         try:
@@ -68,12 +70,10 @@ class Recorder:
         Raises:
             InputError: The file can't be written.
         """
-        self._start_unix_ns = start_unix_ns
         self._unix_ns = steady_unix_ns()
         try:
-            self._writer = RecordingWriter(
-                self._file.begin(), self._facts(start_unix_ns, set_up), start_unix_ns
-            )
+            facts = self._facts(start_unix_ns, set_up)
+            self._writer = RecordingWriter(self._file.begin(), facts)
         except OSError as error:
             raise self._unwritable(error) from None
 
@@ -87,13 +87,10 @@ class Recorder:
         self._tail.add(batch)
         self._write(partial(self._begun.batch, batch))
 
-    def event(self, event: LoopEvent) -> None:
-        """Write what the loop told."""
-        rate_hz = self._checked.loaded.config.sample_rate_hz
-        time_ns = self._start_unix_ns + round(event.sample * 1e9 / rate_hz)
-        before = self._tail.up_to(event.sample)
-        told = Event(time_ns, event.sample, event.level, event.code, event.text, before)
-        self._write(partial(self._begun.event, told))
+    def event(self, event: Event) -> None:
+        """Write an event of the loop, with the samples that led to it."""
+        led_there = replace(event, before=self._tail.up_to(event.sample))
+        self._write(partial(self._begun.event, led_there))
 
     def flush(self) -> None:
         """Hand all that was written to the kernel."""
@@ -111,7 +108,8 @@ class Recorder:
         self._next_sample = max(self._next_sample, ended_at)
         now_ns = self._unix_ns()
         level = "info" if end["code"] == "completed" else "error"
-        event = Event(now_ns, max(0, ended_at - 1), level, "run_ended", end["reason"])
+        last = max(0, ended_at - 1)
+        event = Event(last, level, "run_ended", end["reason"], time_ns=now_ns)
         self._write(partial(self._begun.event, event))
         self._write(partial(self._begun.finish, {**end, "ended": iso_time(now_ns)}, ended_at))
         if self.error:
@@ -150,18 +148,51 @@ class Recorder:
     def _facts(self, start_unix_ns: int, set_up: Mapping[str, str]) -> RunFacts:
         loaded = self._checked.loaded
         config, info = loaded.config, loaded.device.info
+        model_yaml = dump_model(loaded.model) if loaded.model else ""
         return RunFacts(
-            facts={**run_facts(self._checked, iso_time(start_unix_ns)), **set_up},
+            facts={**run_facts(self._checked, iso_time(start_unix_ns), model_yaml), **set_up},
             segments=self._checked.reference.segments,
             experiment_yaml=loaded.yaml_text,
-            model_yaml=dump_model(loaded.model) if loaded.model else "",
+            model_yaml=model_yaml,
             correction_yaml=dump_correction(loaded.correction) if loaded.correction else "",
-            sample_rate_hz=config.sample_rate_hz,
-            command_unit=info.command_unit,
-            measures_command=info.measures_command,
-            records_input=self._checked.records_input,
-            scope_rate_hz=config.recording.scope_rate_hz,
+            layout=RecordingLayout(
+                sample_rate_hz=config.sample_rate_hz,
+                command_unit=info.command_unit,
+                measures_command=info.measures_command,
+                scope_rate_hz=config.recording.scope_rate_hz,
+                start_unix_ns=start_unix_ns,
+                records_input=self._checked.records_input,
+                waveform_unit=self._checked.reference.unit,
+            ),
         )
+
+
+class Tail:
+    """Keeps at least the last samples, however they came.
+
+    Args:
+        samples: How many to record with an event.
+    """
+
+    def __init__(self, samples: int) -> None:
+        self._samples = samples
+        self._newest: Samples | None = None
+
+    def add(self, batch: Batch) -> None:
+        """Take the newest samples of a batch; more of them than are asked for, for late events."""
+        kept = _SPARE * self._samples
+        blocks = -(-kept // batch.flags.shape[1])
+        newest = batch.samples(slice(-blocks, None))
+        if self._newest is not None:
+            newest = self._newest.followed_by(newest)
+        self._newest = newest.rows(slice(-kept, None))
+
+    def up_to(self, sample: int) -> Samples | None:
+        """Return the last samples up to and with ``sample``; None where none is left."""
+        if self._newest is None:
+            return None
+        stop = int(np.searchsorted(self._newest.index, sample, side="right"))
+        return self._newest.rows(slice(max(0, stop - self._samples), stop)) if stop else None
 
 
 def steady_unix_ns() -> Callable[[], int]:

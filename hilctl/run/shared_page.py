@@ -12,7 +12,7 @@ from mmap import mmap
 import numpy as np
 
 from hilctl.base.arrays import F64, I64
-from hilctl.base.events import LoopEvent
+from hilctl.base.events import Event
 from hilctl.loop.pacer import Lateness
 from hilctl.loop.plan import Outcome
 
@@ -173,7 +173,7 @@ class SharedPage:
             return Outcome(**json.loads(self.read_text(Text.OUTCOME)))
         return None
 
-    def push_event(self, event: LoopEvent) -> None:
+    def push_event(self, event: Event) -> None:
         """Leave an event; where there is no room it is counted as lost."""
         head = self.get(Field.EVENT_HEAD)
         if head - self.get(Field.EVENT_TAIL) >= _EVENT_SLOTS:
@@ -185,14 +185,14 @@ class SharedPage:
         self._write(_EVENTS_AT + head % _EVENT_SLOTS * _EVENT_BYTES, _EVENT_BYTES, raw)
         self.put(Field.EVENT_HEAD, head + 1)
 
-    def pop_events(self) -> list[LoopEvent]:
+    def pop_events(self) -> list[Event]:
         """Take the events that came since; they keep their room until they are released."""
         head, found = self.get(Field.EVENT_HEAD), []
         first = max(self._event_tail, head - _EVENT_SLOTS)
         for number in range(first, head):
             raw = self._read(_EVENTS_AT + number % _EVENT_SLOTS * _EVENT_BYTES, _EVENT_BYTES)
             try:
-                found.append(LoopEvent(**json.loads(raw)))
+                found.append(Event(**json.loads(raw)))
             except (ValueError, TypeError):
                 self._integers[Field.EVENTS_LOST] += 1  # damaged
         self._event_tail = head

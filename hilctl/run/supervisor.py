@@ -21,8 +21,8 @@ from hilctl.loop.plan import Outcome
 from hilctl.machine.realtime import be_ordinary
 from hilctl.run.child import LoopChild
 from hilctl.run.control_socket import ControlServer
-from hilctl.run.ending import end_facts
 from hilctl.run.hang_watch import HangWatch
+from hilctl.run.metadata import end_facts
 from hilctl.run.recorder import Recorder
 from hilctl.run.requests import Requests
 from hilctl.run.result import Progress, RunResult

@@ -12,7 +12,7 @@ import numpy as np
 
 from hilctl.base.device import Clock
 from hilctl.base.errors import InputError
-from hilctl.base.events import LoopEvent
+from hilctl.base.events import Event
 from hilctl.base.samples import Batch
 from hilctl.experiment.check import Checked
 from hilctl.loop.block import Block
@@ -20,7 +20,7 @@ from hilctl.loop.host import Tuning
 from hilctl.loop.pacer import Lateness
 from hilctl.loop.plan import Outcome
 from hilctl.run.assemble import assemble
-from hilctl.run.ending import end_facts
+from hilctl.run.metadata import end_facts
 from hilctl.run.recorder import Recorder
 from hilctl.run.result import RunResult
 
@@ -61,7 +61,7 @@ class BatchHost:
         latency_blocks: int,
         *,
         on_batch: Callable[[Batch], None],
-        on_event: Callable[[LoopEvent], None] = lambda event: None,
+        on_event: Callable[[Event], None] = lambda event: None,
         stop: Callable[[], str] = lambda: "",
     ) -> None:
         self.clock: Clock = SampleClock()
@@ -107,7 +107,7 @@ class BatchHost:
         """Return no change: nobody asks for one."""
         return None
 
-    def record_event(self, event: LoopEvent) -> None:
+    def record_event(self, event: Event) -> None:
         """Pass an event on, after the blocks before it."""
         self.flush()
         self._on_event(event)

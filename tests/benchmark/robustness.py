@@ -16,14 +16,16 @@ from pathlib import Path
 
 import numpy as np
 
-from hilctl.analysis.report import SegmentReport, judge
+from hilctl.analysis.figures import SegmentReport
+from hilctl.analysis.report import judge
 from hilctl.base.errors import InputError
+from hilctl.base.samples import Samples
 from hilctl.experiment.load import LoadedExperiment, load_experiment
 from hilctl.loop.compensator import Compensator
 from hilctl.loop.limiter import Limiter
 from hilctl.models.base import HysteresisModel
 from hilctl.models.files import load_model
-from hilctl.recording.data import Recording, Samples, Ticks
+from hilctl.recording.data import Recording, Ticks
 from hilctl.waveforms.build import Reference, build
 
 CONFIGS = Path(__file__).parents[2] / "configs"
@@ -86,7 +88,16 @@ def drive(loaded: LoadedExperiment, model: HysteresisModel, reference: Reference
     return _recording(
         loaded,
         reference,
-        Samples(index, values, wanted, command, measured, displacement_um, flags, np.empty(0)),
+        Samples(
+            index=index,
+            reference_um=values,
+            wanted=wanted,
+            command=command,
+            displacement_um=displacement_um,
+            measured=measured,
+            input_um=values,
+            flags=flags,
+        ),
     )
 
 

@@ -11,8 +11,9 @@ import pytest
 from hilctl.analysis.html import page, write_html
 from hilctl.analysis.report import summarize
 from hilctl.base.errors import InputError
+from hilctl.base.events import Event
 from hilctl.base.segments import Segment
-from hilctl.recording.data import Event, Recording
+from hilctl.recording.data import Recording
 
 NASTY = """<script>alert("x")</script>&amp;<img src=x onerror='y'>"""
 
@@ -57,7 +58,7 @@ def recording(make_recording) -> Recording:
         ],
         run={"name": f"name {NASTY}", "device": f"simulated_{NASTY}"},
         end={"reason": f"reason {NASTY}"},
-        events=(Event(0, 17, "error", f"code {NASTY}", f"event {NASTY}"),),
+        events=(Event(17, "error", f"code {NASTY}", f"event {NASTY}"),),
         experiment_yaml=f"name: {NASTY}\n",
     )
     return replace(recording, model_yaml=f"model: {NASTY}\n", path=Path(f"{NASTY}.mcap"))
@@ -126,7 +127,7 @@ def test_cut_short_recording_has_a_page(recording: Recording) -> None:
 
 def test_only_the_last_events_are_listed(recording: Recording) -> None:
     """Thousands of warnings don't drown the page, and it says so."""
-    many = tuple(Event(0, k, "warning", "late", f"tick {k} was late") for k in range(1000))
+    many = tuple(Event(k, "warning", "late", f"tick {k} was late") for k in range(1000))
     text = Page(page(replace(recording, events=many), summarize(recording))).text
     assert "tick 999 was late" in text
     assert "tick 799 was late" not in text

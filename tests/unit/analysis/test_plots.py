@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from matplotlib.collections import FillBetweenPolyCollection
 
-from hilctl.analysis import canvas, loops, plots, traces
+from hilctl.analysis import canvas, loops, plots
 from hilctl.base.segments import Segment
 from hilctl.recording.data import Recording, Ticks
 
@@ -15,7 +15,7 @@ PERIOD = 1000.0
 
 @pytest.fixture
 def run(make_recording):
-    """Return a builder of runs with that many steady cycles and a ramp out."""
+    """Return a builder of runs with that many steady cycles and a safe ramp."""
 
     def make(cycles: int = 4, *, compensated: bool = True, lag: float = 0.1) -> Recording:
         n = int(PERIOD * cycles)
@@ -63,7 +63,7 @@ class TestTimeHistory:
         for figure in (plots.time_history(recording), plots.error(recording)):
             for axes in figure.axes:
                 for line in axes.get_lines():
-                    assert line.get_xdata().size <= traces.MAX_POINTS
+                    assert line.get_xdata().size <= canvas.MAX_POINTS
 
     def test_spike_stays_visible(self, run) -> None:
         """One odd reading in half a million is drawn."""
@@ -193,7 +193,7 @@ def test_png_of_every_figure_can_be_drawn(run) -> None:
 
 
 def test_pieces_cover_a_run_without_overlap(run) -> None:
-    """Segments, what lies between them and the ramp out: every sample in one piece."""
+    """Segments, what lies between them and the safe ramp: every sample in one piece."""
     parts = (Segment("b", 2000, 3000, 2000, 3000, 10.0), Segment("a", 500, 1500, 500, 1500, 20.0))
     found = canvas.pieces(replace(run(), segments=parts))
     assert found == [

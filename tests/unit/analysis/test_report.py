@@ -1,14 +1,13 @@
 """From recordings to figures: what is judged, what is None, what counts as what."""
 
-import io
 import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from rich.console import Console
 
-from hilctl.analysis.report import RunReport, render, summarize, worst_segment
+from hilctl.analysis.figures import RunReport
+from hilctl.analysis.report import summarize, worst_segment
 from hilctl.base.arrays import F64
 from hilctl.base.errors import DataError
 from hilctl.base.samples import Flag
@@ -100,19 +99,8 @@ class TestSteadyPeriodicRun:
         keep = np.ones(8000, dtype=bool)
         for cycle in range(1, 8):
             keep[1000 * cycle + 90 * cycle : 1000 * cycle + 90 * cycle + 150] = False
-        index = np.flatnonzero(keep).astype(np.int64)
         recording = lagging(cycles=8)
-        samples = whole.samples
-        kept = replace(
-            samples,
-            index=index,
-            reference_um=samples.reference_um[keep],
-            wanted=samples.wanted[keep],
-            command=samples.command[keep],
-            displacement_um=samples.displacement_um[keep],
-            flags=samples.flags[keep],
-        )
-        report = summarize(replace(recording, samples=kept, dropped=1050))
+        report = summarize(replace(recording, samples=whole.samples.rows(keep), dropped=1050))
         check_loop(report)
         assert report.dropped == 1050
         assert report.steady_samples == 7000 - 1050
@@ -318,7 +306,7 @@ class TestWholeRun:
             summarize(lagging(end={"late_ticks": "many"}))
 
     def test_limited_samples_are_those_of_the_waveform(self, lagging) -> None:
-        """Range, slew and invalid count once a sample; the ramp out does not count."""
+        """Range, slew and invalid count once a sample; the safe ramp does not count."""
         recording = lagging(ramp=100)
         recording.samples.flags[10] |= (Flag.RANGE_LIMITED | Flag.SLEW_LIMITED).value
         recording.samples.flags[11] |= Flag.INVALID.value
@@ -335,54 +323,3 @@ class TestWholeRun:
         assert mapping["command_max"] == 0.0
         assert mapping["segments"][0]["label"] == "sine"
         assert mapping["peak_hysteresis_percent"] == report.peak_hysteresis_percent
-
-
-class TestTable:
-    def text(self, report: RunReport) -> str:
-        """Return what a terminal of 120 columns shows."""
-        console = Console(width=120, file=io.StringIO(), record=True)
-        console.print(render(report))
-        return console.export_text()
-
-    def test_floor_stands_beside_the_hysteresis(self, lagging) -> None:
-        """The figure that noise can fake is never shown without its floor."""
-        recording = lagging()
-        recording.samples.displacement_um[:] += np.random.default_rng(2).normal(0.0, 0.03, 5000)
-        report = summarize(recording)
-        line = next(t for t in self.text(report).splitlines() if "peak hysteresis" in t)
-        assert f"{report.peak_hysteresis_percent:.4g} %" in line
-        assert f"noise floor {report.noise_floor_percent:.4g} %" in line
-
-    def test_simulation_is_told(self, lagging) -> None:
-        """A simulated device is called so, a real one is not."""
-        simulated = lagging(run={"name": "x", "device": "simulated_terfenol"})
-        assert "no hardware was driven" in self.text(summarize(simulated))
-        assert "no hardware was driven" not in self.text(summarize(lagging()))
-
-    def test_names_are_not_markup(self, lagging) -> None:
-        """Square brackets in names and labels are shown as they are."""
-        parts = [segment(0, 2000, 1000.0, "[red]a[/red]"), segment(2000, 3000, 1000.0, "[b]")]
-        run = {"name": "[bold]name", "device": "[dac]"}
-        text = self.text(summarize(lagging(run=run, segments=parts)))
-        for shown in ("[bold]name", "[dac]", "[red]a[/red]", "[b]"):
-            assert shown in text
-
-    def test_uncompensated_run_shows_no_errors(self, make_recording) -> None:
-        """Rows that can't have a value in such a run are left out."""
-        recording = make_recording(wave(1000.0, 3), segments=[segment(0, 3000, 1000.0)])
-        text = self.text(summarize(recording))
-        assert "error" not in text
-        assert "nothing compensated" in text
-
-    def test_segments_have_a_table_without_empty_columns(self, make_recording) -> None:
-        """Several segments are listed; columns that no segment fills are left out."""
-        parts = [segment(0, 3000, 1000.0, "first"), segment(3000, 3000, 1000.0, "second")]
-        recording = make_recording(wave(1000.0, 6, LAG), command=wave(1000.0, 6), segments=parts)
-        text = self.text(summarize(recording))
-        for shown in ("first", "second", "peak hyst. %"):
-            assert shown in text
-        assert "err. %" not in text
-
-    def test_incomplete_run_is_told(self, lagging) -> None:
-        """A run cut short can't be taken for a whole one."""
-        assert "NOT complete" in self.text(summarize(replace(lagging(), end={})))

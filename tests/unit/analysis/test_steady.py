@@ -1,14 +1,16 @@
 """Which part of a run is judged whose reference was moved while it went on."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from hilctl.analysis.report import summarize
 from hilctl.analysis.steady import steady_part
+from hilctl.base.events import TUNED, Event
 from hilctl.base.segments import Segment
-from hilctl.loop.plan import Tuning
-from hilctl.loop.tuning import TUNED, Tuner, tuning_text
-from hilctl.recording.data import Event
+from hilctl.loop.host import Tuning
+from hilctl.loop.tuning import Tuner
 
 PERIOD = 100
 CYCLES = 20
@@ -19,7 +21,8 @@ SAMPLES = PERIOD * CYCLES
 def tuned(at: int, gain: float, over: int) -> tuple[Event, Tuning]:
     """Return a change of the gain, as it is recorded and as the loop is told of it."""
     change = Tuning(gain, 0.0, over)
-    return Event(0, at, "info", TUNED, tuning_text(change)), change
+    values = {"gain": gain, "offset": 0.0, "samples": float(over)}
+    return Event(at, "info", TUNED, "gain changed", values), change
 
 
 @pytest.fixture
@@ -33,7 +36,8 @@ def run(make_recording):
         for k in range(SAMPLES):
             if k in due:
                 tuner.move(due[k])
-            tuner.apply(plain[k : k + 1], reference_um[k : k + 1])
+            gain, offset = tuner.advance(1) or (1.0, 0.0)
+            reference_um[k : k + 1] = gain * plain[k : k + 1] + offset
         displacement_um = np.concatenate([np.zeros(LAG), reference_um[:-LAG]])
         whole = [Segment("sine", 0, SAMPLES, 0, SAMPLES, PERIOD)]
         return make_recording(
@@ -69,6 +73,13 @@ def test_change_that_goes_on_to_the_end_leaves_nothing_to_judge(run):
     part = steady_part(recording, recording.segments[0])
     assert (part.samples.index.size, part.cycles, part.cycle) == (0, 0, None)
     assert summarize(recording).peak_hysteresis_percent is None
+
+
+def test_change_of_unknown_length_leaves_nothing_to_judge(run):
+    """A recording of an older version has the length in the event's text only."""
+    event, change = tuned(300, 0.3, 100)
+    recording = run((replace(event, values={}), change))
+    assert steady_part(recording, recording.segments[0]).cycles == 0
 
 
 def test_segments_before_a_change_are_judged_as_ever(run):

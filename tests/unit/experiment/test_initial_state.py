@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from hilctl.base.errors import DataError
-from hilctl.base.samples import Batch, Head
+from hilctl.base.samples import COLUMNS, Batch, Head
 from hilctl.experiment.initial_state import InitialState, initial_state_after
 from hilctl.models.published import exponential_integrated, piezo_ppi
 from hilctl.models.staged import FieldLag, StagedModel
+from hilctl.recording.messages import RecordingLayout
 from hilctl.recording.writer import RecordingWriter, RunFacts
 
 RATE_HZ = 10_000.0
@@ -31,15 +32,17 @@ def record(path: Path, command, *, first=0, whole=True) -> Path:
     batch.heads[:, Head.FIRST_SAMPLE] = first + BLOCK * np.arange(blocks)
     batch.heads[:, Head.SAMPLES] = BLOCK
     batch.heads[0, Head.DROPPED_BEFORE] = first
-    batch.columns[:, 2] = command.reshape(blocks, BLOCK)
+    batch.columns[:, list(COLUMNS).index("command")] = command.reshape(blocks, BLOCK)
     facts = RunFacts(
-        facts={"run_id": "before", "sample_rate_hz": repr(RATE_HZ), "command_unit": "A",
-               "compensator": "none"},
-        segments=(), experiment_yaml="name: made\n", model_yaml="", sample_rate_hz=RATE_HZ,
-        command_unit="A", measures_command=False, scope_rate_hz=1000.0,
+        facts={"run_id": "before", "compensator": "none"},
+        segments=(), experiment_yaml="name: made\n", model_yaml="",
+        layout=RecordingLayout(
+            sample_rate_hz=RATE_HZ, command_unit="A", measures_command=False,
+            scope_rate_hz=1000.0, start_unix_ns=1_700_000_000_000_000_000,
+        ),
     )  # fmt: skip
     with path.open("xb") as stream:
-        writer = RecordingWriter(stream, facts, 1_700_000_000_000_000_000)
+        writer = RecordingWriter(stream, facts)
         writer.batch(batch)
         if whole:
             writer.finish({"code": "completed"}, first + command.size)

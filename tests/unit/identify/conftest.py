@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 
 from hilctl.base.arrays import F64, I64
+from hilctl.base.samples import Samples
 from hilctl.base.segments import Segment
 from hilctl.identify.cycles import average_cycle
 from hilctl.identify.data import Loop
 from hilctl.models.plays import PlayModel
-from hilctl.recording.data import Recording, Samples, Ticks
+from hilctl.recording.data import Recording, Ticks
 
 RATE_HZ = 50_000.0
 
@@ -63,8 +64,8 @@ def recording_of() -> Callable[..., Recording]:
             reference_um=np.full(n, np.nan),
             wanted=command,
             command=command,
-            measured=np.zeros(0),
             displacement_um=displacement_um,
+            input_um=np.full(n, np.nan),
             flags=np.zeros(n, dtype=np.uint32),
         )
         return Recording(

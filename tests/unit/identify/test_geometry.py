@@ -1,13 +1,11 @@
-"""Loop figures against shapes whose figures are known."""
-
-from dataclasses import replace
+"""Weights of loops against shapes whose peak hysteresis is known."""
 
 import numpy as np
 import pytest
 
 from hilctl.base.errors import DataError
 from hilctl.identify.data import History, Loop
-from hilctl.identify.geometry import hysteresis_weights, loop_area, peak_hysteresis_percent
+from hilctl.identify.geometry import hysteresis_weights
 
 TURN = 2.0 * np.pi * np.arange(400) / 400
 
@@ -19,31 +17,12 @@ def ellipse(lag: float, *, frequency_hz: float = 1.0, amplitude: float = 2.0) ->
     )
 
 
-@pytest.mark.parametrize("lag", [0.1, 0.5, -0.5])
-def test_area_of_an_ellipse(lag: float) -> None:
-    """The area is pi times both amplitudes times the sine of the lag, whichever way it turns."""
-    loop = ellipse(lag)
-    expected = np.pi * 2.0 * 10.0 * abs(np.sin(lag))
-    assert loop_area(loop.command, loop.displacement_um) == pytest.approx(expected, rel=1e-3)
-
-
-@pytest.mark.parametrize("start", [0, 37, 399])
-def test_peak_hysteresis_of_an_ellipse(start: int) -> None:
-    """The widest place of an ellipse is 2 y sin(lag), wherever the cycle was cut."""
-    loop = ellipse(0.3)
-    turned = replace(
-        loop,
-        command=np.roll(loop.command, start),
-        displacement_um=np.roll(loop.displacement_um, start),
-    )
-    assert peak_hysteresis_percent(turned) == pytest.approx(100.0 * np.sin(0.3), rel=2e-3)
-
-
-def test_peak_hysteresis_needs_two_branches() -> None:
-    """A command with minor loops has more than two branches and is refused."""
-    loop = Loop("two tones", np.sin(TURN) + np.sin(3.0 * TURN), np.sin(TURN), 1.0)
-    with pytest.raises(DataError, match=r"two tones: .* one maximum and one minimum"):
-        peak_hysteresis_percent(loop)
+def test_loops_with_minor_loops_have_a_weight() -> None:
+    """All pairs of branches count, so a command of two tones is weighted like any other."""
+    command = np.sin(TURN) + 0.5 * np.sin(3.0 * TURN)
+    lagging = np.roll(command, 10)
+    slow, fast = Loop("slow", command, lagging, 1.0), Loop("fast", command, command, 2.0)
+    np.testing.assert_allclose(hysteresis_weights([slow, fast]), [1.0, 0.0], atol=1e-12)
 
 
 def test_weights_are_relative_to_the_slowest_and_largest() -> None:

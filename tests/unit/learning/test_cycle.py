@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from hilctl.base.errors import DataError
+from hilctl.base.samples import Samples
 from hilctl.base.segments import Segment
 from hilctl.learning.cycle import coefficients, cycle_error, harmonic_count
-from hilctl.recording.data import Recording, Samples, Ticks
+from hilctl.recording.data import Recording, Ticks
 
 RATE_HZ = 10_000.0
 
@@ -24,7 +25,13 @@ def recording(period, cycles, error_um, noise_um=0.0, delay=0.0, seed=1) -> Reco
     moved = 10.0 * np.sin(turns - 2.0 * np.pi * delay / period) + error_um(turns) + noise
     nothing = np.zeros(n)
     samples = Samples(
-        index, wanted, nothing, nothing, np.empty(0), moved, nothing.astype(np.uint32)
+        index=index,
+        reference_um=wanted,
+        wanted=nothing,
+        command=nothing,
+        displacement_um=moved,
+        input_um=wanted,
+        flags=nothing.astype(np.uint32),
     )
     none = np.empty(0, dtype=np.int64)
     return Recording(
@@ -86,17 +93,7 @@ def test_missing_samples_do_no_harm():
     made = recording(100.0, 8, lambda t: 0.2 * np.cos(4.0 * t))
     keep = np.ones(made.samples.index.size, dtype=bool)
     keep[330:360] = False
-    samples = made.samples
-    cut = replace(
-        made,
-        samples=Samples(*(
-            column[keep] if column.size else column
-            for column in (
-                samples.index, samples.reference_um, samples.wanted, samples.command,
-                samples.measured, samples.displacement_um, samples.flags,
-            )
-        )),
-    )  # fmt: skip
+    cut = replace(made, samples=made.samples.rows(keep))
     error = cycle_error(cut, cut.segments[0], 5000.0)
     assert abs(error.harmonics_um[4]) == pytest.approx(0.1, rel=1e-3)
 

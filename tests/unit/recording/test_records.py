@@ -8,8 +8,14 @@ from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Chunk, Header, Message, Metadata, Schema
 
-from hilctl.recording.records import contents, inflate, parse
-from hilctl.recording.torn import next_likely, own_channels, take_chunk
+from hilctl.recording.records import (
+    contents,
+    inflate,
+    next_likely,
+    own_channels,
+    parse,
+    take_chunk,
+)
 
 RECORDS = [
     (Opcode.HEADER, Header("", "hilctl 1")),
@@ -123,7 +129,7 @@ def test_unknown_compression_gives_nothing():
 
 def test_a_likely_record_is_found_across_windows(monkeypatch):
     """The search goes on from window to window without missing one on the border."""
-    import hilctl.recording.torn as module
+    import hilctl.recording.records as module
 
     monkeypatch.setattr(module, "_WINDOW_BYTES", 100)
     record = raw(Metadata("hilctl.end", {"code": "completed"}))

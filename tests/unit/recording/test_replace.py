@@ -4,6 +4,7 @@ import io
 import logging
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,8 @@ from mcap.reader import make_reader
 
 from hilctl.analysis.replay import replay
 from hilctl.base.errors import DataError, InputError
+from hilctl.base.events import Event
+from hilctl.base.samples import COLUMNS, Head
 from hilctl.recording.reader import read
 from hilctl.recording.recover import recover_recording
 from hilctl.recording.writer import OutputFile
@@ -141,8 +144,8 @@ def test_torn_and_recovered_read_alike(torn):
     before = read(torn)
     recover_recording(torn)
     after = read(torn)
-    for name in ("index", "command", "displacement_um", "flags"):
-        assert np.array_equal(getattr(before.samples, name), getattr(after.samples, name))
+    for name in ("index", *COLUMNS, "flags"):
+        assert np.array_equal(getattr(before.samples, name), getattr(after.samples, name)), name
     assert np.array_equal(before.ticks.late_ns, after.ticks.late_ns)
     assert [each.sample for each in before.starts] == [each.sample for each in after.starts]
     assert (before.end, after.end["code"]) == ({}, "recovered")
@@ -183,20 +186,24 @@ def test_absent_and_other_files_are_refused(tmp_path):
     assert state(tmp_path).keys() == {"x.mcap"}
 
 
-def test_ring_batches_fill_the_end(torn, batches):
+def test_ring_batches_fill_the_end(torn, batches, make):
     """Blocks that the file lacks are added, those it has are left out, bit for bit."""
-    recovered = recover_recording(torn, batches[2:], {"code": "fault", "reason": "killed"})
+    killed = {"code": "fault", "reason": "killed"}
+    tuned = Event(3100, "info", "tuned", "gain to 2", {"samples": 20.0})
+    recovered = recover_recording(torn, batches[2:], killed, events=[tuned])
     assert (recovered.samples, recovered.added_samples) == (5000, 2000)
     assert recovered.missing_samples == 0
     back = read(torn)
     assert back.samples.index.tolist() == list(range(5000))
-    expected = np.concatenate([b.columns.transpose(1, 0, 2).reshape(6, -1) for b in batches], 1)
-    assert np.array_equal(back.samples.measured, expected[4])
-    assert np.array_equal(back.samples.input_um, expected[5])
-    assert np.array_equal(back.samples.flags, np.concatenate([b.flags.ravel() for b in batches]))
-    assert back.ticks.late_ns.tolist() == np.concatenate([b.heads[:, 5] for b in batches]).tolist()
+    for name, values in make.samples(batches).columns().items():
+        assert np.array_equal(back.samples.columns()[name], values), name
+    assert np.array_equal(back.samples.flags, make.samples(batches).flags)
+    late_ns = np.concatenate([b.heads[:, Head.LATE_NS] for b in batches])
+    assert back.ticks.late_ns.tolist() == late_ns.tolist()
     assert (back.end["code"], back.end["reason"]) == ("fault", "killed")
     assert [start.sample for start in back.starts] == [0]
+    due_ns = make.start_ns + 3100 * 20_000
+    assert back.events[-2] == replace(tuned, time_ns=due_ns)
     assert "2000 samples added from the ring" in back.events[-1].text
     with torn.open("rb") as stream:
         numbers = {}

@@ -6,7 +6,7 @@ from mmap import mmap
 
 import pytest
 
-from hilctl.base.events import LoopEvent
+from hilctl.base.events import Event
 from hilctl.loop.pacer import Lateness
 from hilctl.loop.plan import Outcome
 from hilctl.run.shared_page import SIZE, Field, Phase, SharedPage, Stop, Text
@@ -42,15 +42,15 @@ def test_events_come_once_and_are_cut_to_what_fits(sides):
     """Events keep their order; too many are counted as lost, and long ones are shortened."""
     one, other = sides
     for sample in range(40):
-        one.push_event(LoopEvent(sample, "error", "test", "ü" * 1000, {"number": 0.5}))
+        one.push_event(Event(sample, "error", "test", "ü" * 1000, {"number": 0.5}))
     events = other.pop_events()
     assert [event.sample for event in events] == list(range(32))
     assert set(events[0].text) == {"ü"}
     assert events[0].values == {"number": 0.5}
     assert one.get(Field.EVENTS_LOST) == 8
-    one.push_event(LoopEvent(41, "info", "test", "no room yet"))
+    one.push_event(Event(41, "info", "test", "no room yet"))
     other.release_events()
-    one.push_event(LoopEvent(42, "info", "test", "room"))
+    one.push_event(Event(42, "info", "test", "room"))
     assert [event.sample for event in other.pop_events()] == [42]
 
 

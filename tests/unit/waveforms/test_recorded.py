@@ -8,7 +8,8 @@ import pytest
 
 from hilctl.base.arrays import F64
 from hilctl.base.errors import DataError, InputError
-from hilctl.base.samples import Batch
+from hilctl.base.samples import COLUMNS, Batch, Head
+from hilctl.recording.messages import RecordingLayout
 from hilctl.recording.writer import RecordingWriter, RunFacts
 from hilctl.waveforms.build import Reference
 
@@ -24,28 +25,33 @@ def column(k: int) -> F64:
 
 def record(path: Path, firsts: list[int], columns: F64) -> None:
     blocks = len(firsts)
-    heads = np.zeros((blocks, 7), dtype=np.int64)
-    heads[:, 1] = firsts
-    heads[:, 2] = BLOCK
-    heads[1:, 3] = np.diff(firsts) - BLOCK
+    heads = np.zeros((blocks, len(Head)), dtype=np.int64)
+    heads[:, Head.FIRST_SAMPLE] = firsts
+    heads[:, Head.SAMPLES] = BLOCK
+    heads[1:, Head.DROPPED_BEFORE] = np.diff(firsts) - BLOCK
     batch = Batch(
         heads=heads,
         states=np.zeros((blocks, 1)),
-        columns=np.ascontiguousarray(columns.reshape(6, blocks, BLOCK).transpose(1, 0, 2)),
+        columns=np.ascontiguousarray(
+            columns.reshape(len(COLUMNS), blocks, BLOCK).transpose(1, 0, 2)
+        ),
         flags=np.zeros((blocks, BLOCK), dtype=np.uint32),
     )
     facts = RunFacts(
-        facts={"sample_rate_hz": repr(RATE_HZ), "command_unit": "A", "compensator": "none"},
+        facts={"compensator": "none"},
         segments=(),
         experiment_yaml="name: made\n",
         model_yaml="",
-        sample_rate_hz=RATE_HZ,
-        command_unit="A",
-        measures_command=True,
-        scope_rate_hz=1000.0,
+        layout=RecordingLayout(
+            sample_rate_hz=RATE_HZ,
+            command_unit="A",
+            measures_command=True,
+            scope_rate_hz=1000.0,
+            start_unix_ns=1_700_000_000_000_000_000,
+        ),
     )
     with path.open("xb") as stream:
-        writer = RecordingWriter(stream, facts, 1_700_000_000_000_000_000)
+        writer = RecordingWriter(stream, facts)
         writer.batch(batch)
         writer.finish({"code": "completed"}, writer.samples)
 
@@ -54,7 +60,7 @@ def record(path: Path, firsts: list[int], columns: F64) -> None:
 def recording(tmp_path: Path) -> Path:
     """A recording of 100 samples at 1 kHz."""
     path = tmp_path / "run.mcap"
-    record(path, [0, 20, 40, 60, 80], np.array([column(k) for k in range(6)]))
+    record(path, [0, 20, 40, 60, 80], np.array([column(k) for k in range(len(COLUMNS))]))
     return path
 
 
@@ -92,7 +98,7 @@ def test_column_is_needed(made: Made, recording: Path) -> None:
 
 def test_not_a_number(made: Made, tmp_path: Path) -> None:
     """A recorded value that is not a number is refused with its row."""
-    columns = np.array([column(k) for k in range(6)])
+    columns = np.array([column(k) for k in range(len(COLUMNS))])
     columns[0, 30:] = np.nan
     record(tmp_path / "run.mcap", [0, 20, 40, 60, 80], columns)
     keys = {"kind": "file", "path": "run.mcap", "column": "reference_um"}
@@ -105,7 +111,7 @@ def test_not_a_number(made: Made, tmp_path: Path) -> None:
 
 def test_gap(made: Made, tmp_path: Path) -> None:
     """A recording that lacks samples is refused: closing the gap would make a step."""
-    columns = np.array([column(k) for k in range(6)])
+    columns = np.array([column(k) for k in range(len(COLUMNS))])
     record(tmp_path / "run.mcap", [0, 20, 60, 80, 100], columns)
     with pytest.raises(InputError, match="samples are missing in it"):
         made(RATE_HZ, tmp_path, kind="file", path="run.mcap", column="command")

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from hilctl.base.arrays import F64, I64, U32
-from hilctl.base.samples import Flag
+from hilctl.base.events import Event
+from hilctl.base.samples import Flag, Samples
 from hilctl.base.segments import Segment
-from hilctl.recording.data import Event, Recording, Samples, Ticks
+from hilctl.recording.data import Recording, Ticks
 
 MakeRecording = Callable[..., Recording]
 
@@ -52,8 +53,8 @@ def make_recording() -> MakeRecording:
             reference_um=wanted_um,
             wanted=put_out,
             command=put_out,
-            measured=np.empty(0),
             displacement_um=displacement_um,
+            input_um=wanted_um,
             flags=flags,
         )
         return Recording(

@@ -1,0 +1,58 @@
+"""The table of a sample's columns, and what is made from it."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from hilctl.base.samples import ANSWERS, COLUMNS, RECORDED_FIELDS, Batch, Head, Samples
+
+BLOCK = 5
+
+
+def batch(blocks: int) -> Batch:
+    """Return blocks of random numbers that follow one another."""
+    made = Batch.empty(blocks, BLOCK, 1)
+    rng = np.random.default_rng(1)
+    made.heads[:, Head.FIRST_SAMPLE] = 100 + BLOCK * np.arange(blocks)
+    made.columns[:] = rng.normal(size=made.columns.shape)
+    made.flags[:] = rng.integers(0, 1000, made.flags.shape)
+    return made
+
+
+def same(found: Samples, expected: Samples) -> bool:
+    """Return whether every array is the same."""
+    return all(
+        np.array_equal(getattr(found, name), getattr(expected, name))
+        for name in ("index", "flags", *COLUMNS)
+    )
+
+
+def test_no_field_and_no_number_stands_for_two_columns() -> None:
+    """Within a message every number is one column's in one unit."""
+    assert len({each.name for each in RECORDED_FIELDS}) == len(RECORDED_FIELDS)
+    for message in ("block", "before", "scope"):
+        numbers = [number for each in RECORDED_FIELDS if (number := getattr(each, message))]
+        assert len(set(numbers)) == len(numbers)
+
+
+def test_rows_of_a_block_are_the_columns_in_order() -> None:
+    """Blocks become samples one after the other, each row under its column's name."""
+    made = batch(3)
+    samples = made.samples(slice(1, None))
+    assert samples.index.tolist() == list(range(105, 115))
+    for row, name in enumerate(COLUMNS):
+        assert getattr(samples, name).tolist() == made.columns[1:, row].ravel().tolist()
+    assert samples.flags.tolist() == made.flags[1:].ravel().tolist()
+    assert [list(COLUMNS)[row] for row in ANSWERS] == ["displacement_um", "measured"]
+
+
+def test_rows_are_chosen_of_every_column() -> None:
+    """By slice, by mask or by sample index; a column that is not there stays away."""
+    samples = batch(3).samples()
+    odd = samples.index % 2 == 1
+    for name, values in samples.rows(odd).columns().items():
+        assert values.tolist() == samples.columns()[name][odd].tolist()
+    assert same(samples.part(103, 109), samples.rows(slice(3, 9)))
+    assert same(samples.rows(slice(0, 4)).followed_by(samples.rows(slice(4, None))), samples)
+    unmeasured = replace(samples, measured=np.empty(0)).rows(odd)
+    assert (unmeasured.measured.size, unmeasured.command.size) == (0, 7)
