@@ -92,7 +92,7 @@ def stop(
     wait_s: Annotated[float, typer.Option("--wait", help="Longest wait for its end, s.")] = 60.0,
     as_json: AsJson = False,
 ) -> None:
-    """End a run by its way out: ramp to the safe value, close, record why."""
+    """End a run by its safe ramp, close, and record why."""
     from hilctl.run.client import find_run, stop_run
 
     chosen = find_run(name)

@@ -1,6 +1,6 @@
 """The host watchdog of an emulated device, driven by the registers that the profile names."""
 
-from hilctl_drivers.emulator.memory import Words
+from hilctl_drivers.emulator.registers import Words
 from hilctl_drivers.modbus.profile import ModbusWatchdog
 from hilctl_drivers.modbus.steps import EnsureStep, ModbusStep, WriteStep
 

@@ -1,15 +1,12 @@
 """An emulated Modbus device: a profile's registers in front of the simulated rig."""
 
 from collections.abc import Sequence
+from typing import Protocol
 
 from hilctl.base.errors import InputError
-from hilctl_drivers.emulator.memory import NoSuchRegister, Words
-from hilctl_drivers.emulator.overlay import Overlay
-from hilctl_drivers.emulator.register_map import RegisterMap
-from hilctl_drivers.emulator.rig import Rig
+from hilctl_drivers.emulator.registers import NoSuchRegister, RegisterMap, Words
+from hilctl_drivers.emulator.rig import Rig, Wiring, WriteLog
 from hilctl_drivers.emulator.watchdog import HostWatchdog
-from hilctl_drivers.emulator.wiring import Wiring
-from hilctl_drivers.emulator.write_log import WriteLog
 from hilctl_drivers.modbus.profile import ModbusProfile
 from hilctl_drivers.modbus.steps import ModbusStep, RegisterStep
 
@@ -24,6 +21,30 @@ class Declined(Exception):  # noqa: N818  a reply, not a mistake
     def __init__(self, code: int) -> None:
         super().__init__(f"exception {code}")
         self.code = code
+
+
+class Overlay(Protocol):
+    """Registers that do more than hold a value: buffers, switches, a clock."""
+
+    def has(self, address: int) -> bool:
+        """Return whether a request that begins at this address is for it, just now."""
+        ...
+
+    def read(self, address: int, count: int) -> list[int]:
+        """Return register words; raise ``Declined`` where they can't be read."""
+        ...
+
+    def write(self, address: int, values: Sequence[int]) -> None:
+        """Write register words; raise ``Declined`` where they can't be written."""
+        ...
+
+    def tick(self, now_ns: int) -> None:
+        """Let time pass."""
+        ...
+
+    def stop(self, now_ns: int) -> None:
+        """Leave the outputs alone from now on."""
+        ...
 
 
 def _check_channels(profile: ModbusProfile, output: str | None, sensor: str | None) -> None:

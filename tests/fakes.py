@@ -1,17 +1,17 @@
-"""A link to an emulated Modbus device in the same process, in a time that the caller makes pass.
+"""Test doubles that several tests share.
 
-Nothing waits for anything: a second of streaming takes as long as its samples take to work out.
+A link to an emulated Modbus device in the same process, in a time that the caller makes pass:
+nothing waits for anything, a second of streaming takes as long as its samples take to work out.
 """
 
 from dataclasses import dataclass
 from pathlib import Path
 
 from hilctl.base.errors import InputError
-from hilctl_drivers.emulator.emulated import EmulatedDevice
-from hilctl_drivers.emulator.labjack_attach import attach_stream
+from hilctl_drivers.emulator.labjack_stream import attach_stream
+from hilctl_drivers.emulator.modbus_device import EmulatedDevice
 from hilctl_drivers.emulator.modbus_wire import ModbusWire
-from hilctl_drivers.emulator.rig import Rig
-from hilctl_drivers.emulator.write_log import WriteLog
+from hilctl_drivers.emulator.rig import Rig, WriteLog
 from hilctl_drivers.modbus.profile import ModbusProfile
 from hilctl_drivers.profile import load_profile
 from hilctl_drivers.wire.links import LostError, Missing, NoAnswerError
@@ -69,9 +69,12 @@ class InProcessLink:
             raise LostError("not connected")
         self._time.sleep(self._message_s)
         self.requests.append(bytes(request))
-        used, asked = self._wire.take(bytes(request))
-        reply = self.spoil(self._wire.answer(asked, self._time.now_ns)) if asked else b""
-        if used != len(request) or missing(bytearray(reply)):
+        unread, reply = bytearray(request), b""
+        for asked in self._wire.requests(unread):
+            answer = self._wire.answer(asked, self._time.now_ns)
+            reply += b"" if answer is None else self._wire.encode(answer.data)
+        reply = self.spoil(reply)
+        if unread or missing(bytearray(reply)):
             self.close()
             raise NoAnswerError(f"only {len(reply)} bytes" if reply else "no answer")
         return reply
