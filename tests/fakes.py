@@ -9,7 +9,7 @@ from pathlib import Path
 
 from hilctl.base.errors import InputError
 from hilctl_drivers.emulator.labjack_stream import attach_stream
-from hilctl_drivers.emulator.modbus_device import EmulatedDevice
+from hilctl_drivers.emulator.modbus_device import EmulatedModbus
 from hilctl_drivers.emulator.modbus_wire import ModbusWire
 from hilctl_drivers.emulator.rig import Rig, WriteLog
 from hilctl_drivers.modbus.profile import ModbusProfile
@@ -100,7 +100,7 @@ class InProcess:
         log: What it writes; close it at the end.
     """
 
-    device: EmulatedDevice
+    device: EmulatedModbus
     rig: Rig
     link: InProcessLink
     time: VirtualTime
@@ -134,6 +134,6 @@ class InProcess:
         output, sensor = next(iter(loaded.outputs)), next(iter(loaded.inputs))
         time = VirtualTime()
         rig, writes = Rig(time.now_ns, noise=noise), WriteLog(log, 0)
-        device = EmulatedDevice(loaded, rig, writes, output, sensor)
+        device = EmulatedModbus(loaded, rig, writes, output, sensor)
         attach_stream(device, rig, writes, output, sensor, noise=noise)
         return cls(device, rig, link(ModbusWire("tcp", device), time, message_s), time, writes)

@@ -23,8 +23,8 @@ def doctor(
     as_json: AsJson = False,
 ) -> None:
     """Say what keeps this machine from real time, and measure whether it keeps a rate."""
-    from hilctl.cli.console import measuring, print_rich
-    from hilctl.cli.machine_view import render
+    from hilctl.cli.console import print_rich
+    from hilctl.cli.machine_view import measuring, render
     from hilctl.experiment.load import load_experiment
     from hilctl.machine.diagnosis import DEFAULT_RATE_HZ, diagnose
     from hilctl.machine.settings import Realtime
@@ -66,7 +66,7 @@ def devices(context: typer.Context, as_json: AsJson = False) -> None:
     """List devices, shipped profiles and the serial ports of this machine; nothing is opened."""
     if context.invoked_subcommand is not None:
         return
-    from hilctl.cli.console import print_inventory
+    from hilctl.cli.machine_view import print_inventory
     from hilctl.experiment.inventory import inventory
 
     found = inventory()
@@ -79,7 +79,7 @@ def devices(context: typer.Context, as_json: AsJson = False) -> None:
 @devices_app.command()
 def probe(experiment: ExperimentFile, settings: Settings = None, as_json: AsJson = False) -> None:
     """Open an experiment's device and run its self-test; the output does not move."""
-    from hilctl.cli.console import print_probed
+    from hilctl.cli.machine_view import print_probed
     from hilctl.experiment.inventory import probe as open_and_close
 
     answered = open_and_close(experiment, settings or [])

@@ -12,7 +12,7 @@ from hilctl_drivers.board.profile import FrameProfile, FrameStreaming
 from hilctl_drivers.board.session import Values
 from hilctl_drivers.emulator.fifo import SampleFifo
 from hilctl_drivers.emulator.rig import Rig, Wiring, WriteLog
-from hilctl_drivers.emulator.wire import Answer
+from hilctl_drivers.emulator.wire import EmulatedReply
 
 
 class _Refuse(Exception):  # noqa: N818  a reply, not a mistake
@@ -54,7 +54,7 @@ class EmulatedBoard:
         self._received_ns = 0
         self._now_ns = 0
         self.tripped = False
-        self._kinds: dict[int, Callable[[bytes, bytes], Answer]] = {
+        self._kinds: dict[int, Callable[[bytes, bytes], EmulatedReply]] = {
             board.EXCHANGE: self._exchange,
             board.STREAM: self._stream,
             board.WATCHDOG: self._watchdog,
@@ -76,7 +76,7 @@ class EmulatedBoard:
         if not self.fifo.running:
             self._rig.advance(self._now_ns)
 
-    def answer(self, message: bytes, now_ns: int) -> Answer:
+    def answer(self, message: bytes, now_ns: int) -> EmulatedReply:
         """Take one message and return what to answer; a refused one changes nothing."""
         self.tick(now_ns)
         self._received_ns = self._now_ns
@@ -88,10 +88,10 @@ class EmulatedBoard:
         except _Refuse as refused:
             return self.refusal(message, refused.status)
 
-    def refusal(self, message: bytes, status: int = Status.BAD_MESSAGE) -> Answer:
+    def refusal(self, message: bytes, status: int = Status.BAD_MESSAGE) -> EmulatedReply:
         """Return a reply that says no."""
         kind, seq = (*message[:2], 0, 0)[:2]
-        return Answer(board.STATUS_REPLY.pack(kind | board.REPLY_BIT, seq, status))
+        return EmulatedReply(board.STATUS_REPLY.pack(kind | board.REPLY_BIT, seq, status))
 
     def wrong_id(self, reply: bytes) -> bytes:
         """Return a reply as if to another message."""
@@ -113,7 +113,7 @@ class EmulatedBoard:
             raise _Refuse(Status.OUT_OF_RANGE)
         return values
 
-    def _exchange(self, head: bytes, body: bytes) -> Answer:
+    def _exchange(self, head: bytes, body: bytes) -> EmulatedReply:
         size = board.EXCHANGE_REQUEST.size - board.HEAD.size
         if len(body) < size or body[:size] != b"\1\0" or self.fifo.running:
             raise _Refuse(Status.BAD_MESSAGE)
@@ -123,9 +123,9 @@ class EmulatedBoard:
         reading = self._terminal(np.array([self._rig.displacement_um]))
         self._put_out(float(values[0]), "write", self._now_ns)
         reply = board.EXCHANGE_REPLY.pack(head[0] | board.REPLY_BIT, head[1], 0, 1)
-        return Answer(reply + self._inputs.encode(reading) + board.FIFO_TAIL.pack(0, 0))
+        return EmulatedReply(reply + self._inputs.encode(reading) + board.FIFO_TAIL.pack(0, 0))
 
-    def _stream(self, head: bytes, body: bytes) -> Answer:
+    def _stream(self, head: bytes, body: bytes) -> EmulatedReply:
         size = board.STREAM_REQUEST.size - board.HEAD.size
         fifo, streaming = self.fifo, self._streaming
         if len(body) < size or streaming is None:
@@ -145,7 +145,9 @@ class EmulatedBoard:
             fifo.start(self._now_ns)
         until = max(0, self.queued - self._prefill)
         due_ns = fifo.due_ns(until) if until else 0
-        return Answer(None, due_ns or 0, lambda now_ns: self._stream_reply(head, until, now_ns))
+        return EmulatedReply(
+            None, due_ns or 0, lambda now_ns: self._stream_reply(head, until, now_ns)
+        )
 
     def _stream_reply(self, head: bytes, until: int, now_ns: int) -> bytes:
         self.tick(now_ns)
@@ -162,7 +164,7 @@ class EmulatedBoard:
         tail = board.FIFO_TAIL.pack(level, underruns)
         return reply + self._inputs.encode(self._terminal(readings)) + tail
 
-    def _watchdog(self, head: bytes, body: bytes) -> Answer:
+    def _watchdog(self, head: bytes, body: bytes) -> EmulatedReply:
         size = board.WATCHDOG_REQUEST.size - board.HEAD.size
         if len(body) < size or self._profile.watchdog == "none":
             raise _Refuse(Status.BAD_MESSAGE)
@@ -171,15 +173,15 @@ class EmulatedBoard:
         self._timeout_ns = timeout_ms * 1_000_000
         self.tripped = False
         reply = board.WATCHDOG_REPLY.pack(head[0] | board.REPLY_BIT, head[1], 0, timeout_ms)
-        return Answer(reply)
+        return EmulatedReply(reply)
 
-    def _put_safe(self, head: bytes, body: bytes) -> Answer:
+    def _put_safe(self, head: bytes, body: bytes) -> EmulatedReply:
         value = float(self._values(body, 1)[0])
         if self.tripped:
             raise _Refuse(Status.TRIPPED)
         self._stop()
         self._put_out(value, "safe", self._now_ns)
-        return Answer(board.STATUS_REPLY.pack(head[0] | board.REPLY_BIT, head[1], 0))
+        return EmulatedReply(board.STATUS_REPLY.pack(head[0] | board.REPLY_BIT, head[1], 0))
 
     def _stop(self) -> None:
         """Stop streaming and forget all of it; the output holds its value."""
@@ -187,7 +189,7 @@ class EmulatedBoard:
         self.fifo.clear()
         self._readings, self._returned = np.empty(0), 0
 
-    def _info(self, head: bytes, body: bytes) -> Answer:
+    def _info(self, head: bytes, body: bytes) -> EmulatedReply:
         del body
         low, high = self._output.limits
         streaming = self._streaming
@@ -202,9 +204,9 @@ class EmulatedBoard:
             low,
             high,
         )
-        return Answer(reply + b"hilctl emulated board")
+        return EmulatedReply(reply + b"hilctl emulated board")
 
-    def _clock(self, head: bytes, body: bytes) -> Answer:
+    def _clock(self, head: bytes, body: bytes) -> EmulatedReply:
         if len(body) != board.CLOCK_REQUEST.size - board.HEAD.size or self._streaming is None:
             raise _Refuse(Status.BAD_MESSAGE)
         _, _, rate_hz, prefill = board.CLOCK_REQUEST.unpack(head + body)
@@ -215,7 +217,7 @@ class EmulatedBoard:
         self._stop()
         if rate_hz > 0.0:
             self.fifo.set_rate(rate_hz)
-        return Answer(board.CLOCK_REPLY.pack(head[0] | board.REPLY_BIT, head[1], 0, rate_hz))
+        return EmulatedReply(board.CLOCK_REPLY.pack(head[0] | board.REPLY_BIT, head[1], 0, rate_hz))
 
     def _put_out(self, value: float, event: str, now_ns: int) -> None:
         current_a = self._wiring.gain_a * value + self._wiring.offset_a

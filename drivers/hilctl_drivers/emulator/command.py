@@ -1,4 +1,4 @@
-"""The command ``hilctl emulate``: serves an emulator until it is told to stop."""
+"""The command ``hilctl emulate``: serves an emulator until a signal ends it."""
 
 import gc
 import signal
@@ -10,7 +10,7 @@ from typing import Annotated, cast
 import typer
 
 from hilctl_drivers.emulator.faults import parse_fault
-from hilctl_drivers.emulator.modbus_device import EmulatedDevice
+from hilctl_drivers.emulator.modbus_device import EmulatedModbus
 from hilctl_drivers.emulator.modbus_wire import LinkKind
 from hilctl_drivers.emulator.options import EmulatorOptions, ReaderLine
 from hilctl_drivers.emulator.setup import Emulator, build
@@ -90,7 +90,7 @@ def _places(options: EmulatorOptions, emulator: Emulator) -> list[tuple[str, str
     if options.reader is None:
         return [(options.profile, emulator.address)]
     unit = reader_unit = ""
-    if isinstance(emulator.device, EmulatedDevice):
+    if isinstance(emulator.device, EmulatedModbus):
         unit = f", unit {emulator.device.profile.unit_id}"
         reader_unit = f", unit {emulator.reader_unit_id}"
     return [

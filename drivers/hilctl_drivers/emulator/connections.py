@@ -9,7 +9,7 @@ import tty
 from abc import ABC, abstractmethod
 from contextlib import suppress
 
-from hilctl_drivers.emulator.wire import Wire
+from hilctl_drivers.emulator.wire import EmulatedWire
 
 _CHUNK = 65536
 
@@ -22,7 +22,7 @@ class Connection(ABC):
         faulty: Whether the server's faults happen here.
     """
 
-    def __init__(self, wire: Wire, *, faulty: bool) -> None:
+    def __init__(self, wire: EmulatedWire, *, faulty: bool) -> None:
         self.wire = wire
         self.faulty = faulty
         self.received = bytearray()
@@ -57,7 +57,7 @@ class TcpConnection(Connection):
         wire: What it asks.
     """
 
-    def __init__(self, connection: socket.socket, wire: Wire) -> None:
+    def __init__(self, connection: socket.socket, wire: EmulatedWire) -> None:
         super().__init__(wire, faulty=True)
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._connection = connection
@@ -93,7 +93,7 @@ class PtyConnection(Connection):
         faulty: Whether the server's faults happen here.
     """
 
-    def __init__(self, wire: Wire, *, faulty: bool) -> None:
+    def __init__(self, wire: EmulatedWire, *, faulty: bool) -> None:
         super().__init__(wire, faulty=faulty)
         # Our own hold on the other end keeps the line from ending when a host lets go of it.
         self._master, self._slave = pty.openpty()

@@ -13,7 +13,7 @@ import numpy as np
 from hilctl.base.arrays import F64
 from hilctl_drivers.emulator.fifo import SampleFifo
 from hilctl_drivers.emulator.labjack_input import LabJackInput
-from hilctl_drivers.emulator.modbus_device import Declined, EmulatedDevice
+from hilctl_drivers.emulator.modbus_device import Declined, EmulatedModbus
 from hilctl_drivers.emulator.rig import Rig, WriteLog
 from hilctl_drivers.labjack import stream
 from hilctl_drivers.labjack.profile import BYTES_A_SAMPLE, LabJackStreaming
@@ -242,7 +242,7 @@ def _plain(profile: ModbusProfile, streaming: LabJackStreaming) -> set[int]:
 
 
 def attach_stream(
-    device: EmulatedDevice, rig: Rig, log: WriteLog, output: str, sensor: str, *, noise: bool
+    device: EmulatedModbus, rig: Rig, log: WriteLog, output: str, sensor: str, *, noise: bool
 ) -> None:
     """Give an emulated device its stream, where its profile has one for these channels.
 

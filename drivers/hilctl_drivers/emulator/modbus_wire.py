@@ -15,8 +15,8 @@ from pymodbus.exceptions import ModbusException
 from pymodbus.framer import FramerRTU, FramerSocket
 from pymodbus.pdu import DecodePDU, ExceptionResponse, ModbusPDU
 
-from hilctl_drivers.emulator.modbus_device import Declined, EmulatedDevice
-from hilctl_drivers.emulator.wire import Answer
+from hilctl_drivers.emulator.modbus_device import Declined, EmulatedModbus
+from hilctl_drivers.emulator.wire import EmulatedReply
 
 LinkKind: TypeAlias = Literal["tcp", "rtu"]
 
@@ -75,7 +75,7 @@ class FeedbackPdu(ModbusPDU):
 class _Context:
     """What pymodbus's messages act on: a device's registers."""
 
-    def __init__(self, device: EmulatedDevice) -> None:
+    def __init__(self, device: EmulatedModbus) -> None:
         self._device = device
 
     async def async_getValues(  # noqa: N802  pymodbus calls it by this name
@@ -127,12 +127,12 @@ class ModbusWire:
     def __init__(
         self,
         kind: LinkKind,
-        devices: EmulatedDevice | Mapping[int, EmulatedDevice],
+        devices: EmulatedModbus | Mapping[int, EmulatedModbus],
         lacking: frozenset[int] = frozenset(),
         mute: frozenset[int] = frozenset(),
     ) -> None:
         self._kind = kind
-        if isinstance(devices, EmulatedDevice):
+        if isinstance(devices, EmulatedModbus):
             devices = {devices.profile.unit_id: devices}
         self._devices = dict(devices)
         self._any_unit = kind == "tcp" and len(devices) == 1
@@ -147,7 +147,7 @@ class ModbusWire:
         for device in self._devices.values():
             device.tick(now_ns)
 
-    def _device(self, unit: int) -> EmulatedDevice | None:
+    def _device(self, unit: int) -> EmulatedModbus | None:
         return next(iter(self._devices.values())) if self._any_unit else self._devices.get(unit)
 
     def requests(self, received: bytearray) -> Iterator[bytes]:
@@ -163,7 +163,7 @@ class ModbusWire:
             if pdu and (self._kind == "tcp" or unit in self._devices):
                 yield struct.pack(">HB", transaction, unit) + pdu
 
-    def answer(self, request: bytes, now_ns: int) -> Answer | None:
+    def answer(self, request: bytes, now_ns: int) -> EmulatedReply | None:
         """Carry out a request of :meth:`requests`; None where it is never answered."""
         if request[3] in self._mute:
             return None
@@ -188,7 +188,7 @@ class ModbusWire:
         except (ModbusException, struct.error, KeyError):
             return ExceptionResponse(function, ExcCodes.ILLEGAL_VALUE)
 
-    def refusal(self, request: bytes) -> Answer:
+    def refusal(self, request: bytes) -> EmulatedReply:
         """Return the exception reply of a device that fails to carry a request out."""
         return self._answered(ExceptionResponse(request[3], ExcCodes.DEVICE_FAILURE), request)
 
@@ -201,10 +201,10 @@ class ModbusWire:
         del framed
         return _CORRUPT_AT
 
-    def _answered(self, reply: ModbusPDU, request: bytes) -> Answer:
+    def _answered(self, reply: ModbusPDU, request: bytes) -> EmulatedReply:
         reply.transaction_id, reply.dev_id = struct.unpack_from(">HB", request)
         framed = self._framer.buildFrame(reply)
-        return Answer(framed, wrong_id=lambda data: self._renamed(request, data))
+        return EmulatedReply(framed, wrong_id=lambda data: self._renamed(request, data))
 
     def _renamed(self, request: bytes, reply: bytes) -> bytes:
         """Return a reply in the name of another transaction (TCP) or unit (RTU)."""

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Literal, TypeAlias, get_args
 
 from hilctl.base.errors import InputError
-from hilctl_drivers.emulator.faults import Fault
+from hilctl_drivers.emulator.faults import WireFault
 from hilctl_drivers.emulator.modbus_wire import LinkKind
 from hilctl_drivers.emulator.rig import Wiring
 
@@ -45,7 +45,7 @@ class EmulatorOptions:
     host: str = "127.0.0.1"
     port: int = 0
     log: Path | None = None
-    faults: tuple[Fault, ...] = ()
+    faults: tuple[WireFault, ...] = ()
     output: str | None = None
     sensor: str | None = None
     reader: str | None = None

@@ -51,7 +51,7 @@ class Words:
         self.words[:] = self.encoded(value)
 
 
-class Memory:
+class RegisterBank:
     """Addresses in two maps, because couplers read at one address what they don't write there."""
 
     def __init__(self) -> None:
@@ -66,7 +66,7 @@ class Memory:
         Args:
             words: The value.
             area: coil, discrete, input or holding.
-            address: Wire address of its first word.
+            address: EmulatedWire address of its first word.
             read: Whether it can be read there.
             write: Whether it can be written there.
         """
@@ -138,7 +138,7 @@ class RegisterMap:
 
     def __init__(self, profile: ModbusProfile) -> None:
         self._profile = profile
-        self.memory = Memory()
+        self.memory = RegisterBank()
         self.outputs = {name: self._place_output(each) for name, each in profile.outputs.items()}
         self.inputs = {
             name: self._place(each, read=True, write=False) for name, each in profile.inputs.items()

@@ -5,7 +5,7 @@ from dataclasses import replace
 from typing import Protocol
 
 from hilctl_drivers.board.profile import FrameProfile
-from hilctl_drivers.emulator.wire import Answer
+from hilctl_drivers.emulator.wire import EmulatedReply
 from hilctl_drivers.text.lines import LineFormat
 from hilctl_drivers.text.profile import AsciiProfile
 from hilctl_drivers.wire.errors import Corrupt
@@ -86,11 +86,11 @@ class SerialDevice(Protocol):
         """Let time pass."""
         ...
 
-    def answer(self, message: bytes, now_ns: int) -> Answer | None:
+    def answer(self, message: bytes, now_ns: int) -> EmulatedReply | None:
         """Carry out a message; None where it is for another device."""
         ...
 
-    def refusal(self, message: bytes) -> Answer | None:
+    def refusal(self, message: bytes) -> EmulatedReply | None:
         """Return an answer that says no."""
         ...
 
@@ -122,7 +122,7 @@ class SerialWire:
         received.clear()
         yield from self.framing.feed(data)
 
-    def answer(self, request: bytes, now_ns: int) -> Answer | None:
+    def answer(self, request: bytes, now_ns: int) -> EmulatedReply | None:
         """Carry out a message; None where it is for no device here."""
         for device in self.devices:
             answer = device.answer(request, now_ns)
@@ -130,7 +130,7 @@ class SerialWire:
                 return replace(answer, wrong_id=device.wrong_id)
         return None
 
-    def refusal(self, request: bytes) -> Answer | None:
+    def refusal(self, request: bytes) -> EmulatedReply | None:
         """Return an answer of the first device that says no."""
         return self.devices[0].refusal(request)
 

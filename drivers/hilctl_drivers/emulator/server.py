@@ -11,8 +11,8 @@ from collections.abc import Callable, Sequence
 
 from hilctl.base.errors import InputError
 from hilctl_drivers.emulator.connections import Connection, PtyConnection, TcpConnection
-from hilctl_drivers.emulator.faults import Fault, FaultPlan, spoil
-from hilctl_drivers.emulator.wire import Answer, Wire
+from hilctl_drivers.emulator.faults import FaultPlan, WireFault, spoil
+from hilctl_drivers.emulator.wire import EmulatedReply, EmulatedWire
 
 _TICK_S = 0.005
 _STALE_NS = 50_000_000
@@ -27,21 +27,21 @@ class EmulatorServer:
     """
 
     def __init__(
-        self, faults: Sequence[Fault] = (), clock_ns: Callable[[], int] = time.monotonic_ns
+        self, faults: Sequence[WireFault] = (), clock_ns: Callable[[], int] = time.monotonic_ns
     ) -> None:
         self._plan = FaultPlan(faults)
         self._clock_ns = clock_ns
         self._start_ns = clock_ns()
         self._selector = selectors.DefaultSelector()
-        self._wires: list[Wire] = []
-        self._listeners: dict[socket.socket, Wire] = {}
+        self._wires: list[EmulatedWire] = []
+        self._listeners: dict[socket.socket, EmulatedWire] = {}
         self._connections: list[Connection] = []
         self._unplugged: list[TcpConnection | socket.socket] = []
-        self._late: list[tuple[int, int, Connection, Answer, Fault | None]] = []
+        self._late: list[tuple[int, int, Connection, EmulatedReply, WireFault | None]] = []
         self._count = 0
         self._stopping = False
 
-    def listen_tcp(self, wire: Wire, host: str, port: int) -> str:
+    def listen_tcp(self, wire: EmulatedWire, host: str, port: int) -> str:
         """Listen; return ``host:port``, which is a free one where port 0 is asked for.
 
         Raises:
@@ -56,7 +56,7 @@ class EmulatorServer:
         self._selector.register(listener, selectors.EVENT_READ)
         return f"{host}:{listener.getsockname()[1]}"
 
-    def open_pty(self, wire: Wire, *, faulty: bool = True) -> str:
+    def open_pty(self, wire: EmulatedWire, *, faulty: bool = True) -> str:
         """Open a pty and return the device file of its other end."""
         connection = PtyConnection(wire, faulty=faulty)
         self._wires.append(wire)
@@ -149,7 +149,7 @@ class EmulatorServer:
         else:
             self._reply(connection, answer, fault, now_ns)
 
-    def _keep_back(self, fault: Fault, connection: Connection, request: bytes) -> None:
+    def _keep_back(self, fault: WireFault, connection: Connection, request: bytes) -> None:
         """Do what a fault says that keeps the request from the device."""
         if fault.kind == "unplug":
             self._unplug()
@@ -184,7 +184,7 @@ class EmulatorServer:
                 self._reply(connection, answer, fault, now_ns)
 
     def _reply(
-        self, connection: Connection, answer: Answer, fault: Fault | None, now_ns: int
+        self, connection: Connection, answer: EmulatedReply, fault: WireFault | None, now_ns: int
     ) -> None:
         data = answer.make(now_ns) if answer.make is not None else answer.data
         if data is None:

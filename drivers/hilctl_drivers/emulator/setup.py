@@ -16,19 +16,19 @@ from hilctl.base.errors import InputError
 from hilctl_drivers.board.profile import FrameProfile
 from hilctl_drivers.emulator.board_device import EmulatedBoard
 from hilctl_drivers.emulator.labjack_stream import attach_stream
-from hilctl_drivers.emulator.modbus_device import EmulatedDevice
+from hilctl_drivers.emulator.modbus_device import EmulatedModbus
 from hilctl_drivers.emulator.modbus_wire import ModbusWire
 from hilctl_drivers.emulator.options import EmulatorOptions
 from hilctl_drivers.emulator.rig import Rig, Wiring, WriteLog
 from hilctl_drivers.emulator.serial_wire import FrameFraming, SerialWire, TextFraming
 from hilctl_drivers.emulator.server import EmulatorServer
-from hilctl_drivers.emulator.text_device import EmulatedAscii
-from hilctl_drivers.emulator.wire import Wire
+from hilctl_drivers.emulator.text_device import EmulatedText
+from hilctl_drivers.emulator.wire import EmulatedWire
 from hilctl_drivers.modbus.profile import ModbusProfile
 from hilctl_drivers.profile import Profile, load_profile
 from hilctl_drivers.text.profile import AsciiProfile
 
-AnyDevice: TypeAlias = EmulatedDevice | EmulatedAscii | EmulatedBoard
+AnyDevice: TypeAlias = EmulatedModbus | EmulatedText | EmulatedBoard
 _SUFFIX = {"V": "v", "mA": "ma", "A": "a"}
 
 
@@ -41,7 +41,7 @@ class Port(NamedTuple):
         faulty: Whether faults happen there.
     """
 
-    wire: Wire
+    wire: EmulatedWire
     tcp_port: int | None = None
     faulty: bool = True
 
@@ -59,14 +59,14 @@ class Emulator:
         address: ``host:port``, or the pty's device file.
         reader_address: Where the reader is.
         reader_unit_id: Its unit id there; None where it is no Modbus device.
-        options: What the driver needs to be told, as in an experiment's device section.
+        options: What the driver needs to know, as in an experiment's device section.
     """
 
     server: EmulatorServer
     log: WriteLog
     device: AnyDevice
     reader: AnyDevice
-    wires: tuple[Wire, ...]
+    wires: tuple[EmulatedWire, ...]
     address: str
     reader_address: str
     reader_unit_id: int | None
@@ -235,11 +235,11 @@ class _ModbusPlan(_Plan):
     def devices(self, rig: Rig, log: WriteLog) -> tuple[AnyDevice, AnyDevice, list[Port]]:
         profile, output, sensor, wiring = self._profile, self._output, self._sensor, self._wiring
         if self._reader is profile:
-            device = reader = EmulatedDevice(profile, rig, log, output, sensor, wiring)
+            device = reader = EmulatedModbus(profile, rig, log, output, sensor, wiring)
             attach_stream(device, rig, log, output, sensor, noise=self._options.noise)
         else:
-            device = EmulatedDevice(profile, rig, log, output, None, wiring)
-            reader = EmulatedDevice(self._reader, rig, log, None, sensor, wiring)
+            device = EmulatedModbus(profile, rig, log, output, None, wiring)
+            reader = EmulatedModbus(self._reader, rig, log, None, sensor, wiring)
         unit, reader_unit = profile.unit_id, self.reader_unit_id
         assert reader_unit is not None
         ports = [(0, {unit: device}), (1, {reader_unit: reader})]
@@ -247,7 +247,7 @@ class _ModbusPlan(_Plan):
             ports = [(0, {reader_unit: reader, unit: device})]
         return device, reader, [self._port(which, devices) for which, devices in ports]
 
-    def _port(self, which: int, devices: dict[int, EmulatedDevice]) -> Port:
+    def _port(self, which: int, devices: dict[int, EmulatedModbus]) -> Port:
         options, link = self._options, self._links[which]
         wire = ModbusWire(link, devices, options.lacking, options.mute)
         return Port(wire, (options.port, options.reader_port)[which] if link == "tcp" else None)
@@ -291,9 +291,9 @@ class _TextPlan(_Plan):
 
     def _device(
         self, profile: AsciiProfile, rig: Rig, log: WriteLog, output: str | None, sensor: str | None
-    ) -> EmulatedAscii:
+    ) -> EmulatedText:
         address = profile.address if isinstance(profile.address, int) else 0
-        return EmulatedAscii(
+        return EmulatedText(
             profile, rig, log, self._wiring, output=output, sensor=sensor, address=address
         )
 

@@ -4,7 +4,7 @@ import re
 from string import Formatter
 
 from hilctl_drivers.emulator.rig import Rig, Wiring, WriteLog
-from hilctl_drivers.emulator.wire import Answer
+from hilctl_drivers.emulator.wire import EmulatedReply
 from hilctl_drivers.text.profile import (
     AsciiInput,
     AsciiProfile,
@@ -21,7 +21,7 @@ _UNDEFINED = '-113,"Undefined header"'
 _REFUSED = '-200,"Execution error"'
 
 
-class Template:
+class TemplateMatcher:
     """A template as the device that receives it.
 
     Args:
@@ -70,7 +70,7 @@ def in_style(example: str, pattern: str, value: float) -> str:
     return example[:start] + number + example[stop:]
 
 
-class EmulatedAscii:
+class EmulatedText:
     """The device.
 
     Args:
@@ -121,7 +121,7 @@ class EmulatedAscii:
         self._now_ns = max(self._now_ns, now_ns)
         self._rig.advance(self._now_ns)
 
-    def answer(self, message: bytes, now_ns: int) -> Answer | None:
+    def answer(self, message: bytes, now_ns: int) -> EmulatedReply | None:
         """Carry out a line; None where it is for another address."""
         self.tick(now_ns)
         text = message.decode("ascii", "replace")
@@ -136,13 +136,13 @@ class EmulatedAscii:
             return None
         return self._unknown()
 
-    def refusal(self, message: bytes) -> Answer | None:
+    def refusal(self, message: bytes) -> EmulatedReply | None:
         """Return an answer that says no."""
         del message
         if self._profile.errors:
             return self._reply(self._profile.errors[-1].example)
         self._errors.append(_REFUSED)
-        return Answer(None)
+        return EmulatedReply(None)
 
     def wrong_id(self, reply: bytes) -> bytes:
         """Return a reply in another's name; where none is in it, one to something else."""
@@ -151,37 +151,37 @@ class EmulatedAscii:
             return reply[:1] + f"{self._address ^ 3:02X}".encode() + reply[3:]
         return b"ANOTHER," + reply
 
-    def _reply(self, text: str) -> Answer:
+    def _reply(self, text: str) -> EmulatedReply:
         """Return a reply; an example's address becomes our own."""
         shipped = self._profile.address
         if isinstance(shipped, int) and text[:1] in {"!", "?"} and text[1:3] == f"{shipped:02X}":
             text = f"{text[:1]}{self._address:02X}{text[3:]}"
-        return Answer(text.encode() if text else None)
+        return EmulatedReply(text.encode() if text else None)
 
     def _is_for_another(self, text: str) -> bool:
         if self._profile.address == "none" or not re.match(r"[#$~%@][0-9A-F]{2}", text):
             return False
         return text[1:3] != f"{self._address:02X}"
 
-    def _unknown(self) -> Answer:
+    def _unknown(self) -> EmulatedReply:
         if self._profile.errors:
             return self._reply(self._profile.errors[-1].example)
         self._errors.append(_UNDEFINED)
-        return Answer(None)
+        return EmulatedReply(None)
 
     def _outputs(self, text: str) -> str | None:
         for name, output in self._profile.outputs.items():
-            fields = Template(output.write, self._address).match(text)
+            fields = TemplateMatcher(output.write, self._address).match(text)
             if fields is not None:
                 reply = "" if output.reply == "none" else output.reply.example
                 return self._set(name, fields["value"], reply)
             readback = output.readback
-            if readback != "none" and Template(readback.ask, self._address).match(text) is not None:
+            if readback != "none" and self._matches(readback.ask, text):
                 return in_style(readback.example, readback.pattern, self._values[name])
         combined = self._profile.exchange
         if combined == "none":
             return None
-        fields = Template(combined.write, self._address).match(text)
+        fields = TemplateMatcher(combined.write, self._address).match(text)
         if fields is None:
             return None
         source = self._profile.inputs[combined.input]
@@ -205,7 +205,7 @@ class EmulatedAscii:
 
     def _inputs(self, text: str) -> str | None:
         for name, source in self._profile.inputs.items():
-            if Template(source.ask, self._address).match(text) is not None:
+            if self._matches(source.ask, text):
                 return in_style(source.example, source.pattern, self._reading(name, source))
         return None
 
@@ -246,7 +246,7 @@ class EmulatedAscii:
         assert watchdog != "none"
         self._received_ns = self._now_ns
         if name == "arm":
-            fields = Template(template, self._address).match(text) or {}
+            fields = TemplateMatcher(template, self._address).match(text) or {}
             counts = fields.get("timeout", watchdog.min_s / watchdog.unit_s)
             self._timeout_ns = round(counts * watchdog.unit_s * 1e9)
         elif name == "disarm":
@@ -274,7 +274,7 @@ class EmulatedAscii:
         return None
 
     def _matches(self, template: str, text: str) -> bool:
-        return Template(template, self._address).match(text) is not None
+        return TemplateMatcher(template, self._address).match(text) is not None
 
     def _put_out(self, name: str, value: float, event: str, now_ns: int) -> None:
         self._values[name] = value

@@ -8,7 +8,7 @@ Target = tuple[Words, list[int] | None]
 """A value and the words that trigger something; None stands for any words but zeros."""
 
 
-class HostWatchdog:
+class EmulatedWatchdog:
     """Trips when the host has been silent for the timeout.
 
     It is armed by the last of the profile's arm steps and disarmed by the last of the disarm steps,

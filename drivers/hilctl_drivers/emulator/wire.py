@@ -6,7 +6,7 @@ from typing import Protocol
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class EmulatedReply:
     """A reply, before its framing.
 
     Attributes:
@@ -22,7 +22,7 @@ class Answer:
     wrong_id: Callable[[bytes], bytes] | None = None
 
 
-class Wire(Protocol):
+class EmulatedWire(Protocol):
     """Devices that share a line, or a port, and how they are spoken to."""
 
     def tick(self, now_ns: int) -> None:
@@ -33,11 +33,11 @@ class Wire(Protocol):
         """Yield complete requests, and take them out of what was received."""
         ...
 
-    def answer(self, request: bytes, now_ns: int) -> Answer | None:
+    def answer(self, request: bytes, now_ns: int) -> EmulatedReply | None:
         """Carry out a request; None where it is for no device here."""
         ...
 
-    def refusal(self, request: bytes) -> Answer | None:
+    def refusal(self, request: bytes) -> EmulatedReply | None:
         """Return an answer that says no."""
         ...
 

@@ -3,16 +3,16 @@
 import pytest
 
 from hilctl.base.errors import InputError
-from hilctl_drivers.emulator.faults import KINDS, Fault, FaultPlan, parse_fault, spoil
+from hilctl_drivers.emulator.faults import KINDS, FaultPlan, WireFault, parse_fault, spoil
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_texts_are_read(kind):
     """A count, a time, and how late."""
-    assert parse_fault(f"{kind}@12") == Fault(kind, at_count=12)
-    assert parse_fault(f"{kind}@2.5s") == Fault(kind, at_s=2.5)
+    assert parse_fault(f"{kind}@12") == WireFault(kind, at_count=12)
+    assert parse_fault(f"{kind}@2.5s") == WireFault(kind, at_s=2.5)
     if kind == "delay":
-        assert parse_fault("delay:0.3@1") == Fault("delay", at_count=1, delay_s=0.3)
+        assert parse_fault("delay:0.3@1") == WireFault("delay", at_count=1, delay_s=0.3)
 
 
 @pytest.mark.parametrize(

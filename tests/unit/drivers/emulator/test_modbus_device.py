@@ -3,13 +3,13 @@
 import pytest
 
 from hilctl.base.errors import InputError
-from hilctl_drivers.emulator.modbus_device import Declined, EmulatedDevice
+from hilctl_drivers.emulator.modbus_device import Declined, EmulatedModbus
 from hilctl_drivers.emulator.rig import Rig, WriteLog
 from hilctl_drivers.profile import load_profile
 
 
-def device_of(name: str, output: str, sensor: str) -> EmulatedDevice:
-    return EmulatedDevice(load_profile(name), Rig(0), WriteLog(None, 0), output, sensor)
+def device_of(name: str, output: str, sensor: str) -> EmulatedModbus:
+    return EmulatedModbus(load_profile(name), Rig(0), WriteLog(None, 0), output, sensor)
 
 
 def test_unknown_channels_are_refused():

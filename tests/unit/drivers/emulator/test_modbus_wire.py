@@ -2,7 +2,7 @@
 
 import pytest
 
-from hilctl_drivers.emulator.modbus_device import EmulatedDevice
+from hilctl_drivers.emulator.modbus_device import EmulatedModbus
 from hilctl_drivers.emulator.modbus_wire import ModbusWire
 from hilctl_drivers.emulator.rig import Rig, Wiring, WriteLog
 from hilctl_drivers.modbus.pdu import (
@@ -25,8 +25,8 @@ FLOAT32 = RegisterFormat("float32")
 MS = 1_000_000
 
 
-def device_of(name: str, output: str, sensor: str) -> EmulatedDevice:
-    return EmulatedDevice(load_profile(name), Rig(0), WriteLog(None, 0), output, sensor)
+def device_of(name: str, output: str, sensor: str) -> EmulatedModbus:
+    return EmulatedModbus(load_profile(name), Rig(0), WriteLog(None, 0), output, sensor)
 
 
 @pytest.fixture
@@ -120,8 +120,8 @@ def test_rtu_ignores_others_and_rubbish():
 def test_units_share_a_line_and_a_rig():
     """One unit drives, the other shows; neither has the other's registers."""
     rig, log, wiring = Rig(0), WriteLog(None, 0), Wiring(1.0, 0.0, 12.5, 0.0)
-    drives = EmulatedDevice(load_profile("adam_4024"), rig, log, "AO0", None, wiring)
-    reads = EmulatedDevice(load_profile("adam_4117"), rig, log, None, "AI2", wiring)
+    drives = EmulatedModbus(load_profile("adam_4024"), rig, log, "AO0", None, wiring)
+    reads = EmulatedModbus(load_profile("adam_4117"), rig, log, None, "AI2", wiring)
     wire = ModbusWire("rtu", {1: drives, 2: reads})
 
     def transact(unit: int, pdu: bytes, now_ns: int) -> bytes:

@@ -12,7 +12,7 @@ from pymodbus.client import ModbusTcpClient
 
 from hilctl_drivers.emulator.faults import parse_fault
 from hilctl_drivers.emulator.server import EmulatorServer
-from hilctl_drivers.emulator.wire import Answer
+from hilctl_drivers.emulator.wire import EmulatedReply
 from hilctl_drivers.modbus.pdu import (
     read_pdu,
     tcp_adu,
@@ -75,10 +75,10 @@ class EchoWire:
             yield bytes([received.pop(0)])
 
     def answer(self, request, now_ns):
-        return Answer(self._size * request, now_ns + 10 * MS if self._late else 0)
+        return EmulatedReply(self._size * request, now_ns + 10 * MS if self._late else 0)
 
     def refusal(self, request):
-        return Answer(b"!")
+        return EmulatedReply(b"!")
 
     def encode(self, data):
         return data

@@ -3,7 +3,7 @@
 import pytest
 
 from hilctl.base.errors import InputError
-from hilctl_drivers.emulator.faults import Fault
+from hilctl_drivers.emulator.faults import WireFault
 
 
 def test_port_in_use_is_one_line(served):
@@ -25,11 +25,11 @@ def test_port_in_use_is_one_line(served):
         ("cobs_board", {"link": "tcp"}, "are for Modbus profiles, cobs_board has a line"),
         ("icp_m7024_dcon", {}, "has no input to show a displacement at: name a reader"),
         ("nothing", {}, "no profile 'nothing' is shipped"),
-        ("cobs_board", {"faults": (Fault("reset", at_count=1),)}, "is for tcp"),
+        ("cobs_board", {"faults": (WireFault("reset", at_count=1),)}, "is for tcp"),
         ("adam_4024", {"reader": "adam_4117", "sensor": "AI9"}, "4117 .* has no AI9: AI0, AI1"),
         ("adam_4024", {"reader": "adam_4117", "output": "AI0"}, "4024 .* has no AI0: AO0, AO1"),
         ("adam_4024", {"reader": "adam_4117", "reader_unit_id": 1}, "reader_unit_id must not"),
-        ("wago_750", {"link": "rtu", "faults": (Fault("reset", at_count=1),)}, "is for tcp"),
+        ("wago_750", {"link": "rtu", "faults": (WireFault("reset", at_count=1),)}, "is for tcp"),
     ],
 )
 def test_what_can_not_be_emulated_is_refused(served, profile, options, words):

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from hilctl_drivers.emulator.text_device import Template, in_style
+from hilctl_drivers.emulator.text_device import TemplateMatcher, in_style
 
 MS = 1_000_000
 START_NS = 10_000_000_000
@@ -24,13 +24,17 @@ def dcon(emulate, tmp_path):
 class TestTemplates:
     def test_a_template_is_read_backwards(self):
         """Numbers in any form that the field can have, hexadecimal ones by their format."""
-        assert Template("#{address:02X}0{value:+07.3f}", 1).match("#010-05.250") == {"value": -5.25}
-        assert Template("~{address:02X}31{timeout:02X}", 10).match("~0A3164") == {"timeout": 100.0}
-        assert Template("CURR {value:.6f};:MEAS:CURR?", 0).match("CURR 1.5;:MEAS:CURR?") == {
+        assert TemplateMatcher("#{address:02X}0{value:+07.3f}", 1).match("#010-05.250") == {
+            "value": -5.25
+        }
+        assert TemplateMatcher("~{address:02X}31{timeout:02X}", 10).match("~0A3164") == {
+            "timeout": 100.0
+        }
+        assert TemplateMatcher("CURR {value:.6f};:MEAS:CURR?", 0).match("CURR 1.5;:MEAS:CURR?") == {
             "value": 1.5
         }
         for other in ("#020-05.250", "#010-05.250 ", "#010", "#011+05.000x"):
-            assert Template("#{address:02X}0{value:+07.3f}", 1).match(other) is None
+            assert TemplateMatcher("#{address:02X}0{value:+07.3f}", 1).match(other) is None
 
     @pytest.mark.parametrize(
         ("example", "pattern", "value", "reply"),
