@@ -26,7 +26,9 @@ def emulate(
         list[str] | None, typer.Option(help="KIND@COUNT or KIND@SECONDSs; may be repeated.")
     ] = None,
     output: Annotated[str | None, typer.Option(help="Output that drives the rig.")] = None,
-    sensor: Annotated[str | None, typer.Option(help="Input that shows the displacement.")] = None,
+    sensor: Annotated[
+        str | None, typer.Option(help="Input that shows the displacement; or READER:INPUT.")
+    ] = None,
     reader: Annotated[
         str | None, typer.Option(help="Profile of the device that has the input, if another one.")
     ] = None,
@@ -39,6 +41,8 @@ def emulate(
     ] = EmulatorOptions.reader_port,
 ) -> None:
     """Serve the simulated rig as a real device would, until Ctrl-C."""
+    if reader is None and sensor is not None and ":" in sensor:
+        reader, _, sensor = sensor.rpartition(":")
     options = EmulatorOptions(
         profile=profile,
         link=cast(LinkKind | None, link),

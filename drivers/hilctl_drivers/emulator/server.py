@@ -99,6 +99,7 @@ class EmulatorServer:
         elif source in self._connections:  # else it was let go of since
             assert isinstance(source, Connection)
             if events & selectors.EVENT_WRITE:
+                self._selector.modify(source, selectors.EVENT_READ)
                 self._send(source, b"")
             if events & selectors.EVENT_READ:
                 self._receive(source)
@@ -129,9 +130,10 @@ class EmulatorServer:
 
     def _answer(self, connection: Connection, request: bytes) -> None:
         now_ns = self._clock_ns()
-        # A new request means that the host has given up on answers that are still to come.
-        self._late = [each for each in self._late if each[2] is not connection or each[4]]
-        heapq.heapify(self._late)
+        if self._late:
+            # A new request means that the host has given up on answers that are still to come.
+            self._late = [each for each in self._late if each[2] is not connection or each[4]]
+            heapq.heapify(self._late)
         fault = None
         if connection.faulty:
             fault = self._plan.next((now_ns - self._start_ns) * 1e-9)
@@ -198,5 +200,5 @@ class EmulatorServer:
 
     def _send(self, connection: Connection, data: bytes) -> None:
         connection.send(data)
-        room = selectors.EVENT_WRITE if connection.unsent else 0
-        self._selector.modify(connection, selectors.EVENT_READ | room)
+        if connection.unsent:
+            self._selector.modify(connection, selectors.EVENT_READ | selectors.EVENT_WRITE)
