@@ -1,6 +1,16 @@
 """The command line: the only place that prints.
 
-Heavy parts are imported by the command that needs them, so that ``--help`` is quick.
+A command is imported when it is called, and imports its heavy parts itself, so that ``--help`` is
+quick.
+
+commands.py    which commands there are, and where each one's function is
+options.py     options that they share
+running.py     start, check, steer and stop runs; shown by run_view.py
+recordings.py  judge, replay, export and recover them, find models; identify_view.py
+comparing.py   models against one another; compare_view.py
+learning.py    corrections from run to run
+machine.py     this computer and its devices; machine_view.py
+console.py     what recordings.py and comparing.py print
 
 Exit codes: 0 done; 1 a replay that differs, or a rate that this machine does not keep; 2 the input
 can't be used, nothing has moved; 3 a run that ended by a fault; 128 + n a run stopped by signal n.
@@ -15,31 +25,21 @@ import typer
 
 from hilctl import __version__
 from hilctl.base.errors import ConfigError, HilctlError, InputError
-from hilctl.cli import comparing, learning, machine, recordings, running
-from hilctl.cli.options import app, devices_app, print_json
+from hilctl.cli.commands import HELP_NAMES, CommandTable
+from hilctl.cli.options import print_json
 
 __all__ = ["app", "main"]
 
-_COMMANDS = (
-    running.run,
-    running.check,
-    running.status,
-    running.set_,
-    running.stop,
-    recordings.report,
-    recordings.replay,
-    recordings.export,
-    recordings.recover,
-    recordings.identify,
-    comparing.compare,
-    learning.learn,
-    machine.doctor,
-    machine.emulate,
-    machine.schema,
+app = typer.Typer(
+    name="hilctl",
+    cls=CommandTable,
+    help="Real-time hysteresis compensation for smart-material actuators.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,  # rich takes longer to import than all of the rest
+    context_settings=HELP_NAMES,
 )
-for _command in _COMMANDS:
-    app.command(name=_command.__name__.rstrip("_"))(_command)
-app.add_typer(devices_app, name="devices")
 
 
 def main() -> None:

@@ -1,4 +1,4 @@
-"""Commands about machine and devices: doctor, devices, emulate, schema."""
+"""Commands about machine and devices: doctor, devices, schema."""
 
 from pathlib import Path
 from typing import Annotated
@@ -6,13 +6,9 @@ from typing import Annotated
 import typer
 
 from hilctl.base.files import write_text
-from hilctl.cli.options import (
-    AsJson,
-    ExperimentFile,
-    Settings,
-    devices_app,
-    print_json,
-)
+from hilctl.cli.options import AsJson, ExperimentFile, Settings, print_json
+
+devices_app = typer.Typer(rich_markup_mode=None)
 
 
 def doctor(
@@ -27,8 +23,8 @@ def doctor(
     as_json: AsJson = False,
 ) -> None:
     """Say what keeps this machine from real time, and measure whether it keeps a rate."""
-    from hilctl.cli.console import measuring, print_rich
-    from hilctl.cli.machine_view import render
+    from hilctl.cli.console import print_rich
+    from hilctl.cli.machine_view import measuring, render
     from hilctl.experiment.load import load_experiment
     from hilctl.machine.diagnosis import DEFAULT_RATE_HZ, diagnose
     from hilctl.machine.settings import Realtime
@@ -67,7 +63,7 @@ def devices(context: typer.Context, as_json: AsJson = False) -> None:
     """List devices, shipped profiles and the serial ports of this machine; nothing is opened."""
     if context.invoked_subcommand is not None:
         return
-    from hilctl.cli.console import print_inventory
+    from hilctl.cli.machine_view import print_inventory
     from hilctl.experiment.inventory import inventory
 
     found = inventory()
@@ -80,7 +76,7 @@ def devices(context: typer.Context, as_json: AsJson = False) -> None:
 @devices_app.command()
 def probe(experiment: ExperimentFile, settings: Settings = None, as_json: AsJson = False) -> None:
     """Open an experiment's device and run its self-test; the output does not move."""
-    from hilctl.cli.console import print_probed
+    from hilctl.cli.machine_view import print_probed
     from hilctl.experiment.inventory import probe as open_and_close
 
     answered = open_and_close(experiment, settings or [])
@@ -88,45 +84,3 @@ def probe(experiment: ExperimentFile, settings: Settings = None, as_json: AsJson
         print_json(answered.to_mapping())
     else:
         print_probed(answered)
-
-
-def emulate(
-    profile: Annotated[str, typer.Argument(help="Shipped profile, or path of one.")],
-    link: Annotated[str | None, typer.Option(help="tcp or rtu; else the profile's own.")] = None,
-    host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
-    port: Annotated[int, typer.Option(help="TCP port; 0 takes a free one.")] = 0,
-    log: Annotated[Path | None, typer.Option(help="File for a log of every write.")] = None,
-    fault: Annotated[
-        list[str] | None, typer.Option(help="KIND@COUNT or KIND@SECONDSs; may be repeated.")
-    ] = None,
-    output: Annotated[str | None, typer.Option(help="Output that drives the rig.")] = None,
-    sensor: Annotated[str | None, typer.Option(help="Input that shows the displacement.")] = None,
-    reader: Annotated[
-        str | None, typer.Option(help="Profile of the device that has the input, if another one.")
-    ] = None,
-    reader_line: Annotated[
-        str | None, typer.Option(help="The reader's: same or own; own for Modbus TCP devices.")
-    ] = None,
-    reader_unit_id: Annotated[int | None, typer.Option(help="The reader's unit id.")] = None,
-    reader_port: Annotated[
-        int, typer.Option(help="The reader's own TCP port; 0 takes a free one.")
-    ] = 0,
-) -> None:
-    """Serve the simulated rig as a real device would, until Ctrl-C."""
-    from hilctl.cli.emulate import emulate as serve
-
-    serve(
-        profile,
-        link=link,
-        host=host,
-        port=port,
-        log=log,
-        faults=fault or [],
-        output=output,
-        sensor=sensor,
-        reader=reader,
-        reader_line=reader_line,
-        reader_unit_id=reader_unit_id,
-        reader_port=reader_port,
-        on_ready=lambda name, address: print(f"{name} answers at {address}", flush=True),
-    )

@@ -1,11 +1,15 @@
-"""A diagnosis for people, in a terminal."""
+"""This machine for people, in a terminal: its diagnosis, and the devices at it."""
 
 import math
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
-from rich.console import Group, RenderableType
+from rich.console import Console, Group, RenderableType
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 from rich.text import Text
 
+from hilctl.experiment.inventory import Inventory, Probed
 from hilctl.machine.diagnosis import Diagnosis, lateness_counts
 from hilctl.machine.latency import Latency
 from hilctl.machine.realtime import Step
@@ -73,3 +77,45 @@ def _lateness(latency: Latency) -> RenderableType:
     figures = latency.percentiles_us()
     line = ", ".join(f"{name} {value:.1f}" for name, value in figures.items())
     return Group(table, Text(f"{line} us"))
+
+
+@contextmanager
+def measuring(seconds: float, *, quiet: bool) -> Iterator[Callable[[float], None]]:
+    """Show a bar on standard error; yield what to call with the time that has passed, in s."""
+    console = Console(stderr=True)
+    with Progress(
+        TextColumn("[bold]measuring"),
+        BarColumn(bar_width=24),
+        TimeRemainingColumn(),
+        console=console,
+        disable=quiet or not console.is_terminal,
+        transient=True,
+    ) as progress:
+        task = progress.add_task("measuring", total=seconds)
+        yield lambda elapsed_s: progress.update(task, completed=min(elapsed_s, seconds))
+
+
+def print_inventory(found: Inventory) -> None:
+    """Print devices, profiles and serial ports."""
+    table = Table(title="devices", title_justify="left", show_header=False, box=None)
+    for kind, place in sorted(found.devices.items()):
+        table.add_row(kind, place)
+    profiles = Table(title="profiles", title_justify="left", show_header=False, box=None)
+    for name in found.profiles:
+        profiles.add_row(name)
+    ports = Table(title="serial ports", title_justify="left", show_header=False, box=None)
+    for port in found.serial_ports:
+        ports.add_row(port.path, port.description)
+    console = Console()
+    console.print(table, profiles)
+    console.print(ports if found.serial_ports else "no serial port found", soft_wrap=True)
+
+
+def print_probed(answered: Probed) -> None:
+    """Print what a device said of itself."""
+    console = Console()
+    console.print(f"[green]{answered.name} answers[/]: {answered.description}", highlight=False)
+    note = f": {answered.rate_note}" if answered.rate_note else ""
+    console.print(f"at most {answered.max_rate_hz:.6g} samples a second{note}", highlight=False)
+    for key, value in answered.details.items():
+        console.print(f"  {key}: {value}", highlight=False, markup=False)

@@ -1,4 +1,4 @@
-"""What the commands share: the applications, their common options, printing."""
+"""What the commands share: common options, and printing for programs."""
 
 import json
 import sys
@@ -6,16 +6,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-
-app = typer.Typer(
-    name="hilctl",
-    help="Real-time hysteresis compensation for smart-material actuators.",
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-    add_completion=False,
-    context_settings={"help_option_names": ["-h", "--help"]},
-)
-devices_app = typer.Typer(help="List devices, or probe one.", no_args_is_help=False)
 
 ExperimentFile = Annotated[
     Path, typer.Argument(help="Experiment file (YAML).", metavar="EXPERIMENT")

@@ -35,7 +35,7 @@ def run(
     if detach:
         _detach(experiment, output, settings or [], overwrite=overwrite, as_json=as_json)
         return
-    from hilctl.cli.console import LiveView, print_run, run_mapping
+    from hilctl.cli.run_view import LiveView, print_run, run_mapping
     from hilctl.run.start import start_run
 
     finish_orphans()
@@ -70,7 +70,7 @@ def _detach(
 
 def status(as_json: AsJson = False) -> None:
     """Say which runs are going on, and where each stands."""
-    from hilctl.cli.console import print_status
+    from hilctl.cli.run_view import print_status
     from hilctl.run.client import status_of
     from hilctl.run.run_folder import runs
 
@@ -92,7 +92,7 @@ def stop(
     wait_s: Annotated[float, typer.Option("--wait", help="Longest wait for its end, s.")] = 60.0,
     as_json: AsJson = False,
 ) -> None:
-    """End a run by its way out: ramp to the safe value, close, record why."""
+    """End a run by its safe ramp, close, and record why."""
     from hilctl.run.client import find_run, stop_run
 
     chosen = find_run(name)
@@ -129,7 +129,7 @@ def set_(
 
 def check(experiment: ExperimentFile, settings: Settings = None, as_json: AsJson = False) -> None:
     """Check an experiment and say what it would do; nothing moves."""
-    from hilctl.cli.console import print_forecast
+    from hilctl.cli.run_view import print_forecast
     from hilctl.run.start import checked_experiment
 
     checked = checked_experiment(experiment, settings or [])

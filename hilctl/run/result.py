@@ -39,10 +39,12 @@ class Progress:
         samples: Samples recorded so far.
         total: Samples of the waveform.
         late_ticks: Ticks that woke late so far.
+        compensated: Whether the reference is a displacement, with a compensator behind it.
         batch: The newest samples.
     """
 
     samples: int
     total: int
     late_ticks: int
+    compensated: bool
     batch: Batch

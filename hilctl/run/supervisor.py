@@ -249,6 +249,7 @@ class _StartedRun:
         while (batch := self.ring.pop()) is not None:
             recorder.batch(batch)
             total, late = self._checked.forecast.samples, page.get(Field.LATE_TICKS)
-            on_progress(Progress(recorder.samples, total, late, batch))
+            compensated = self._config.compensator is not None
+            on_progress(Progress(recorder.samples, total, late, compensated, batch))
         for event in page.pop_events():
             recorder.event(event)

@@ -16,7 +16,8 @@ import pytest
 from hilctl.base.device import Device
 from hilctl.base.errors import DeviceError
 from hilctl.experiment.registry import BUILTIN, device_class
-from hilctl_drivers.emulator.modbus_bench import EmulatorOptions, build
+from hilctl_drivers.emulator.options import EmulatorOptions
+from hilctl_drivers.emulator.setup import build
 from hilctl_drivers.modbus.profile import ModbusProfile
 from hilctl_drivers.profile import load_profile, shipped_profiles
 

@@ -8,9 +8,9 @@ import pytest
 
 from hilctl.base.errors import DeviceError
 from hilctl.experiment.registry import device_class
-from hilctl_drivers.emulator.in_process import InProcess
 from hilctl_drivers.modbus.profile import ModbusProfile
 from hilctl_drivers.profile import load_profile, shipped_profiles
+from tests.fakes import InProcess
 
 RATE_HZ = 10_000.0
 BLOCK = 50

@@ -14,8 +14,8 @@ import pytest
 
 from hilctl.base.errors import DeviceError
 from hilctl.experiment.registry import device_class
-from hilctl_drivers.emulator.serial_bench import SerialEmulation
-from hilctl_drivers.emulator.serial_server import emulated_serial
+from hilctl_drivers.emulator.options import EmulatorOptions
+from hilctl_drivers.emulator.setup import emulated
 from hilctl_drivers.profile import load_profile, shipped_profiles
 
 SERIAL = (
@@ -151,8 +151,8 @@ def wired(case, tmp_path, stack):
         Path(reader).write_text(ONLY_READS)
     stream = getattr(profile, "exchange", "none") == "stream"
     clock = Clock(real=stream)
-    wanted = SerialEmulation(str(path), reader=reader, own_line=line == "own")
-    emulator = stack.enter_context(emulated_serial(wanted, clock))
+    wanted = EmulatorOptions(str(path), reader=reader, reader_line=line)
+    emulator = stack.enter_context(emulated(wanted, clock))
     options = {**emulator.options, "timeout_s": 5.0, "fifo_blocks": FIFO_BLOCKS}
     chosen = device_class("serial_dac")
     device = chosen(chosen.Options.model_validate(options))

@@ -13,7 +13,8 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from hilctl_drivers.emulator.modbus_bench import Emulator, EmulatorOptions, build
+from hilctl_drivers.emulator.options import EmulatorOptions
+from hilctl_drivers.emulator.setup import Emulator, build
 
 BAUD = 115_200
 RTU_PROFILE = """\

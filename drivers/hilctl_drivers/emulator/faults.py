@@ -7,7 +7,7 @@ from typing import Literal, TypeAlias, cast, get_args
 
 from hilctl.base.errors import InputError
 
-Kind: TypeAlias = Literal[
+FaultKind: TypeAlias = Literal[
     "silence",
     "delay",
     "exception",
@@ -18,12 +18,12 @@ Kind: TypeAlias = Literal[
     "reset",
     "unplug",
 ]
-KINDS: tuple[Kind, ...] = get_args(Kind)
+KINDS: tuple[FaultKind, ...] = get_args(FaultKind)
 DELAY_S = 1.0
 
 
 @dataclass(frozen=True, slots=True)
-class Fault:
+class WireFault:
     """One fault.
 
     Attributes:
@@ -36,13 +36,13 @@ class Fault:
         delay_s: How late, for ``delay``.
     """
 
-    kind: Kind
+    kind: FaultKind
     at_count: int | None = None
     at_s: float | None = None
     delay_s: float = DELAY_S
 
 
-def parse_fault(text: str) -> Fault:
+def parse_fault(text: str) -> WireFault:
     """Read ``KIND@COUNT`` or ``KIND@SECONDSs``; ``delay:SECONDS@...`` says how late.
 
     Raises:
@@ -58,10 +58,10 @@ def parse_fault(text: str) -> Fault:
         raise InputError(f"only delay takes a time before the @, got {text!r}")
     late_s = float(delay) if delay else DELAY_S
     if seconds:
-        return Fault(cast("Kind", kind), at_s=float(at), delay_s=late_s)
+        return WireFault(cast("FaultKind", kind), at_s=float(at), delay_s=late_s)
     if "." in at or int(at) < 1:
         raise InputError(f"the count after @ must be a whole number from 1, got {text!r}")
-    return Fault(cast("Kind", kind), at_count=int(at), delay_s=late_s)
+    return WireFault(cast("FaultKind", kind), at_count=int(at), delay_s=late_s)
 
 
 class FaultPlan:
@@ -71,12 +71,12 @@ class FaultPlan:
         faults: What to do; each happens once, but ``unplug`` stays.
     """
 
-    def __init__(self, faults: Sequence[Fault]) -> None:
+    def __init__(self, faults: Sequence[WireFault]) -> None:
         self._due = list(faults)
         self.count = 0
         """Transactions so far."""
 
-    def next(self, elapsed_s: float) -> Fault | None:
+    def next(self, elapsed_s: float) -> WireFault | None:
         """Count a transaction and return its fault, if it has one.
 
         Args:
@@ -92,7 +92,7 @@ class FaultPlan:
         return None
 
 
-def spoil(kind: Kind, reply: bytes, corrupt_at: int) -> bytes:
+def spoil(kind: FaultKind, reply: bytes, corrupt_at: int) -> bytes:
     """Return a reply with a fault on its bytes; kinds that don't change bytes leave it as it is.
 
     Args:

@@ -1,4 +1,4 @@
-"""Stream-out and stream-in of an emulated LabJack T4 or T7: registers in front of a scan clock.
+"""Stream-out and stream-in of an emulated LabJack T4 or T7: registers in front of a FIFO.
 
 It does what :mod:`hilctl_drivers.labjack.stream` says of the device. What no document was
 seen for is made up: that a trip of the watchdog ends the stream, and in which order queued sets of
@@ -11,9 +11,10 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from hilctl.base.arrays import F64
-from hilctl_drivers.emulator.emulated import Declined
+from hilctl_drivers.emulator.fifo import SampleFifo
 from hilctl_drivers.emulator.labjack_input import LabJackInput
-from hilctl_drivers.emulator.scan_clock import Played, ScanClock
+from hilctl_drivers.emulator.modbus_device import Declined, EmulatedModbus
+from hilctl_drivers.emulator.rig import Rig, WriteLog
 from hilctl_drivers.labjack import stream
 from hilctl_drivers.labjack.profile import BYTES_A_SAMPLE, LabJackStreaming
 from hilctl_drivers.modbus.profile import ModbusProfile
@@ -33,7 +34,8 @@ class LabJackStream:
         sensor: Input that shows the displacement.
         current_a: From the output's value to the rig's current.
         volts: From displacements in um to volts at the input.
-        on_played: Told what was put out.
+        on_played: Called with the first value's number, float64[n] currents in A, and the time of
+            the last.
         noise: Whether the sensor has noise.
     """
 
@@ -46,7 +48,7 @@ class LabJackStream:
         *,
         current_a: Callable[[F64], F64],
         volts: Callable[[F64], F64],
-        on_played: Played,
+        on_played: Callable[[int, F64, int], None],
         noise: bool,
     ) -> None:
         self._streaming = streaming
@@ -56,7 +58,8 @@ class LabJackStream:
         self._analog = {profile.wire_address(each) for each in profile.inputs.values()}
         self._current_a = current_a
         self._volts = volts
-        self.clock = ScanClock(noise=noise, on_played=on_played)
+        self.fifo = SampleFifo(noise=noise, repeats=True, on_played=self._played)
+        self._on_played = on_played
         self.input = LabJackInput(streaming)
         self._words = {address: [0, 0] for address in _plain(profile, streaming)}
         self._pending: list[F64] = []
@@ -69,7 +72,7 @@ class LabJackStream:
         }
         self._reads: dict[int, Callable[[int], bytes]] = {
             stream.OUT_BUFFER_STATUS: lambda count: stream.u32(self._capacity - self._held),
-            stream.ENABLE: lambda count: stream.u32(int(self.clock.running)),
+            stream.ENABLE: lambda count: stream.u32(int(self.fifo.running)),
             stream.DATA_CR: self._data,
             stream.FLASH_READ: self._read_flash,
         }
@@ -78,7 +81,7 @@ class LabJackStream:
     @property
     def running(self) -> bool:
         """Whether it streams."""
-        return self.clock.running
+        return self.fifo.running
 
     def has(self, address: int) -> bool:
         """Return whether an address is the stream's business; inputs are while it runs."""
@@ -89,14 +92,16 @@ class LabJackStream:
     def tick(self, now_ns: int) -> None:
         """Let time pass."""
         self._now_ns = max(self._now_ns, now_ns)
-        volts = self._volts(self.clock.advance(self._now_ns))
-        if volts.size:
-            self.input.keep(volts)
+        self.fifo.advance(self._now_ns)
+
+    def _played(self, first: int, current_a: F64, displacement_um: F64, now_ns: int) -> None:
+        self._on_played(first, current_a, now_ns)
+        self.input.keep(self._volts(displacement_um))
 
     def stop(self, now_ns: int) -> None:
         """Stop streaming at a time that may be past; the output holds its value."""
         self.tick(now_ns)
-        self.clock.stop()
+        self.fifo.stop()
 
     def read(self, address: int, count: int) -> list[int]:
         """Return register words.
@@ -136,7 +141,7 @@ class LabJackStream:
 
     @property
     def _held(self) -> int:
-        return self.clock.level + sum(part.size for part in self._pending)
+        return self.fifo.level + sum(part.size for part in self._pending)
 
     def _number(self, address: int) -> int:
         high, low = self._words[address]
@@ -161,7 +166,7 @@ class LabJackStream:
             not allowed or self._number(stream.OUT_TARGET) != self._target
         ):
             raise Declined(_FAILURE_EXCEPTION)
-        self.clock.clear()
+        self.fifo.clear()
         self._pending.clear()
 
     def _take_values(self, data: bytes) -> None:
@@ -179,14 +184,14 @@ class LabJackStream:
         if data != stream.u32(stream.USE_AT_ONCE):
             raise Declined(_VALUE_EXCEPTION)
         for values in self._pending:
-            self.clock.queue(self._current_a(values))
+            self.fifo.queue(self._current_a(values))
         self._pending.clear()
 
     def _enable(self, data: bytes) -> None:
         if data == stream.u32(0):
             if not self.running:
                 raise Declined(_FAILURE_EXCEPTION)
-            self.clock.stop()
+            self.fifo.stop()
             return
         addresses = [self._number(stream.SCANLIST_ADDRESS + 2 * k) for k in range(2)]
         settings = (self._number(stream.NUM_ADDRESSES), self._number(stream.AUTO_TARGET))
@@ -201,7 +206,8 @@ class LabJackStream:
         ):
             raise Declined(_FAILURE_EXCEPTION)
         self.input.start(self._number(stream.BUFFER_SIZE_BYTES))
-        self.clock.start(rate_hz, self._now_ns)
+        self.fifo.set_rate(rate_hz)
+        self.fifo.start(self._now_ns)
 
     @property
     def _rate_hz(self) -> float:
@@ -233,3 +239,45 @@ def _plain(profile: ModbusProfile, streaming: LabJackStreaming) -> set[int]:
         profile.wire_address(step) for step in streaming.setup if isinstance(step, RegisterStep)
     }
     return settings | scanned | steps
+
+
+def attach_stream(
+    device: EmulatedModbus, rig: Rig, log: WriteLog, output: str, sensor: str, *, noise: bool
+) -> None:
+    """Give an emulated device its stream, where its profile has one for these channels.
+
+    Args:
+        device: Which.
+        rig: What it stands at.
+        log: Where what is put out goes.
+        output: Output that drives the rig.
+        sensor: Input that shows the displacement.
+        noise: Whether the sensor has noise.
+    """
+    profile, wiring = device.profile, device.wiring
+    streaming = profile.streaming
+    if streaming == "none" or output not in streaming.outputs or sensor not in streaming.inputs:
+        return
+    channel, terminal = profile.outputs[output], profile.inputs[sensor]
+    words, _ = device.memory.targets(
+        channel.area, profile.wire_address(channel), [0] * channel.words
+    )[0]
+
+    def played(first: int, current_a: F64, now_ns: int) -> None:
+        words.value = value = (float(current_a[-1]) - wiring.offset_a) / wiring.gain_a
+        rig.put_out(float(current_a[-1]), now_ns)
+        log.event(
+            now_ns, "played", output=output, first=first, samples=current_a.size, value=value,
+            unit=channel.unit, current_a=float(current_a[-1]),
+        )  # fmt: skip
+
+    device.overlay = LabJackStream(
+        profile,
+        streaming,
+        output,
+        sensor,
+        current_a=lambda values: values * wiring.gain_a + wiring.offset_a,
+        volts=lambda um: np.clip((um - wiring.offset_um) / wiring.sensor_um, *terminal.limits),
+        on_played=played,
+        noise=noise,
+    )

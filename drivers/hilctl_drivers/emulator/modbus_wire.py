@@ -7,7 +7,7 @@ milliseconds in each transaction.
 """
 
 import struct
-from collections.abc import Coroutine, Mapping, Sequence
+from collections.abc import Coroutine, Iterator, Mapping, Sequence
 from typing import Any, Literal, TypeAlias
 
 from pymodbus.constants import ExcCodes
@@ -15,12 +15,12 @@ from pymodbus.exceptions import ModbusException
 from pymodbus.framer import FramerRTU, FramerSocket
 from pymodbus.pdu import DecodePDU, ExceptionResponse, ModbusPDU
 
-from hilctl_drivers.emulator.emulated import Declined, EmulatedDevice
+from hilctl_drivers.emulator.modbus_device import Declined, EmulatedModbus
+from hilctl_drivers.emulator.wire import EmulatedReply
 
 LinkKind: TypeAlias = Literal["tcp", "rtu"]
 
-CORRUPT_AT = 3
-"""Byte of a reply whose change no receiver may miss: the protocol id (TCP), data (RTU)."""
+_CORRUPT_AT = 3  # the protocol id (TCP), data (RTU)
 
 _AREAS: dict[int, tuple[str, ...]] = {
     1: ("coil",),
@@ -75,7 +75,7 @@ class FeedbackPdu(ModbusPDU):
 class _Context:
     """What pymodbus's messages act on: a device's registers."""
 
-    def __init__(self, device: EmulatedDevice) -> None:
+    def __init__(self, device: EmulatedModbus) -> None:
         self._device = device
 
     async def async_getValues(  # noqa: N802  pymodbus calls it by this name
@@ -121,16 +121,18 @@ class ModbusWire:
         kind: ``tcp`` or ``rtu``.
         devices: What carries requests out: one, or several by unit id.
         lacking: Functions that the devices are to refuse as unknown, with exception 1.
+        mute: Functions that are never answered, as some devices do with those they don't know.
     """
 
     def __init__(
         self,
         kind: LinkKind,
-        devices: EmulatedDevice | Mapping[int, EmulatedDevice],
+        devices: EmulatedModbus | Mapping[int, EmulatedModbus],
         lacking: frozenset[int] = frozenset(),
+        mute: frozenset[int] = frozenset(),
     ) -> None:
         self._kind = kind
-        if isinstance(devices, EmulatedDevice):
+        if isinstance(devices, EmulatedModbus):
             devices = {devices.profile.unit_id: devices}
         self._devices = dict(devices)
         self._any_unit = kind == "tcp" and len(devices) == 1
@@ -138,62 +140,76 @@ class ModbusWire:
         self._decoder.register(FeedbackPdu)
         self._framer = (FramerSocket if kind == "tcp" else FramerRTU)(self._decoder)
         self._lacking = lacking
+        self._mute = mute
 
     def tick(self, now_ns: int) -> None:
         """Let time pass for all devices."""
         for device in self._devices.values():
             device.tick(now_ns)
 
-    def _device(self, unit: int) -> EmulatedDevice | None:
+    def _device(self, unit: int) -> EmulatedModbus | None:
         return next(iter(self._devices.values())) if self._any_unit else self._devices.get(unit)
 
-    def take(self, received: bytes) -> tuple[int, bytes]:
-        """Find one request.
+    def requests(self, received: bytearray) -> Iterator[bytes]:
+        """Yield complete requests, with their envelope's ids before them, and take them out.
 
-        Args:
-            received: All that has come and was not used yet.
-
-        Returns:
-            How many bytes are used up, and the request with its envelope's ids; empty where it is
-            not complete or was not for us.
+        Those that are for nobody here are taken out and not yielded.
         """
-        used, unit, transaction, pdu = self._framer.decode(received)
-        if not pdu or (self._kind == "rtu" and unit not in self._devices):
-            return used, b""
-        return used, struct.pack(">HB", transaction, unit) + pdu
+        while received:
+            used, unit, transaction, pdu = self._framer.decode(bytes(received))
+            if not used:
+                return
+            del received[:used]
+            if pdu and (self._kind == "tcp" or unit in self._devices):
+                yield struct.pack(">HB", transaction, unit) + pdu
 
-    def answer(self, request: bytes, now_ns: int) -> bytes:
-        """Carry out a request of :meth:`take` and return the reply's bytes."""
+    def answer(self, request: bytes, now_ns: int) -> EmulatedReply | None:
+        """Carry out a request of :meth:`requests`; None where it is never answered."""
+        if request[3] in self._mute:
+            return None
+        return self._answered(self._reply(request, now_ns), request)
+
+    def _reply(self, request: bytes, now_ns: int) -> ModbusPDU:
         unit, function = request[2], request[3]
         device = self._device(unit)
         if device is None:
-            return self.refusal(request, ExcCodes.GATEWAY_NO_RESPONSE)
+            return ExceptionResponse(function, ExcCodes.GATEWAY_NO_RESPONSE)
         device.request(now_ns)
         if function in self._lacking | ({23, 76} - {device.profile.exchange}):
-            return self.refusal(request, 1)
+            return ExceptionResponse(function, ExcCodes.ILLEGAL_FUNCTION)
         try:
             message = self._decoder.decode(request[3:])
             if message is None:
                 known = function in self._decoder.pdu_table
-                return self.refusal(request, 3 if known else 1)
+                code = ExcCodes.ILLEGAL_VALUE if known else ExcCodes.ILLEGAL_FUNCTION
+                return ExceptionResponse(function, code)
             context: Any = _Context(device)  # all that the messages ask for
-            reply = _finish(message.datastore_update(context, unit))
+            return _finish(message.datastore_update(context, unit))
         except (ModbusException, struct.error, KeyError):
-            return self.refusal(request, 3)
-        return self._framed(reply, request)
+            return ExceptionResponse(function, ExcCodes.ILLEGAL_VALUE)
 
-    def refusal(self, request: bytes, code: int) -> bytes:
-        """Return the bytes of an exception reply to a request."""
-        return self._framed(ExceptionResponse(request[3], code), request)
+    def refusal(self, request: bytes) -> EmulatedReply:
+        """Return the exception reply of a device that fails to carry a request out."""
+        return self._answered(ExceptionResponse(request[3], ExcCodes.DEVICE_FAILURE), request)
 
-    def wrong_id(self, request: bytes, reply: bytes) -> bytes:
+    def encode(self, data: bytes) -> bytes:
+        """Return a reply as it is: pymodbus made it with its envelope."""
+        return data
+
+    def corrupt_at(self, framed: bytes) -> int:
+        """Return the byte of a reply whose damage no receiver may miss."""
+        del framed
+        return _CORRUPT_AT
+
+    def _answered(self, reply: ModbusPDU, request: bytes) -> EmulatedReply:
+        reply.transaction_id, reply.dev_id = struct.unpack_from(">HB", request)
+        framed = self._framer.buildFrame(reply)
+        return EmulatedReply(framed, wrong_id=lambda data: self._renamed(request, data))
+
+    def _renamed(self, request: bytes, reply: bytes) -> bytes:
         """Return a reply in the name of another transaction (TCP) or unit (RTU)."""
         transaction, unit = struct.unpack_from(">HB", request)
         data = reply[7:] if self._kind == "tcp" else reply[1:-2]
         if self._kind == "tcp":
             return self._framer.encode(data, unit, (transaction + 1) & 0xFFFF)
         return self._framer.encode(data, unit % 247 + 1, 0)
-
-    def _framed(self, reply: ModbusPDU, request: bytes) -> bytes:
-        reply.transaction_id, reply.dev_id = struct.unpack_from(">HB", request)
-        return self._framer.buildFrame(reply)

@@ -1,9 +1,14 @@
-"""The simulated Terfenol-D rig on a clock of its own, as it stands behind an emulated device."""
+"""What stands behind an emulated device: rig, wiring, and a log of what was put out."""
 
-from dataclasses import replace
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import IO, Any
 
 import numpy as np
 
+from hilctl.base.errors import InputError
+from hilctl_drivers.profile_parts import Range
 from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
 
 RATE_HZ = 10_000.0
@@ -60,3 +65,78 @@ class Rig:
         self._plant.step(self._held[:count], self._read[0, :count], self._read[1, :count])
         self.displacement_um = float(self._read[0, count - 1])
         self._samples += count
+
+
+@dataclass(frozen=True, slots=True)
+class Wiring:
+    """What stands between the device's terminals and the rig.
+
+    Attributes:
+        gain_a: Amplifier, A for one unit of the output.
+        offset_a: Current at 0 of the output.
+        sensor_um: Sensor, um for one unit of the input.
+        offset_um: Displacement at 0 of the input.
+    """
+
+    gain_a: float
+    offset_a: float
+    sensor_um: float
+    offset_um: float
+
+    @classmethod
+    def spread(cls, output: Range, sensor: Range) -> "Wiring":
+        """Return a wiring that spreads the rig's ranges over those of the two channels.
+
+        An output in A drives the coil itself.
+        """
+        rig = TerfenolParameters()
+        gain_a, offset_a = _spread(output, rig.dac_range_a)
+        if output.unit == "A":
+            gain_a, offset_a = 1.0, 0.0
+        return cls(gain_a, offset_a, *_spread(sensor, rig.sensor_range_um))
+
+
+def _spread(channel: Range, reach: float) -> tuple[float, float]:
+    gain = 2.0 * reach / (channel.max - channel.min)
+    return gain, -0.5 * gain * (channel.max + channel.min)
+
+
+class WriteLog:
+    """One JSON object a line, on disk as soon as it happened.
+
+    Args:
+        path: File to write, replaced if it exists; None keeps no log.
+        unix_offset_ns: What to add to the monotonic clock to get Unix time.
+
+    Raises:
+        InputError: The file can't be written.
+    """
+
+    def __init__(self, path: Path | None, unix_offset_ns: int) -> None:
+        self._offset_ns = unix_offset_ns
+        self._file: IO[bytes] | None = None
+        if path is not None:
+            try:
+                self._file = path.open("wb", buffering=0)
+            except OSError as error:
+                raise InputError(f"{path}: can't be written: {error.strerror}") from None
+
+    def event(self, now_ns: int, event: str, **more: Any) -> None:
+        """Write one line.
+
+        Args:
+            now_ns: Monotonic time.
+            event: What happened.
+            more: Plain values.
+        """
+        if self._file is None:
+            return
+        unix_s = (now_ns + self._offset_ns) * 1e-9
+        entry = {"event": event, "monotonic_ns": now_ns, "unix_s": unix_s, **more}
+        self._file.write(json.dumps(entry).encode() + b"\n")
+
+    def close(self) -> None:
+        """Close the file."""
+        if self._file is not None:
+            self._file.close()
+            self._file = None

@@ -1,6 +1,6 @@
 """The host watchdog of an emulated device, driven by the registers that the profile names."""
 
-from hilctl_drivers.emulator.memory import Words
+from hilctl_drivers.emulator.registers import Words
 from hilctl_drivers.modbus.profile import ModbusWatchdog
 from hilctl_drivers.modbus.steps import EnsureStep, ModbusStep, WriteStep
 
@@ -8,7 +8,7 @@ Target = tuple[Words, list[int] | None]
 """A value and the words that trigger something; None stands for any words but zeros."""
 
 
-class HostWatchdog:
+class EmulatedWatchdog:
     """Trips when the host has been silent for the timeout.
 
     It is armed by the last of the profile's arm steps and disarmed by the last of the disarm steps,

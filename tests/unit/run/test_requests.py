@@ -2,7 +2,7 @@
 
 import pytest
 
-from hilctl.cli.console import print_status
+from hilctl.cli.run_view import print_status
 
 PATH = "/home/somebody/a/folder/with/a/long/name/recordings/2026-11-21_terfenol_sine_6a.mcap"
 RUNNING = {

@@ -16,7 +16,8 @@ from hilctl.loop.loop import Loop
 from hilctl.loop.pacer import SystemClock
 from hilctl.loop.plan import Plan
 from hilctl_drivers.emulator.faults import parse_fault
-from hilctl_drivers.emulator.serial_server import SerialEmulation, emulated_serial
+from hilctl_drivers.emulator.options import EmulatorOptions
+from hilctl_drivers.emulator.setup import emulated
 from hilctl_drivers.profile import shipped_profiles
 from hilctl_drivers.serial.device import SerialDac
 from hilctl_drivers.serial.options import SerialOptions
@@ -80,8 +81,8 @@ def board(tmp_path):
         log = tmp_path / f"log{len(stack)}.jsonl"
         made = tuple(parse_fault(fault) for fault in faults)
         clock = Clock()
-        wanted = SerialEmulation(str(profile), log=log, faults=made, noise=noise)
-        served = emulated_serial(wanted, clock)
+        wanted = EmulatorOptions(str(profile), log=log, faults=made, noise=noise)
+        served = emulated(wanted, clock)
         stack.append((Board(served.__enter__(), log, clock, **options), served))
         return stack[-1][0]
 
@@ -124,7 +125,7 @@ def test_the_board_keeps_the_pace(board):
     bench = board()
     bench.open()
     bench.hold(1.0, FIFO_BLOCKS)
-    assert bench.emulator.device.player.played < BLOCK
+    assert bench.emulator.device.fifo.played < BLOCK
     start = time.monotonic()
     bench.hold(1.0, 10)
     assert time.monotonic() - start > 0.9 * 10 * BLOCK / RATE_HZ
@@ -138,7 +139,7 @@ def test_a_stall_of_this_machine_costs_fifo_and_no_sample(board):
     bench.hold(1.0, 25)
     bench.clock.extra_ns += 100 * MS
     assert all(np.isfinite(each).all() for each in bench.hold(1.0, 20))
-    assert bench.emulator.device.player.underruns == 0
+    assert bench.emulator.device.fifo.underruns == 0
     bench.device.close()
 
 
@@ -201,7 +202,7 @@ def test_a_block_with_a_bad_value_is_refused_whole(board, bad):
     command[40] = bad
     with pytest.raises(DeviceError, match=r"command\[40\] must be in"):
         bench.exchange(command)
-    assert bench.emulator.device.player.queued == 2 * BLOCK
+    assert bench.emulator.device.queued == 2 * BLOCK
     bench.hold(1.0, 2)
 
 

@@ -4,9 +4,9 @@ import struct
 
 import pytest
 
-from hilctl_drivers.emulator.in_process import InProcess
 from hilctl_drivers.labjack.frames import Feedback, ReadFrame, WriteFrame
 from hilctl_drivers.wire.errors import Refused
+from tests.fakes import InProcess
 
 SETTINGS = {
     4040: 1000, 4050: 256, 4060: 1, 4090: 1,  # stream-out 0: DAC0, 128 values, the last repeated

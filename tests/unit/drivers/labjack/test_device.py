@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from hilctl.base.errors import DeviceError, InputError
-from hilctl_drivers.emulator.in_process import InProcess, InProcessLink
 from hilctl_drivers.labjack import stream
 from hilctl_drivers.labjack.device import ModbusStream
 from hilctl_drivers.labjack.setup import ModbusStreamOptions, stream_time
 from hilctl_drivers.profile import load_profile
 from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
 from hilctl_drivers.wire.links import NoAnswerError
+from tests.fakes import InProcess, InProcessLink
 
 RATE_HZ = 10_000.0
 BLOCK = 100
@@ -78,7 +78,7 @@ class Bench:
     @property
     def clock(self):
         """The emulated device's scan clock."""
-        return self.emulated.device.overlay.clock
+        return self.emulated.device.overlay.fifo
 
 
 @pytest.fixture
@@ -184,7 +184,7 @@ def test_the_device_keeps_the_pace(bench):
     made.hold(1.0, 50)
     assert made.time() - before == pytest.approx(50 * BLOCK / RATE_HZ, rel=0.01)
     assert made.device.stream.level_min > (FIFO_BLOCKS - 1.1) * BLOCK
-    assert made.clock.repeated == 0
+    assert made.clock.underruns == 0
 
 
 def test_a_block_costs_no_more_messages_than_values_and_readings_need(bench):
@@ -217,7 +217,7 @@ def test_the_highest_rate_needs_all_of_the_messages(bench):
     found = np.concatenate(back[6:])
     expected = alone(commands[: found.size], rate_hz)
     assert found == pytest.approx(expected, abs=0.51 * LSB_UM)
-    assert made.clock.repeated == 0
+    assert made.clock.underruns == 0
 
 
 def test_a_stall_of_this_machine_costs_fifo_and_no_sample(bench):
@@ -227,7 +227,7 @@ def test_a_stall_of_this_machine_costs_fifo_and_no_sample(bench):
     made.hold(1.0, 10)
     made.stall(0.035)
     assert all(np.isfinite(each).all() for each in made.hold(1.0, 20))
-    assert made.clock.repeated == 0
+    assert made.clock.underruns == 0
     made.device.close()
     assert not made.clock.running
 
@@ -241,7 +241,7 @@ def test_an_underrun_is_told_with_its_length(bench):
     with pytest.raises(DeviceError, match=r"underrun: .* put out for (\d+) sample periods") as e:
         made.hold(1.0, 1)
     told = int(str(e.value).split("put out for ")[1].split()[0])
-    assert told == made.clock.repeated
+    assert told == made.clock.underruns
     assert 250 <= told <= 350
     made.device.make_safe(0.0)
     assert made.events()[-1]["current_a"] == pytest.approx(0.0, abs=1e-9)
@@ -442,7 +442,7 @@ def test_a_stream_of_an_earlier_run_is_stopped(bench):
     assert not again.clock.running
     found = again.hold(2.0, FIFO_BLOCKS + 2)
     assert np.isfinite(found[-1]).all()
-    assert again.clock.repeated == 0
+    assert again.clock.underruns == 0
 
 
 def test_opening_again_starts_at_zero_and_keeps_the_output(bench):

@@ -12,7 +12,8 @@ from pydantic import ValidationError
 
 from hilctl.base.errors import DeviceError, InputError
 from hilctl_drivers.emulator.faults import parse_fault
-from hilctl_drivers.emulator.modbus_bench import Emulator, EmulatorOptions, build
+from hilctl_drivers.emulator.options import EmulatorOptions
+from hilctl_drivers.emulator.setup import Emulator, build
 from hilctl_drivers.modbus.device import ModbusDac
 from hilctl_drivers.modbus.options import ModbusOptions
 from hilctl_drivers.profile import load_profile, shipped_profiles

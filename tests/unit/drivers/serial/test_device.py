@@ -10,7 +10,8 @@ import pytest
 
 from hilctl.base.errors import DeviceError, InputError
 from hilctl_drivers.emulator.faults import parse_fault
-from hilctl_drivers.emulator.serial_server import SerialEmulation, emulated_serial
+from hilctl_drivers.emulator.options import EmulatorOptions
+from hilctl_drivers.emulator.setup import emulated
 from hilctl_drivers.profile import shipped_profiles
 from hilctl_drivers.serial.device import SerialDac
 from hilctl_drivers.serial.options import SerialOptions
@@ -90,15 +91,15 @@ def rig(profiles, tmp_path):
 
     def of(kind, faults=(), reader=None, own_line=False, **options):
         log = tmp_path / f"log{len(stack)}.jsonl"
-        wanted = SerialEmulation(
+        wanted = EmulatorOptions(
             profiles.get(kind, kind),
             log=log,
             faults=tuple(parse_fault(text) for text in faults),
             reader=reader,
-            own_line=own_line,
+            reader_line="own" if own_line else "same",
         )
         clock = Clock()
-        served = emulated_serial(wanted, clock)
+        served = emulated(wanted, clock)
         made = Rig(served.__enter__(), log, clock, **options)
         stack.append((made, served))
         return made
@@ -280,8 +281,8 @@ def test_a_reader_that_fails_is_named(rig):
     bench = rig("kepco_bop", reader="agilent_34970a", own_line=True)
     bench.open()
     bench.exchange(0.0)
-    bench.emulator.lines[1].devices = []
-    port = bench.emulator.lines[1].name
+    bench.emulator.wires[1].devices = []
+    port = bench.emulator.reader_address
     with pytest.raises(DeviceError, match=rf"reader Agilent 34970A .* at {port}: "):
         exchange_until_it_fails(bench, 0.0)
 

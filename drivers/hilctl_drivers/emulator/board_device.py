@@ -10,11 +10,9 @@ from hilctl_drivers.board import frames as board
 from hilctl_drivers.board.frames import Status
 from hilctl_drivers.board.profile import FrameProfile, FrameStreaming
 from hilctl_drivers.board.session import Values
-from hilctl_drivers.emulator.answer import Answer
-from hilctl_drivers.emulator.rig import Rig
-from hilctl_drivers.emulator.stream_player import StreamPlayer
-from hilctl_drivers.emulator.wiring import Wiring
-from hilctl_drivers.emulator.write_log import WriteLog
+from hilctl_drivers.emulator.fifo import SampleFifo
+from hilctl_drivers.emulator.rig import Rig, Wiring, WriteLog
+from hilctl_drivers.emulator.wire import EmulatedReply
 
 
 class _Refuse(Exception):  # noqa: N818  a reply, not a mistake
@@ -47,15 +45,16 @@ class EmulatedBoard:
         self._inputs = Values(self._sensor)
         streaming = profile.streaming
         self._streaming = streaming if isinstance(streaming, FrameStreaming) else None
-        depth = self._streaming.fifo_depth if self._streaming else 0
-        self.player = StreamPlayer(depth, noise=noise, on_played=self._played)
+        self.fifo = SampleFifo(noise=noise, repeats=False, on_played=self._played)
         self._prefill = 0
+        self._readings = np.empty(0)
+        self._returned = 0
         self._timeout_ns = 0
         self._safe = 0.0
-        self._heard_ns = 0
+        self._received_ns = 0
         self._now_ns = 0
         self.tripped = False
-        self._kinds: dict[int, Callable[[bytes, bytes], Answer]] = {
+        self._kinds: dict[int, Callable[[bytes, bytes], EmulatedReply]] = {
             board.EXCHANGE: self._exchange,
             board.STREAM: self._stream,
             board.WATCHDOG: self._watchdog,
@@ -66,21 +65,21 @@ class EmulatedBoard:
 
     def tick(self, now_ns: int) -> None:
         """Let time pass; the watchdog may trip on the way."""
-        due_ns = self._heard_ns + self._timeout_ns
+        due_ns = self._received_ns + self._timeout_ns
         if self._timeout_ns and not self.tripped and due_ns <= now_ns:
-            self.player.advance(due_ns)
-            self.player.stop()
+            self.fifo.advance(due_ns)
+            self._stop()
             self.tripped = True
             self._put_out(self._safe, "watchdog", due_ns)
         self._now_ns = max(self._now_ns, now_ns)
-        self.player.advance(self._now_ns)
-        if not self.player.running:
+        self.fifo.advance(self._now_ns)
+        if not self.fifo.running:
             self._rig.advance(self._now_ns)
 
-    def hear(self, message: bytes, now_ns: int) -> Answer:
+    def answer(self, message: bytes, now_ns: int) -> EmulatedReply:
         """Take one message and return what to answer; a refused one changes nothing."""
         self.tick(now_ns)
-        self._heard_ns = self._now_ns
+        self._received_ns = self._now_ns
         head = message[: board.HEAD.size]
         if len(head) < board.HEAD.size or head[0] not in self._kinds:
             return self.refusal(message, Status.BAD_MESSAGE)
@@ -89,14 +88,19 @@ class EmulatedBoard:
         except _Refuse as refused:
             return self.refusal(message, refused.status)
 
-    def refusal(self, message: bytes, status: int = Status.BAD_MESSAGE) -> Answer:
+    def refusal(self, message: bytes, status: int = Status.BAD_MESSAGE) -> EmulatedReply:
         """Return a reply that says no."""
         kind, seq = (*message[:2], 0, 0)[:2]
-        return Answer(board.STATUS_REPLY.pack(kind | board.REPLY_BIT, seq, status))
+        return EmulatedReply(board.STATUS_REPLY.pack(kind | board.REPLY_BIT, seq, status))
 
     def wrong_id(self, reply: bytes) -> bytes:
         """Return a reply as if to another message."""
         return reply[:1] + bytes([reply[1] ^ 0x55]) + reply[2:]
+
+    @property
+    def queued(self) -> int:
+        """Values taken since the clock was set."""
+        return self.fifo.played + self.fifo.level
 
     def _values(self, data: bytes, count: int) -> F64:
         """Return the values of a message, all of them good."""
@@ -109,9 +113,9 @@ class EmulatedBoard:
             raise _Refuse(Status.OUT_OF_RANGE)
         return values
 
-    def _exchange(self, head: bytes, body: bytes) -> Answer:
+    def _exchange(self, head: bytes, body: bytes) -> EmulatedReply:
         size = board.EXCHANGE_REQUEST.size - board.HEAD.size
-        if len(body) < size or body[:size] != b"\1\0" or self.player.running:
+        if len(body) < size or body[:size] != b"\1\0" or self.fifo.running:
             raise _Refuse(Status.BAD_MESSAGE)
         values = self._values(body[size:], 1)
         if self.tripped:
@@ -119,44 +123,48 @@ class EmulatedBoard:
         reading = self._terminal(np.array([self._rig.displacement_um]))
         self._put_out(float(values[0]), "write", self._now_ns)
         reply = board.EXCHANGE_REPLY.pack(head[0] | board.REPLY_BIT, head[1], 0, 1)
-        return Answer(reply + self._inputs.encode(reading) + board.FIFO_TAIL.pack(0, 0))
+        return EmulatedReply(reply + self._inputs.encode(reading) + board.FIFO_TAIL.pack(0, 0))
 
-    def _stream(self, head: bytes, body: bytes) -> Answer:
+    def _stream(self, head: bytes, body: bytes) -> EmulatedReply:
         size = board.STREAM_REQUEST.size - board.HEAD.size
-        player, streaming = self.player, self._streaming
+        fifo, streaming = self.fifo, self._streaming
         if len(body) < size or streaming is None:
             raise _Refuse(Status.BAD_MESSAGE)
         _, _, first, count = board.STREAM_REQUEST.unpack(head + body[:size])
         values = self._values(body[size:], count)
         if self.tripped:
             raise _Refuse(Status.TRIPPED)
-        if not player.running or count > streaming.block_max:
+        if not fifo.running or count > streaming.block_max:
             raise _Refuse(Status.BAD_MESSAGE)
-        if first != player.queued & 0xFFFFFFFF:
+        if first != self.queued & 0xFFFFFFFF:
             raise _Refuse(Status.WRONG_FIRST)
-        if player.level + count > player.depth:
+        if fifo.level + count > streaming.fifo_depth:
             raise _Refuse(Status.FIFO_FULL)
-        player.queue(values * self._wiring.gain_a + self._wiring.offset_a, self._now_ns)
-        until = max(0, player.queued - self._prefill)
-        due_ns = player.due_ns(until) if until else 0
-        return Answer(None, due_ns or 0, lambda now_ns: self._stream_reply(head, until, now_ns))
+        fifo.queue(values * self._wiring.gain_a + self._wiring.offset_a)
+        if not fifo.started and fifo.level >= self._prefill:
+            fifo.start(self._now_ns)
+        until = max(0, self.queued - self._prefill)
+        due_ns = fifo.due_ns(until) if until else 0
+        return EmulatedReply(
+            None, due_ns or 0, lambda now_ns: self._stream_reply(head, until, now_ns)
+        )
 
     def _stream_reply(self, head: bytes, until: int, now_ns: int) -> bytes:
         self.tick(now_ns)
         if self.tripped:
             return board.STATUS_REPLY.pack(head[0] | board.REPLY_BIT, head[1], Status.TRIPPED)
-        player = self.player
-        if player.played < until:  # it was stopped meanwhile
-            until = player.played
-        first = player.returned
-        readings = self._terminal(player.take(until))
-        level, underruns = min(player.level, 0xFFFF), min(player.underruns, 0xFFFF)
+        fifo, first = self.fifo, self._returned
+        count = min(max(0, until - first), self._readings.size)  # none where it was stopped since
+        readings, self._readings = np.split(self._readings, [count])
+        self._returned += count
+        level, underruns = min(fifo.level, 0xFFFF), min(fifo.underruns, 0xFFFF)
         reply = board.STREAM_REPLY.pack(
             head[0] | board.REPLY_BIT, head[1], 0, first & 0xFFFFFFFF, readings.size
         )
-        return reply + self._inputs.encode(readings) + board.FIFO_TAIL.pack(level, underruns)
+        tail = board.FIFO_TAIL.pack(level, underruns)
+        return reply + self._inputs.encode(self._terminal(readings)) + tail
 
-    def _watchdog(self, head: bytes, body: bytes) -> Answer:
+    def _watchdog(self, head: bytes, body: bytes) -> EmulatedReply:
         size = board.WATCHDOG_REQUEST.size - board.HEAD.size
         if len(body) < size or self._profile.watchdog == "none":
             raise _Refuse(Status.BAD_MESSAGE)
@@ -165,17 +173,23 @@ class EmulatedBoard:
         self._timeout_ns = timeout_ms * 1_000_000
         self.tripped = False
         reply = board.WATCHDOG_REPLY.pack(head[0] | board.REPLY_BIT, head[1], 0, timeout_ms)
-        return Answer(reply)
+        return EmulatedReply(reply)
 
-    def _put_safe(self, head: bytes, body: bytes) -> Answer:
+    def _put_safe(self, head: bytes, body: bytes) -> EmulatedReply:
         value = float(self._values(body, 1)[0])
         if self.tripped:
             raise _Refuse(Status.TRIPPED)
-        self.player.stop()
+        self._stop()
         self._put_out(value, "safe", self._now_ns)
-        return Answer(board.STATUS_REPLY.pack(head[0] | board.REPLY_BIT, head[1], 0))
+        return EmulatedReply(board.STATUS_REPLY.pack(head[0] | board.REPLY_BIT, head[1], 0))
 
-    def _info(self, head: bytes, body: bytes) -> Answer:
+    def _stop(self) -> None:
+        """Stop streaming and forget all of it; the output holds its value."""
+        self.fifo.stop()
+        self.fifo.clear()
+        self._readings, self._returned = np.empty(0), 0
+
+    def _info(self, head: bytes, body: bytes) -> EmulatedReply:
         del body
         low, high = self._output.limits
         streaming = self._streaming
@@ -190,29 +204,32 @@ class EmulatedBoard:
             low,
             high,
         )
-        return Answer(reply + b"hilctl emulated board")
+        return EmulatedReply(reply + b"hilctl emulated board")
 
-    def _clock(self, head: bytes, body: bytes) -> Answer:
+    def _clock(self, head: bytes, body: bytes) -> EmulatedReply:
         if len(body) != board.CLOCK_REQUEST.size - board.HEAD.size or self._streaming is None:
             raise _Refuse(Status.BAD_MESSAGE)
         _, _, rate_hz, prefill = board.CLOCK_REQUEST.unpack(head + body)
         too_fast = not 0.0 <= rate_hz <= self._profile.max_rate_hz * (1.0 + 1e-6)
-        if too_fast or prefill > self.player.depth or not math.isfinite(rate_hz):
+        if too_fast or prefill > self._streaming.fifo_depth or not math.isfinite(rate_hz):
             raise _Refuse(Status.BAD_MESSAGE)
         self._prefill = prefill
-        self.player.set_clock(rate_hz, prefill)
-        return Answer(board.CLOCK_REPLY.pack(head[0] | board.REPLY_BIT, head[1], 0, rate_hz))
+        self._stop()
+        if rate_hz > 0.0:
+            self.fifo.set_rate(rate_hz)
+        return EmulatedReply(board.CLOCK_REPLY.pack(head[0] | board.REPLY_BIT, head[1], 0, rate_hz))
 
     def _put_out(self, value: float, event: str, now_ns: int) -> None:
         current_a = self._wiring.gain_a * value + self._wiring.offset_a
         self._rig.put_out(current_a, now_ns)
-        self.player.current_a = current_a
+        self.fifo.current_a = current_a
         self._log.event(
             now_ns, event, output=self._output_name, value=value, unit=self._output.unit,
             current_a=current_a,
         )  # fmt: skip
 
-    def _played(self, first: int, current_a: F64, now_ns: int) -> None:
+    def _played(self, first: int, current_a: F64, displacement_um: F64, now_ns: int) -> None:
+        self._readings = np.concatenate([self._readings, displacement_um])
         value = (float(current_a[-1]) - self._wiring.offset_a) / self._wiring.gain_a
         self._log.event(
             now_ns, "played", output=self._output_name, first=first, samples=current_a.size,

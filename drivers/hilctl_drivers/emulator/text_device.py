@@ -1,12 +1,10 @@
 """An emulated device that speaks lines of text: a profile's templates in front of the rig."""
 
 import re
+from string import Formatter
 
-from hilctl_drivers.emulator.answer import Answer
-from hilctl_drivers.emulator.ascii_templates import Template, in_style
-from hilctl_drivers.emulator.rig import Rig
-from hilctl_drivers.emulator.wiring import Wiring
-from hilctl_drivers.emulator.write_log import WriteLog
+from hilctl_drivers.emulator.rig import Rig, Wiring, WriteLog
+from hilctl_drivers.emulator.wire import EmulatedReply
 from hilctl_drivers.text.profile import (
     AsciiInput,
     AsciiProfile,
@@ -17,12 +15,62 @@ from hilctl_drivers.text.profile import (
     SendStep,
 )
 
+_NUMBER = r"[-+]?[0-9]*\.?[0-9]+(?:[eE][-+]?[0-9]+)?"
 _OUT_OF_RANGE = '-222,"Data out of range"'
 _UNDEFINED = '-113,"Undefined header"'
 _REFUSED = '-200,"Execution error"'
 
 
-class EmulatedAscii:
+class TemplateMatcher:
+    """A template as the device that receives it.
+
+    Args:
+        text: The template.
+        address: The device's address.
+    """
+
+    def __init__(self, text: str, address: int) -> None:
+        self._bases: dict[str, int] = {}
+        parts = []
+        for literal, field, spec, _ in Formatter().parse(text):
+            parts.append(re.escape(literal))
+            if field == "address":
+                parts.append(re.escape(format(address, spec or "")))
+            elif field is not None:
+                hexadecimal = (spec or "").endswith(("X", "x"))
+                self._bases[field] = 16 if hexadecimal else 10
+                group = r"[0-9A-Fa-f]+" if hexadecimal else _NUMBER
+                parts.append(f"(?P<{field}>{group})")
+        self._pattern = re.compile("".join(parts), re.ASCII)
+
+    def match(self, text: str) -> dict[str, float] | None:
+        """Return the fields of a line, or None where it is another one."""
+        found = self._pattern.fullmatch(text)
+        if found is None:
+            return None
+        return {
+            name: float(int(value, 16)) if self._bases[name] == 16 else float(value)
+            for name, value in found.groupdict().items()
+        }
+
+
+def in_style(example: str, pattern: str, value: float) -> str:
+    """Return a reply like ``example``, with ``value`` where the pattern's group is."""
+    found = re.fullmatch(pattern, example, re.ASCII)
+    assert found is not None, "a profile's examples match their patterns"
+    start, stop = found.span(1)
+    model = example[start:stop]
+    sign = "+" if model[0] in "+-" else ""
+    if "E" in model.upper():
+        number = f"{value:{sign}.6E}"
+    else:
+        decimals = len(model.partition(".")[2])
+        value = round(value, decimals) + 0.0  # no device says -0.000
+        number = f"{value:{sign}0{len(model)}.{decimals}f}"
+    return example[:start] + number + example[stop:]
+
+
+class EmulatedText:
     """The device.
 
     Args:
@@ -60,41 +108,41 @@ class EmulatedAscii:
         self._safe = dict(self._values)
         self._errors: list[str] = []
         self._timeout_ns = 0
-        self._heard_ns = 0
+        self._received_ns = 0
         self._now_ns = 0
         self.tripped = False
 
     def tick(self, now_ns: int) -> None:
         """Let time pass; the watchdog may trip on the way."""
-        due_ns = self._heard_ns + self._timeout_ns
+        due_ns = self._received_ns + self._timeout_ns
         if self._timeout_ns and not self.tripped and due_ns <= now_ns:
             self.tripped = True
             self._trip(due_ns)
         self._now_ns = max(self._now_ns, now_ns)
         self._rig.advance(self._now_ns)
 
-    def hear(self, message: bytes, now_ns: int) -> Answer | None:
+    def answer(self, message: bytes, now_ns: int) -> EmulatedReply | None:
         """Carry out a line; None where it is for another address."""
         self.tick(now_ns)
         text = message.decode("ascii", "replace")
         watchdog = self._profile.watchdog
         if watchdog != "none" and watchdog.kick == "any":
-            self._heard_ns = self._now_ns
+            self._received_ns = self._now_ns
         for part in (self._outputs, self._inputs, self._watchdog, self._questions, self._steps):
             found = part(text)
             if found is not None:
-                return self._answer(found)
+                return self._reply(found)
         if self._is_for_another(text):
             return None
         return self._unknown()
 
-    def refusal(self, message: bytes) -> Answer | None:
+    def refusal(self, message: bytes) -> EmulatedReply | None:
         """Return an answer that says no."""
         del message
         if self._profile.errors:
-            return self._answer(self._profile.errors[-1].example)
+            return self._reply(self._profile.errors[-1].example)
         self._errors.append(_REFUSED)
-        return Answer(None)
+        return EmulatedReply(None)
 
     def wrong_id(self, reply: bytes) -> bytes:
         """Return a reply in another's name; where none is in it, one to something else."""
@@ -103,37 +151,37 @@ class EmulatedAscii:
             return reply[:1] + f"{self._address ^ 3:02X}".encode() + reply[3:]
         return b"ANOTHER," + reply
 
-    def _answer(self, text: str) -> Answer:
+    def _reply(self, text: str) -> EmulatedReply:
         """Return a reply; an example's address becomes our own."""
         shipped = self._profile.address
         if isinstance(shipped, int) and text[:1] in {"!", "?"} and text[1:3] == f"{shipped:02X}":
             text = f"{text[:1]}{self._address:02X}{text[3:]}"
-        return Answer(text.encode() if text else None)
+        return EmulatedReply(text.encode() if text else None)
 
     def _is_for_another(self, text: str) -> bool:
         if self._profile.address == "none" or not re.match(r"[#$~%@][0-9A-F]{2}", text):
             return False
         return text[1:3] != f"{self._address:02X}"
 
-    def _unknown(self) -> Answer:
+    def _unknown(self) -> EmulatedReply:
         if self._profile.errors:
-            return self._answer(self._profile.errors[-1].example)
+            return self._reply(self._profile.errors[-1].example)
         self._errors.append(_UNDEFINED)
-        return Answer(None)
+        return EmulatedReply(None)
 
     def _outputs(self, text: str) -> str | None:
         for name, output in self._profile.outputs.items():
-            fields = Template(output.write, self._address).heard(text)
+            fields = TemplateMatcher(output.write, self._address).match(text)
             if fields is not None:
                 reply = "" if output.reply == "none" else output.reply.example
                 return self._set(name, fields["value"], reply)
             readback = output.readback
-            if readback != "none" and Template(readback.ask, self._address).heard(text) is not None:
+            if readback != "none" and self._matches(readback.ask, text):
                 return in_style(readback.example, readback.pattern, self._values[name])
         combined = self._profile.exchange
         if combined == "none":
             return None
-        fields = Template(combined.write, self._address).heard(text)
+        fields = TemplateMatcher(combined.write, self._address).match(text)
         if fields is None:
             return None
         source = self._profile.inputs[combined.input]
@@ -146,7 +194,7 @@ class EmulatedAscii:
         if self.tripped and watchdog != "none" and watchdog.refuses_while_tripped:
             return "" if watchdog.refusal == "none" else watchdog.refusal.example
         if watchdog != "none" and watchdog.kick == "write":
-            self._heard_ns = self._now_ns
+            self._received_ns = self._now_ns
         if not output.min <= value <= output.max:
             if self._profile.errors:
                 return self._profile.errors[0].example
@@ -157,7 +205,7 @@ class EmulatedAscii:
 
     def _inputs(self, text: str) -> str | None:
         for name, source in self._profile.inputs.items():
-            if Template(source.ask, self._address).heard(text) is not None:
+            if self._matches(source.ask, text):
                 return in_style(source.example, source.pattern, self._reading(name, source))
         return None
 
@@ -177,28 +225,28 @@ class EmulatedAscii:
         watchdog = self._profile.watchdog
         if watchdog == "none":
             return None
-        if watchdog.tripped != "none" and self._hears(watchdog.tripped.ask, text):
+        if watchdog.tripped != "none" and self._matches(watchdog.tripped.ask, text):
             example = watchdog.tripped.example
             return example if self.tripped else example[:-1] + "0"
         for name in ("arm", "disarm", "feed", "clear"):
             steps = getattr(watchdog, name)
             for step in steps:
-                if isinstance(step, SendStep) and self._hears(step.text, text):
+                if isinstance(step, SendStep) and self._matches(step.text, text):
                     if step is steps[-1]:
                         self._switch(name, step.text, text)
                     return "" if step.reply == "none" else step.reply.example
         for name, steps in watchdog.safe.items():
             for step in steps:
-                if isinstance(step, NumberStep) and self._hears(step.ask, text):
+                if isinstance(step, NumberStep) and self._matches(step.ask, text):
                     return in_style(step.example, step.pattern, self._safe[name])
         return None
 
     def _switch(self, name: str, template: str, text: str) -> None:
         watchdog = self._profile.watchdog
         assert watchdog != "none"
-        self._heard_ns = self._now_ns
+        self._received_ns = self._now_ns
         if name == "arm":
-            fields = Template(template, self._address).heard(text) or {}
+            fields = TemplateMatcher(template, self._address).match(text) or {}
             counts = fields.get("timeout", watchdog.min_s / watchdog.unit_s)
             self._timeout_ns = round(counts * watchdog.unit_s * 1e9)
         elif name == "disarm":
@@ -208,10 +256,10 @@ class EmulatedAscii:
 
     def _questions(self, text: str) -> str | None:
         query = self._profile.error_query
-        if query != "none" and self._hears(query.ask, text):
+        if query != "none" and self._matches(query.ask, text):
             return self._errors.pop(0) if self._errors else query.example
         test = self._profile.selftest
-        return test.example if test != "none" and self._hears(test.ask, text) else None
+        return test.example if test != "none" and self._matches(test.ask, text) else None
 
     def _steps(self, text: str) -> str | None:
         watchdog = self._profile.watchdog
@@ -219,14 +267,14 @@ class EmulatedAscii:
         if watchdog != "none":
             steps += tuple(step for each in watchdog.safe.values() for step in each)
         for step in steps:
-            if isinstance(step, SendStep) and self._hears(step.text, text):
+            if isinstance(step, SendStep) and self._matches(step.text, text):
                 return step.reply.example if isinstance(step.reply, Reply) else ""
-            if isinstance(step, AskStep | NumberStep) and self._hears(step.ask, text):
+            if isinstance(step, AskStep | NumberStep) and self._matches(step.ask, text):
                 return step.example
         return None
 
-    def _hears(self, template: str, text: str) -> bool:
-        return Template(template, self._address).heard(text) is not None
+    def _matches(self, template: str, text: str) -> bool:
+        return TemplateMatcher(template, self._address).match(text) is not None
 
     def _put_out(self, name: str, value: float, event: str, now_ns: int) -> None:
         self._values[name] = value

@@ -1,15 +1,12 @@
 """An emulated Modbus device: a profile's registers in front of the simulated rig."""
 
 from collections.abc import Sequence
+from typing import Protocol
 
 from hilctl.base.errors import InputError
-from hilctl_drivers.emulator.memory import NoSuchRegister, Words
-from hilctl_drivers.emulator.overlay import Overlay
-from hilctl_drivers.emulator.register_map import RegisterMap
-from hilctl_drivers.emulator.rig import Rig
-from hilctl_drivers.emulator.watchdog import HostWatchdog
-from hilctl_drivers.emulator.wiring import Wiring
-from hilctl_drivers.emulator.write_log import WriteLog
+from hilctl_drivers.emulator.registers import NoSuchRegister, RegisterMap, Words
+from hilctl_drivers.emulator.rig import Rig, Wiring, WriteLog
+from hilctl_drivers.emulator.watchdog import EmulatedWatchdog
 from hilctl_drivers.modbus.profile import ModbusProfile
 from hilctl_drivers.modbus.steps import ModbusStep, RegisterStep
 
@@ -26,6 +23,30 @@ class Declined(Exception):  # noqa: N818  a reply, not a mistake
         self.code = code
 
 
+class Overlay(Protocol):
+    """Registers that do more than hold a value: buffers, switches, a clock."""
+
+    def has(self, address: int) -> bool:
+        """Return whether a request that begins at this address is for it, just now."""
+        ...
+
+    def read(self, address: int, count: int) -> list[int]:
+        """Return register words; raise ``Declined`` where they can't be read."""
+        ...
+
+    def write(self, address: int, values: Sequence[int]) -> None:
+        """Write register words; raise ``Declined`` where they can't be written."""
+        ...
+
+    def tick(self, now_ns: int) -> None:
+        """Let time pass."""
+        ...
+
+    def stop(self, now_ns: int) -> None:
+        """Leave the outputs alone from now on."""
+        ...
+
+
 def _check_channels(profile: ModbusProfile, output: str | None, sensor: str | None) -> None:
     outputs, inputs = profile.outputs, profile.inputs
     if output in {None, *outputs} and sensor in {None, *inputs}:
@@ -35,7 +56,7 @@ def _check_channels(profile: ModbusProfile, output: str | None, sensor: str | No
     raise InputError(f"{profile.title} has no {wanted}: {names}")
 
 
-class EmulatedDevice:
+class EmulatedModbus:
     """The device: what its registers hold, and what writing them does.
 
     It starts with the output where the rig is at 0 A, as if its power-on value had been set so.
@@ -72,12 +93,12 @@ class EmulatedDevice:
         self._steps = registers.steps
         self._outputs, self._inputs = registers.outputs, registers.inputs
         if wiring is None:
-            assert output is not None, "a device that only reads is told of its wiring"
-            assert sensor is not None, "a device that only drives is told of its wiring"
+            assert output is not None, "a device that only reads needs its wiring"
+            assert sensor is not None, "a device that only drives needs its wiring"
             wiring = Wiring.spread(profile.outputs[output], profile.inputs[sensor])
         self.wiring = wiring
         watchdog = profile.watchdog
-        self._watchdog = None if watchdog == "none" else HostWatchdog(watchdog, self._steps)
+        self._watchdog = None if watchdog == "none" else EmulatedWatchdog(watchdog, self._steps)
         self._now_ns = 0
         self.overlay: Overlay | None = None
         """Registers that do more than hold a value, before all others."""

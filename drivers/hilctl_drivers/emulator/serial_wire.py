@@ -1,21 +1,15 @@
-"""One emulated serial line: a pty, its framing, and the devices on it."""
+"""Messages on an emulated serial line: its framing, and the devices on it."""
 
-import os
-import pty
-import termios
-import tty
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import Protocol
 
 from hilctl_drivers.board.profile import FrameProfile
-from hilctl_drivers.emulator.answer import Answer, SerialDevice
+from hilctl_drivers.emulator.wire import EmulatedReply
 from hilctl_drivers.text.lines import LineFormat
 from hilctl_drivers.text.profile import AsciiProfile
 from hilctl_drivers.wire.errors import Corrupt
 from hilctl_drivers.wire.framing import Framing, binary_framing
-
-_CHUNK = 65536
 
 
 class LineFraming(Protocol):
@@ -85,57 +79,65 @@ class FrameFraming:
         return len(reply) // 2
 
 
-class SerialLine:
-    """A pty with devices on it.
+class SerialDevice(Protocol):
+    """An emulated device on a line; it sees messages without their framing."""
+
+    def tick(self, now_ns: int) -> None:
+        """Let time pass."""
+        ...
+
+    def answer(self, message: bytes, now_ns: int) -> EmulatedReply | None:
+        """Carry out a message; None where it is for another device."""
+        ...
+
+    def refusal(self, message: bytes) -> EmulatedReply | None:
+        """Return an answer that says no."""
+        ...
+
+    def wrong_id(self, reply: bytes) -> bytes:
+        """Return a reply in another's name, or to something else."""
+        ...
+
+
+class SerialWire:
+    """Devices on a serial line.
 
     Args:
         framing: What its messages look like.
-        devices: Who hears them; the first that is meant answers.
+        devices: What is on it; the first that a message is for answers.
     """
 
     def __init__(self, framing: LineFraming, devices: Sequence[SerialDevice]) -> None:
-        self._master, self._slave = pty.openpty()
-        tty.setraw(self._slave, termios.TCSANOW)
-        os.set_blocking(self._master, False)
         self.framing = framing
         self.devices = devices
-        self.name = os.ttyname(self._slave)
-        self.plugged = True
-        self._unsent = bytearray()
 
-    def fileno(self) -> int:
-        """What to wait for."""
-        return self._master
-
-    @property
-    def has_unsent(self) -> bool:
-        """Whether bytes wait for room, as they would in a USB device's buffer."""
-        return bool(self._unsent)
-
-    def read(self) -> list[bytes]:
-        """Return the messages that have come."""
-        with suppress(BlockingIOError):
-            return self.framing.feed(os.read(self._master, _CHUNK))
-        return []
-
-    def send(self, data: bytes) -> None:
-        """Send bytes, as far as there is room; the rest with the next :meth:`send`."""
-        self._unsent += data
-        with suppress(BlockingIOError):
-            while self._unsent:
-                del self._unsent[: os.write(self._master, self._unsent)]
-
-    def hear(self, message: bytes, now_ns: int) -> tuple[SerialDevice, Answer] | None:
-        """Return who answers a message, and what."""
+    def tick(self, now_ns: int) -> None:
+        """Let time pass for all devices."""
         for device in self.devices:
-            answer = device.hear(message, now_ns)
+            device.tick(now_ns)
+
+    def requests(self, received: bytearray) -> Iterator[bytes]:
+        """Yield the good messages; the framing keeps what is not complete."""
+        data = bytes(received)
+        received.clear()
+        yield from self.framing.feed(data)
+
+    def answer(self, request: bytes, now_ns: int) -> EmulatedReply | None:
+        """Carry out a message; None where it is for no device here."""
+        for device in self.devices:
+            answer = device.answer(request, now_ns)
             if answer is not None:
-                return device, answer
+                return replace(answer, wrong_id=device.wrong_id)
         return None
 
-    def unplug(self) -> None:
-        """Take the port away, as a pulled adapter does."""
-        if self.plugged:
-            self.plugged = False
-            os.close(self._master)
-            os.close(self._slave)
+    def refusal(self, request: bytes) -> EmulatedReply | None:
+        """Return an answer of the first device that says no."""
+        return self.devices[0].refusal(request)
+
+    def encode(self, data: bytes) -> bytes:
+        """Return a reply as it stands on the line."""
+        return self.framing.encode(data)
+
+    def corrupt_at(self, framed: bytes) -> int:
+        """Return the byte of a framed reply whose damage must be found out."""
+        return self.framing.corrupt_at(framed)

@@ -1,0 +1,103 @@
+"""The command ``hilctl emulate``: serves an emulator until a signal ends it."""
+
+import gc
+import signal
+from collections.abc import Callable
+from pathlib import Path
+from types import FrameType
+from typing import Annotated, cast
+
+import typer
+
+from hilctl_drivers.emulator.faults import parse_fault
+from hilctl_drivers.emulator.modbus_device import EmulatedModbus
+from hilctl_drivers.emulator.modbus_wire import LinkKind
+from hilctl_drivers.emulator.options import EmulatorOptions, ReaderLine
+from hilctl_drivers.emulator.setup import Emulator, build
+
+
+def emulate(
+    profile: Annotated[str, typer.Argument(help="Shipped profile, or path of one.")],
+    link: Annotated[str | None, typer.Option(help="tcp or rtu; else the profile's own.")] = None,
+    host: Annotated[str, typer.Option(help="Address to listen on.")] = EmulatorOptions.host,
+    port: Annotated[int, typer.Option(help="TCP port; 0 takes a free one.")] = EmulatorOptions.port,
+    log: Annotated[Path | None, typer.Option(help="File for a log of every write.")] = None,
+    fault: Annotated[
+        list[str] | None, typer.Option(help="KIND@COUNT or KIND@SECONDSs; may be repeated.")
+    ] = None,
+    output: Annotated[str | None, typer.Option(help="Output that drives the rig.")] = None,
+    sensor: Annotated[
+        str | None, typer.Option(help="Input that shows the displacement; or READER:INPUT.")
+    ] = None,
+    reader: Annotated[
+        str | None, typer.Option(help="Profile of the device that has the input, if another one.")
+    ] = None,
+    reader_line: Annotated[
+        str | None, typer.Option(help="The reader's: same or own; same for Modbus RTU, else own.")
+    ] = None,
+    reader_unit_id: Annotated[int | None, typer.Option(help="The reader's unit id.")] = None,
+    reader_port: Annotated[
+        int, typer.Option(help="The reader's own TCP port; 0 takes a free one.")
+    ] = EmulatorOptions.reader_port,
+) -> None:
+    """Serve the simulated rig as a real device would, until Ctrl-C."""
+    if reader is None and sensor is not None and ":" in sensor:
+        reader, _, sensor = sensor.rpartition(":")
+    options = EmulatorOptions(
+        profile=profile,
+        link=cast(LinkKind | None, link),
+        host=host,
+        port=port,
+        log=log,
+        faults=tuple(parse_fault(text) for text in fault or ()),
+        output=output,
+        sensor=sensor,
+        reader=reader,
+        reader_line=cast(ReaderLine | None, reader_line),
+        reader_unit_id=reader_unit_id,
+        reader_port=reader_port,
+    )
+    serve(options, lambda name, address: typer.echo(f"{name} answers at {address}"))
+
+
+def serve(options: EmulatorOptions, on_ready: Callable[[str, str], None]) -> None:
+    """Serve an emulator until SIGINT or SIGTERM.
+
+    Args:
+        options: What to emulate.
+        on_ready: Called with a profile and its ``host:port`` or device file once it answers.
+
+    Raises:
+        InputError: See :func:`~hilctl_drivers.emulator.setup.build`.
+    """
+    emulator = build(options)
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        del number, frame
+        emulator.server.stop()
+
+    gc.collect()
+    gc.freeze()  # a collection of all that was imported takes tens of ms
+    before = {each: signal.signal(each, stop) for each in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        for name, address in _places(options, emulator):
+            on_ready(name, address)
+        emulator.server.run()
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        emulator.log.close()
+
+
+def _places(options: EmulatorOptions, emulator: Emulator) -> list[tuple[str, str]]:
+    """Return each profile that is served, and where; with the unit ids of two Modbus devices."""
+    if options.reader is None:
+        return [(options.profile, emulator.address)]
+    unit = reader_unit = ""
+    if isinstance(emulator.device, EmulatedModbus):
+        unit = f", unit {emulator.device.profile.unit_id}"
+        reader_unit = f", unit {emulator.reader_unit_id}"
+    return [
+        (options.profile, emulator.address + unit),
+        (options.reader, emulator.reader_address + reader_unit),
+    ]

@@ -1,0 +1,204 @@
+"""Serves emulated devices at TCP ports and ptys, with faults where they are wanted.
+
+One thread and no locks: requests, the rig's time, watchdogs and sample clocks take turns.
+"""
+
+import heapq
+import selectors
+import socket
+import time
+from collections.abc import Callable, Sequence
+
+from hilctl.base.errors import InputError
+from hilctl_drivers.emulator.connections import Connection, PtyConnection, TcpConnection
+from hilctl_drivers.emulator.faults import FaultPlan, WireFault, spoil
+from hilctl_drivers.emulator.wire import EmulatedReply, EmulatedWire
+
+_TICK_S = 0.005
+_STALE_NS = 50_000_000
+
+
+class EmulatorServer:
+    """Answers requests until it is stopped.
+
+    Args:
+        faults: What goes wrong.
+        clock_ns: Monotonic time.
+    """
+
+    def __init__(
+        self, faults: Sequence[WireFault] = (), clock_ns: Callable[[], int] = time.monotonic_ns
+    ) -> None:
+        self._plan = FaultPlan(faults)
+        self._clock_ns = clock_ns
+        self._start_ns = clock_ns()
+        self._selector = selectors.DefaultSelector()
+        self._wires: list[EmulatedWire] = []
+        self._listeners: dict[socket.socket, EmulatedWire] = {}
+        self._connections: list[Connection] = []
+        self._unplugged: list[TcpConnection | socket.socket] = []
+        self._late: list[tuple[int, int, Connection, EmulatedReply, WireFault | None]] = []
+        self._count = 0
+        self._stopping = False
+
+    def listen_tcp(self, wire: EmulatedWire, host: str, port: int) -> str:
+        """Listen; return ``host:port``, which is a free one where port 0 is asked for.
+
+        Raises:
+            InputError: The port is in use or not ours to have.
+        """
+        try:
+            listener = socket.create_server((host, port))
+        except OSError as error:
+            raise InputError(f"can't listen on {host}:{port}: {error.strerror}") from None
+        self._listeners[listener] = wire
+        self._wires.append(wire)
+        self._selector.register(listener, selectors.EVENT_READ)
+        return f"{host}:{listener.getsockname()[1]}"
+
+    def open_pty(self, wire: EmulatedWire, *, faulty: bool = True) -> str:
+        """Open a pty and return the device file of its other end."""
+        connection = PtyConnection(wire, faulty=faulty)
+        self._wires.append(wire)
+        self._add(connection)
+        return connection.name
+
+    def run(self) -> None:
+        """Serve until :meth:`stop`."""
+        while not self._stopping:
+            for key, events in self._selector.select(self._pause_s()):
+                self._serve(key.fileobj, events)
+            now_ns = self._clock_ns()
+            for wire in self._wires:
+                wire.tick(now_ns)
+            self._send_due(now_ns)
+        self.close()
+
+    def stop(self) -> None:
+        """Make :meth:`run` end; from any thread or signal handler."""
+        self._stopping = True  # noticed at the next tick of the rig
+
+    def close(self) -> None:
+        """Let go of everything, where it is not going to :meth:`run`."""
+        for each in (*self._connections, *self._listeners, *self._unplugged):
+            each.close()
+        self._connections.clear()
+        self._listeners.clear()
+        self._unplugged.clear()
+        self._selector.close()
+
+    def _pause_s(self) -> float:
+        if not self._late:
+            return _TICK_S
+        return min(_TICK_S, max(0.0, (self._late[0][0] - self._clock_ns()) * 1e-9))
+
+    def _serve(self, source: object, events: int) -> None:
+        if source in self._listeners:
+            assert isinstance(source, socket.socket)
+            self._add(TcpConnection(source.accept()[0], self._listeners[source]))
+        elif source in self._connections:  # else it was let go of since
+            assert isinstance(source, Connection)
+            if events & selectors.EVENT_WRITE:
+                self._selector.modify(source, selectors.EVENT_READ)
+                self._send(source, b"")
+            if events & selectors.EVENT_READ:
+                self._receive(source)
+
+    def _add(self, connection: Connection) -> None:
+        self._connections.append(connection)
+        self._selector.register(connection, selectors.EVENT_READ)
+
+    def _drop(self, connection: Connection, *, reset: bool = False) -> None:
+        self._connections.remove(connection)
+        self._selector.unregister(connection)
+        connection.close(reset=reset)
+
+    def _receive(self, connection: Connection) -> None:
+        data = connection.read()
+        if data is None:
+            self._drop(connection)
+            return
+        now_ns = self._clock_ns()
+        if now_ns - connection.received_ns > _STALE_NS:
+            connection.received.clear()  # half a request that was given up
+        connection.received_ns = now_ns
+        connection.received += data
+        for request in connection.wire.requests(connection.received):
+            self._answer(connection, request)
+            if connection not in self._connections:
+                return
+
+    def _answer(self, connection: Connection, request: bytes) -> None:
+        now_ns = self._clock_ns()
+        if self._late:
+            # A new request means that the host has given up on answers that are still to come.
+            self._late = [each for each in self._late if each[2] is not connection or each[4]]
+            heapq.heapify(self._late)
+        fault = None
+        if connection.faulty:
+            fault = self._plan.next((now_ns - self._start_ns) * 1e-9)
+        if fault is not None and fault.kind in {"silence", "unplug", "reset", "exception"}:
+            self._keep_back(fault, connection, request)
+            return
+        answer = connection.wire.answer(request, now_ns)
+        if answer is None:
+            return
+        delay_ns = round(fault.delay_s * 1e9) if fault is not None and fault.kind == "delay" else 0
+        due_ns = max(answer.due_ns, now_ns) + delay_ns
+        if due_ns > now_ns:
+            self._count += 1
+            heapq.heappush(self._late, (due_ns, self._count, connection, answer, fault))
+        else:
+            self._reply(connection, answer, fault, now_ns)
+
+    def _keep_back(self, fault: WireFault, connection: Connection, request: bytes) -> None:
+        """Do what a fault says that keeps the request from the device."""
+        if fault.kind == "unplug":
+            self._unplug()
+        elif fault.kind == "reset":
+            self._drop(connection, reset=True)
+        elif fault.kind == "exception":
+            refusal = connection.wire.refusal(request)
+            if refusal is not None and refusal.data is not None:
+                self._send(connection, connection.wire.encode(refusal.data))
+
+    def _unplug(self) -> None:
+        """Fall silent for good, wherever faults happen.
+
+        A pulled network cable closes no connection; a pulled adapter takes its port along.
+        """
+        for connection in [each for each in self._connections if each.faulty]:
+            if isinstance(connection, TcpConnection):
+                self._connections.remove(connection)
+                self._selector.unregister(connection)
+                self._unplugged.append(connection)
+            else:
+                self._drop(connection)
+        for listener in self._listeners:
+            self._selector.unregister(listener)
+        self._unplugged += self._listeners
+        self._listeners.clear()
+
+    def _send_due(self, now_ns: int) -> None:
+        while self._late and self._late[0][0] <= now_ns:
+            _, _, connection, answer, fault = heapq.heappop(self._late)
+            if connection in self._connections:
+                self._reply(connection, answer, fault, now_ns)
+
+    def _reply(
+        self, connection: Connection, answer: EmulatedReply, fault: WireFault | None, now_ns: int
+    ) -> None:
+        data = answer.make(now_ns) if answer.make is not None else answer.data
+        if data is None:
+            return
+        if fault is not None and fault.kind == "wrong_id" and answer.wrong_id is not None:
+            data = answer.wrong_id(data)
+        framed = connection.wire.encode(data)
+        if fault is not None:
+            framed = spoil(fault.kind, framed, connection.wire.corrupt_at(framed))
+        self._send(connection, framed)
+
+    def _send(self, connection: Connection, data: bytes) -> None:
+        connection.send(data)
+        if connection.unsent:
+            self._selector.modify(connection, selectors.EVENT_READ | selectors.EVENT_WRITE)

@@ -1,0 +1,130 @@
+"""Which commands there are, and a group that imports one only when it is called.
+
+A name stands for where its function is, so that a command may come from ``hilctl_drivers``, which
+``hilctl`` never imports, and ``--help`` costs no more than this table.
+"""
+
+from importlib import import_module
+from typing import Any, NamedTuple
+
+import typer
+from typer.core import TyperCommand, TyperGroup
+
+from hilctl.base.errors import InputError
+
+
+class CommandEntry(NamedTuple):
+    """Where a command stands.
+
+    Attributes:
+        place: ``module:function``, or ``module:app`` for a group of commands.
+        help: What it does, in a line; as its docstring begins.
+    """
+
+    place: str
+    help: str
+
+
+COMMANDS: dict[str, CommandEntry] = {
+    "run": CommandEntry(
+        "hilctl.cli.running:run",
+        "Run an experiment and record it; Ctrl-C ramps to the safe value first.",
+    ),
+    "check": CommandEntry(
+        "hilctl.cli.running:check",
+        "Check an experiment and say what it would do; nothing moves.",
+    ),
+    "status": CommandEntry(
+        "hilctl.cli.running:status", "Say which runs are going on, and where each stands."
+    ),
+    "set": CommandEntry(
+        "hilctl.cli.running:set_",
+        "Move the reference of a run without a bump: gain * reference + offset.",
+    ),
+    "stop": CommandEntry(
+        "hilctl.cli.running:stop", "End a run by its safe ramp, close, and record why."
+    ),
+    "report": CommandEntry(
+        "hilctl.cli.recordings:report", "Judge a recording: hysteresis, error, noise, lateness."
+    ),
+    "replay": CommandEntry(
+        "hilctl.cli.recordings:replay",
+        "Recompute the commands from the recorded reference and compare them bit for bit.",
+    ),
+    "export": CommandEntry(
+        "hilctl.cli.recordings:export",
+        "Write a recording's samples as CSV, NumPy, Parquet or MATLAB file.",
+    ),
+    "recover": CommandEntry(
+        "hilctl.cli.recordings:recover",
+        "Make a recording that was cut short whole again; the bytes as they were stay as RUN.torn.",
+    ),
+    "identify": CommandEntry(
+        "hilctl.cli.recordings:identify",
+        "Find a model's parameters from recordings or measured tables.",
+    ),
+    "compare": CommandEntry(
+        "hilctl.cli.comparing:compare",
+        "Find models of the literature on the same loops, and hold them against one another.",
+    ),
+    "learn": CommandEntry(
+        "hilctl.cli.learning:learn",
+        "Learn a correction for a reference that repeats: run, correct, and run again.",
+    ),
+    "doctor": CommandEntry(
+        "hilctl.cli.machine:doctor",
+        "Say what keeps this machine from real time, and measure whether it keeps a rate.",
+    ),
+    "devices": CommandEntry(
+        "hilctl.cli.machine:devices_app",
+        "List devices, shipped profiles and the serial ports of this machine; nothing is opened.",
+    ),
+    "emulate": CommandEntry(
+        "hilctl_drivers.emulator.command:emulate",
+        "Serve the simulated rig as a real device would, until Ctrl-C.",
+    ),
+    "schema": CommandEntry(
+        "hilctl.cli.machine:schema", "Print the JSON schema of experiment files, for editors."
+    ),
+}
+
+HELP_NAMES = {"help_option_names": ["-h", "--help"]}
+
+
+class CommandTable(TyperGroup):
+    """The commands of :data:`COMMANDS`; help and suggestions know them before they are loaded."""
+
+    def __init__(self, **settings: Any) -> None:
+        lines = {name: TyperCommand(name, help=entry.help) for name, entry in COMMANDS.items()}
+        super().__init__(**{**settings, "commands": lines})
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """Write each command's whole line, where typer would cut it."""
+        del ctx
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, entry.help) for name, entry in COMMANDS.items()])
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """Return the name of the command that is called, the command, and its arguments."""
+        name, line, rest = super().resolve_command(ctx, args)
+        return name, line and load(line.name or ""), rest
+
+
+def load(name: str) -> Any:
+    """Return a command of the table, ready to be called.
+
+    Raises:
+        InputError: It can't be imported: a part of the installation is missing.
+    """
+    module_name, _, attribute = COMMANDS[name].place.partition(":")
+    try:
+        found = getattr(import_module(module_name), attribute)
+    except (ImportError, AttributeError) as error:
+        raise InputError(f"{name} can't be loaded: {error}") from error
+    if isinstance(found, typer.Typer):
+        group = typer.main.get_group(found)
+        group.name = name
+        return group
+    alone = typer.Typer(add_completion=False, rich_markup_mode=None, context_settings=HELP_NAMES)
+    alone.command(name)(found)
+    return typer.main.get_command(alone)

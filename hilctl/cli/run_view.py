@@ -1,0 +1,170 @@
+"""Runs for people, in a terminal: progress, forecast, how each stands and how it ended."""
+
+import time
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from hilctl.analysis.report import summarize
+from hilctl.cli.report_view import render
+from hilctl.experiment.check import Checked
+from hilctl.recording.reader import read
+from hilctl.run.result import Progress as RunProgress
+from hilctl.run.result import RunResult
+
+_REFRESH_S = 0.1
+_LARGEST_REPORTED = 5_000_000
+
+
+class LiveView:
+    """A progress line on standard error: samples, error, command, late ticks.
+
+    Args:
+        quiet: Show nothing.
+    """
+
+    def __init__(self, *, quiet: bool) -> None:
+        console = Console(stderr=True)
+        self._progress = Progress(
+            TextColumn("[bold]run"),
+            BarColumn(bar_width=24),
+            TextColumn("{task.percentage:>3.0f} %"),
+            TextColumn("{task.fields[live]}"),
+            TimeRemainingColumn(),
+            console=console,
+            disable=quiet or not console.is_terminal,
+            refresh_per_second=8,
+        )
+        self._task: TaskID | None = None
+        self._shown = 0.0
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self._progress.stop()
+
+    def update(self, progress: RunProgress) -> None:
+        """Show the newest samples, a few times a second."""
+        if self._progress.disable:
+            return
+        now = time.monotonic()
+        if now - self._shown < _REFRESH_S and progress.samples < progress.total:
+            return
+        self._shown = now
+        if self._task is None:
+            self._progress.start()
+            self._task = self._progress.add_task("run", total=progress.total, live="")
+        done = min(progress.samples, progress.total)
+        self._progress.update(self._task, completed=done, live=_live_text(progress))
+
+
+def _live_text(progress: RunProgress) -> str:
+    newest = progress.batch.samples(slice(-1, None))
+    command, displacement_um = newest.command, newest.displacement_um
+    error_um = displacement_um - newest.reference_um
+    shown = progress.compensated and np.isfinite(error_um[-1])
+    error = f"error {error_um[-1]:+7.2f} um  " if shown else ""
+    return (
+        f"{error}x {displacement_um[-1]:+8.2f} um  command {command[-1]:+7.3f}  "
+        f"late {progress.late_ticks}"
+    )
+
+
+def run_mapping(result: RunResult) -> dict[str, Any]:
+    """Return a run's end and its report as plain values."""
+    summary = summarize(read(result.path)).to_mapping()
+    return {
+        **summary,
+        "recorded_samples": result.samples,
+        "dropped": result.missing,  # a recording that was cut short can't say it
+        "output": str(result.path),
+        "code": result.code,
+        "reason": result.reason,
+        "output_safe": result.safe,
+    }
+
+
+def print_run(result: RunResult) -> None:
+    """Print how a run ended and, unless it is very long, its report."""
+    console = Console()
+    colour = {"completed": "green", "stopped": "yellow"}.get(result.code, "red")
+    console.print(f"[{colour}]{result.code}[/]: {result.reason}", highlight=False)
+    if not result.safe:
+        console.print("[bold red]The output is not known to be at its safe value.[/]")
+    if result.samples == 0:
+        console.print("no sample was recorded")
+    elif result.samples <= _LARGEST_REPORTED:
+        console.print(render(summarize(read(result.path))))
+    console.print(f"recorded: {result.path}", soft_wrap=True, highlight=False)
+    console.print(f"  hilctl report {result.path} --html run.html", soft_wrap=True, highlight=False)
+
+
+def print_forecast(checked: Checked) -> None:
+    """Print what a run will do."""
+    forecast, config = checked.forecast, checked.loaded.config
+    unit, reference_unit = forecast.command_unit, checked.reference.unit
+    limits = config.limits
+    low, high = limits.command_range
+    table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
+    rows = {
+        "experiment": config.name,
+        "device": checked.loaded.device.info.description,
+        "samples": f"{forecast.samples} at {config.sample_rate_hz:g} Hz, {config.block} a tick",
+        "highest rate": f"{forecast.highest_rate_hz:.6g} Hz"
+        + (f" ({forecast.rate_note})" if forecast.rate_note else ""),
+        "duration": f"{forecast.duration_s:g} s",
+        "reference": f"{forecast.reference_min:.4g} to {forecast.reference_max:.4g} "
+        f"{reference_unit}",
+        "command": f"{forecast.command_min:.4g} to {forecast.command_max:.4g} {unit} "
+        f"(limits {low:g} to {high:g})",
+        "slew": f"{forecast.slew_per_s:.4g} {unit}/s (limit {limits.slew_per_s:g})",
+        "recording": f"about {forecast.recording_mb:.3g} MB",
+    }
+    if forecast.heating_rms_a is not None:
+        rows["heating"] = f"{forecast.heating_rms_a:.4g} A rms (limit {limits.rms_current_a:g})"
+    for name, text in rows.items():
+        table.add_row(name, text)
+    console = Console()
+    console.print(table)
+    console.print("[green]may start[/]")
+
+
+def print_status(found: list[dict[str, Any]]) -> None:
+    """Print which runs are going on, a block of lines each."""
+    console = Console()
+    if not found:
+        console.print("no run is going on")
+    for run in found:
+        console.print(f"[bold]{escape(run['name'])}[/]  {run['state']}", highlight=False)
+        for name, text in _status_lines(run).items():
+            # A path is left whole, wherever the line ends, so that it can be copied.
+            line = f"  {name:10} {text}"
+            console.print(line, highlight=False, markup=False, soft_wrap=True)
+
+
+def _status_lines(run: dict[str, Any]) -> dict[str, str]:
+    """Return what there is to say of a run, by name; little where nobody answers for it."""
+    lines = {}
+    if total := run.get("total_samples", 0):
+        at_s, total_s = run["sample"] / run["sample_rate_hz"], total / run["sample_rate_hz"]
+        lines["at"] = f"{at_s:.1f} of {total_s:.1f} s"
+        lines["samples"] = (
+            f"{run['recorded_samples']:,} recorded, {run['missing_samples']:,} missing"
+        )
+        lines["late ticks"] = f"{run['late_ticks']:,}"
+        lines["reference"] = f"gain {run['gain']:g}, offset {run['offset']:g}"
+    lines["recording"] = run["recording"]
+    if trouble := run.get("recording_error") or run.get("error"):
+        lines["trouble"] = trouble
+    return lines

@@ -1,0 +1,61 @@
+"""The table of commands: every place is right, and nothing is loaded before it is called."""
+
+import subprocess
+import sys
+
+import pytest
+
+from hilctl.base.errors import InputError
+from hilctl.cli.commands import COMMANDS, CommandEntry, load
+
+
+def in_a_process(code, *arguments):
+    return subprocess.run(
+        [sys.executable, "-c", code, *arguments], capture_output=True, text=True, timeout=120
+    )
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_loads_and_says_what_the_table_says(name):
+    """Its own help begins with the line that the list of commands shows."""
+    command = load(name)
+    assert command.name == name
+    assert command.help.splitlines()[0] == COMMANDS[name].help
+
+
+@pytest.mark.parametrize("place", ["hilctl_absent.command:run", "hilctl.cli.machine:absent"])
+def test_a_command_that_is_not_installed_is_one_line(place, monkeypatch):
+    """The message says which command, and what is missing."""
+    monkeypatch.setitem(COMMANDS, "emulate", CommandEntry(place, "Serve."))
+    with pytest.raises(InputError, match=r"emulate can't be loaded: .*absent"):
+        load("emulate")
+
+
+@pytest.mark.parametrize("words", [["--help"], ["-h"], ["--version"], ["stauts"]])
+def test_the_list_of_commands_loads_none_of_them(words):
+    """Help, version and a slip of the finger cost no import of a command."""
+    code = """
+import sys
+from hilctl.cli import main
+try:
+    main()
+finally:
+    print("loaded:", [m for m in sys.modules if m.startswith(("hilctl.cli.", "hilctl_drivers"))])
+"""
+    ended = in_a_process(code, *words)
+    loaded = ended.stdout.splitlines()[-1]
+    assert loaded == "loaded: ['hilctl.cli.commands', 'hilctl.cli.options']"
+    assert ended.returncode == (2 if words == ["stauts"] else 0)
+
+
+def test_a_slip_of_the_finger_is_answered_with_the_nearest_command():
+    """The commands are known without being loaded."""
+    ended = in_a_process("from hilctl.cli import main; main()", "stauts")
+    assert "No such command 'stauts'. Did you mean 'status'?" in ended.stderr
+
+
+def test_a_group_of_commands_runs_its_own():
+    """``devices`` is one, with ``probe`` in it."""
+    ended = in_a_process("from hilctl.cli import main; main()", "devices", "probe", "absent.yaml")
+    assert ended.returncode == 2
+    assert ended.stderr == "hilctl: absent.yaml: no such file\n"

@@ -1,0 +1,67 @@
+"""Emulators that all tests here share."""
+
+import json
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+
+import pytest
+
+from hilctl_drivers.emulator.options import EmulatorOptions
+from hilctl_drivers.emulator.setup import build, emulated
+
+MS = 1_000_000
+START_NS = 10_000_000_000
+
+
+class Emulated:
+    """An emulated device on a line, with the time and the bytes in the test's hand."""
+
+    def __init__(self, profile, tmp_path, **wanted):
+        self.log = tmp_path / "writes.jsonl"
+        self.now_ns = START_NS
+        made = EmulatorOptions(str(profile), log=self.log, noise=False, **wanted)
+        self.emulator = build(made, lambda: self.now_ns)
+        self.device = self.emulator.device
+
+    def ask(self, message, after_ms=0):
+        """Return the answer to a message without framing, sent ``after_ms`` after the last."""
+        self.now_ns += after_ms * MS
+        answer = self.device.answer(message, self.now_ns)
+        if answer is None or (answer.make is None and answer.data is None):
+            return None
+        if answer.make is None:
+            return answer.data
+        self.now_ns = max(self.now_ns, answer.due_ns)
+        return answer.make(self.now_ns)
+
+    def writes(self):
+        return [json.loads(line) for line in self.log.read_text().splitlines()]
+
+    def close(self):
+        self.emulator.server.close()
+        self.emulator.log.close()
+
+
+@pytest.fixture
+def emulate(tmp_path):
+    """Return a function that makes an emulated device; all are put away afterwards."""
+    made = []
+
+    def of(profile, **wanted):
+        made.append(Emulated(profile, tmp_path, **wanted))
+        return made[-1]
+
+    yield of
+    for each in made:
+        each.close()
+
+
+@pytest.fixture
+def served() -> Iterator[Callable[..., str]]:
+    """Serve emulators in threads; yield a function that starts one and returns its address."""
+    with ExitStack() as running:
+
+        def start(profile: str, **options) -> str:
+            return running.enter_context(emulated(EmulatorOptions(profile, **options))).address
+
+        yield start

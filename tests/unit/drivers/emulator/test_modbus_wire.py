@@ -1,0 +1,151 @@
+"""Requests as pymodbus takes them apart, replies as our framing takes them apart."""
+
+import pytest
+
+from hilctl_drivers.emulator.modbus_device import EmulatedModbus
+from hilctl_drivers.emulator.modbus_wire import ModbusWire
+from hilctl_drivers.emulator.rig import Rig, Wiring, WriteLog
+from hilctl_drivers.modbus.pdu import (
+    feedback_pdu,
+    read_pdu,
+    reply_data,
+    rtu_adu,
+    rtu_pdu,
+    tcp_adu,
+    tcp_pdu,
+    write_pdu,
+    write_read_pdu,
+    write_single_pdu,
+)
+from hilctl_drivers.modbus.registers import RegisterFormat
+from hilctl_drivers.profile import load_profile
+from hilctl_drivers.wire.errors import Refused
+
+FLOAT32 = RegisterFormat("float32")
+MS = 1_000_000
+
+
+def device_of(name: str, output: str, sensor: str) -> EmulatedModbus:
+    return EmulatedModbus(load_profile(name), Rig(0), WriteLog(None, 0), output, sensor)
+
+
+@pytest.fixture
+def t7() -> ModbusWire:
+    """An emulated T7 behind Modbus TCP."""
+    return ModbusWire("tcp", device_of("labjack_t7", "DAC0", "AIN0"))
+
+
+def requests(wire: ModbusWire, received: bytes) -> list[bytes]:
+    return list(wire.requests(bytearray(received)))
+
+
+def ask(wire: ModbusWire, pdu: bytes, now_ns: int = 0) -> bytes:
+    """Send a request over TCP framing and return the checked reply's data."""
+    (request,) = requests(wire, tcp_adu(7, 1, pdu))
+    return reply_data(pdu, tcp_pdu(wire.answer(request, now_ns).data, 7, 1))
+
+
+def test_write_moves_and_read_shows(t7):
+    """Function 16 puts out, functions 3 and 4 read the same on a LabJack."""
+    ask(t7, write_pdu(1000, FLOAT32.encode(3.25)))
+    volts = [FLOAT32.decode(ask(t7, read_pdu(f, 0, 2), 10 * MS)) for f in (3, 4)]
+    assert volts[0] == volts[1]
+    assert 12.5 * volts[0] == pytest.approx(16.5, abs=1.0)
+    assert FLOAT32.decode(ask(t7, read_pdu(3, 1000, 2))) == 3.25
+
+
+def test_feedback_reads_before_the_command_acts(t7):
+    """Function 76 writes and reads in one; the reading is of the moment of the write."""
+    pdu = feedback_pdu(1000, FLOAT32.encode(4.0), 0, 2)
+    first = FLOAT32.decode(ask(t7, pdu))
+    second = FLOAT32.decode(ask(t7, pdu, 10 * MS))
+    assert abs(12.5 * first) < 0.5
+    assert 12.5 * second > 5.0
+
+
+def test_coupler_reads_elsewhere_than_it_writes():
+    """On a WAGO register 0 is written as output and read as input; 0x200 reads it back."""
+    wire = ModbusWire("tcp", device_of("wago_750", "AO0", "AI0"))
+    raw = (8000).to_bytes(2, "big")
+    assert abs(int.from_bytes(ask(wire, write_read_pdu(0, 1, 0, raw)), "big", signed=True)) < 90
+    assert ask(wire, read_pdu(3, 0x200, 1)) == raw
+    ask(wire, write_single_pdu(0, raw))
+    assert ask(wire, read_pdu(3, 0, 1), 10 * MS) != raw
+
+
+@pytest.mark.parametrize(
+    ("pdu", "code"),
+    [
+        (read_pdu(3, 12345, 1), 2),
+        (read_pdu(3, 0, 9), 2),
+        (write_pdu(0, FLOAT32.encode(1.0)), 2),
+        (write_pdu(1000, b"\x00\x00"), 2),
+        (write_pdu(1000, FLOAT32.encode(5.1)), 3),
+        (write_pdu(1000, FLOAT32.encode(-0.1)), 3),
+        (write_pdu(1000, b"\x7f\xc0\x00\x00"), 3),
+        (write_pdu(1000, FLOAT32.encode(1.0) + FLOAT32.encode(9.0)), 3),
+        (write_read_pdu(0, 2, 1000, FLOAT32.encode(1.0)), 1),
+    ],
+)
+def test_refusals_change_nothing(t7, pdu, code):
+    """Wrong addresses, parts of values, values out of range, unknown functions."""
+    ask(t7, write_pdu(1000, FLOAT32.encode(2.0)))
+    with pytest.raises(Refused) as refusal:
+        ask(t7, pdu)
+    assert refusal.value.code == code
+    assert FLOAT32.decode(ask(t7, read_pdu(3, 1000, 2))) == 2.0
+
+
+def test_requests_in_one_segment_are_all_answered(t7):
+    """The second of two is not lost, and half of one waits for the rest."""
+    pdu = read_pdu(3, 1000, 2)
+    both = tcp_adu(1, 1, pdu) + tcp_adu(2, 1, pdu)
+    received = bytearray(both + both[:5])
+    replies = [t7.answer(request, 0).data for request in t7.requests(received)]
+    assert [int.from_bytes(reply[:2], "big") for reply in replies] == [1, 2]
+    assert received == both[:5]
+
+
+def test_rtu_ignores_others_and_rubbish():
+    """Another unit's request and a spoilt one get no reply."""
+    wire = ModbusWire("rtu", device_of("wago_750", "AO0", "AI0"))
+    pdu = read_pdu(3, 0x200, 1)
+    good = rtu_adu(1, pdu)
+    (request,) = requests(wire, good)
+    assert len(reply_data(pdu, rtu_pdu(wire.answer(request, 0).data, 1))) == 2
+    assert requests(wire, rtu_adu(2, pdu)) == []
+    assert requests(wire, good[:-1] + bytes([good[-1] ^ 1])) == []
+
+
+def test_units_share_a_line_and_a_rig():
+    """One unit drives, the other shows; neither has the other's registers."""
+    rig, log, wiring = Rig(0), WriteLog(None, 0), Wiring(1.0, 0.0, 12.5, 0.0)
+    drives = EmulatedModbus(load_profile("adam_4024"), rig, log, "AO0", None, wiring)
+    reads = EmulatedModbus(load_profile("adam_4117"), rig, log, None, "AI2", wiring)
+    wire = ModbusWire("rtu", {1: drives, 2: reads})
+
+    def transact(unit: int, pdu: bytes, now_ns: int) -> bytes:
+        (request,) = requests(wire, rtu_adu(unit, pdu))
+        return reply_data(pdu, rtu_pdu(wire.answer(request, now_ns).data, unit))
+
+    transact(1, write_single_pdu(0, (4095).to_bytes(2, "big")), 0)
+    raw = int.from_bytes(transact(2, read_pdu(3, 2, 1), 10 * MS), "big")
+    assert 12.5 * (raw * 20.0 / 65535.0 - 10.0) == pytest.approx(rig.displacement_um, abs=0.01)
+    assert rig.displacement_um > 40.0
+    with pytest.raises(Refused):
+        transact(2, write_single_pdu(0, bytes(2)), 10 * MS)
+    assert requests(wire, rtu_adu(3, read_pdu(3, 0, 1))) == []
+
+
+def test_gateway_says_that_a_unit_is_not_there():
+    """Over TCP a unit that nobody has is exception 11; one device alone takes any unit."""
+    device = device_of("labjack_t7", "DAC0", "AIN0")
+    pdu = read_pdu(3, 1000, 2)
+    wire = ModbusWire("tcp", {1: device, 2: device_of("labjack_t7", "DAC0", "AIN0")})
+    (request,) = requests(wire, tcp_adu(7, 3, pdu))
+    with pytest.raises(Refused) as refusal:
+        reply_data(pdu, tcp_pdu(wire.answer(request, 0).data, 7, 3))
+    assert refusal.value.code == 11
+    alone = ModbusWire("tcp", device)
+    (request,) = requests(alone, tcp_adu(7, 3, pdu))
+    assert len(reply_data(pdu, tcp_pdu(alone.answer(request, 0).data, 7, 3))) == 4

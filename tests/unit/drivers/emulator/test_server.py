@@ -1,0 +1,160 @@
+"""Emulated devices over sockets, asked by independent clients."""
+
+import json
+import os
+import select
+import socket
+import threading
+from contextlib import ExitStack
+
+import pytest
+from pymodbus.client import ModbusTcpClient
+
+from hilctl_drivers.emulator.faults import parse_fault
+from hilctl_drivers.emulator.server import EmulatorServer
+from hilctl_drivers.emulator.wire import EmulatedReply
+from hilctl_drivers.modbus.pdu import (
+    read_pdu,
+    tcp_adu,
+)
+from hilctl_drivers.modbus.registers import RegisterFormat
+
+FLOAT32 = RegisterFormat("float32")
+MS = 1_000_000
+
+
+def test_independent_client_agrees(served):
+    """pymodbus's client reads and writes the emulated device, with its own conversions."""
+    host, port = served("labjack_t7").split(":")
+    with ModbusTcpClient(host, port=int(port), retries=0) as client:
+        kind = client.DATATYPE.FLOAT32
+        client.write_registers(1000, client.convert_to_registers(4.25, kind))
+        back = client.read_holding_registers(1000, count=2).registers
+        assert client.convert_from_registers(back, kind) == 4.25
+        test = client.read_input_registers(55100, count=2).registers
+        assert test == [0x0011, 0x2233]
+        assert client.read_holding_registers(9999, count=1).exception_code == 2
+
+
+def test_pipelined_requests_are_answered_in_order(served):
+    """Two requests in one segment get two replies."""
+    host, port = served("labjack_t7").split(":")
+    pdu = read_pdu(3, 1000, 2)
+    with socket.create_connection((host, int(port)), 5.0) as link:
+        link.sendall(tcp_adu(1, 1, pdu) + tcp_adu(2, 1, pdu))
+        got = b""
+        while len(got) < 26:
+            got += link.recv(100)
+    assert (got[:2], got[13:15]) == (b"\x00\x01", b"\x00\x02")
+
+
+def test_log_tells_time_and_value(served, tmp_path):
+    """Each write is one JSON object with both clocks, on disk at once."""
+    path = tmp_path / "log.jsonl"
+    host, port = served("labjack_t7", log=path).split(":")
+    with ModbusTcpClient(host, port=int(port), retries=0) as client:
+        client.write_registers(1000, [0x4020, 0x0000])
+    entry = json.loads(path.read_text())
+    assert entry["event"] == "write"
+    assert (entry["output"], entry["value"], entry["current_a"]) == ("DAC0", 2.5, 0.0)
+    assert entry["monotonic_ns"] > 0
+    assert entry["unix_s"] > 1.7e9
+
+
+class EchoWire:
+    """A wire whose requests are single bytes; each is answered by itself, 10 ms later if late."""
+
+    def __init__(self, *, late=False, size=1):
+        self._late, self._size = late, size
+
+    def tick(self, now_ns):
+        pass
+
+    def requests(self, received):
+        while received:
+            yield bytes([received.pop(0)])
+
+    def answer(self, request, now_ns):
+        return EmulatedReply(self._size * request, now_ns + 10 * MS if self._late else 0)
+
+    def refusal(self, request):
+        return EmulatedReply(b"!")
+
+    def encode(self, data):
+        return data
+
+    def corrupt_at(self, framed):
+        return 0
+
+
+class Served:
+    """A server that runs in a thread, in a time that the test makes pass, and its ptys."""
+
+    def __init__(self, faults, wires):
+        self.now_ns = 0
+        self._server = EmulatorServer([parse_fault(text) for text in faults], lambda: self.now_ns)
+        names = [self._server.open_pty(wire, faulty=not i) for i, wire in enumerate(wires)]
+        self.ports = [os.open(name, os.O_RDWR | os.O_NOCTTY) for name in names]
+        self._thread = threading.Thread(target=self._server.run)
+        self._thread.start()
+
+    def ask(self, data, which=0, timeout_s=5.0):
+        """Return what comes within the time; nothing where the line is dead."""
+        os.write(self.ports[which], data)
+        ready, _, _ = select.select([self.ports[which]], [], [], timeout_s)
+        return os.read(self.ports[which], 1000) if ready else None
+
+    def close(self):
+        self._server.stop()
+        self._thread.join()
+        for port in self.ports:
+            os.close(port)
+
+
+@pytest.fixture
+def serving():
+    """Return a function that serves wires at ptys."""
+    with ExitStack() as stack:
+
+        def start(*wires, faults=()):
+            made = Served(faults, wires)
+            stack.callback(made.close)
+            return made
+
+        yield start
+
+
+def test_faults_happen_on_the_first_line_only(serving):
+    """The other line counts no requests and knows no faults."""
+    server = serving(EchoWire(), EchoWire(), faults=["exception@2"])
+    assert [server.ask(b"a", which) for which in (1, 0, 1, 0, 0)] == [b"a", b"a", b"a", b"!", b"a"]
+
+
+def test_an_unplugged_line_is_gone_and_the_other_stays(serving):
+    """A pulled adapter takes its port along."""
+    server = serving(EchoWire(), EchoWire(), faults=["unplug@1"])
+    os.write(server.ports[0], b"a")
+    select.select([server.ports[0]], [], [], 5.0)
+    assert os.read(server.ports[0], 10) == b""
+    assert server.ask(b"b", which=1) == b"b"
+
+
+def test_a_late_answer_is_given_up_with_the_next_request(serving):
+    """Nothing comes before its time, and only the newest comes."""
+    server = serving(EchoWire(late=True))
+    os.write(server.ports[0], b"ab")
+    while (got := server.ask(b"", timeout_s=0.0)) is None:
+        server.now_ns += 10 * MS
+    assert got == b"b"
+
+
+def test_what_the_host_does_not_read_waits_for_room(serving):
+    """A full line stops nothing, and loses nothing."""
+    server = serving(EchoWire(size=100_000), EchoWire())
+    os.write(server.ports[0], b"ab")
+    assert server.ask(b"c", which=1) == b"c"
+    got = b""
+    while len(got) < 200_000:
+        assert select.select([server.ports[0]], [], [], 5.0)[0]
+        got += os.read(server.ports[0], 65536)
+    assert got == 100_000 * b"a" + 100_000 * b"b"

@@ -1,0 +1,149 @@
+"""Emulated devices that speak lines of text, with the time in the test's hand."""
+
+from pathlib import Path
+
+import pytest
+
+from hilctl_drivers.emulator.text_device import TemplateMatcher, in_style
+
+MS = 1_000_000
+START_NS = 10_000_000_000
+
+
+DCON = (Path(__file__).parents[3] / "data" / "dcon_module.yaml").read_text()
+
+
+@pytest.fixture
+def dcon(emulate, tmp_path):
+    """A DCON module with an output and an input, at address 2."""
+    path = tmp_path / "dcon.yaml"
+    path.write_text(DCON)
+    return emulate(path)
+
+
+class TestTemplates:
+    def test_a_template_is_read_backwards(self):
+        """Numbers in any form that the field can have, hexadecimal ones by their format."""
+        assert TemplateMatcher("#{address:02X}0{value:+07.3f}", 1).match("#010-05.250") == {
+            "value": -5.25
+        }
+        assert TemplateMatcher("~{address:02X}31{timeout:02X}", 10).match("~0A3164") == {
+            "timeout": 100.0
+        }
+        assert TemplateMatcher("CURR {value:.6f};:MEAS:CURR?", 0).match("CURR 1.5;:MEAS:CURR?") == {
+            "value": 1.5
+        }
+        for other in ("#020-05.250", "#010-05.250 ", "#010", "#011+05.000x"):
+            assert TemplateMatcher("#{address:02X}0{value:+07.3f}", 1).match(other) is None
+
+    @pytest.mark.parametrize(
+        ("example", "pattern", "value", "reply"),
+        [
+            ("!01+05.000", "![0-9A-F]{2}([+-][0-9]+\\.[0-9]+)", -1.5, "!01-01.500"),
+            ("05.003", "([0-9]+\\.[0-9]+)", 12.3456, "12.346"),
+            ("2.71E1", "(.*)", -0.00125, "-1.250000E-03"),
+            ("+2.61920000E+00", "(.*)", 1.5, "+1.500000E+00"),
+        ],
+    )
+    def test_a_reply_looks_like_the_example(self, example, pattern, value, reply):
+        """Sign, digits and exponent are as in the vendor's example."""
+        assert in_style(example, pattern, value) == reply
+
+
+class TestDcon:
+    def test_output_moves_the_rig_and_the_input_shows_it(self, dcon):
+        """A write is acknowledged and logged in A; the input shows the displacement in V."""
+        assert dcon.ask(b"#020") == b">+00.000"
+        assert dcon.ask(b"#020+05.000") == b">"
+        reading = dcon.ask(b"#020", after_ms=500)
+        assert reading.startswith(b">+")
+        assert 2.0 < float(reading[1:]) < 3.5  # 5 A is about 35 um, at 12.5 um/V
+        (write,) = dcon.writes()
+        assert (write["event"], write["value"], write["current_a"]) == ("write", 5.0, 5.0)
+
+    def test_out_of_range_and_unknown_are_said(self, dcon):
+        """``?`` for a value that is out of range, ``?AA`` for a command that it does not have."""
+        assert dcon.ask(b"#020+10.001") == b"?"
+        assert dcon.ask(b"$02Z") == b"?02"
+        assert dcon.ask(b"#030+05.000") is None
+        assert dcon.writes() == []
+
+    def test_checksum_is_looked_at(self, dcon):
+        """A line with a wrong checksum is ignored, as a module does."""
+        framing = dcon.emulator.wires[0].framing
+        good = b"#020+05.000"
+        check = b"%02X" % (sum(good) & 0xFF)
+        assert framing.feed(good + check + b"\r") == [good]
+        assert framing.feed(good + b"00\r") == []
+
+
+class TestHostWatchdog:
+    @pytest.fixture
+    def module(self, emulate, tmp_path):
+        """The shipped DCON module, with a reader for the sensor, armed at 0.5 s."""
+        path = tmp_path / "reader.yaml"
+        path.write_text(DCON.replace("checksum: dcon", "checksum: none"))
+        made = emulate("icp_m7024_dcon", reader=str(path), reader_line="same")
+        assert made.ask(b"~013105") == b"!01"
+        return made
+
+    def test_silence_puts_the_output_at_its_safe_value(self, module):
+        """It trips when due, says so, and ignores commands with ``!`` until it is cleared."""
+        assert module.ask(b"#010+04.000", after_ms=499) == b">"
+        assert module.ask(b"~010", after_ms=2) == b"!0104"
+        assert module.ask(b"#010+01.000") == b"!"
+        assert module.ask(b"$0160") == b"!01+00.000"
+        trip = next(w for w in module.writes() if w["event"] == "watchdog" and w["output"] == "AO0")
+        assert (trip["value"], trip["monotonic_ns"]) == (0.0, START_NS + 500 * MS)
+        assert module.ask(b"~011") == b"!01"
+        assert module.ask(b"~010") == b"!0100"
+        assert module.ask(b"#010+01.000") == b">"
+
+    def test_only_the_host_ok_feeds_it(self, module):
+        """``~**`` is not answered and keeps it quiet; commands do not."""
+        for _ in range(5):
+            assert module.ask(b"~**", after_ms=400) is None
+            assert module.ask(b"~010") == b"!0100"
+        for _ in range(4):
+            module.ask(b"#010+02.000", after_ms=200)
+        assert module.ask(b"~010") == b"!0104"
+
+    def test_disarmed_it_never_trips(self, module):
+        """After ``~AA30VV`` silence means nothing."""
+        assert module.ask(b"~013005") == b"!01"
+        assert module.ask(b"~010", after_ms=60_000) == b"!0100"
+
+
+class TestScpi:
+    @pytest.fixture
+    def supply(self, emulate):
+        """A Kepco BOP, with the sensor on a voltmeter on another line."""
+        return emulate("kepco_bop", reader="agilent_34970a")
+
+    def test_commands_are_silent_and_errors_wait_to_be_asked_for(self, supply):
+        """A setting is not answered; one out of range is kept as error -222 and changes nothing."""
+        assert supply.ask(b"CURR 3.000000") is None
+        assert supply.ask(b"MEAS:CURR?") == b"3.000000E+00"
+        assert supply.ask(b"CURR 99") is None
+        assert supply.ask(b"SYST:ERR?") == b'-222,"Data out of range"'
+        assert supply.ask(b"SYST:ERR?").startswith(b"0")
+        assert supply.ask(b"NONSENSE") is None
+        assert supply.ask(b"SYST:ERR?").startswith(b"-113")
+        assert supply.ask(b"CURR?") == b"3.000000E+00"
+
+    def test_the_voltmeter_sees_what_the_supply_does(self, supply):
+        """Both lines stand on one rig."""
+        voltmeter = supply.emulator.reader
+        supply.ask(b"CURR 5")
+        answer = voltmeter.answer(b"READ?", START_NS + 500 * MS)
+        assert 2.0 < float(answer.data) < 3.5
+
+
+def test_gen_refuses_with_its_codes(emulate):
+    """TDK-Lambda GEN: ``OK`` to what it takes, ``C..`` or ``E..`` to what it does not."""
+    supply = emulate("tdk_lambda_gen", reader="agilent_34970a")
+    assert supply.ask(b"ADR 06") == b"OK"
+    assert supply.ask(b"PC 5.000") == b"OK"
+    assert supply.ask(b"MC?") == b"05.000"
+    assert supply.ask(b"PC 39.000") == b"C05"
+    assert supply.ask(b"PC?") == b"05.000"
