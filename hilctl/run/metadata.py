@@ -39,6 +39,7 @@ def run_facts(checked: Checked, started: str) -> dict[str, str]:
         "kernel": f"{platform.system()} {platform.release()} {platform.machine()}",
         "device": info.name,
         "device_description": info.description,
+        "simulated": str(info.simulated).lower(),
         "buffered": str(info.buffered).lower(),
         "fifo_depth": str(info.fifo_depth),
         "command_unit": info.command_unit,

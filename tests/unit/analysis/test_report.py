@@ -355,7 +355,7 @@ class TestTable:
 
     def test_simulation_is_told(self, lagging) -> None:
         """A simulated device is called so, a real one is not."""
-        simulated = lagging(run={"name": "x", "device": "simulated_terfenol"})
+        simulated = lagging(run={"name": "x", "device": "my_rig", "simulated": "true"})
         assert "no hardware was driven" in self.text(summarize(simulated))
         assert "no hardware was driven" not in self.text(summarize(lagging()))
 
