@@ -105,11 +105,6 @@ class Range(Part):
             raise ValueError(f"min must be < max, got {self.min:g} and {self.max:g}")
         return self
 
-    @property
-    def bipolar(self) -> bool:
-        """Whether it goes to both sides of 0."""
-        return self.min < 0.0 < self.max
-
 
 class Watchdog(Part):
     """The device's own host watchdog: what it does when this machine falls silent."""

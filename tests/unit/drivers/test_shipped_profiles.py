@@ -351,4 +351,3 @@ class TestBoards:
         assert (profile.exchange == "stream") is stream
         assert (profile.link.framing, profile.link.crc) == ("cobs", "crc16_ccitt_false")
         assert profile.outputs["DAC"].format.encode(2.5).hex() == "00002040"
-        assert profile.outputs["DAC"].bipolar
