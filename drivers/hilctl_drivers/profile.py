@@ -5,29 +5,93 @@ Shipped profiles are in ``profiles/``; a user's own is given by its path.
 """
 
 import json
+from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Annotated, Any, TypeAlias, TypeVar, cast
 
 import yaml
-from pydantic import ValidationError
+from pydantic import PlainSerializer, PlainValidator, ValidationError, ValidationInfo
 from pydantic.json_schema import models_json_schema
+from pydantic_core import PydanticKnownError
 
 from hilctl.base.errors import ConfigError, InputError, Problem
-from hilctl_drivers.board.profile import FrameProfile
-from hilctl_drivers.modbus.profile import ModbusProfile
+from hilctl.base.files import TextFiles
+from hilctl_drivers.profile_parts import BaseProfile
 from hilctl_drivers.profile_problems import read_yaml, rules_broken, value_at
-from hilctl_drivers.text.profile import AsciiProfile
 
-Profile: TypeAlias = ModbusProfile | AsciiProfile | FrameProfile
-"""A device's profile; which one follows from ``link.kind``."""
+LINK_KINDS: dict[str, str] = {
+    "tcp": "hilctl_drivers.modbus.profile:ModbusProfile",
+    "rtu": "hilctl_drivers.modbus.profile:ModbusProfile",
+    "ascii": "hilctl_drivers.text.profile:AsciiProfile",
+    "frames": "hilctl_drivers.board.profile:FrameProfile",
+}
+"""What a profile's ``link.kind`` says of it: the class of such profiles, which knows the rest of
+its protocol. A new protocol is one line here."""
 
 FOLDER = Path(__file__).parent / "profiles"
-_CLASSES: dict[str, type[ModbusProfile] | type[AsciiProfile] | type[FrameProfile]] = {
-    "tcp": ModbusProfile,
-    "rtu": ModbusProfile,
-    "ascii": AsciiProfile,
-    "frames": FrameProfile,
-}
+_Profile = TypeVar("_Profile", bound=BaseProfile)
+
+
+class BrokenProfile(ConfigError, ValueError):  # noqa: N818  what it is, not what it raises
+    """A profile breaks rules; also a ``ValueError``, so that an options' validation collects it."""
+
+
+@dataclass(frozen=True, slots=True)
+class NamedProfile:
+    """A profile, and how the experiment names it.
+
+    Attributes:
+        name: Name of a shipped profile, or path.
+        profile: What it holds.
+    """
+
+    name: str
+    profile: BaseProfile
+
+
+def _named(value: object, info: ValidationInfo) -> NamedProfile:
+    """Resolve a profile's name while options are validated.
+
+    The validation's context may have ``files``, where texts are read from, and ``folder``, what
+    paths are relative to. So what was checked is what runs, also in another process.
+    """
+    if isinstance(value, NamedProfile):
+        return value
+    if not isinstance(value, str):
+        raise PydanticKnownError("string_type")
+    context = info.context or {}
+    try:
+        return NamedProfile(
+            value, load_profile(value, context.get("files"), context.get("folder", Path()))
+        )
+    except BrokenProfile:
+        raise
+    except InputError as error:
+        raise ValueError(str(error)) from None
+
+
+ProfileName: TypeAlias = Annotated[
+    NamedProfile,
+    PlainValidator(_named, json_schema_input_type=str),
+    PlainSerializer(lambda named: named.name, return_type=str),
+]
+"""An option that names a profile; it holds the profile too once it is validated."""
+
+
+def named_class(place: str) -> Any:
+    """Return what stands at ``module:name``."""
+    module, _, name = place.partition(":")
+    return getattr(import_module(module), name)
+
+
+def profile_class(kind: str) -> type[BaseProfile]:
+    """Return the class of profiles with this ``link.kind``.
+
+    Raises:
+        KeyError: There is none.
+    """
+    return cast("type[BaseProfile]", named_class(LINK_KINDS[kind]))
 
 
 def shipped_profiles() -> dict[str, Path]:
@@ -35,35 +99,36 @@ def shipped_profiles() -> dict[str, Path]:
     return {path.stem: path for path in sorted(FOLDER.glob("*.yaml"))}
 
 
-def load_profile(name_or_path: str) -> Profile:
+def load_profile(
+    name_or_path: str, files: TextFiles | None = None, folder: Path | None = None
+) -> BaseProfile:
     """Return a profile by the name of a shipped one, or by path.
 
     What has a suffix or a slash is a path.
 
+    Args:
+        name_or_path: The name or the path.
+        files: Where the text is read from; the disk where None.
+        folder: What a path is relative to; the working folder where None.
+
     Raises:
         InputError: There is no such profile, or the file can't be read.
-        ConfigError: It breaks rules; all are listed.
+        BrokenProfile: It breaks rules; all are listed.
     """
     shipped = shipped_profiles()
     if name_or_path in shipped:
         path = shipped[name_or_path]
     elif "/" in name_or_path or Path(name_or_path).suffix in {".yaml", ".yml"}:
-        path = Path(name_or_path)
+        path = (folder or Path()) / name_or_path
     else:
         raise InputError(
             f"no profile '{name_or_path}' is shipped: take one of {', '.join(shipped)},"
             " or give the path of a .yaml file"
         )
-    try:
-        text = path.read_text(encoding="utf-8")
-    except UnicodeDecodeError:
-        raise InputError(f"{path}: is not UTF-8 text") from None
-    except OSError as error:
-        raise InputError(f"{path}: can't be read: {error.strerror}") from None
-    return parse_profile(text, str(path))
+    return parse_profile((files or TextFiles()).read(path), str(path))
 
 
-def parse_profile(text: str, where: str) -> Profile:
+def parse_profile(text: str, where: str) -> BaseProfile:
     """Return the profile in a YAML text.
 
     Args:
@@ -71,45 +136,55 @@ def parse_profile(text: str, where: str) -> Profile:
         where: Its name in messages.
 
     Raises:
-        ConfigError: It breaks rules; all are listed.
+        BrokenProfile: It breaks rules; all are listed.
     """
     try:
         data = read_yaml(text)
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         hint = " ".join(str(error).split())
-        raise ConfigError([Problem(where, "", "is not readable YAML", hint=hint)]) from None
+        raise BrokenProfile([Problem(where, "", "is not readable YAML", hint=hint)]) from None
     if not isinstance(data, dict):
-        raise ConfigError([Problem(where, "", "must hold a mapping of keys to values")])
+        raise BrokenProfile([Problem(where, "", "must hold a mapping of keys to values")])
     kind = value_at(data, ("link", "kind"))
-    if not isinstance(kind, str) or kind not in _CLASSES:
-        rule = f"must be one of {', '.join(_CLASSES)}"
-        raise ConfigError(
+    if not isinstance(kind, str) or kind not in LINK_KINDS:
+        rule = f"must be one of {', '.join(LINK_KINDS)}"
+        raise BrokenProfile(
             [Problem(where, "link.kind", rule, "nothing" if kind is None else repr(kind))]
         )
     try:
-        profile = _CLASSES[kind].model_validate(data)
+        profile = profile_class(kind).model_validate(data)
     except ValidationError as error:
-        raise ConfigError(rules_broken(error, data, where, _known_keys(kind))) from None
+        raise BrokenProfile(rules_broken(error, data, where, _known_keys(kind))) from None
     missing = [key for key in profile.unverified if value_at(data, key.split(".")) is None]
     if missing:
         rule = "must name keys that are in this file"
         problems = [Problem(where, "unverified", rule, key) for key in missing]
-        raise ConfigError(problems)
+        raise BrokenProfile(problems)
     return profile
 
 
 def _known_keys(kind: str) -> set[str]:
-    schema = _CLASSES[kind].model_json_schema()
+    schema = profile_class(kind).model_json_schema()
     parts = (schema, *schema["$defs"].values())
     return {name for part in parts for name in part.get("properties", {})}
 
 
-def with_link(profile: Profile, **changes: Any) -> Profile:
+def with_link(profile: _Profile, **changes: Any) -> _Profile:
     """Return a profile with other link settings, such as the baud that a device was set to.
 
+    Args:
+        profile: The device.
+        **changes: Settings by name; those that are None stay as they are.
+
     Raises:
-        InputError: The link has no such setting, or the value breaks a rule.
+        InputError: The link has no such setting, the value breaks a rule, or the device can't be
+            set to that baud.
     """
+    changes = {key: value for key, value in changes.items() if value is not None}
+    if not changes:
+        return profile
+    if "baud" in changes:
+        check_baud(profile, changes["baud"])
     data = profile.model_dump()
     data["link"] |= changes
     try:
@@ -119,9 +194,22 @@ def with_link(profile: Profile, **changes: Any) -> Profile:
         raise InputError("\n".join(str(problem) for problem in problems)) from None
 
 
+def check_baud(profile: BaseProfile, baud: int) -> None:
+    """Refuse a baud that the device can't be set to, where its profile knows those that it can.
+
+    Raises:
+        InputError: It can't.
+    """
+    others: tuple[int, ...] = getattr(profile.link, "bauds", ())
+    known = sorted({*others, getattr(profile.link, "baud", baud)})
+    if others and baud not in known:
+        text = ", ".join(map(str, known))
+        raise InputError(f"baud must be one that {profile.title} can be set to, {text}, got {baud}")
+
+
 def profile_schema_text() -> str:
     """Return the JSON schema of profiles, as the text of ``profiles/schema.json``."""
-    models = (ModbusProfile, AsciiProfile, FrameProfile)
+    models = list(dict.fromkeys(map(profile_class, LINK_KINDS)))
     refs, schema = models_json_schema([(model, "validation") for model in models])
     whole = {
         "$schema": "https://json-schema.org/draft/2020-12/schema",

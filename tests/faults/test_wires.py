@@ -31,7 +31,7 @@ MODULE = {
 
 def over_tcp(address: str) -> dict:
     host, port = address.split(":")
-    return {**T7, "host": host, "port": int(port)}
+    return {**T7, "host": host, "tcp_port": int(port)}
 
 
 TCP_FAULTS: dict[str, str] = {

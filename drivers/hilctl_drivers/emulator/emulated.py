@@ -10,8 +10,8 @@ from hilctl_drivers.emulator.rig import Rig
 from hilctl_drivers.emulator.watchdog import HostWatchdog
 from hilctl_drivers.emulator.wiring import Wiring
 from hilctl_drivers.emulator.write_log import WriteLog
+from hilctl_drivers.modbus.channels import ModbusStep, RegisterStep
 from hilctl_drivers.modbus.profile import ModbusProfile
-from hilctl_drivers.modbus.steps import ModbusStep, RegisterStep
 
 
 class Declined(Exception):  # noqa: N818  a reply, not a mistake

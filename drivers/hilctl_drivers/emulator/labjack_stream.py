@@ -16,8 +16,8 @@ from hilctl_drivers.emulator.labjack_input import LabJackInput
 from hilctl_drivers.emulator.scan_clock import Played, ScanClock
 from hilctl_drivers.labjack import stream
 from hilctl_drivers.labjack.profile import BYTES_A_SAMPLE, LabJackStreaming
+from hilctl_drivers.modbus.channels import RegisterStep
 from hilctl_drivers.modbus.profile import ModbusProfile
-from hilctl_drivers.modbus.steps import RegisterStep
 
 _VALUE_EXCEPTION, _FAILURE_EXCEPTION = 3, 4
 _PERIOD_NS, _PERIODS_MAX = 100, 65_536

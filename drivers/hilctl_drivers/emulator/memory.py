@@ -3,8 +3,8 @@
 import struct
 from collections.abc import Sequence
 
+from hilctl_drivers.modbus.channels import Register
 from hilctl_drivers.modbus.registers import RegisterFormat
-from hilctl_drivers.profile_parts import Register
 
 Key = tuple[str, int]
 """Area and wire address."""

@@ -191,7 +191,7 @@ class _Plan:
         output, sensor = self.profile.outputs[self.output], self.reader.inputs[self.sensor]
         made: dict[str, Any] = {
             "profile": self.options.profile,
-            **_place(address, "", "port"),
+            **_place(address),
             "output": self.output,
             "input": self.sensor,
             "sensor": {
@@ -204,17 +204,15 @@ class _Plan:
             gain = {f"gain_a_per_{_SUFFIX[output.unit]}": wiring.gain_a}
             made["amplifier"] = {**gain, "offset_a": wiring.offset_a}
         if self.reader is not self.profile:
-            made |= {"reader": self.options.reader, "reader_unit_id": self.reader_unit}
-            if self.apart:
-                made |= _place(reader_address, "reader_", "tcp_port")
+            place = _place(reader_address) if self.apart else {}
+            reader = {"profile": self.options.reader, "unit_id": self.reader_unit}
+            made["reader"] = reader | place
         return made
 
 
-def _place(address: str, prefix: str, port_key: str) -> dict[str, Any]:
+def _place(address: str) -> dict[str, Any]:
     host, _, port = address.rpartition(":")
-    if not host:
-        return {f"{prefix}serial_port": address}
-    return {f"{prefix}host": host, f"{prefix}{port_key}": int(port)}
+    return {"host": host, "tcp_port": int(port)} if host else {"serial_port": address}
 
 
 def _modbus(name: str) -> ModbusProfile:

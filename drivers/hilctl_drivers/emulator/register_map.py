@@ -1,9 +1,8 @@
 """Which registers an emulated Modbus device has, and what stands in them at first."""
 
 from hilctl_drivers.emulator.memory import Memory, Words
+from hilctl_drivers.modbus.channels import ExpectStep, ModbusStep, Register, RegisterStep
 from hilctl_drivers.modbus.profile import ModbusOutput, ModbusProfile
-from hilctl_drivers.modbus.steps import ExpectStep, ModbusStep, RegisterStep
-from hilctl_drivers.profile_parts import Register
 
 
 class RegisterMap:

@@ -191,7 +191,6 @@ def _options(
         gain = {f"gain_a_per_{suffix[unit]}": wiring.gain_a, "offset_a": wiring.offset_a}
         made["amplifier"] = gain
     if wanted.reader:
-        made["reader"] = wanted.reader
-        if len(lines) > 1:
-            made["reader_port"] = lines[1].name
+        place = {"serial_port": lines[1].name} if len(lines) > 1 else {}
+        made["reader"] = {"profile": wanted.reader, **place}
     return made

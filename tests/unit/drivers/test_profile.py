@@ -9,8 +9,8 @@ import yaml
 
 from hilctl.base.errors import ConfigError, InputError
 from hilctl_drivers.board.profile import FrameProfile
+from hilctl_drivers.modbus.channels import EnsureStep, RegisterStep
 from hilctl_drivers.modbus.profile import ModbusProfile
-from hilctl_drivers.modbus.steps import EnsureStep, RegisterStep
 from hilctl_drivers.profile import (
     FOLDER,
     load_profile,
@@ -296,8 +296,8 @@ class TestLoading:
         """A path without a file, a folder and a file that is not text are named."""
         (tmp_path / "x.yaml").write_bytes(b"\xff\xfe\x00")
         for path, message in (
-            (tmp_path / "none.yaml", "No such file"),
-            (tmp_path, "Is a directory"),
+            (tmp_path / "none.yaml", "no such file"),
+            (tmp_path, "is not a file"),
             (tmp_path / "x.yaml", "not UTF-8"),
         ):
             with pytest.raises(InputError, match=message) as error:

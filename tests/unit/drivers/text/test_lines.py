@@ -1,6 +1,5 @@
 """Lines of text: bytes as in the vendors' documents, numbers, and lines out of a stream."""
 
-
 import pytest
 
 from hilctl_drivers.text.lines import LineFormat, parse_number
