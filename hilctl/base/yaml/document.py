@@ -6,7 +6,7 @@ A document remembers where each value stands, so that a broken rule is reported 
 
 import types
 import typing
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
 
@@ -113,10 +113,21 @@ class Document:
                 return self._places[loc[:end]]
         return self.name
 
-    def validate(self, model: type[Model], *, at: Loc = (), without: tuple[str, ...] = ()) -> Model:
-        """Build a pydantic model from the document, or from the part of it at ``at``.
+    def validate(
+        self,
+        model: type[Model],
+        *,
+        at: Loc = (),
+        without: tuple[str, ...] = (),
+        context: Mapping[str, Any] | None = None,
+    ) -> Model:
+        """Build a pydantic model from the document, or from a part of it.
 
-        Keys in ``without`` are left out: they belong to somebody else.
+        Args:
+            model: What to build.
+            at: Where the part stands; all of the document where empty.
+            without: Keys that are left out: they belong to somebody else.
+            context: What the model's validators find in ``info.context``.
 
         Raises:
             ConfigError: One or more rules are broken; all are listed.
@@ -127,7 +138,7 @@ class Document:
         if without:
             data = {key: value for key, value in data.items() if key not in without}
         try:
-            return model.model_validate(data)
+            return model.model_validate(data, context=context)
         except ValidationError as error:
             details = error.errors(include_url=False)
             raise ConfigError([self._problem(model, detail, at) for detail in details]) from None

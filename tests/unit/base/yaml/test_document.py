@@ -3,7 +3,7 @@
 from typing import Annotated, Literal
 
 import pytest
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from hilctl.base.errors import ConfigError, InputError
 from hilctl.base.yaml.document import Document, dotted, load_document
@@ -164,6 +164,25 @@ def test_part_of_a_document():
         "bench.yaml:6: parts.0.peak_a: is required",
         "bench.yaml:7: parts.0.radius_um: unknown key (known: peak_a, slow, steps)",
     ]
+
+
+def test_context_reaches_the_validators():
+    """What validates a value may depend on what the caller knows."""
+
+    class Named(Strict):
+        name: str
+
+        @field_validator("name")
+        @classmethod
+        def _known(cls, name, info):
+            if name not in info.context["names"]:
+                raise ValueError("must be known")
+            return name
+
+    one = document("name: bench\n")
+    assert one.validate(Named, context={"names": ["bench"]}).name == "bench"
+    with pytest.raises(ConfigError, match=r"bench\.yaml:1: name: must be known"):
+        one.validate(Named, context={"names": []})
 
 
 def test_long_values_are_cut():
