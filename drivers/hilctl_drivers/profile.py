@@ -33,8 +33,8 @@ FOLDER = Path(__file__).parent / "profiles"
 _Profile = TypeVar("_Profile", bound=BaseProfile)
 
 
-class BrokenProfile(ConfigError, ValueError):  # noqa: N818  what it is, not what it raises
-    """A profile breaks rules; also a ``ValueError``, so that an options' validation collects it."""
+class BrokenProfileError(ConfigError, ValueError):
+    """A profile that options name breaks rules; a ``ValueError``: validation collects it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,8 +65,8 @@ def _named(value: object, info: ValidationInfo) -> NamedProfile:
         return NamedProfile(
             value, load_profile(value, context.get("files"), context.get("folder", Path()))
         )
-    except BrokenProfile:
-        raise
+    except ConfigError as error:
+        raise BrokenProfileError(error.problems) from None
     except InputError as error:
         raise ValueError(str(error)) from None
 
@@ -113,7 +113,7 @@ def load_profile(
 
     Raises:
         InputError: There is no such profile, or the file can't be read.
-        BrokenProfile: It breaks rules; all are listed.
+        ConfigError: It breaks rules; all are listed.
     """
     shipped = shipped_profiles()
     if name_or_path in shipped:
@@ -136,30 +136,30 @@ def parse_profile(text: str, where: str) -> BaseProfile:
         where: Its name in messages.
 
     Raises:
-        BrokenProfile: It breaks rules; all are listed.
+        ConfigError: It breaks rules; all are listed.
     """
     try:
         data = read_yaml(text)
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         hint = " ".join(str(error).split())
-        raise BrokenProfile([Problem(where, "", "is not readable YAML", hint=hint)]) from None
+        raise ConfigError([Problem(where, "", "is not readable YAML", hint=hint)]) from None
     if not isinstance(data, dict):
-        raise BrokenProfile([Problem(where, "", "must hold a mapping of keys to values")])
+        raise ConfigError([Problem(where, "", "must hold a mapping of keys to values")])
     kind = value_at(data, ("link", "kind"))
     if not isinstance(kind, str) or kind not in LINK_KINDS:
         rule = f"must be one of {', '.join(LINK_KINDS)}"
-        raise BrokenProfile(
+        raise ConfigError(
             [Problem(where, "link.kind", rule, "nothing" if kind is None else repr(kind))]
         )
     try:
         profile = profile_class(kind).model_validate(data)
     except ValidationError as error:
-        raise BrokenProfile(rules_broken(error, data, where, _known_keys(kind))) from None
+        raise ConfigError(rules_broken(error, data, where, _known_keys(kind))) from None
     missing = [key for key in profile.unverified if value_at(data, key.split(".")) is None]
     if missing:
         rule = "must name keys that are in this file"
         problems = [Problem(where, "unverified", rule, key) for key in missing]
-        raise BrokenProfile(problems)
+        raise ConfigError(problems)
     return profile
 
 

@@ -16,6 +16,8 @@ from hilctl.base.strict import Strict
 from hilctl_drivers.profile import ProfileName
 from hilctl_drivers.profile_parts import Range, Watchdog
 
+PROFILE = "name of a shipped profile, or path of your own, from the experiment's folder"
+
 _Channel = TypeVar("_Channel", bound=Range)
 
 
@@ -116,7 +118,7 @@ class WatchdogOptions(Strict):
 class ReaderOptions(Strict):
     """The device that has the input, where it is another one."""
 
-    profile: ProfileName = Field(description="name of a shipped profile, or path of your own")
+    profile: ProfileName = Field(description=PROFILE)
     serial_port: str | None = Field(
         default=None, description="its device file; left out where it is on the same line"
     )
@@ -148,7 +150,7 @@ FifoBlocks: TypeAlias = Annotated[
 class DacOptions(DeviceOptions):
     """Options of every DAC that has a profile."""
 
-    profile: ProfileName = Field(description="name of a shipped profile, or path of your own")
+    profile: ProfileName = Field(description=PROFILE)
     serial_port: str | None = Field(
         default=None, description="device file; best under /dev/serial/by-id"
     )

@@ -140,8 +140,14 @@ class Document:
         try:
             return model.model_validate(data, context=context)
         except ValidationError as error:
-            details = error.errors(include_url=False)
-            raise ConfigError([self._problem(model, detail, at) for detail in details]) from None
+            problems: list[Problem] = []
+            for detail in error.errors(include_url=False):
+                cause = detail.get("ctx", {}).get("error")
+                if isinstance(cause, ConfigError):  # of a file that a validator has read
+                    problems += cause.problems
+                else:
+                    problems.append(self._problem(model, detail, at))
+            raise ConfigError(problems) from None
 
     def _problem(self, model: type[BaseModel], detail: ErrorDetails, at: Loc) -> Problem:
         loc, parent = _plain_loc(model, detail["loc"])
