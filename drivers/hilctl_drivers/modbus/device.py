@@ -60,6 +60,7 @@ class ModbusDac(DacDevice):
         self._guard = ModbusGuard(setup)
         self._pair: _Pair | None = None
         self._swap: Swap = _not_open
+        self._feeds = False
         self.one_transaction = False
         """Whether a tick is one transaction; known once it is open."""
 
@@ -81,6 +82,7 @@ class ModbusDac(DacDevice):
         replace(rates, note=f"{how} a sample; {rates.note}").check(sample_rate_hz)
         # Armed last: the steps above may take longer than its time-out.
         self._guard.arm(pair.writer, sample_rate_hz)
+        self._feeds = self._guard.feed_every > 0
 
     def _exchange(
         self, first_sample: int, command: F64, displacement_um: F64, measured: F64
@@ -88,7 +90,7 @@ class ModbusDac(DacDevice):
         gain, offset, um_per_unit, offset_um = self._factors
         data = self._swap(self._encode((command.item() - offset) / gain))
         displacement_um[0] = self._decode(data) * um_per_unit + offset_um
-        if self._guard.feed_every and self._pair is not None:
+        if self._feeds and self._pair is not None:
             self._guard.feed(self._pair.writer)
 
     def _put_out(self, command: float) -> None:
