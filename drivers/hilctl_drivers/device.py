@@ -1,184 +1,183 @@
-"""What both families of commercial devices ask of an experiment's options, Modbus and serial."""
+"""The base of every device here: what a DAC must do whatever it speaks.
 
-import ipaddress
-from collections.abc import Mapping
-from pathlib import Path
-from typing import Literal, TypeAlias, TypeVar
+It checks block, rate, sizes and range before anything is sent, never clips, names the device and
+the deed in each error, and lets go of the connection after a failure: nobody knows then what the
+device holds, so it must be opened again. A back end connects, exchanges and disconnects.
+"""
 
-from pydantic import Field
+from abc import ABC, abstractmethod
+from typing import ClassVar
 
-from hilctl.base.device import DeviceOptions
-from hilctl.base.errors import InputError
-from hilctl_drivers.profile_parts import BaseProfile, Range, Watchdog
-from hilctl_drivers.wire.line_settings import AsciiLink, FramesLink, RtuLink
-from hilctl_drivers.wire.serial_port import SerialSettings
-from hilctl_drivers.wiring import SignalChain
+import numpy as np
 
-_Channel = TypeVar("_Channel")
-
-
-class HostWatchdog(DeviceOptions):
-    """What the device does by itself when this machine falls silent."""
-
-    timeout_s: float = Field(gt=0.0, description="silence after which it acts, s")
-    safe_command: float = Field(
-        default=0.0, description="where it puts the output, in the command's unit"
-    )
+from hilctl.base.arrays import F64
+from hilctl.base.device import DeviceInfo, DeviceOptions
+from hilctl.base.errors import DeviceError
+from hilctl_drivers.wire.timing import RateLimit
 
 
-WantedWatchdog: TypeAlias = HostWatchdog | Literal["none"]
-"""The watchdog that an experiment asks for; none says that its absence is known."""
-
-
-def channel(what: str, name: str, channels: Mapping[str, _Channel], title: str) -> _Channel:
-    """Return an output or input by its name.
+class DacDevice(ABC):
+    """A :class:`~hilctl.base.device.Device`; back ends implement the underscored methods.
 
     Args:
-        what: The option that names it.
-        name: Its name.
-        channels: What the device has.
-        title: The device.
-
-    Raises:
-        InputError: There is none of this name.
+        info: What it says of itself.
+        title: Its name in messages.
+        action: What an exchange does, in messages: ``write AO0, read AI0``.
+        output: Name of its output, in messages.
     """
-    if name in channels:
-        return channels[name]
-    known = ", ".join(channels) or "none"
-    raise InputError(f"{what} must be one that {title} has, got {name!r} (it has {known})")
 
+    Options: ClassVar[type[DeviceOptions]]
 
-def check_senses(name: str, sensor_input: object, title: str) -> None:
-    """Refuse an input that no sensor can be wired to.
+    def __init__(self, info: DeviceInfo, title: str, action: str, output: str) -> None:
+        self._info = info
+        self._title = title
+        self._action = action
+        self._output_name = output
+        self._low, self._high = info.command_min, info.command_max
+        self._block = 0  # samples in each exchange; 0 while it is not open
 
-    Raises:
-        InputError: It measures the device's own output.
-    """
-    if getattr(sensor_input, "measures", "terminal") != "terminal":
-        raise InputError(
-            f"input {name} of {title} measures the device's own output: name the device that reads "
-            "the sensor as reader"
-        )
+    @property
+    def info(self) -> DeviceInfo:
+        """What the device is and what it accepts."""
+        return self._info
 
+    def open(self, sample_rate_hz: float, block: int) -> None:
+        """Connect, check that the device is what it should be, and set it up; nothing moves.
 
-def check_watchdog(
-    title: str,
-    output_name: str,
-    output: Range,
-    chain: SignalChain,
-    wanted: WantedWatchdog,
-    has: Watchdog | Literal["none"],
-) -> None:
-    """Refuse a watchdog that the device hasn't got, or that can't do what is asked of it.
+        Raises:
+            DeviceError: It can't be reached, is another device, refuses a step, or can't keep this
+                rate or block.
+        """
+        self.close()
+        try:
+            self._check_block(block)
+            self._rates(block).check(sample_rate_hz)
+            self._open(sample_rate_hz, block)
+        except DeviceError as error:
+            self._release()
+            raise self._error("open", str(error)) from None
+        self._block = block
 
-    Args:
-        title: The device.
-        output_name: The output in use.
-        output: What that gives.
-        chain: What it is wired to.
-        wanted: What the experiment asks for.
-        has: What the device has.
+    def exchange(
+        self, first_sample: int, command: F64, displacement_um: F64, measured: F64
+    ) -> None:
+        """Send one block of commands, see :meth:`hilctl.base.device.Device.exchange`.
 
-    Raises:
-        InputError: It has none, can't take the time-out, or would not go to the safe command.
-    """
-    if wanted == "none":
-        return
-    if has == "none":
-        raise InputError(
-            f"{title} has no host watchdog: it holds its last output when this "
-            "machine dies; say watchdog: none if you accept that"
-        )
-    has.counts(wanted.timeout_s)
-    low, high = chain.command_range(output.min, output.max)
-    if not low <= wanted.safe_command <= high:
-        raise InputError(
-            f"watchdog.safe_command must be {low:g} to {high:g}, got {wanted.safe_command:g}"
-        )
-    _check_protects(title, output_name, has)
-    at_zero, unit = chain.command(0.0), chain.command_unit
-    if has.on_trip in {"zero", "reset"} and abs(at_zero - wanted.safe_command) > 1e-9:
-        raise InputError(
-            f"the watchdog of {title} puts {output_name} at 0 {output.unit}, which is {at_zero:g} "
-            f"{unit} here: watchdog.safe_command must be that, got {wanted.safe_command:g}"
-        )
+        After an error on the wire the device must be opened again.
 
+        Raises:
+            DeviceError: Not open, a block of another size than agreed, or a command out of range or
+                not finite, and then nothing was sent; or no good answer in time.
+        """
+        block = self._block
+        if not command.size == displacement_um.size == measured.size == block or not block:
+            self._check_sizes(command, displacement_um, measured)
+        if block == 1:  # most devices: a comparison of arrays takes ten times as long
+            if not self._low <= command.item() <= self._high:
+                raise self._out_of_range(command)
+        elif not ((command >= self._low) & (command <= self._high)).all():
+            raise self._out_of_range(command)
+        try:
+            self._exchange(first_sample, command, displacement_um, measured)
+        except DeviceError as error:
+            self._block = 0
+            self._abandon()
+            raise self._error(self._action, str(error)) from None
 
-def _check_protects(title: str, name: str, has: Watchdog) -> None:
-    """Refuse a watchdog whose trip leaves the output where it is."""
-    safe = getattr(has, "safe", {})
-    if has.on_trip == "hold":
-        raise InputError(
-            f"the watchdog of {title} holds {name} where it is when it trips: say watchdog: none "
-            "if you accept that"
-        )
-    if has.on_trip == "safe" and safe and name not in safe:
-        raise InputError(
-            f"the watchdog of {title} does nothing for {name}, only for "
-            f"{', '.join(safe)}: take one of these, or say watchdog: none"
-        )
+    def make_safe(self, command: float) -> None:
+        """Put the output at ``command`` at once and let go; a watchdog that is armed stays so.
 
+        Opens a connection of its own where there is none.
 
-def details(profile: BaseProfile, link: str, options: DeviceOptions) -> dict[str, str]:
-    """Return what is worth keeping with a recording, as text.
+        Raises:
+            DeviceError: ``command`` is out of range or not finite; the device can't be reached, or
+                does not confirm.
+        """
+        if not self._low <= command <= self._high:
+            raise self._out_of_range(np.array([command]))
+        self._block = 0
+        try:
+            self._put_out(command)
+        except DeviceError as error:
+            raise self._error(f"make safe, {self._output_name}", str(error)) from None
+        finally:
+            self._release()
 
-    Args:
-        profile: The device.
-        link: Its link, with the experiment's settings in it.
-        options: The experiment's options.
-    """
-    return {
-        **provenance(profile),
-        "link": link,
-        **{name: str(value) for name, value in options.model_dump(exclude_none=True).items()},
-    }
+    def close(self) -> None:
+        """Take leave of the device and let go of it; the output stays. Closing twice is fine.
 
+        After an error in an exchange there is no connection any more, and a watchdog stays armed.
 
-def provenance(profile: BaseProfile, prefix: str = "") -> dict[str, str]:
-    """Return what a profile is of, and where it was taken from."""
-    return {
-        f"{prefix}vendor": profile.vendor,
-        f"{prefix}model": profile.model,
-        f"{prefix}source": "; ".join(profile.source),
-        f"{prefix}verified": profile.verified,
-    }
+        Raises:
+            DeviceError: The device did not confirm; the connection is given up all the same.
+        """
+        opened, self._block = self._block != 0, 0
+        try:
+            if opened:
+                self._close()
+        except DeviceError as error:
+            raise self._error("close", str(error)) from None
+        finally:
+            self._release()
 
+    def _longest_block(self) -> tuple[int, str]:
+        """Return the most samples of an exchange and, in words that follow it, why."""
+        return 1, ""
 
-def line_settings(link: RtuLink | AsciiLink | FramesLink) -> SerialSettings:
-    """Return how a profile's serial line is set."""
-    gaps = {"rtu": "frame_gap_s", "ascii": "min_gap_s"}
-    return SerialSettings(
-        link.baud,
-        link.bytesize,
-        link.parity,
-        link.stopbits,
-        getattr(link, gaps[link.kind]) if link.kind in gaps else 0.0,
-        link.boot_wait_s,
-        flow=link.flow,
-        dtr=link.dtr,
-        rts=link.rts,
-    )
+    def _rates(self, block: int) -> RateLimit:
+        """Return the sample rates that it can keep with this block."""
+        del block
+        return RateLimit(self._info.max_rate_hz, self._info.rate_note)
 
+    @abstractmethod
+    def _open(self, sample_rate_hz: float, block: int) -> None:
+        """Connect and set up; block and rate are good. :meth:`_release` follows an error."""
 
-def held_port(path: str) -> str:
-    """Return a serial port as :attr:`hilctl.base.device.DeviceInfo.holds` has it.
+    @abstractmethod
+    def _exchange(
+        self, first_sample: int, command: F64, displacement_um: F64, measured: F64
+    ) -> None:
+        """Exchange a block whose sizes and range are good. :meth:`_abandon` follows an error."""
 
-    Links such as those under ``/dev/serial/by-id`` are followed, so that two names of one port are
-    one.
-    """
-    return f"serial:{Path(path).resolve()}"
+    def _abandon(self) -> None:
+        """Give up a connection on which an exchange has failed."""
+        self._release()
 
+    @abstractmethod
+    def _put_out(self, command: float) -> None:
+        """Put out a command that is in range, open or not; :meth:`_release` follows."""
 
-def held_address(host: str, port: int) -> str:
-    """Return a TCP port as :attr:`hilctl.base.device.DeviceInfo.holds` has it.
+    @abstractmethod
+    def _close(self) -> None:
+        """Disarm and say good-bye to a device that is open; :meth:`_release` follows."""
 
-    Addresses come in their shortest form. Names stay as they are, but for ``localhost``: asking
-    for them could take seconds, and :attr:`hilctl.base.device.Device.info` must not wait.
-    """
-    if host.lower() == "localhost":
-        host = "127.0.0.1"
-    try:
-        address = ipaddress.ip_address(host)
-    except ValueError:
-        return f"tcp:{host.lower()}:{port}"
-    return f"tcp:[{address}]:{port}" if address.version == 6 else f"tcp:{address}:{port}"
+    @abstractmethod
+    def _release(self) -> None:
+        """Let go of what is held, without a word to the device; it may be held no more."""
+
+    def _check_block(self, block: int) -> None:
+        """Refuse a block that is too long."""
+        most, why = self._longest_block()
+        if not 1 <= block <= most:
+            span = "1 sample" if most == 1 else f"1 to {most} samples"
+            raise DeviceError(f"block must be {span}{why}, got {block}")
+
+    def _check_sizes(self, command: F64, displacement_um: F64, measured: F64) -> None:
+        """Refuse a block that is not as agreed at open."""
+        if not self._block:
+            raise self._error(self._action, "not open")
+        sizes = ", ".join(str(each.size) for each in (command, displacement_um, measured))
+        size = "1 sample" if self._block == 1 else f"{self._block} samples"
+        rule = f"block must be {size}, as at open"
+        raise self._error(self._action, f"{rule}, got {sizes}")
+
+    def _error(self, action: str, what: str) -> DeviceError:
+        return DeviceError(f"{self._title}: {what} (to {action})")
+
+    def _out_of_range(self, command: F64) -> DeviceError:
+        """Return the error for a block with a command out of range or not a number."""
+        index = int(np.argmin((command >= self._low) & (command <= self._high)))
+        name = "command" if command.size == 1 else f"command[{index}]"
+        unit = self._info.command_unit
+        rule = f"{name} must be in [{self._low:g}, {self._high:g}] {unit}"
+        return self._error(self._action, f"{rule}, got {command[index]} {unit}, nothing was sent")

@@ -5,30 +5,93 @@ Shipped profiles are in ``profiles/``; a user's own is given by its path.
 """
 
 import json
+from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Annotated, Any, TypeAlias, TypeVar, cast
 
-from pydantic import ValidationError
+from pydantic import PlainSerializer, PlainValidator, ValidationError, ValidationInfo
 from pydantic.json_schema import models_json_schema
+from pydantic_core import PydanticKnownError
 
 from hilctl.base.errors import ConfigError, InputError, Problem
-from hilctl.base.files import read_text
+from hilctl.base.files import TextFiles
 from hilctl.base.yaml.document import Document
 from hilctl.base.yaml.messages import broken_rules, loc_of
-from hilctl_drivers.board.profile import FrameProfile
-from hilctl_drivers.modbus.profile import ModbusProfile
-from hilctl_drivers.text.profile import AsciiProfile
+from hilctl_drivers.profile_parts import BaseProfile
 
-Profile: TypeAlias = ModbusProfile | AsciiProfile | FrameProfile
-"""A device's profile; which one follows from ``link.kind``."""
+LINK_KINDS: dict[str, str] = {
+    "tcp": "hilctl_drivers.modbus.profile:ModbusProfile",
+    "rtu": "hilctl_drivers.modbus.profile:ModbusProfile",
+    "ascii": "hilctl_drivers.text.profile:AsciiProfile",
+    "frames": "hilctl_drivers.board.profile:FrameProfile",
+}
+"""What a profile's ``link.kind`` says of it: the class of such profiles, which knows the rest of
+its protocol. A new protocol is one line here."""
 
 FOLDER = Path(__file__).parent / "profiles"
-_CLASSES: dict[str, type[ModbusProfile] | type[AsciiProfile] | type[FrameProfile]] = {
-    "tcp": ModbusProfile,
-    "rtu": ModbusProfile,
-    "ascii": AsciiProfile,
-    "frames": FrameProfile,
-}
+_Profile = TypeVar("_Profile", bound=BaseProfile)
+
+
+class BrokenProfileError(ConfigError, ValueError):
+    """A profile that options name breaks rules; a ``ValueError``: validation collects it."""
+
+
+@dataclass(frozen=True, slots=True)
+class NamedProfile:
+    """A profile, and how the experiment names it.
+
+    Attributes:
+        name: Name of a shipped profile, or path.
+        profile: What it holds.
+    """
+
+    name: str
+    profile: BaseProfile
+
+
+def _named(value: object, info: ValidationInfo) -> NamedProfile:
+    """Resolve a profile's name while options are validated.
+
+    The validation's context may have ``files``, where texts are read from, and ``folder``, what
+    paths are relative to. So what was checked is what runs, also in another process.
+    """
+    if isinstance(value, NamedProfile):
+        return value
+    if not isinstance(value, str):
+        raise PydanticKnownError("string_type")
+    context = info.context or {}
+    try:
+        return NamedProfile(
+            value, load_profile(value, context.get("files"), context.get("folder", Path()))
+        )
+    except ConfigError as error:
+        raise BrokenProfileError(error.problems) from None
+    except InputError as error:
+        raise ValueError(str(error)) from None
+
+
+ProfileName: TypeAlias = Annotated[
+    NamedProfile,
+    PlainValidator(_named, json_schema_input_type=str),
+    PlainSerializer(lambda named: named.name, return_type=str),
+]
+"""An option that names a profile; it holds the profile too once it is validated."""
+
+
+def named_class(place: str) -> Any:
+    """Return what stands at ``module:name``."""
+    module, _, name = place.partition(":")
+    return getattr(import_module(module), name)
+
+
+def profile_class(kind: str) -> type[BaseProfile]:
+    """Return the class of profiles with this ``link.kind``.
+
+    Raises:
+        KeyError: There is none.
+    """
+    return cast("type[BaseProfile]", named_class(LINK_KINDS[kind]))
 
 
 def shipped_profiles() -> dict[str, Path]:
@@ -36,10 +99,17 @@ def shipped_profiles() -> dict[str, Path]:
     return {path.stem: path for path in sorted(FOLDER.glob("*.yaml"))}
 
 
-def load_profile(name_or_path: str) -> Profile:
+def load_profile(
+    name_or_path: str, files: TextFiles | None = None, folder: Path | None = None
+) -> BaseProfile:
     """Return a profile by the name of a shipped one, or by path.
 
     What has a suffix or a slash is a path.
+
+    Args:
+        name_or_path: The name or the path.
+        files: Where the text is read from; the disk where None.
+        folder: What a path is relative to; the working folder where None.
 
     Raises:
         InputError: There is no such profile, or the file can't be read.
@@ -49,16 +119,16 @@ def load_profile(name_or_path: str) -> Profile:
     if name_or_path in shipped:
         path = shipped[name_or_path]
     elif "/" in name_or_path or Path(name_or_path).suffix in {".yaml", ".yml"}:
-        path = Path(name_or_path)
+        path = (folder or Path()) / name_or_path
     else:
         raise InputError(
             f"no profile '{name_or_path}' is shipped: take one of {', '.join(shipped)},"
             " or give the path of a .yaml file"
         )
-    return parse_profile(read_text(path), str(path))
+    return parse_profile((files or TextFiles()).read(path), str(path))
 
 
-def parse_profile(text: str, where: str) -> Profile:
+def parse_profile(text: str, where: str) -> BaseProfile:
     """Return the profile in a YAML text.
 
     Args:
@@ -71,12 +141,12 @@ def parse_profile(text: str, where: str) -> Profile:
     document = Document(where, text)
     link = document.data.get("link")
     kind = link.get("kind") if isinstance(link, dict) else None
-    if not isinstance(kind, str) or kind not in _CLASSES:
-        rule = f"must be one of {', '.join(_CLASSES)}"
+    if not isinstance(kind, str) or kind not in LINK_KINDS:
+        rule = f"must be one of {', '.join(LINK_KINDS)}"
         value = "nothing" if kind is None else repr(kind)
         place = document.where(("link", "kind"))
         raise ConfigError([Problem(place, "link.kind", rule, value)])
-    profile = document.validate(_CLASSES[kind])
+    profile = document.validate(profile_class(kind))
     problems = [
         Problem(
             document.where(("unverified", index)),
@@ -92,12 +162,22 @@ def parse_profile(text: str, where: str) -> Profile:
     return profile
 
 
-def with_link(profile: Profile, **changes: Any) -> Profile:
+def with_link(profile: _Profile, **changes: Any) -> _Profile:
     """Return a profile with other link settings, such as the baud that a device was set to.
 
+    Args:
+        profile: The device.
+        **changes: Settings by name; those that are None stay as they are.
+
     Raises:
-        InputError: The link has no such setting, or the value breaks a rule.
+        InputError: The link has no such setting, the value breaks a rule, or the device can't be
+            set to that baud.
     """
+    changes = {key: value for key, value in changes.items() if value is not None}
+    if not changes:
+        return profile
+    if "baud" in changes:
+        check_baud(profile, changes["baud"])
     data = profile.model_dump()
     data["link"] |= changes
     try:
@@ -107,9 +187,22 @@ def with_link(profile: Profile, **changes: Any) -> Profile:
         raise InputError("\n".join(str(problem) for problem in problems)) from None
 
 
+def check_baud(profile: BaseProfile, baud: int) -> None:
+    """Refuse a baud that the device can't be set to, where its profile knows those that it can.
+
+    Raises:
+        InputError: It can't.
+    """
+    others: tuple[int, ...] = getattr(profile.link, "bauds", ())
+    known = sorted({*others, getattr(profile.link, "baud", baud)})
+    if others and baud not in known:
+        text = ", ".join(map(str, known))
+        raise InputError(f"baud must be one that {profile.title} can be set to, {text}, got {baud}")
+
+
 def profile_schema_text() -> str:
     """Return the JSON schema of profiles, as the text of ``profiles/schema.json``."""
-    models = (ModbusProfile, AsciiProfile, FrameProfile)
+    models = list(dict.fromkeys(map(profile_class, LINK_KINDS)))
     refs, schema = models_json_schema([(model, "validation") for model in models])
     whole = {
         "$schema": "https://json-schema.org/draft/2020-12/schema",

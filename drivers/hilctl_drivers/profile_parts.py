@@ -1,91 +1,20 @@
-"""The parts of a device profile that all links share: registers, ranges, watchdog, provenance."""
+"""The parts of a device profile that all protocols share: ranges, watchdog, provenance."""
 
 import math
 from collections.abc import Mapping
-from typing import Annotated, Literal, Self, TypeAlias
+from typing import Annotated, ClassVar, Literal, Self, TypeAlias
 
 from pydantic import Field, StringConstraints, model_validator
 
-from hilctl.base.device import DeviceOptions
 from hilctl.base.errors import InputError
-from hilctl_drivers.modbus.registers import RegisterFormat
-from hilctl_drivers.wire.errors import BadRequest
+from hilctl.base.strict import Strict
+from hilctl_drivers.wire.line_settings import LinkSettings
 
-RegisterType: TypeAlias = Literal["bit", "int16", "uint16", "int32", "uint32", "float32", "float64"]
-Area: TypeAlias = Literal["coil", "discrete", "input", "holding"]
-AddressBase: TypeAlias = Literal[0, 1, "modicon"]
 Text: TypeAlias = Annotated[str, StringConstraints(min_length=1)]
 Name: TypeAlias = Annotated[str, StringConstraints(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
 
-READ_FUNCTION: dict[str, int] = {"coil": 1, "discrete": 2, "holding": 3, "input": 4}
 
-
-class Part(DeviceOptions):
-    """Base of everything in a profile: frozen, strict, no unknown keys."""
-
-
-class Register(Part):
-    """A value in a Modbus device: where it stands and how it is written in bytes.
-
-    Value = raw * scale + offset.
-    """
-
-    area: Area = Field(default="holding", description="what is read or written")
-    address: int = Field(ge=0, description="as the vendor's document has it, see address_base")
-    address_base: AddressBase | None = Field(
-        default=None,
-        description="0 or 1: number of the first register; modicon: 40001, 30001, 10001 or 1 by"
-        " area; left out: the profile's",
-    )
-    type: RegisterType = Field(description="how the raw value is stored")
-    order: str = Field(
-        default="",
-        description="bytes on the wire, A the most significant: ABCD, CDAB, BADC, DCBA; left out:"
-        " most significant first",
-    )
-    scale: float = Field(default=1.0, description="value = raw * scale + offset")
-    offset: float = Field(default=0.0, description="value = raw * scale + offset")
-
-    @model_validator(mode="after")
-    def _consistent(self) -> Self:
-        bits = self.area in {"coil", "discrete"}
-        if bits != (self.type == "bit"):
-            rule = "must be bit" if bits else "must not be bit"
-            raise ValueError(f"type {rule} in area {self.area}")
-        if bits and (self.order, self.scale, self.offset) != ("", 1.0, 0.0):
-            raise ValueError("a bit has no order, scale or offset")
-        if not bits:
-            _ = self.format
-        return self
-
-    @property
-    def format(self) -> RegisterFormat:
-        """How the value becomes bytes.
-
-        Raises:
-            BadRequest: It is a bit, or order or scale is wrong.
-        """
-        if self.type == "bit":
-            raise BadRequest("a bit has no register format")
-        return RegisterFormat(self.type, self.order, self.scale, self.offset)
-
-    @property
-    def words(self) -> int:
-        """Registers (or bits) that it takes up."""
-        return 1 if self.type == "bit" else self.format.count
-
-    @property
-    def read_function(self) -> int:
-        """Modbus function that reads it: 1, 2, 3 or 4."""
-        return READ_FUNCTION[self.area]
-
-    @property
-    def representable(self) -> tuple[float, float]:
-        """Lowest and highest value that its type can hold, scaled."""
-        return (0.0, 1.0) if self.type == "bit" else self.format.limits
-
-
-class Range(Part):
+class Range(Strict):
     """What a channel means at the terminals.
 
     ``min`` and ``max`` are what the device puts out or takes in, not what its register could hold.
@@ -95,7 +24,11 @@ class Range(Part):
     min: float = Field(description="lowest value that the device puts out or reads, in unit")
     max: float = Field(description="highest value that the device puts out or reads, in unit")
     resolution: float | None = Field(default=None, gt=0.0, description="smallest step, in unit")
-    settle_s: float = Field(default=0.0, ge=0.0, description="time the output takes to settle, s")
+    settle_s: float = Field(
+        default=0.0,
+        ge=0.0,
+        description="time it takes to settle, s; a sample period is longer by that",
+    )
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
@@ -104,12 +37,12 @@ class Range(Part):
         return self
 
     @property
-    def bipolar(self) -> bool:
-        """Whether it goes to both sides of 0."""
-        return self.min < 0.0 < self.max
+    def limits(self) -> tuple[float, float]:
+        """Lowest and highest value, in ``unit``."""
+        return self.min, self.max
 
 
-class Watchdog(Part):
+class Watchdog(Strict):
     """The device's own host watchdog: what it does when this machine falls silent."""
 
     unit_s: float = Field(gt=0.0, description="one count of the device's timeout, s")
@@ -122,9 +55,6 @@ class Watchdog(Part):
         description="what the outputs do: go to the safe value, to 0, stay, or the device restarts"
     )
     refuses_while_tripped: bool = Field(description="whether it refuses commands until cleared")
-    survives_power_cycle: bool = Field(
-        default=False, description="whether the trip is still there after power-on"
-    )
 
     @model_validator(mode="after")
     def _span(self) -> Self:
@@ -150,17 +80,7 @@ class Watchdog(Part):
         return counts
 
 
-def check_channels(outputs: Mapping[str, Range], inputs: Mapping[str, Range]) -> None:
-    """Refuse a profile of nothing; a device with inputs only can be another one's reader.
-
-    Raises:
-        ValueError: There are neither outputs nor inputs.
-    """
-    if not outputs and not inputs:
-        raise ValueError("must have outputs or inputs, or both")
-
-
-class WaitStep(Part):
+class WaitStep(Strict):
     """Let the device settle."""
 
     kind: Literal["wait"]
@@ -168,8 +88,20 @@ class WaitStep(Part):
     note: str = ""
 
 
-class BaseProfile(Part):
-    """What every profile says of a device, whatever it speaks."""
+class BaseProfile(Strict):
+    """What every profile says of a device, whatever it speaks.
+
+    Subclasses narrow ``link``, ``outputs``, ``inputs`` and ``watchdog`` to their protocol's.
+
+    Attributes:
+        DEVICE: The kind of device in an experiment that such profiles are for.
+        WIRE: What makes a :class:`~hilctl_drivers.serial.wire.SerialWire` from a
+            :class:`~hilctl_drivers.serial.setup.SerialSetup`, as ``module:name``; empty where the
+            protocol has a device of its own.
+    """
+
+    DEVICE: ClassVar[str]
+    WIRE: ClassVar[str] = ""
 
     vendor: Text
     model: Text = Field(description="model, as ordered")
@@ -183,6 +115,10 @@ class BaseProfile(Part):
     notes: tuple[Text, ...] = Field(default=(), description="what a user must know before wiring")
     turnaround_s: float = Field(ge=0.0, le=1.0, description="request received to reply begun, s")
     max_rate_hz: float = Field(gt=0.0, description="highest sample rate that makes sense, Hz")
+    link: LinkSettings
+    outputs: Mapping[Name, Range]
+    inputs: Mapping[Name, Range]
+    watchdog: Watchdog | Literal["none"]
 
     @model_validator(mode="after")
     def _says_what_is_unverified(self) -> Self:
@@ -192,7 +128,25 @@ class BaseProfile(Part):
             )
         return self
 
+    @model_validator(mode="after")
+    def _has_channels(self) -> Self:
+        # A device with inputs only can be another one's reader.
+        if not self.outputs and not self.inputs:
+            raise ValueError("must have outputs or inputs, or both")
+        if self.watchdog != "none" and not self.outputs:
+            raise ValueError("watchdog must be none where there are no outputs to make safe")
+        return self
+
     @property
     def title(self) -> str:
         """Vendor and model."""
         return f"{self.vendor} {self.model}"
+
+    def provenance(self, prefix: str = "") -> dict[str, str]:
+        """Return what the profile is of, and where it was taken from, to keep with a recording."""
+        return {
+            f"{prefix}vendor": self.vendor,
+            f"{prefix}model": self.model,
+            f"{prefix}source": "; ".join(self.source),
+            f"{prefix}verified": self.verified,
+        }

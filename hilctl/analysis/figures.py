@@ -76,6 +76,7 @@ class RunReport(Figures):
         path: File that was read.
         name: Name of the experiment.
         device: Name of the device.
+        simulated: Whether that is a simulation.
         reason: Why the run ended, or that its record is cut short.
         complete: Whether it has a record of its end and the last sample of its last segment.
         samples: Samples of the waveform.
@@ -107,6 +108,7 @@ class RunReport(Figures):
     path: str
     name: str
     device: str
+    simulated: bool
     reason: str
     complete: bool
     samples: int
@@ -130,11 +132,6 @@ class RunReport(Figures):
     lateness_by_minute: list[dict[str, float]]
     exchange_us: dict[str, float]
     segments: tuple[SegmentReport, ...]
-
-    @property
-    def simulated(self) -> bool:
-        """Whether the device is a simulation."""
-        return self.device.startswith("simulated_")
 
     def to_mapping(self) -> dict[str, Any]:
         """Return plain values for JSON; a number that is not finite becomes None."""

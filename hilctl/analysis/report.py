@@ -122,6 +122,7 @@ def _identity(recording: Recording) -> dict[str, Any]:
         "path": str(recording.path),
         "name": recording.run.get("name", ""),
         "device": recording.run.get("device", ""),
+        "simulated": recording.run.get("simulated") == "true",
         "reason": recording.end.get("reason", "") if recording.end else cut_short,
         "complete": bool(recording.end) and waveform_end(recording.samples) >= end,
         "sample_rate_hz": recording.sample_rate_hz,

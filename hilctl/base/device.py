@@ -43,6 +43,8 @@ class DeviceInfo:
         holds: What it holds alone while it is open, each by a name that is the same for every
             device that would hold it (``serial:/dev/ttyUSB0``, ``tcp:10.0.0.5:502``): one run at a
             time may hold it. Empty where any number may run side by side.
+        simulated: Whether it drives no hardware and steps on sample count: it may run faster than
+            real time, and its recordings say so.
         details: Anything worth keeping with a recording (serial numbers, physical parameters).
     """
 
@@ -60,6 +62,7 @@ class DeviceInfo:
     latency_blocks: int = 0
     measures_command: bool = False
     holds: tuple[str, ...] = ()
+    simulated: bool = False
     details: Mapping[str, str] = field(default_factory=dict)
 
 

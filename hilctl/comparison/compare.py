@@ -10,7 +10,7 @@ from hilctl.base.yaml.document import Document
 from hilctl.comparison.catalogue import CATALOGUE, entry
 from hilctl.comparison.data import Fitted, Frame, read_loops
 from hilctl.comparison.judging import ModelError, inverse_ns, model_error
-from hilctl.comparison.trials import SIMULATED, Bench, Trial, full_stroke, waveforms_of
+from hilctl.comparison.trials import Bench, Trial, full_stroke, waveforms_of
 from hilctl.experiment.load import LoadedExperiment, load_experiment, resolve
 from hilctl.identify.data import Loop
 from hilctl.models.base import HysteresisModel
@@ -225,12 +225,9 @@ def _recorded(recording: Recording, settings: Sequence[str]) -> LoadedExperiment
 
     Its waveform and its compensator, whose file may be elsewhere, are of no use here.
     """
-    if not recording.experiment_yaml:
+    if not recording.experiment_yaml or recording.run.get("simulated") == "false":
         return None
     document = Document(f"{recording.path} (experiment)", recording.experiment_yaml)
-    device = document.data.get("device")
-    if not isinstance(device, dict) or not str(device.get("kind")).startswith(SIMULATED):
-        return None
     hold = f"{{kind: hold, unit: {recording.command_unit}, level: 0.0, duration_s: 1.0}}"
     plain = ("compensator=none", f"waveform={hold}")
     return resolve(document, recording.path.parent, (*plain, *settings))

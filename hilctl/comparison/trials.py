@@ -29,9 +29,6 @@ CYCLES = 4
 STROKE = 0.98
 """Part of the measured stroke that a trial covers where no experiment says otherwise."""
 
-SIMULATED = "simulated_"
-"""What the names of devices begin with whose time is the sample count."""
-
 _SOFT_S = 0.2
 _LIMITED = int(Flag.RANGE_LIMITED | Flag.SLEW_LIMITED | Flag.INVALID)
 
@@ -115,10 +112,10 @@ class Bench:
     def __init__(
         self, loaded: LoadedExperiment, waveforms: Sequence[AnyWaveform], folder: Path
     ) -> None:
-        name = loaded.device.info.name
-        if not name.startswith(SIMULATED):
+        info = loaded.device.info
+        if not info.simulated:
             raise InputError(
-                f"inverses are tried on simulated devices only, not on {name}: run each one with "
+                f"inverses are tried on simulated devices only, not on {info.name}: run each with "
                 "'hilctl run'"
             )
         self._device = loaded.device

@@ -73,7 +73,7 @@ def resolve(
         document.set(setting)
     problems: list[Problem] = []
     config = _collect(problems, lambda: document.validate(Experiment))
-    device = _collect(problems, lambda: _make_device(document))
+    device = _collect(problems, lambda: _make_device(document, folder, files))
     named = _NamedFiles(document, folder, files)
     model = _collect(problems, lambda: named.load("model", load_model))
     correction = _collect(problems, lambda: named.load("correction", load_correction))
@@ -115,7 +115,7 @@ def _collect(problems: list[Problem], load: Callable[[], T]) -> T | None:
     return None
 
 
-def _make_device(document: Document) -> Device | None:
+def _make_device(document: Document, folder: Path, files: TextFiles) -> Device | None:
     given = document.data.get("device")
     if not isinstance(given, dict):
         return None
@@ -129,7 +129,8 @@ def _make_device(document: Document) -> Device | None:
         chosen = device_class(kind)
     except InputError as error:
         raise ConfigError([Problem(where, "device.kind", str(error))]) from None
-    options = document.validate(chosen.Options, at=("device",), without=("kind",))
+    context = {"folder": folder, "files": files}
+    options = document.validate(chosen.Options, at=("device",), without=("kind",), context=context)
     try:
         return chosen(options)
     except ConfigError:

@@ -49,6 +49,7 @@ def run_facts(checked: "Checked", started: str, model_yaml: str) -> dict[str, st
         "kernel": f"{platform.system()} {platform.release()} {platform.machine()}",
         "device": info.name,
         "device_description": info.description,
+        "simulated": str(info.simulated).lower(),
         "buffered": str(info.buffered).lower(),
         "fifo_depth": str(info.fifo_depth),
         "block": str(config.block),

@@ -125,7 +125,7 @@ def run_unpaced(checked: Checked, output: Path, *, overwrite: bool = False) -> R
         InputError: The device is not a simulated one, or the recording can't be written.
     """
     info = checked.loaded.device.info
-    if not info.name.startswith("simulated_"):
+    if not info.simulated:
         raise InputError(f"{info.name}: only a simulated device can run without real time")
     recorder = Recorder(checked, output, overwrite=overwrite)
     try:

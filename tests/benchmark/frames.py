@@ -26,7 +26,7 @@ from hilctl_drivers.modbus.pdu import (
 )
 from hilctl_drivers.modbus.registers import RegisterFormat
 from hilctl_drivers.modbus.transactions import RtuTransaction, TcpTransaction
-from hilctl_drivers.text.lines import LineFormat, fixed_number, parse_number
+from hilctl_drivers.text.lines import LineFormat, parse_number
 from hilctl_drivers.wire.crc import CRCS
 from hilctl_drivers.wire.framing import Framing, binary_framing
 
@@ -116,7 +116,7 @@ def steps() -> dict[str, Step]:
         **{f"exchange: RTU {name}": rtu_exchange(pdu) for name, pdu in PDUS.items()},
         **{f"frame of 8 bytes and back: {name}": there_and_back(f) for name, f in frames.items()},
         "DCON line and back": lambda value: parse_number(
-            line.decode(line.encode(fixed_number(value, 2, 3)))
+            line.decode(line.encode(f"{value:+07.3f}"))
         ),
         "pymodbus framing: TCP write and read 23": pymodbus_exchange(
             FramerSocket(DecodePDU(False)), tcp_adu(1, 1, answer)

@@ -107,7 +107,7 @@ class Bench:
             "kind": "modbus_dac",
             "profile": str(profile),
             "host": host,
-            "port": int(port),
+            "tcp_port": int(port),
             "output": "OUT",
             "input": "IN",
             "timeout_s": 1.0,

@@ -73,7 +73,7 @@ def serving(server: Path, *words: str, fds: tuple[int, ...] = ()) -> Iterator[st
 def driver_batch(folder: Path, link: str, **where: object) -> Batch:
     """Return the driver's side: command in, displacement out, as in a tick."""
     from hilctl_drivers.modbus.device import ModbusDac
-    from hilctl_drivers.modbus.options import ModbusOptions
+    from hilctl_drivers.modbus.setup import ModbusOptions
 
     profile = folder / "profile.yaml"
     profile.write_text(PROFILE.format(link=link), encoding="utf-8")
@@ -198,7 +198,7 @@ def use_fifo() -> str:
 def over_tcp(folder: Path, server: Path, library: Path, options: argparse.Namespace) -> float:
     """Compare over TCP on loopback."""
     with serving(server, "tcp") as port:
-        ours = driver_batch(folder, "{kind: tcp}", host="127.0.0.1", port=int(port))
+        ours = driver_batch(folder, "{kind: tcp}", host="127.0.0.1", tcp_port=int(port))
         return compare("TCP", ours, c_batch(library, "client_tcp", int(port)), options)
 
 

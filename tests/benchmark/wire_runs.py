@@ -54,6 +54,7 @@ class Wire:
     seconds: float = 4.0
 
 
+VOLTMETER = {"reader": {"profile": "agilent_34970a"}}
 MODBUS = {"kind": "modbus_dac", "output": "OUT", "input": "IN", **AMPLIFIER}
 WIRES = (
     Wire("Modbus TCP", "generic_float32", MODBUS, ("host",), most_hz=500.0),
@@ -62,23 +63,24 @@ WIRES = (
     Wire(
         "SCPI",
         "kepco_bop",
-        {"kind": "serial_dac", "output": "current", "input": "AI101", "reader": "agilent_34970a"},
-        ("serial_port", "reader_port"),
+        {"kind": "serial_dac", "output": "current", "input": "AI101", **VOLTMETER},
+        ("serial_port", "reader"),
         ("--sensor", "agilent_34970a:AI101"),
     ),
     Wire(
         "SCPI, measured",
         "kepco_bop",
-        {"kind": "serial_dac", "output": "current", "input": "AI101", "reader": "agilent_34970a",
+        {"kind": "serial_dac", "output": "current", "input": "AI101", **VOLTMETER,
          "measure": "current"},
-        ("serial_port", "reader_port"),
+        ("serial_port", "reader"),
         ("--sensor", "agilent_34970a:AI101"),
     ),
     Wire(
         "DCON",
         "icp_m7024_dcon",
-        {"kind": "serial_dac", "output": "AO0", "input": "AI0", "reader": "dcon.yaml", **AMPLIFIER},
-        ("serial_port", "reader_port"),
+        {"kind": "serial_dac", "output": "AO0", "input": "AI0", "reader": {"profile": "dcon.yaml"},
+         **AMPLIFIER},
+        ("serial_port", "reader"),
         ("--sensor", "dcon.yaml:AI0"),
     ),
     Wire("COBS", "cobs_board", BOARD),
@@ -118,16 +120,20 @@ def emulated(wire: Wire, folder: Path, *words: str) -> Iterator[dict[str, Any]]:
             assert process.stdout is not None
             make_real_time(process.pid)
             found = [process.stdout.readline().split()[-1] for _ in wire.ports]
-            yield {**COMMON, **wire.device, "profile": wire.profile, **_addresses(wire, found)}
+            yield {**COMMON, "profile": wire.profile, **_placed(wire, found)}
         finally:
             process.terminate()
 
 
-def _addresses(wire: Wire, found: Sequence[str]) -> dict[str, Any]:
+def _placed(wire: Wire, found: Sequence[str]) -> dict[str, Any]:
+    """Return a wire's device section with the addresses that its emulator listens at."""
     if wire.ports == ("host",):
         host, port = found[0].split(":")
-        return {"host": host, "port": int(port)}
-    return dict(zip(wire.ports, found, strict=True))
+        return {**wire.device, "host": host, "tcp_port": int(port)}
+    section = {**wire.device, "serial_port": found[0]}
+    if "reader" in wire.ports:
+        section["reader"] = {**wire.device["reader"], "serial_port": found[1]}
+    return section
 
 
 def write_experiment(

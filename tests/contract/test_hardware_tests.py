@@ -27,7 +27,7 @@ device:
   kind: modbus_dac
   profile: labjack_t7
   host: 127.0.0.1
-  port: {port}
+  tcp_port: {port}
   output: DAC0
   input: {sensor}
   timeout_s: 2.0

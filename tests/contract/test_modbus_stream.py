@@ -47,7 +47,7 @@ class Bench:
         }
         self.device = chosen(
             chosen.Options.model_validate(options),
-            connect=lambda setup: setup.writer.session(self.emulated.link),
+            connect=lambda peer: peer.session(self.emulated.link),
             sleep=self.emulated.time.sleep,
             clock=self.emulated.time,
         )

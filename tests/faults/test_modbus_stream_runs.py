@@ -35,7 +35,7 @@ FAULTS = {
 
 def over_tcp(address):
     host, port = address.split(":")
-    return {**T7, "host": host, "port": int(port)}
+    return {**T7, "host": host, "tcp_port": int(port)}
 
 
 def assert_made_safe(device):

@@ -2,9 +2,21 @@
 
 import os
 import signal
+from pathlib import Path
 
 import pytest
+import yaml
 
+from hilctl.run.start import checked_experiment
+from hilctl.run.supervisor import Supervisor
+
+EXPERIMENT = {
+    "name": "exchanged",
+    "waveform": {"kind": "sine", "unit": "A", "amplitude": 4.0, "frequency_hz": 2.0},
+    "compensator": "none",
+    "limits": {"peak_current_a": 5.0, "slew_a_per_s": 500.0, "stroke_um": [-100.0, 100.0]},
+    "safe": {"value": 0.0, "ramp_s": 0.2},
+}
 TIMEOUT_S = 0.5
 WATCHDOG_S = 1.0
 FAULT_AT = 250
@@ -31,7 +43,7 @@ MODULE = {
 
 def over_tcp(address: str) -> dict:
     host, port = address.split(":")
-    return {**T7, "host": host, "port": int(port)}
+    return {**T7, "host": host, "tcp_port": int(port)}
 
 
 TCP_FAULTS: dict[str, str] = {
@@ -146,3 +158,22 @@ def test_second_run_on_the_same_device_is_refused(emulate, run):
     printed = first.interrupt()
     assert printed["code"] == "stopped"
     assert printed["dropped"] == printed["skipped_ticks"]  # a busy machine may be late
+
+
+def test_profile_exchanged_after_the_check_changes_nothing(emulate, tmp_path, profile):
+    """What was checked is what runs: the loop's process reads no profile from disk."""
+    device = emulate(profile("rtu_module"))
+    mine = tmp_path / "mine.yaml"
+    mine.write_text(Path(profile("rtu_module")).read_text())
+    section = {**MODULE, "profile": mine.name, "serial_port": device.address}
+    waveform = {**EXPERIMENT["waveform"], "duration_s": 0.5}
+    path = tmp_path / "run.yaml"
+    changes = {"sample_rate_hz": 50, "device": section, "waveform": waveform}
+    path.write_text(yaml.safe_dump({**EXPERIMENT, **changes}), encoding="utf-8")
+    checked = checked_experiment(path, ())
+    mine.write_text(mine.read_text().replace("address: 100", "address: 90"))
+    output = tmp_path / "run.mcap"
+    result = Supervisor(checked, output, overwrite=False, on_progress=lambda _: None).run()
+    assert result.code == "completed"
+    put_out = [each["current_a"] for each in device.log.writes("OUT")]
+    assert max(put_out) == pytest.approx(4.0, abs=0.2)

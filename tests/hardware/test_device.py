@@ -184,7 +184,7 @@ def test_small_move_is_seen_and_comes_back(bench):
 
 def test_opening_and_closing_move_nothing(bench):
     """The output stays where it was left while the device is closed, opened and probed."""
-    if bench.device.info.name.startswith("simulated_"):
+    if bench.device.info.simulated:
         pytest.skip("opening a simulated device puts it at rest")
     bench.open()
     rest = bench.go(bench.safe)

@@ -18,7 +18,7 @@ import pytest
 
 from hilctl.base.errors import DeviceError
 from hilctl_drivers.modbus.device import ModbusDac
-from hilctl_drivers.modbus.options import ModbusOptions
+from hilctl_drivers.modbus.setup import ModbusOptions
 
 HERE = Path(__file__).parent
 BAUD = 115_200
@@ -140,7 +140,7 @@ class Served:
         from pymodbus.client import ModbusSerialClient, ModbusTcpClient
 
         if self.server.link == "tcp":
-            made = ModbusTcpClient(self._where["host"], port=self._where["port"])
+            made = ModbusTcpClient(self._where["host"], port=self._where["tcp_port"])
         else:
             made = ModbusSerialClient(self._where["serial_port"], baudrate=BAUD)
         assert made.connect()
@@ -208,7 +208,7 @@ def start(programs, run_program, first_line, cable, tmp_path_factory) -> Callabl
             process = stack.enter_context(run_program([*command, *words], fds))
             said = first_line(process)
             if server.link == "tcp":
-                where = {"host": "127.0.0.1", "port": int(said)}
+                where = {"host": "127.0.0.1", "tcp_port": int(said)}
             yield Served(server, process, where, folder)
 
     return started

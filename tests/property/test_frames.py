@@ -35,9 +35,6 @@ from hilctl_drivers.modbus.registers import RegisterFormat
 from hilctl_drivers.modbus.transactions import RtuTransaction, TcpTransaction
 from hilctl_drivers.text.lines import (
     LineFormat,
-    dcon_answer,
-    fixed_number,
-    parse_fixed_number,
     parse_number,
 )
 from hilctl_drivers.wire.crc import CRCS
@@ -93,14 +90,6 @@ def test_lines_come_back(checksum, terminator, text):
     """Any printable text, its own checksum marks included."""
     line = LineFormat(terminator, checksum)
     assert line.decode(line.encode(text)) == text
-
-
-@given(st.floats(-99.9994, 99.9994))
-def test_fixed_numbers_come_back_to_half_their_last_digit(value):
-    """The field has 5 digits and a sign; what comes back is the nearest it can say."""
-    text = fixed_number(value, 2, 3)
-    assert len(text) == 7
-    assert abs(parse_fixed_number(text, 2, 3) - value) <= 0.5e-3 + 1e-12
 
 
 @given(st.sampled_from(list(NUMPY)), st.data())
@@ -320,10 +309,7 @@ def line(checksum):
     form = LineFormat(b"\r", checksum)
 
     def make(rng):
-        number = fixed_number(rng.uniform(-10, 10), 2, 3)
-        if checksum == "dcon":
-            read = lambda wire: parse_fixed_number(dcon_answer("#012", form.decode(wire)), 2, 3)  # noqa: E731
-            return form.encode(">" + number), read
+        number = f"{rng.uniform(-10, 10):+07.3f}"
         return form.encode(number), lambda wire: parse_number(form.decode(wire))
 
     return make

@@ -1,21 +1,37 @@
 """Profiles of microcontroller boards; messages are in :mod:`hilctl_drivers.board.frames`."""
 
-from typing import Literal, Self, TypeAlias
+from typing import ClassVar, Literal, Self, TypeAlias
 
 from pydantic import Field, model_validator
 
+from hilctl.base.strict import Strict
 from hilctl_drivers.board.frames import exchange_sizes
-from hilctl_drivers.modbus.registers import RegisterFormat
-from hilctl_drivers.profile_parts import BaseProfile, Name, Part, Range, Watchdog
-from hilctl_drivers.wire.line_settings import FramesLink
+from hilctl_drivers.modbus.registers import RegisterFormat, RegisterType
+from hilctl_drivers.profile_parts import BaseProfile, Name, Range, Watchdog
+from hilctl_drivers.wire.line_settings import BinaryLineSettings
 
-ValueType: TypeAlias = Literal["int16", "uint16", "int32", "uint32", "float32", "float64"]
+CrcName: TypeAlias = Literal["crc16_modbus", "crc16_ccitt_false", "crc16_xmodem", "crc32", "none"]
+
+
+class FramesLink(BinaryLineSettings):
+    """Binary frames to a microcontroller board; see :mod:`hilctl_drivers.board.frames`."""
+
+    kind: Literal["frames"]
+    framing: Literal["cobs", "length"] = Field(
+        description="cobs: COBS and a 0 byte at the end; length: a length before the payload"
+    )
+    crc: CrcName = Field(description="check after the payload, least significant byte first")
+    payload_max: int = Field(default=4096, ge=8, le=4096, description="longest payload, bytes")
+    usb: bool = Field(description="a USB device: baud means nothing, frames pass in USB frames")
+    usb_frame_s: float = Field(
+        default=1e-3, gt=0.0, description="time between USB frames, s: 1 ms full, 125 us high speed"
+    )
 
 
 class FrameChannel(Range):
     """A DAC or ADC of a board: how its values stand in a message."""
 
-    type: ValueType = Field(description="how a raw value is stored")
+    type: RegisterType = Field(description="how a raw value is stored")
     order: str = Field(default="", description="as in a register; DCBA is least significant first")
     scale: float = Field(default=1.0, description="value = raw * scale + offset")
     offset: float = Field(default=0.0, description="value = raw * scale + offset")
@@ -36,13 +52,8 @@ class FrameChannel(Range):
         """How a value becomes bytes."""
         return RegisterFormat(self.type, self.order, self.scale, self.offset)
 
-    @property
-    def limits(self) -> tuple[float, float]:
-        """Lowest and highest value that it takes, in ``unit``."""
-        return self.min, self.max
 
-
-class FrameStreaming(Part):
+class FrameStreaming(Strict):
     """A sample clock and a FIFO of the board's own."""
 
     fifo_depth: int = Field(ge=2, le=65535, description="samples that its FIFO holds")
@@ -62,8 +73,11 @@ class FrameWatchdog(Watchdog):
 class FrameProfile(BaseProfile):
     """A board that speaks binary frames."""
 
+    DEVICE: ClassVar[str] = "serial_dac"
+    WIRE: ClassVar[str] = "hilctl_drivers.board.wire:board_wire"
+
     link: FramesLink
-    protocol: Literal["hilctl-1"] = Field(description="messages, see board_protocol.py")
+    protocol: Literal["hilctl-1"] = Field(description="messages, as in drivers/README.md")
     exchange: Literal["single", "stream"] = Field(
         description="single: one sample a message; stream: blocks through a FIFO"
     )

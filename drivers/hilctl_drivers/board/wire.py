@@ -1,61 +1,45 @@
-"""A microcontroller board asked sample by sample, and what its streaming form shares with it."""
+"""A microcontroller board: asked sample by sample, or fed block by block through its FIFO.
 
-from typing import Protocol
+A board with a FIFO answers a block when all but ``prefill`` of the samples queued so far have been
+put out, and gives back the readings of those. So its clock is the pace; a block's readings come
+``fifo_blocks`` exchanges after it; and between two exchanges the FIFO holds that many blocks, which
+is how long this machine may stall. The first sample is put out once that many are there.
+"""
+
+import numpy as np
 
 from hilctl.base.arrays import F64
 from hilctl.base.errors import DeviceError
 from hilctl_drivers.board import frames as board
-from hilctl_drivers.board.profile import FrameProfile
-from hilctl_drivers.board.session import BoardFacts, BoardSession
-from hilctl_drivers.feed_time import check_feeds
+from hilctl_drivers.board.profile import FrameProfile, FrameStreaming
+from hilctl_drivers.board.session import BoardFacts, BoardSession, Readings
+from hilctl_drivers.board.timing import exchange_time, settle_s
 from hilctl_drivers.serial.setup import SerialSetup
+from hilctl_drivers.serial.wire import SerialWire, refuse
 from hilctl_drivers.wire.errors import WatchdogTripped
 from hilctl_drivers.wire.links import Link, LostError
+from hilctl_drivers.wire.timing import RateLimit, check_feeds
+
+_FIRST_MAX = 2**32
 
 
-class Wire(Protocol):
-    """How one kind of device is talked to; values are in the units of its channels."""
+def board_wire(setup: SerialSetup) -> SerialWire:
+    """Return how a board is talked to, as its profile says.
 
-    def open(self, sample_rate_hz: float, block: int) -> None:
-        """Connect, check and set up; the output does not move.
+    Args:
+        setup: What the experiment says of it.
 
-        Raises:
-            DeviceError: It can't be reached, is another device, or can't keep this rate or block.
-        """
-        ...
-
-    def exchange(self, first_sample: int, output: F64, reading: F64, measured: F64) -> None:
-        """Send float64[B], fill ``reading`` (float64[B]), see :class:`~hilctl.base.device.Device`.
-
-        ``measured``, float64[B] in the output's unit, is filled where the setup has ``measure``.
-
-        Raises:
-            DeviceError: No good answer in time.
-        """
-        ...
-
-    def put_out(self, value: float) -> None:
-        """Put ``value`` out at once, by the open link or by a new one; tried twice.
-
-        Raises:
-            DeviceError: The device can't be reached or does not confirm.
-        """
-        ...
-
-    def close(self) -> None:
-        """Disarm, carry out the close steps and let go of the port.
-
-        Raises:
-            DeviceError: The device did not confirm; the port is let go all the same.
-        """
-        ...
-
-    def release(self) -> None:
-        """Let go of the port and say nothing to the device."""
-        ...
+    Raises:
+        InputError: Options that a board has no use for.
+    """
+    profile = setup.profile
+    assert isinstance(profile, FrameProfile)
+    if profile.streaming == "none":
+        return BoardSingle(setup, profile)
+    return BoardStream(setup, profile, profile.streaming)
 
 
-class BoardWire:
+class BoardWire(SerialWire):
     """What both forms of a board share.
 
     Args:
@@ -64,12 +48,27 @@ class BoardWire:
     """
 
     def __init__(self, setup: SerialSetup, profile: FrameProfile) -> None:
-        self._setup = setup
+        super().__init__(setup)
+        refuse(setup, "reader", "measure", "unit_id")
         self._profile = profile
         self._session = BoardSession(profile, setup.link())
+        self._safe = setup.chain.output(setup.options.safe_command)
+
+    def rates(self, block: int) -> RateLimit:
+        """See :meth:`~hilctl_drivers.serial.wire.SerialWire.rates`."""
+        most_hz, whose = self._profile.max_rate_hz, f"the profile of {self._profile.title}"
+        if settle_s(self._profile) * most_hz > 1.0:
+            most_hz = 1.0 / settle_s(self._profile)
+            whose = f"settling {1e3 / most_hz:.2f} ms: {whose}"
+        streaming = self._profile.streaming
+        lowest_hz = 0.0 if streaming == "none" else streaming.rate_min_hz
+        return RateLimit.of(exchange_time(self._profile, block), most_hz, whose, lowest_hz)
 
     def put_out(self, value: float) -> None:
-        """See :meth:`Wire.put_out`; a board that has gone to its safe value is told again."""
+        """See :meth:`~hilctl_drivers.serial.wire.SerialWire.put_out`.
+
+        A board whose watchdog has tripped is armed and told again.
+        """
         try:
             self._put_out(value)
         except LostError:
@@ -86,7 +85,7 @@ class BoardWire:
             self._session.put_out(value)
 
     def release(self) -> None:
-        """See :meth:`Wire.release`."""
+        """See :meth:`~hilctl_drivers.serial.wire.SerialWire.release`."""
         self._session.link.close()
 
     def _connect(self, link: Link) -> BoardFacts:
@@ -99,7 +98,7 @@ class BoardWire:
                 f"{facts.name or 'the board'} speaks version {facts.version} of the protocol, "
                 f"not {board.VERSION}"
             )
-        low, high = self._setup.output_range
+        low, high = self._setup.output.limits
         slack = 1e-6 * (high - low)
         if low < facts.low - slack or high > facts.high + slack:
             raise DeviceError(
@@ -111,27 +110,26 @@ class BoardWire:
     def _arm(self) -> None:
         """Set the watchdog as the experiment wants it, and clear a trip of an earlier run."""
         if self._profile.watchdog != "none":
-            timeout_s = self._setup.watchdog_timeout_s or 0.0
-            self._session.set_watchdog(timeout_s, self._setup.safe_output)
+            timeout_s = self._setup.options.watchdog_timeout_s or 0.0
+            self._session.set_watchdog(timeout_s, self._safe)
 
     def _disarm(self) -> None:
         if self._profile.watchdog != "none":
-            self._session.set_watchdog(0.0, self._setup.safe_output)
+            self._session.set_watchdog(0.0, self._safe)
 
 
 class BoardSingle(BoardWire):
-    """A :class:`Wire` to a board that takes one sample a message, paced by this machine."""
+    """A board that takes one sample a message, paced by this machine."""
 
     def open(self, sample_rate_hz: float, block: int) -> None:
-        """See :meth:`Wire.open`."""
-        if block != 1:
-            raise DeviceError(f"block must be 1 for a board without a FIFO, got {block}")
-        check_feeds(self._setup.watchdog_timeout_s, sample_rate_hz)
+        """See :meth:`~hilctl_drivers.serial.wire.SerialWire.open`."""
+        del block
+        check_feeds(self._setup.options.watchdog_timeout_s, sample_rate_hz)
         self._connect(self._setup.link())
         self._arm()
 
     def exchange(self, first_sample: int, output: F64, reading: F64, measured: F64) -> None:
-        """See :meth:`Wire.exchange`."""
+        """See :meth:`~hilctl_drivers.serial.wire.SerialWire.exchange`."""
         del first_sample, measured
         found = self._session.exchange(output)
         if found.values.size != 1:
@@ -139,8 +137,97 @@ class BoardSingle(BoardWire):
         reading[:] = found.values
 
     def close(self) -> None:
-        """See :meth:`Wire.close`."""
-        try:
-            self._disarm()
-        finally:
-            self.release()
+        """See :meth:`~hilctl_drivers.serial.wire.SerialWire.close`."""
+        self._disarm()
+
+
+class BoardStream(BoardWire):
+    """A board that plays blocks from its FIFO.
+
+    Args:
+        setup: What the experiment says of it.
+        profile: What the board is.
+        streaming: What its FIFO is.
+    """
+
+    def __init__(
+        self, setup: SerialSetup, profile: FrameProfile, streaming: FrameStreaming
+    ) -> None:
+        super().__init__(setup, profile)
+        self.block_max, self.fifo_depth = streaming.block_max, streaming.fifo_depth
+        self._latency_blocks = setup.options.fifo_blocks
+        self._block = 0
+        self._next_sample = 0
+        self.fifo_level_min = 0
+        """Lowest level that an answer has told of since the output began to move."""
+
+    def open(self, sample_rate_hz: float, block: int) -> None:
+        """See :meth:`~hilctl_drivers.serial.wire.SerialWire.open`; starts no clock yet."""
+        self._check_block(block, self.fifo_depth, self.block_max)
+        check_feeds(self._setup.options.watchdog_timeout_s, sample_rate_hz / block)
+        facts = self._connect(self._setup.link(extra_s=block / sample_rate_hz))
+        self._check_board(facts, sample_rate_hz, block)
+        self._arm()
+        prefill = self._latency_blocks * block
+        self._session.set_clock(sample_rate_hz, prefill)
+        self._block = block
+        self._next_sample = 0
+        self.fifo_level_min = prefill
+
+    def exchange(self, first_sample: int, output: F64, reading: F64, measured: F64) -> None:
+        """Queue a block and wait for the readings of the one that it pushes out.
+
+        Raises:
+            DeviceError: No good answer in time; samples that don't follow the last ones; the board
+                ran out of samples.
+        """
+        del measured
+        if first_sample != self._next_sample:
+            rule = f"samples must follow one another, {self._next_sample} is next"
+            raise DeviceError(f"{rule}, got {first_sample}: open again to start at 0")
+        found = self._session.stream(first_sample, output)
+        self._check_answer(found, first_sample)
+        self._next_sample += output.size
+        if found.values.size:
+            reading[:] = found.values
+            self.fifo_level_min = min(self.fifo_level_min, found.fifo_level)
+
+    def close(self) -> None:
+        """Stop the clock and disarm; the output holds its last value."""
+        self._session.set_clock(0.0, 0)
+        self._disarm()
+
+    def _check_block(self, block: int, depth: int, block_max: int) -> None:
+        if not 1 <= block <= block_max:
+            raise DeviceError(f"block must be 1 to {block_max} samples, got {block}")
+        need = (self._latency_blocks + 1) * block
+        if need > depth:
+            most = depth // block - 1
+            rule = f"fifo_blocks + 1 blocks must fit into the FIFO, {depth} samples"
+            hint = f"at most {most} with this block" if most else "take smaller blocks"
+            raise DeviceError(f"{rule}, got {need} ({hint})")
+
+    def _check_board(self, facts: BoardFacts, sample_rate_hz: float, block: int) -> None:
+        """Hold what is wanted against what the board itself says, which may be less."""
+        if sample_rate_hz > facts.rate_max_hz * (1.0 + 1e-6):
+            rule = f"sample rate must be <= {facts.rate_max_hz:g} Hz, says {facts.name}"
+            raise DeviceError(f"{rule}, got {sample_rate_hz:g}")
+        self._check_block(block, facts.fifo_depth, facts.block_max)
+
+    def _check_answer(self, found: Readings, first_sample: int) -> None:
+        if found.underruns:
+            played = first_sample - self._latency_blocks * self._block
+            raise DeviceError(
+                f"underrun: the board had nothing to put out for {found.underruns} sample periods, "
+                f"about sample {max(0, played)}; its FIFO kept {self._latency_blocks} blocks of "
+                f"{self._block}: this machine or the line was slower than that"
+            )
+        answered = first_sample - self._latency_blocks * self._block
+        want = self._block if answered >= 0 else 0
+        if found.values.size != want or (want and found.first != answered % _FIRST_MAX):
+            raise DeviceError(
+                f"readings must be {want} from sample {max(0, answered)} on, got "
+                f"{found.values.size} from {found.first}"
+            )
+        if not np.isfinite(found.values).all():
+            raise DeviceError("the board sent readings that are not numbers")

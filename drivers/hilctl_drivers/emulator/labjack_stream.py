@@ -17,8 +17,8 @@ from hilctl_drivers.emulator.modbus_device import Declined, EmulatedModbus
 from hilctl_drivers.emulator.rig import Rig, WriteLog
 from hilctl_drivers.labjack import stream
 from hilctl_drivers.labjack.profile import BYTES_A_SAMPLE, LabJackStreaming
+from hilctl_drivers.modbus.channels import RegisterStep
 from hilctl_drivers.modbus.profile import ModbusProfile
-from hilctl_drivers.modbus.steps import RegisterStep
 
 _VALUE_EXCEPTION, _FAILURE_EXCEPTION = 3, 4
 _PERIOD_NS, _PERIODS_MAX = 100, 65_536

@@ -7,8 +7,8 @@ from hilctl.base.errors import InputError
 from hilctl_drivers.emulator.registers import NoSuchRegister, RegisterMap, Words
 from hilctl_drivers.emulator.rig import Rig, Wiring, WriteLog
 from hilctl_drivers.emulator.watchdog import EmulatedWatchdog
+from hilctl_drivers.modbus.channels import ModbusStep, RegisterStep
 from hilctl_drivers.modbus.profile import ModbusProfile
-from hilctl_drivers.modbus.steps import ModbusStep, RegisterStep
 
 
 class Declined(Exception):  # noqa: N818  a reply, not a mistake

@@ -3,10 +3,9 @@
 import struct
 from collections.abc import Sequence
 
+from hilctl_drivers.modbus.channels import ExpectStep, ModbusStep, Register, RegisterStep
 from hilctl_drivers.modbus.profile import ModbusOutput, ModbusProfile
 from hilctl_drivers.modbus.registers import RegisterFormat
-from hilctl_drivers.modbus.steps import ExpectStep, ModbusStep, RegisterStep
-from hilctl_drivers.profile_parts import Register
 
 Key = tuple[str, int]
 """Area and wire address."""

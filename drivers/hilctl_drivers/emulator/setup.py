@@ -25,7 +25,8 @@ from hilctl_drivers.emulator.server import EmulatorServer
 from hilctl_drivers.emulator.text_device import EmulatedText
 from hilctl_drivers.emulator.wire import EmulatedWire
 from hilctl_drivers.modbus.profile import ModbusProfile
-from hilctl_drivers.profile import Profile, load_profile
+from hilctl_drivers.profile import load_profile
+from hilctl_drivers.profile_parts import BaseProfile
 from hilctl_drivers.text.profile import AsciiProfile
 
 AnyDevice: TypeAlias = EmulatedModbus | EmulatedText | EmulatedBoard
@@ -154,7 +155,7 @@ def _plan(options: EmulatorOptions) -> "_Plan":
         if reader is not profile:
             raise InputError(f"{profile.title} reads its own sensor: it takes no reader")
         return _BoardPlan(options, profile)
-    if not isinstance(reader, AsciiProfile):
+    if not (isinstance(profile, AsciiProfile) and isinstance(reader, AsciiProfile)):
         raise InputError(f"{options.reader}: only text profiles read for {profile.title}")
     return _TextPlan(options, profile, reader)
 
@@ -164,7 +165,7 @@ class _Plan(ABC):
 
     reader_unit_id: int | None = None
 
-    def __init__(self, options: EmulatorOptions, profile: Profile, reader: Profile) -> None:
+    def __init__(self, options: EmulatorOptions, profile: BaseProfile, reader: BaseProfile) -> None:
         self._options = options
         sensors = [
             name
@@ -253,19 +254,16 @@ class _ModbusPlan(_Plan):
         return Port(wire, (options.port, options.reader_port)[which] if link == "tcp" else None)
 
     def places(self, addresses: list[str]) -> dict[str, Any]:
-        made = _modbus_place(addresses[0], "", "port")
+        made = _modbus_place(addresses[0])
         if self._reader is not self._profile:
-            made |= {"reader": self._options.reader, "reader_unit_id": self.reader_unit_id}
-        if self._apart:
-            made |= _modbus_place(addresses[1], "reader_", "tcp_port")
+            reader = {"profile": self._options.reader, "unit_id": self.reader_unit_id}
+            made["reader"] = reader | (_modbus_place(addresses[1]) if self._apart else {})
         return made
 
 
-def _modbus_place(address: str, prefix: str, port_key: str) -> dict[str, Any]:
+def _modbus_place(address: str) -> dict[str, Any]:
     host, _, port = address.rpartition(":")
-    if not host:
-        return {f"{prefix}serial_port": address}
-    return {f"{prefix}host": host, f"{prefix}{port_key}": int(port)}
+    return {"host": host, "tcp_port": int(port)} if host else {"serial_port": address}
 
 
 class _TextPlan(_Plan):
@@ -298,11 +296,10 @@ class _TextPlan(_Plan):
         )
 
     def places(self, addresses: list[str]) -> dict[str, Any]:
-        made = {"serial_port": addresses[0]}
+        made: dict[str, Any] = {"serial_port": addresses[0]}
         if self._options.reader is not None:
-            made["reader"] = self._options.reader
-        if self._apart:
-            made["reader_port"] = addresses[1]
+            place = {"serial_port": addresses[1]} if self._apart else {}
+            made["reader"] = {"profile": self._options.reader, **place}
         return made
 
 
@@ -321,7 +318,7 @@ class _BoardPlan(_Plan):
         return {"serial_port": addresses[0]}
 
 
-def _chosen(what: str, name: str | None, names: list[str], profile: Profile) -> str:
+def _chosen(what: str, name: str | None, names: list[str], profile: BaseProfile) -> str:
     if name in names:
         return str(name)
     if name is not None:

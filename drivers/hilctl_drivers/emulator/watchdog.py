@@ -1,8 +1,8 @@
 """The host watchdog of an emulated device, driven by the registers that the profile names."""
 
 from hilctl_drivers.emulator.registers import Words
+from hilctl_drivers.modbus.channels import EnsureStep, ModbusStep, WriteStep
 from hilctl_drivers.modbus.profile import ModbusWatchdog
-from hilctl_drivers.modbus.steps import EnsureStep, ModbusStep, WriteStep
 
 Target = tuple[Words, list[int] | None]
 """A value and the words that trigger something; None stands for any words but zeros."""

@@ -2,7 +2,7 @@
 
 profile.py  what a profile says of streaming
 frames.py   Modbus function 76
-stream.py   registers and messages of a stream
+stream.py   registers and messages of a stream; timing.py  how long they take
 setup.py    an experiment's options, held against the profile
 session.py  one stream
 device.py   the device

@@ -58,7 +58,7 @@ class WriteFrame:
         return 0
 
 
-Frame: TypeAlias = ReadFrame | WriteFrame
+FeedbackFrame: TypeAlias = ReadFrame | WriteFrame
 
 
 def _counted(words: int) -> int:
@@ -67,7 +67,7 @@ def _counted(words: int) -> int:
     return words
 
 
-def frames_pdu(frames: Sequence[Frame]) -> bytes:
+def frames_pdu(frames: Sequence[FeedbackFrame]) -> bytes:
     """Return the request for frames, in their order.
 
     Raises:
@@ -80,7 +80,7 @@ def frames_pdu(frames: Sequence[Frame]) -> bytes:
     return pdu
 
 
-class Feedback:
+class ModbusFeedback:
     """A T-series device that is asked by function 76.
 
     Args:
@@ -93,7 +93,7 @@ class Feedback:
         self._unit = unit
         self._transaction = 0
 
-    def call(self, frames: Sequence[Frame]) -> list[bytes]:
+    def call(self, frames: Sequence[FeedbackFrame]) -> list[bytes]:
         """Carry frames out in one message; return what each read frame found.
 
         Raises:

@@ -5,14 +5,15 @@ from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
-from hilctl_drivers.modbus.steps import ModbusStep
-from hilctl_drivers.profile_parts import Name, Part
+from hilctl.base.strict import Strict
+from hilctl_drivers.modbus.channels import ModbusStep
+from hilctl_drivers.profile_parts import Name
 
 BYTES_A_SAMPLE = 2
 """A T-series device keeps a sample of either buffer as 16 bits."""
 
 
-class LabJackStreaming(Part):
+class LabJackStreaming(Strict):
     """Stream-out and stream-in of LabJack's T series, in one scan list."""
 
     kind: Literal["labjack"]

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from hilctl.base.arrays import F64
 from hilctl.base.errors import DeviceError
 from hilctl_drivers.labjack import stream
-from hilctl_drivers.labjack.frames import Feedback, Frame, WriteFrame
+from hilctl_drivers.labjack.frames import FeedbackFrame, ModbusFeedback, WriteFrame
 from hilctl_drivers.labjack.profile import LabJackStreaming
 from hilctl_drivers.labjack.stream import f32, u32
 
@@ -37,7 +37,7 @@ class StreamSession:
 
     def __init__(
         self,
-        feedback: Feedback,
+        feedback: ModbusFeedback,
         streaming: LabJackStreaming,
         timeout_s: float,
         turnaround_s: float,
@@ -185,7 +185,7 @@ class StreamSession:
         self._waiting -= count
         return readings[:count]
 
-    def _exchange(self, frames: Sequence[Frame]) -> None:
+    def _exchange(self, frames: Sequence[FeedbackFrame]) -> None:
         """Fetch readings, judge what they say, and write."""
         data, free = self._feedback.call([*stream.READ_FRAMES, *frames])
         found = stream.stream_data(data, free)

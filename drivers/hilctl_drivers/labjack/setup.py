@@ -1,48 +1,26 @@
 """What an experiment says of a device that streams over Modbus, held against its profile."""
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TypeAlias
 
-from pydantic import Field
-
 from hilctl.base.device import DeviceInfo
 from hilctl.base.errors import DeviceError, InputError
 from hilctl_drivers.labjack.profile import LabJackStreaming
-from hilctl_drivers.labjack.stream import VALUES_MAX
-from hilctl_drivers.modbus.options import ModbusOptions
-from hilctl_drivers.modbus.profile import ModbusProfile
+from hilctl_drivers.labjack.timing import stream_time
 from hilctl_drivers.modbus.session import ModbusSession
-from hilctl_drivers.modbus.setup import ModbusSetup
-from hilctl_drivers.wire_time import WireTime
+from hilctl_drivers.modbus.setup import ModbusOptions, ModbusPeer, ModbusSetup
+from hilctl_drivers.wire.timing import RateLimit
+from hilctl_drivers.wiring import FifoBlocks
 
-_NAME = "modbus_stream"
-
-Connect: TypeAlias = Callable[[ModbusSetup], ModbusSession]
+Connect: TypeAlias = Callable[[ModbusPeer], ModbusSession]
 """Makes a session on a new link."""
 
 
 class ModbusStreamOptions(ModbusOptions):
     """Options of ``modbus_stream``."""
 
-    fifo_blocks: int = Field(
-        default=8,
-        ge=1,
-        le=1024,
-        description="blocks kept in the device's buffer: what a stall of this machine may last,"
-        " and by how much displacements come later",
-    )
-
-
-def stream_time(profile: ModbusProfile, block: int) -> WireTime:
-    """Return what a block costs: messages that bring its values, and one that waits for the clock.
-
-    Readings come back in the same messages, so that fetching the last of them is one more.
-    """
-    messages = math.ceil(block / VALUES_MAX) + 1
-    what = f"{block} samples in {messages} messages over TCP"
-    return WireTime(what, 0.0, 0.0, 0, 0.0, messages * profile.turnaround_s, block)
+    fifo_blocks: FifoBlocks = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,13 +41,13 @@ class StreamSetup:
 
     @classmethod
     def of(cls, options: ModbusStreamOptions) -> "StreamSetup":
-        """Load the profile and hold the options against it.
+        """Hold options against their profile.
 
         Raises:
             InputError: They don't go together, or the device can't stream.
         """
         base = ModbusSetup.of(options)
-        profile = base.profile
+        profile = base.writer.profile
         streaming = profile.streaming
         if streaming == "none":
             raise InputError(f"{profile.title} can't stream: take kind: modbus_dac, and block: 1")
@@ -82,53 +60,42 @@ class StreamSetup:
             if name not in known:
                 rule = f"{what} must be one that {profile.title} can stream, {', '.join(known)}"
                 raise InputError(f"{rule}, got {name!r}")
-        return cls(base, streaming, options.fifo_blocks, base.input_address() // 2)
-
-    @property
-    def title(self) -> str:
-        """The device in messages: its profile and where it is."""
-        return f"{_NAME} {self.base.writer.name} at {self.base.writer.place}"
+        return cls(base, streaming, options.fifo_blocks, base.writer.address(base.input) // 2)
 
     @property
     def block_max(self) -> int:
         """Longest block of which one more than ``fifo_blocks`` fit into the buffer."""
         return max(1, self.streaming.fifo_depth // (self.fifo_blocks + 1))
 
-    def rate(self, block: int) -> tuple[float, str]:
-        """Return the highest sample rate with that block, in Hz, and why it is that."""
-        wire = stream_time(self.base.profile, block)
-        most_hz = self.streaming.rate_max_hz
-        if wire.highest_rate_hz <= most_hz:
-            return wire.highest_rate_hz, str(wire)
-        per_s = self.streaming.samples_per_s_max
-        return most_hz, f"{per_s:g} samples a second for an input and an output; {wire}"
+    def rates(self, block: int) -> RateLimit:
+        """Return the sample rates that it can keep with that block."""
+        per_s, settle_s = self.streaming.samples_per_s_max, self.base.output.settle_s
+        most_hz, whose = self.streaming.rate_max_hz, f"{per_s:g} samples a second for an input and"
+        whose += " an output: its profile"
+        if settle_s * most_hz > 1.0:
+            most_hz, whose = 1.0 / settle_s, f"settling {settle_s * 1e3:.2f} ms: its profile"
+        wire = stream_time(self.base.writer.profile, block)
+        return RateLimit.of(wire, most_hz, whose, self.streaming.rate_min_hz)
 
-    def check_rate(self, rate_hz: float, block: int, capacity: int) -> None:
-        """Refuse what the device's clock or buffer can't do.
+    def check_capacity(self, block: int, capacity: int) -> None:
+        """Refuse a block that the buffer is too small for.
 
         Args:
-            rate_hz: Sample rate.
             block: Samples in an exchange.
             capacity: Samples that the buffer holds.
 
         Raises:
             DeviceError: What can't be, and what would be possible.
         """
-        need = (self.fifo_blocks + 1) * block
-        if block < 1 or need > capacity:
+        if (self.fifo_blocks + 1) * block > capacity:
             most = max(1, capacity // (self.fifo_blocks + 1))
             rule = f"block must be 1 to {most}: fifo_blocks + 1 of them must fit into the FIFO"
             raise DeviceError(f"{rule}, {capacity} samples, got {block}")
-        highest_hz, note = self.rate(block)
-        lowest_hz = self.streaming.rate_min_hz
-        if not lowest_hz <= rate_hz <= highest_hz:
-            span = f"[{lowest_hz:g}, {highest_hz:.6g}] Hz with blocks of {block}"
-            raise DeviceError(f"sample rate must be in {span} ({note}), got {rate_hz:g}")
 
     def info(self) -> DeviceInfo:
         """Return what the device is and what it accepts."""
         found = self.base.info()
-        highest_hz, note = self.rate(self.block_max)
+        rates = self.rates(self.block_max)
         depth = self.streaming.fifo_depth
         details = {
             **found.details,
@@ -137,9 +104,9 @@ class StreamSetup:
         }
         return replace(
             found,
-            name=_NAME,
-            max_rate_hz=highest_hz,
-            rate_note=note,
+            name="modbus_stream",
+            max_rate_hz=rates.highest_hz,
+            rate_note=rates.note,
             buffered=True,
             fifo_depth=depth,
             latency_blocks=self.fifo_blocks,

@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from hilctl.base.arrays import F64
 from hilctl.base.errors import DeviceError
-from hilctl_drivers.labjack.frames import FRAME_HEAD, Frame, ReadFrame, WriteFrame
+from hilctl_drivers.labjack.frames import FRAME_HEAD, FeedbackFrame, ReadFrame, WriteFrame
 from hilctl_drivers.labjack.profile import BYTES_A_SAMPLE
 from hilctl_drivers.modbus.pdu import PDU_MAX
 from hilctl_drivers.wire.errors import Mismatch
@@ -83,14 +83,14 @@ def f32(value: float) -> bytes:
     return struct.pack(">f", value)
 
 
-READ_FRAMES: Final[tuple[Frame, ...]] = (
+READ_FRAMES: Final[tuple[FeedbackFrame, ...]] = (
     ReadFrame(DATA_CR, DATA_HEAD.size // 2 + SAMPLES_MAX),
     ReadFrame(OUT_BUFFER_STATUS, _U32_WORDS),
 )
 """What each message of a run begins with: what was before its own values came."""
 
 
-def value_frames(values: F64) -> tuple[Frame, ...]:
+def value_frames(values: F64) -> tuple[FeedbackFrame, ...]:
     """Return what queues float64[n] values, n at most :data:`VALUES_MAX`."""
     data = values.astype(">f4").tobytes()
     return WriteFrame(OUT_BUFFER_F32, data), WriteFrame(OUT_SET_LOOP, u32(USE_AT_ONCE))

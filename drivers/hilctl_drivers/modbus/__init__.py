@@ -1,10 +1,10 @@
 """DACs over Modbus TCP and RTU, sample by sample.
 
-profile.py       what a profile says of one; channels.py, steps.py its parts
+profile.py       what a profile says of one; channels.py  its registers and steps
 pdu.py           requests and replies as bytes; registers.py  numbers in registers
-transactions.py  one request and its reply; session.py  one conversation
-options.py       an experiment's options; peer.py  who they name; setup.py  held against the profile
-pair.py          the module with the output and the one with the input
+transactions.py  requests prepared once and sent many times; session.py  one conversation
+timing.py        how long an exchange takes
+setup.py         an experiment's options, held against the profile
 watchdog.py      the module's host watchdog
-device.py        the device
+device.py        the device, and the one that reads the sensor where it is another
 """

@@ -1,13 +1,81 @@
-"""Modbus registers that stand for something, and what their addresses mean on the wire."""
+"""Registers in a profile: channels, the steps that set a device up, and what tells of a trip."""
 
-from typing import Self
+from typing import Annotated, Literal, Self, TypeAlias
 
 from pydantic import Field, model_validator
 
-from hilctl_drivers.modbus.registers import RegisterFormat
-from hilctl_drivers.profile_parts import AddressBase, Area, Range, Register
+from hilctl.base.strict import Strict
+from hilctl_drivers.modbus.registers import RegisterFormat, RegisterType
+from hilctl_drivers.profile_parts import Range, WaitStep
+from hilctl_drivers.wire.errors import BadRequest
 
+Area: TypeAlias = Literal["coil", "discrete", "input", "holding"]
+AddressBase: TypeAlias = Literal[0, 1, "modicon"]
+StepValue: TypeAlias = float | Literal["timeout", "safe"]
+
+_READ_FUNCTION: dict[str, int] = {"coil": 1, "discrete": 2, "holding": 3, "input": 4}
 _MODICON: dict[Area, int] = {"coil": 0, "discrete": 1, "input": 3, "holding": 4}
+
+
+class Register(Strict):
+    """A value in a Modbus device: where it stands and how it is written in bytes.
+
+    Value = raw * scale + offset.
+    """
+
+    area: Area = Field(default="holding", description="what is read or written")
+    address: int = Field(ge=0, description="as the vendor's document has it, see address_base")
+    address_base: AddressBase | None = Field(
+        default=None,
+        description="0 or 1: number of the first register; modicon: 40001, 30001, 10001 or 1 by"
+        " area; left out: the profile's",
+    )
+    type: Literal["bit", RegisterType] = Field(description="how the raw value is stored")
+    order: str = Field(
+        default="",
+        description="bytes on the wire, A the most significant: ABCD, CDAB, BADC, DCBA; left out:"
+        " most significant first",
+    )
+    scale: float = Field(default=1.0, description="value = raw * scale + offset")
+    offset: float = Field(default=0.0, description="value = raw * scale + offset")
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        bits = self.area in {"coil", "discrete"}
+        if bits != (self.type == "bit"):
+            rule = "must be bit" if bits else "must not be bit"
+            raise ValueError(f"type {rule} in area {self.area}")
+        if bits and (self.order, self.scale, self.offset) != ("", 1.0, 0.0):
+            raise ValueError("a bit has no order, scale or offset")
+        if not bits:
+            _ = self.format
+        return self
+
+    @property
+    def format(self) -> RegisterFormat:
+        """How the value becomes bytes.
+
+        Raises:
+            BadRequest: It is a bit, or order or scale is wrong.
+        """
+        if self.type == "bit":
+            raise BadRequest("a bit has no register format")
+        return RegisterFormat(self.type, self.order, self.scale, self.offset)
+
+    @property
+    def words(self) -> int:
+        """Registers (or bits) that it takes up."""
+        return 1 if self.type == "bit" else self.format.count
+
+    @property
+    def read_function(self) -> int:
+        """Modbus function that reads it: 1, 2, 3 or 4."""
+        return _READ_FUNCTION[self.area]
+
+    @property
+    def representable(self) -> tuple[float, float]:
+        """Lowest and highest value that its type can hold, scaled."""
+        return (0.0, 1.0) if self.type == "bit" else self.format.limits
 
 
 class Channel(Register, Range):
@@ -53,11 +121,6 @@ class Channel(Register, Range):
         return ends[0], ends[1]
 
     @property
-    def limits(self) -> tuple[float, float]:
-        """Lowest and highest value that it takes: inside both register and device, in ``unit``."""
-        return self.min, self.max
-
-    @property
     def step(self) -> float:
         """Smallest step in ``unit``; 0 where the profile doesn't say and the type is a float."""
         if self.resolution is not None:
@@ -76,6 +139,62 @@ class ModbusSelftest(Register):
         low, high = self.representable
         if not low <= self.expect <= high:
             raise ValueError(f"expect must fit into {self.type}, got {self.expect:g}")
+        return self
+
+
+class RegisterStep(Register):
+    """A step on one register.
+
+    ``timeout`` and ``safe`` stand for what the experiment says of the watchdog.
+    """
+
+    value: StepValue = Field(description="a number, or timeout or safe in watchdog steps")
+    note: str = ""
+
+    @model_validator(mode="after")
+    def _value_fits(self) -> Self:
+        low, high = self.representable
+        if isinstance(self.value, float) and not low <= self.value <= high:
+            raise ValueError(f"value must fit into {self.type}, got {self.value:g}")
+        return self
+
+
+class WriteStep(RegisterStep):
+    """Write a register, and read it again where ``verify`` is set."""
+
+    kind: Literal["write"]
+    verify: bool = False
+
+
+class EnsureStep(RegisterStep):
+    """Read a register; write it only where it differs, then read it again.
+
+    For settings in flash that must not be rewritten at each run.
+    """
+
+    kind: Literal["ensure"]
+
+
+class ExpectStep(RegisterStep):
+    """Read a register and refuse to go on where it differs; writes nothing."""
+
+    kind: Literal["expect"]
+
+
+ModbusStep: TypeAlias = Annotated[
+    WriteStep | EnsureStep | ExpectStep | WaitStep, Field(discriminator="kind")
+]
+
+
+class TripFlag(Register):
+    """A register that says yes where any bit of ``mask`` is set."""
+
+    mask: int = Field(ge=1, le=0xFFFFFFFF, description="bits of the raw value that say yes")
+
+    @model_validator(mode="after")
+    def _fits(self) -> Self:
+        if self.type.startswith("float") or self.mask > self.representable[1]:
+            raise ValueError(f"mask must fit into {self.type}, got {self.mask:#x}")
         return self
 
 

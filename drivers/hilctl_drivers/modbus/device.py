@@ -6,167 +6,259 @@ read and then a write; the read may go to another device. Nothing is sent twice,
 the last reply has come.
 """
 
-from typing import ClassVar
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import ClassVar, TypeAlias
 
 from hilctl.base.arrays import F64
-from hilctl.base.device import DeviceInfo, DeviceOptions
+from hilctl.base.device import DeviceOptions
 from hilctl.base.errors import DeviceError
-from hilctl_drivers.modbus.options import ModbusOptions
-from hilctl_drivers.modbus.pair import ModbusPair, Swap
-from hilctl_drivers.modbus.session import format_of
-from hilctl_drivers.modbus.setup import ModbusSetup
+from hilctl_drivers.device import DacDevice
+from hilctl_drivers.modbus.pdu import (
+    feedback_pdu,
+    read_pdu,
+    write_pdu,
+    write_read_pdu,
+    write_single_pdu,
+)
+from hilctl_drivers.modbus.setup import ModbusOptions, ModbusSetup
 from hilctl_drivers.modbus.watchdog import ModbusGuard
+from hilctl_drivers.wire.errors import Refused
+from hilctl_drivers.wire.links import NoAnswerError
+
+Swap: TypeAlias = Callable[[bytes], bytes]
+"""Write these register bytes to the output, return those of the input.
+
+The input is read first, so that it does not show yet what is written. Function 23 has an order of
+its own: the specification lets the device write first.
+"""
 
 
-class ModbusDac:
+class ModbusDac(DacDevice):
     """A :class:`~hilctl.base.device.Device` on Modbus."""
 
     Options: ClassVar[type[DeviceOptions]] = ModbusOptions
 
     def __init__(self, options: ModbusOptions) -> None:
-        """Load the profile and describe the device; nothing is sent before :meth:`open`.
+        """Describe the device; nothing is sent before :meth:`open`.
 
         Raises:
             InputError: The profile can't be used, or options don't go with it.
         """
         setup = ModbusSetup.of(options)
-        output, sensor_input = format_of(setup.output), format_of(setup.input)
-        assert output is not None
-        assert sensor_input is not None
+        super().__init__(
+            setup.info(),
+            f"modbus_dac {setup.writer.name} at {setup.writer.place}",
+            f"write {options.output}, read {options.input}",
+            options.output,
+        )
         self._setup = setup
         self._factors = setup.chain.factors
-        self._encode, self._decode = output.encode, sensor_input.decode
-        self._info = setup.info()
-        self._low, self._high = self._info.command_min, self._info.command_max
-        self._action = f"write {options.output}, read {options.input}"
+        self._encode = setup.output.format.encode
+        self._decode = setup.input.format.decode
         self._guard = ModbusGuard(setup)
-        self._pair: ModbusPair | None = None
-        self._swap: Swap | None = None
+        self._pair: _Pair | None = None
+        self._swap: Swap = _not_open
+        self._feeds = False
         self.one_transaction = False
         """Whether a tick is one transaction; known once it is open."""
 
-    @property
-    def info(self) -> DeviceInfo:
-        """What the device is and what it accepts."""
-        return self._info
+    def _open(self, sample_rate_hz: float, block: int) -> None:
+        """Self-test, init steps, one reading of the input, watchdog; see :class:`DacDevice`.
 
-    def open(self, sample_rate_hz: float, block: int) -> None:
-        """Connect, check that it is the device of the profile, and set it up.
-
-        Self-test, init steps, one reading of the input; then whether it can read and write in one
-        transaction, which is tried by writing what the output holds already; the watchdog.
-
-        Raises:
-            DeviceError: It can't be reached, is another device, refuses a step, or can't keep this
-                rate or block.
+        Whether it can read and write in one transaction is tried by writing what the output holds
+        already. Only then is it known what rate it can keep.
         """
-        if block != 1:
-            raise self._error("open", f"block must be 1, got {block}")
-        self._check_rate(sample_rate_hz, self._info.max_rate_hz)
-        self.close()
-        pair = ModbusPair(self._setup)
-        try:
-            pair.open()
-            self._guard.clear_trip(pair.writer)
-            pair.set_up()
-            swap, self.one_transaction = pair.find_swap()
-            self._check_rate(sample_rate_hz, self._setup.rate(self.one_transaction)[0])
-            self._guard.arm(pair.writer, sample_rate_hz)
-        except DeviceError as error:
-            pair.release()
-            raise self._error("open", str(error)) from None
-        self._pair, self._swap = pair, swap
+        del block
+        self._pair = pair = _Pair(self._setup)
+        pair.open()
+        # A device that has tripped refuses the steps that follow.
+        self._guard.clear_trip(pair.writer)
+        pair.set_up()
+        self._swap, self.one_transaction = pair.find_swap()
+        rates = self._setup.rates(self.one_transaction)
+        how = "one transaction" if self.one_transaction else "a read and a write"
+        replace(rates, note=f"{how} a sample; {rates.note}").check(sample_rate_hz)
+        # Armed last: the steps above may take longer than its time-out.
+        self._guard.arm(pair.writer, sample_rate_hz)
+        self._feeds = self._guard.feed_every > 0
 
-    def exchange(
+    def _exchange(
         self, first_sample: int, command: F64, displacement_um: F64, measured: F64
     ) -> None:
-        """Put a command out, read a displacement, see :meth:`hilctl.base.device.Device.exchange`.
-
-        After an error the device must be opened again: what comes next on this link could belong
-        to what went before.
-
-        Raises:
-            DeviceError: Out of range or not finite, and then nothing was sent; no good answer in
-                time; not open; not one sample.
-        """
-        del first_sample, measured
-        swap = self._swap
-        if swap is None:
-            raise self._error(self._action, "not open")
-        if command.size != 1 or displacement_um.size != 1:
-            sizes = f"{command.size} and {displacement_um.size}"
-            raise self._error(self._action, f"block must be 1 sample, got {sizes}")
-        value = command.item()
-        if not self._low <= value <= self._high:
-            raise self._out_of_range(value)
         gain, offset, um_per_unit, offset_um = self._factors
-        try:
-            data = swap(self._encode((value - offset) / gain))
-            displacement_um[0] = self._decode(data) * um_per_unit + offset_um
-            if self._guard.feed_every and self._pair is not None:
-                self._guard.feed(self._pair.writer)
-        except DeviceError as error:
-            self._abandon()
-            raise self._error(self._action, str(error)) from None
+        data = self._swap(self._encode((command.item() - offset) / gain))
+        displacement_um[0] = self._decode(data) * um_per_unit + offset_um
+        if self._feeds and self._pair is not None:
+            self._guard.feed(self._pair.writer)
 
-    def make_safe(self, command: float) -> None:
-        """Put the output at ``command`` by a new connection, after giving up the present one.
+    def _put_out(self, command: float) -> None:
+        self._release()  # many devices take one connection only
+        self._pair = pair = _Pair(self._setup)
+        pair.writer.link.open()
+        self._guard.clear_trip(pair.writer)
+        pair.put_out(self._encode(self._setup.chain.output(command)))
 
-        Many devices take one connection only. The watchdog, if armed, stays so.
+    def _close(self) -> None:
+        if self._pair is not None:
+            self._guard.disarm(self._pair.writer)
+            self._pair.tear_down()
 
-        Raises:
-            DeviceError: ``command`` is out of range or not finite; the device can't be reached, or
-                does not confirm.
-        """
-        if not self._low <= command <= self._high:
-            raise self._out_of_range(command)
-        self._abandon()
-        pair = ModbusPair(self._setup)
-        try:
-            pair.writer.link.open()
-            self._guard.clear_trip(pair.writer)
-            pair.put_out(self._encode(self._setup.chain.output(command)))
-        except DeviceError as error:
-            raise self._error(f"make safe, {self._setup.options.output}", str(error)) from None
-        finally:
-            pair.release()
-
-    def close(self) -> None:
-        """Disarm the watchdog, carry out the profile's close steps, and disconnect.
-
-        After an error in an exchange there is no connection any more, and the watchdog stays armed.
-
-        Raises:
-            DeviceError: A step failed; the link is closed all the same.
-        """
-        pair, self._pair, self._swap = self._pair, None, None
-        if pair is None:
-            return
-        try:
-            self._guard.disarm(pair.writer)
-            pair.tear_down()
-        except DeviceError as error:
-            raise self._error("close", str(error)) from None
-        finally:
-            pair.release()
-
-    def _abandon(self) -> None:
-        pair, self._pair, self._swap = self._pair, None, None
+    def _release(self) -> None:
+        pair, self._pair, self._swap = self._pair, None, _not_open
         if pair is not None:
             pair.release()
 
-    def _error(self, action: str, what: str) -> DeviceError:
-        return DeviceError(f"{self._setup.title}: {what} (to {action})")
 
-    def _out_of_range(self, value: float) -> DeviceError:
-        """Return the error for a value that is out of range or not a number."""
-        unit = self._info.command_unit
-        rule = f"command must be in [{self._low:g}, {self._high:g}] {unit}"
-        return self._error(self._action, f"{rule}, got {value} {unit}, nothing was sent")
+def _not_open(data: bytes) -> bytes:
+    raise DeviceError("not open")
 
-    def _check_rate(self, sample_rate_hz: float, highest_hz: float) -> None:
-        if not 0.0 < sample_rate_hz <= highest_hz:
-            how = "one transaction" if self.one_transaction else "a read and a write"
-            note = self._setup.rate(self.one_transaction)[1]
-            rule = f"sample rate must be in (0, {highest_hz:.6g}] Hz with {how} a sample ({note})"
-            raise self._error("open", f"{rule}, got {sample_rate_hz:g}")
+
+class _Pair:
+    """Two sessions, or one of them twice; nothing is sent before :meth:`open`.
+
+    Args:
+        setup: What the experiment says of the device.
+    """
+
+    def __init__(self, setup: ModbusSetup) -> None:
+        self._setup = setup
+        self.writer = setup.writer.session()
+        self.reader = self.writer
+        self._one = not setup.reads_elsewhere
+        if not self._one:
+            self.reader = setup.reader.session(self.writer.link if setup.shares_link else None)
+
+    def open(self) -> None:
+        """Connect and run the self-tests.
+
+        Raises:
+            DeviceError: A device can't be reached, or is another one.
+        """
+        self.writer.link.open()
+        self.writer.check_selftest()
+        if self._one:
+            return
+        with self._reader_named():
+            if self.reader.link is not self.writer.link:
+                self.reader.link.open()
+            self.reader.check_selftest()
+
+    def set_up(self) -> None:
+        """Run the init steps of the profiles.
+
+        Raises:
+            DeviceError: A step failed.
+        """
+        self.writer.run(self.writer.profile.init)
+        if not self._one:
+            with self._reader_named():
+                self.reader.run(self.reader.profile.init)
+
+    def tear_down(self) -> None:
+        """Run the close steps of the profiles.
+
+        Raises:
+            DeviceError: A step failed.
+        """
+        self.writer.run(self.writer.profile.close)
+        if not self._one:
+            with self._reader_named():
+                self.reader.run(self.reader.profile.close)
+
+    def release(self) -> None:
+        """Close the links."""
+        self.writer.link.close()
+        self.reader.link.close()
+
+    def find_swap(self) -> tuple[Swap, bool]:
+        """Return how a sample is exchanged, and whether that is one transaction.
+
+        The input is read once before: an address that the device does not have must not show only
+        when the output has begun to move. One transaction is tried by writing what the output holds
+        already.
+
+        Raises:
+            DeviceError: The input or the output can't be read.
+        """
+        with self._reader_named():
+            self.reader.read_bytes(self._setup.input)
+        swap = self._combined()
+        readback = self._setup.output.readback_register
+        if swap is None or readback is None:
+            return self._one_after_the_other(), False
+        held = self.writer.read_bytes(readback)  # who is silent here is not there at all
+        try:
+            swap(held)
+        except Refused:
+            return self._one_after_the_other(), False
+        except NoAnswerError:  # some devices are silent about functions they don't know
+            self.writer.link.open()
+            return self._one_after_the_other(), False
+        return swap, True
+
+    def put_out(self, data: bytes) -> None:
+        """Write the output's register bytes.
+
+        Raises:
+            DeviceError: The device does not confirm.
+        """
+        self.writer.call(self.writer.prepare(self._write_pdu(data)))
+
+    def _write_pdu(self, data: bytes) -> bytes:
+        output = self._setup.output
+        address = self._setup.writer.address(output)
+        return (write_single_pdu if output.function == 6 else write_pdu)(address, data)
+
+    def _one_after_the_other(self) -> Swap:
+        setup, source = self._setup, self._setup.input
+        writer, reader = self.writer, self.reader
+        write = writer.prepare(self._write_pdu(bytes(2 * setup.output.words)))
+        address = setup.reader.address(source)
+        read = reader.prepare(read_pdu(source.read_function, address, source.words))
+
+        def pair(data: bytes) -> bytes:
+            found = reader.call(read)
+            writer.call(write, data)
+            return found
+
+        def named_pair(data: bytes) -> bytes:
+            try:
+                found = reader.call(read)
+            except DeviceError as error:
+                raise self._named(error) from None
+            writer.call(write, data)
+            return found
+
+        return pair if self._one else named_pair
+
+    def _combined(self) -> Swap | None:
+        setup = self._setup
+        kind = setup.writer.profile.exchange
+        if kind == "none" or not self._one:
+            return None
+        source, target = setup.reader.address(setup.input), setup.writer.address(setup.output)
+        words, data = setup.input.words, bytes(2 * setup.output.words)
+        if kind == 23:
+            pdu = write_read_pdu(source, words, target, data)
+        else:
+            pdu = feedback_pdu(target, data, source, words)
+        transaction = self.writer.prepare(pdu)
+        transact, usual = self.writer.link.transact, transaction.reply_size
+        request, missing, reply = transaction.request, transaction.missing, transaction.reply
+        return lambda data: reply(transact(request(data), missing, usual))
+
+    @contextmanager
+    def _reader_named(self) -> Iterator[None]:
+        try:
+            yield
+        except DeviceError as error:
+            raise self._named(error) from None
+
+    def _named(self, error: DeviceError) -> DeviceError:
+        """Return an error that says that the reader made it, where it is another device."""
+        if self._one:
+            return error
+        reader = self._setup.reader
+        return DeviceError(f"reader {reader.name}, unit {reader.unit} at {reader.place}: {error}")

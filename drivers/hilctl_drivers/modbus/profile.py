@@ -1,22 +1,53 @@
 """Profiles of devices that speak Modbus, TCP or RTU."""
 
 from collections.abc import Iterator
-from typing import Annotated, Literal, Self
+from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
 from hilctl_drivers.labjack.profile import LabJackStreaming
-from hilctl_drivers.modbus.channels import Channel, ModbusSelftest, wire_address
-from hilctl_drivers.modbus.steps import Flag, ModbusStep, RegisterStep
-from hilctl_drivers.profile_parts import (
+from hilctl_drivers.modbus.channels import (
     AddressBase,
-    BaseProfile,
-    Name,
+    Channel,
+    ModbusSelftest,
+    ModbusStep,
     Register,
-    Watchdog,
-    check_channels,
+    RegisterStep,
+    TripFlag,
+    wire_address,
 )
-from hilctl_drivers.wire.line_settings import RtuLink, TcpLink
+from hilctl_drivers.profile_parts import BaseProfile, Name, Watchdog
+from hilctl_drivers.wire.line_settings import BinaryLineSettings, LinkSettings
+
+GAP_CHARS = 3.5
+FAST_BAUD = 19200
+FAST_GAP_S = 1.75e-3
+"""Silence between RTU frames above 19200 baud (Modbus over serial line 1.02, section 2.5.1.1)."""
+
+
+class ModbusTcpLink(LinkSettings):
+    """Modbus TCP."""
+
+    kind: Literal["tcp"]
+    port: int = Field(default=502, ge=1, le=65535)
+
+
+class ModbusRtuLink(BinaryLineSettings):
+    """Modbus RTU."""
+
+    kind: Literal["rtu"]
+    gap_s: float | None = Field(
+        default=None,
+        ge=0.0,
+        description="silence before each frame, s; left out: 3.5 characters, 1.75 ms above 19200",
+    )
+
+    @property
+    def silence_s(self) -> float:
+        """Silence before each frame, s."""
+        if self.gap_s is not None:
+            return self.gap_s
+        return FAST_GAP_S if self.baud > FAST_BAUD else GAP_CHARS * self.char_s
 
 
 class ModbusOutput(Channel):
@@ -78,7 +109,7 @@ class ModbusWatchdog(Watchdog):
     safe: dict[Name, tuple[ModbusStep, ...]] = Field(
         default={}, description="steps that set an output's safe value, by output"
     )
-    tripped: Flag | Literal["none"] = Field(default="none", description="what tells of a trip")
+    tripped: TripFlag | Literal["none"] = Field(default="none", description="what tells of a trip")
 
     @model_validator(mode="after")
     def _can_be_fed(self) -> Self:
@@ -130,7 +161,9 @@ class ModbusWatchdog(Watchdog):
 class ModbusProfile(BaseProfile):
     """A device that speaks Modbus."""
 
-    link: Annotated[TcpLink | RtuLink, Field(discriminator="kind")]
+    DEVICE: ClassVar[str] = "modbus_dac"
+
+    link: Annotated[ModbusTcpLink | ModbusRtuLink, Field(discriminator="kind")]
     unit_id: int = Field(default=1, ge=0, le=255, description="as shipped")
     address_base: AddressBase = Field(description="see a register's address_base")
     exchange: Literal[23, 76, "none"] = Field(
@@ -146,11 +179,8 @@ class ModbusProfile(BaseProfile):
 
     @model_validator(mode="after")
     def _channels(self) -> Self:
-        check_channels(self.outputs, self.inputs)
         if self.exchange != "none" and not (self.outputs and self.inputs):
             raise ValueError("exchange must be none where there are no outputs or no inputs")
-        if self.watchdog != "none" and not self.outputs:
-            raise ValueError("watchdog must be none where there are no outputs to make safe")
         if self.streaming != "none":
             self.streaming.check_names(self.outputs, self.inputs)
         return self

@@ -5,26 +5,19 @@ from collections.abc import Callable, Sequence
 from typing import Literal
 
 from hilctl.base.errors import DeviceError
-from hilctl_drivers.modbus.pdu import coil_pdu, read_pdu, write_pdu, write_single_pdu
-from hilctl_drivers.modbus.profile import ModbusProfile
-from hilctl_drivers.modbus.registers import RegisterFormat
-from hilctl_drivers.modbus.steps import (
+from hilctl_drivers.modbus.channels import (
     EnsureStep,
     ExpectStep,
-    Flag,
     ModbusStep,
+    Register,
     RegisterStep,
+    TripFlag,
 )
+from hilctl_drivers.modbus.pdu import coil_pdu, read_pdu, write_pdu, write_single_pdu
+from hilctl_drivers.modbus.profile import ModbusProfile
 from hilctl_drivers.modbus.transactions import RtuTransaction, TcpTransaction, Transaction
-from hilctl_drivers.profile_parts import Register, WaitStep
+from hilctl_drivers.profile_parts import WaitStep
 from hilctl_drivers.wire.links import Link
-
-
-def format_of(register: Register) -> RegisterFormat | None:
-    """Return how a register's value is written; None for a bit."""
-    if register.type == "bit":
-        return None
-    return RegisterFormat(register.type, register.order, register.scale, register.offset)
 
 
 class ModbusSession:
@@ -154,7 +147,7 @@ class ModbusSession:
                 "profile's"
             )
 
-    def is_set(self, flag: Flag) -> bool:
+    def is_set(self, flag: TripFlag) -> bool:
         """Return whether a flag says yes."""
         found = self.read_bytes(flag)
         return bool(int.from_bytes(found, "big") & flag.mask)
@@ -162,13 +155,11 @@ class ModbusSession:
 
 def _encoded(register: Register, value: float | str) -> bytes:
     assert isinstance(value, float), "watchdog steps are bound to numbers first"
-    form = format_of(register)
-    return bytes([value != 0.0]) if form is None else form.encode(value)
+    return bytes([value != 0.0]) if register.type == "bit" else register.format.encode(value)
 
 
 def _decoded(register: Register, data: bytes) -> float:
-    form = format_of(register)
-    return float(data[0]) if form is None else form.decode(data)
+    return float(data[0]) if register.type == "bit" else register.format.decode(data)
 
 
 def _named(step: RegisterStep) -> str:

@@ -1,27 +1,130 @@
 """What an experiment says of a Modbus device, held against the device's profile."""
 
 from dataclasses import dataclass, replace
+from typing import Literal, Self
+
+from pydantic import Field, model_validator
 
 from hilctl.base.device import DeviceInfo
 from hilctl.base.errors import InputError
-from hilctl_drivers.device import (
-    channel,
-    check_senses,
-    check_watchdog,
-    details,
-    provenance,
-)
-from hilctl_drivers.feed_time import with_feeding
-from hilctl_drivers.modbus.options import ModbusOptions
-from hilctl_drivers.modbus.pdu import read_pdu
-from hilctl_drivers.modbus.peer import ModbusPeer, reader_of, writer_of
-from hilctl_drivers.modbus.profile import ModbusInput, ModbusOutput, ModbusProfile
+from hilctl_drivers.modbus.channels import Register
+from hilctl_drivers.modbus.profile import ModbusInput, ModbusOutput, ModbusProfile, ModbusRtuLink
 from hilctl_drivers.modbus.session import ModbusSession
-from hilctl_drivers.modbus.steps import ModbusStep
-from hilctl_drivers.profile_parts import Register
+from hilctl_drivers.modbus.timing import exchange_time, feed_time, read_time
+from hilctl_drivers.profile import NamedProfile, check_baud, with_link
 from hilctl_drivers.wire.links import Link
-from hilctl_drivers.wire_time import WireTime, exchange_time, requests_time
-from hilctl_drivers.wiring import SignalChain
+from hilctl_drivers.wire.serial_port import SerialLink, held_port
+from hilctl_drivers.wire.tcp import TcpLink, held_address
+from hilctl_drivers.wire.timing import RateLimit, WireTime
+from hilctl_drivers.wiring import (
+    DacOptions,
+    ReaderOptions,
+    SignalChain,
+    channel,
+    check_watchdog,
+)
+
+_TCP_PORT = 502
+
+
+class ModbusReaderOptions(ReaderOptions):
+    """The device that has the input, where it is another one."""
+
+    host: str | None = Field(
+        default=None, description="its name or address; left out where it is on the same connection"
+    )
+    tcp_port: int | None = Field(
+        default=None, ge=1, le=65535, description="its TCP port; else the usual"
+    )
+
+    @model_validator(mode="after")
+    def _one_place(self) -> Self:
+        if self.host is not None and self.serial_port is not None:
+            raise ValueError("must have one of host and serial_port, or none")
+        if self.host is None and self.tcp_port is not None:
+            raise ValueError("tcp_port goes with host")
+        return self
+
+
+class ModbusOptions(DacOptions):
+    """Options of ``modbus_dac``."""
+
+    host: str | None = Field(
+        default=None, description="name or address, for Modbus TCP or a gateway to Modbus RTU"
+    )
+    tcp_port: int | None = Field(
+        default=None, ge=1, le=65535, description="TCP port; else the usual"
+    )
+    reader: ModbusReaderOptions | None = Field(
+        default=None, description="the device that has the input, where it is another one"
+    )
+
+    @model_validator(mode="after")
+    def _one_place(self) -> Self:
+        if (self.host is None) == (self.serial_port is None):
+            raise ValueError("must have either host or serial_port")
+        if self.host is None and self.tcp_port is not None:
+            raise ValueError("tcp_port goes with host")
+        return self
+
+
+@dataclass(frozen=True, slots=True)
+class ModbusPeer:
+    """A device and its place: TCP, a gateway, or a serial line.
+
+    Attributes:
+        name: Its profile's name, as the experiment has it.
+        profile: What it is, with the experiment's line settings in it.
+        unit: Its unit id.
+        host: Where it is on the network; empty on a serial port.
+        port: TCP port there, or device file of the serial port.
+        timeout_s: Longest wait for one answer.
+    """
+
+    name: str
+    profile: ModbusProfile
+    unit: int
+    host: str
+    port: int | str
+    timeout_s: float
+
+    @classmethod
+    def of(
+        cls, options: ModbusOptions | ModbusReaderOptions, profile: ModbusProfile, timeout_s: float
+    ) -> "ModbusPeer":
+        """Return the device that options tell the place of."""
+        usual = getattr(profile.link, "port", _TCP_PORT)
+        unit = profile.unit_id if options.unit_id is None else options.unit_id
+        port = options.serial_port or options.tcp_port or usual
+        return cls(options.profile.name, profile, unit, options.host or "", port, timeout_s)
+
+    @property
+    def place(self) -> str:
+        """Where it is: ``host:port`` or the serial port."""
+        return f"{self.host}:{self.port}" if self.host else str(self.port)
+
+    @property
+    def holds(self) -> str:
+        """Its place as :attr:`hilctl.base.device.DeviceInfo.holds` has it."""
+        if self.host:
+            return held_address(self.host, int(self.port))
+        return held_port(str(self.port))
+
+    def address(self, register: Register) -> int:
+        """Return an address as it stands in a frame to the device."""
+        return self.profile.wire_address(register)
+
+    def link(self) -> Link:
+        """Return a new link to it."""
+        if self.host:
+            return TcpLink(self.host, int(self.port), self.timeout_s)
+        assert isinstance(self.profile.link, ModbusRtuLink)
+        return SerialLink(str(self.port), self.profile.link.settings, self.timeout_s)
+
+    def session(self, link: Link | None = None) -> ModbusSession:
+        """Return a session, on a link that it shares with others or on a new one."""
+        framing: Literal["tcp", "rtu"] = "tcp" if self.host else "rtu"
+        return ModbusSession(self.profile, link or self.link(), self.unit, framing=framing)
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,43 +149,26 @@ class ModbusSetup:
 
     @classmethod
     def of(cls, options: ModbusOptions) -> "ModbusSetup":
-        """Load the profiles and hold the options against them.
+        """Hold options against their profiles.
 
         Raises:
-            InputError: They don't go together.
+            InputError: They don't go together, a time-out is too short, or the watchdog can't do
+                what is asked of it.
         """
-        writer = writer_of(options)
-        reader = reader_of(options, writer)
+        writer = _writer_of(options)
+        reader = _reader_of(options, writer)
         there, here = reader.profile, writer.profile
         output = channel("output", options.output, here.outputs, here.title)
         sensor_input = channel("input", options.input, there.inputs, there.title)
-        check_senses(options.input, sensor_input, there.title)
         chain = SignalChain(output, sensor_input, options.amplifier, options.sensor)
         setup = cls(options, writer, reader, output, sensor_input, chain)
-        setup.check()
-        return setup
-
-    def check(self) -> None:
-        """Refuse a time-out that is too short, and a watchdog that can't do what is asked of it."""
-        wire = self.wire(self.may_combine)
-        if self.options.timeout_s <= wire.total_s:
+        wire = setup.wire(setup.may_combine)
+        if options.timeout_s <= wire.answered_s:
             raise InputError(
-                f"timeout_s must be > {wire.total_s:g}, got {self.options.timeout_s:g} ({wire})"
+                f"timeout_s must be > {wire.answered_s:g}, got {options.timeout_s:g} ({wire})"
             )
-        options, profile = self.options, self.profile
-        check_watchdog(
-            profile.title,
-            options.output,
-            self.output,
-            self.chain,
-            options.watchdog,
-            profile.watchdog,
-        )
-
-    @property
-    def profile(self) -> ModbusProfile:
-        """What has the output."""
-        return self.writer.profile
+        check_watchdog(here.title, options, output, chain, here.watchdog)
+        return setup
 
     @property
     def reads_elsewhere(self) -> bool:
@@ -94,25 +180,6 @@ class ModbusSetup:
         """Whether both devices are on one line or connection."""
         return self.reader.holds == self.writer.holds
 
-    def link(self) -> Link:
-        """Return a new link to the device."""
-        return self.writer.link()
-
-    @property
-    def unit(self) -> int:
-        """The device's unit id."""
-        return self.writer.unit
-
-    @property
-    def title(self) -> str:
-        """The device in messages: its profile and where it is."""
-        return f"modbus_dac {self.writer.name} at {self.writer.place}"
-
-    @property
-    def reader_title(self) -> str:
-        """The reader in messages."""
-        return f"reader {self.reader.name}, unit {self.reader.unit} at {self.reader.place}"
-
     @property
     def may_combine(self) -> bool:
         """Whether a sample may be one transaction; :meth:`ModbusDac.open` finds out.
@@ -121,49 +188,45 @@ class ModbusSetup:
         """
         if self.reads_elsewhere:
             return False
-        return self.profile.exchange != "none" and self.output.readback_register is not None
+        return self.writer.profile.exchange != "none" and self.output.readback_register is not None
 
     def wire(self, one_transaction: bool) -> WireTime:
         """Return what a sample costs on the wire."""
-        name = self.options.output
-        if self.reads_elsewhere:
-            write = exchange_time(self.profile, name, None)
-            read = read_pdu(self.input.read_function, self.input_address(), self.input.words)
-            wire = requests_time(self.reader.profile, [read]).then(write)
-            if self.shares_link:
-                return wire
-            # Of two lines, one is silent before its next request while the other is at work.
-            return replace(wire, gaps=wire.gaps // 2, gaps_s=0.5 * wire.gaps_s)
-        return exchange_time(
-            self.profile, name, self.options.input, one_transaction=one_transaction
-        )
+        profile, name = self.writer.profile, self.options.output
+        if not self.reads_elsewhere:
+            return exchange_time(profile, name, self.options.input, one_transaction=one_transaction)
+        wire = read_time(self.reader.profile, self.input).then(exchange_time(profile, name, None))
+        if self.shares_link:
+            return wire
+        # Of two lines, one is silent before its next request while the other is at work.
+        return replace(wire, gaps=wire.gaps // 2, gaps_s=0.5 * wire.gaps_s)
 
-    def rate(self, one_transaction: bool) -> tuple[float, str]:
-        """Return the highest sample rate, in Hz, and why it is that.
+    def rates(self, one_transaction: bool) -> RateLimit:
+        """Return the sample rates that wire and devices leave.
 
         Args:
             one_transaction: Whether a sample is one transaction, not a read and a write.
         """
         wire = self.wire(one_transaction)
         if self.options.watchdog != "none":
-            wire = with_feeding(wire, self.profile)
+            wire = wire.then(feed_time(self.writer.profile))
         slowest = min((self.writer, self.reader), key=lambda peer: peer.profile.max_rate_hz)
-        most_hz = slowest.profile.max_rate_hz
-        if wire.highest_rate_hz <= most_hz:
-            return wire.highest_rate_hz, str(wire)
         whose = f"profile {slowest.name}" if self.reads_elsewhere else "its profile"
-        return most_hz, f"{whose} says so; the wire alone: {wire}"
+        return RateLimit.of(wire, slowest.profile.max_rate_hz, whose)
 
     def info(self) -> DeviceInfo:
         """Return what the device is and what it accepts."""
-        options, reader = self.options, self.reader
+        options, writer, reader = self.options, self.writer, self.reader
         low, high = self.chain.command_range(*self.output.limits)
         low_um, high_um = self.chain.displacement_range(*self.input.limits)
-        highest_hz, note = self.rate(self.may_combine)
-        description = f"{self.profile.title} at {self.writer.place}: {options.output}"
+        rates = self.rates(self.may_combine)
+        description = f"{writer.profile.title} at {writer.place}: {options.output}"
+        details = {**writer.profile.provenance(), "link": writer.profile.link.model_dump_json()}
+        details |= options.details()
         if self.reads_elsewhere:
             description += f"; {reader.profile.title}, unit {reader.unit} at {reader.place}:"
             description += f" {options.input}"
+            details |= reader.profile.provenance("reader_")
         else:
             description += f", {options.input}"
         return DeviceInfo(
@@ -174,45 +237,63 @@ class ModbusSetup:
             command_max=high,
             sensor_min_um=low_um,
             sensor_max_um=high_um,
-            max_rate_hz=highest_hz,
-            rate_note=note,
-            holds=tuple(dict.fromkeys((self.writer.holds, reader.holds))),
-            details=self.details(),
+            max_rate_hz=rates.highest_hz,
+            rate_note=rates.note,
+            holds=tuple(dict.fromkeys((writer.holds, reader.holds))),
+            details=details,
         )
 
-    def details(self) -> dict[str, str]:
-        """Return what is worth keeping with a recording, as text."""
-        found = details(self.profile, self.profile.link.model_dump_json(), self.options)
-        if self.reads_elsewhere:
-            found |= provenance(self.reader.profile, "reader_")
-        return found
 
-    def address(self, register: Register) -> int:
-        """Return an address in a frame to the device that has the output."""
-        return self.profile.wire_address(register)
+def _writer_of(options: ModbusOptions) -> ModbusPeer:
+    """Return the device that has the output.
 
-    def input_address(self) -> int:
-        """Return the input's address in a frame to the device that has it."""
-        return self.reader.profile.wire_address(self.input)
+    Raises:
+        InputError: The profile does not go with the place.
+    """
+    profile = _modbus_profile(options.profile, options.serial_port, "host")
+    given = {"baud": options.baud, "parity": options.parity, "stopbits": options.stopbits}
+    changes = {key: value for key, value in given.items() if value is not None}
+    if changes and not isinstance(profile.link, ModbusRtuLink):
+        raise InputError(f"{', '.join(changes)} must be left out: {profile.title} has no line")
+    return ModbusPeer.of(options, with_link(profile, **changes), options.timeout_s)
 
-    def bound(self, steps: tuple[ModbusStep, ...]) -> tuple[ModbusStep, ...]:
-        """Return watchdog steps with the experiment's timeout and safe value in them."""
-        wanted, watchdog = self.options.watchdog, self.profile.watchdog
-        if wanted == "none" or watchdog == "none":
-            return ()
-        safe = self.chain.output(wanted.safe_command)
-        return watchdog.bound(steps, self.output, wanted.timeout_s, safe)
 
-    def session(self) -> ModbusSession:
-        """Return a session with the device that has the output, on a new link."""
-        return self.writer.session()
+def _reader_of(options: ModbusOptions, writer: ModbusPeer) -> ModbusPeer:
+    """Return the device that has the input, often the same.
 
-    def reader_session(self, writer: ModbusSession) -> ModbusSession:
-        """Return a session with the device that has the input.
+    Raises:
+        InputError: The profile does not go with the place, or two devices of one line have one
+            unit id or no baud in common.
+    """
+    given = options.reader
+    if given is None:
+        return writer
+    alone = given.host or given.serial_port
+    serial_port = given.serial_port if alone else options.serial_port
+    profile = _modbus_profile(given.profile, serial_port, "reader.host")
+    reader = ModbusPeer.of(given, profile, options.timeout_s)
+    if alone:
+        reader = replace(reader, profile=with_link(profile, baud=given.baud))
+        if reader.holds != writer.holds:
+            return reader
+    if reader.unit == writer.unit:
+        raise InputError(
+            f"{profile.title} and {writer.profile.title} can't both be unit {writer.unit} at "
+            f"{writer.place}: give reader.unit_id, or reader.host or reader.serial_port where it "
+            "has a place of its own"
+        )
+    line = writer.profile.link
+    if isinstance(profile.link, ModbusRtuLink) and isinstance(line, ModbusRtuLink):
+        if not writer.host:  # behind a gateway the line is the gateway's business
+            check_baud(profile, line.baud)
+        profile = profile.model_copy(update={"link": line})
+    return replace(writer, name=reader.name, profile=profile, unit=reader.unit)
 
-        Args:
-            writer: Session with the other; its link is shared where both are in one place.
-        """
-        if not self.reads_elsewhere:
-            return writer
-        return self.reader.session(writer.link if self.shares_link else None)
+
+def _modbus_profile(named: NamedProfile, serial_port: str | None, other: str) -> ModbusProfile:
+    profile = named.profile
+    if not isinstance(profile, ModbusProfile):
+        raise InputError(f"profile {named.name} is not one of a Modbus device")
+    if profile.link.kind == "tcp" and serial_port is not None:
+        raise InputError(f"profile {named.name} is for Modbus tcp: give {other}")
+    return profile

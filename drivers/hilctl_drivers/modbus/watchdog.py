@@ -1,9 +1,10 @@
 """The host watchdog of a Modbus device during a run: cleared, armed, fed, disarmed."""
 
-from hilctl_drivers.feed_time import check_feeds
+from hilctl_drivers.modbus.channels import ModbusStep
 from hilctl_drivers.modbus.profile import ModbusWatchdog
 from hilctl_drivers.modbus.session import ModbusSession
 from hilctl_drivers.modbus.setup import ModbusSetup
+from hilctl_drivers.wire.timing import check_feeds
 
 
 class ModbusGuard:
@@ -15,6 +16,8 @@ class ModbusGuard:
 
     def __init__(self, setup: ModbusSetup) -> None:
         self._setup = setup
+        self._wanted = setup.options.watchdog
+        self._has = setup.writer.profile.watchdog
         self._ticks = 0
         self.feed_every = 0
         """Ticks from one feeding to the next; 0 where exchanges feed it."""
@@ -25,29 +28,28 @@ class ModbusGuard:
         Raises:
             DeviceError: A step failed.
         """
-        watchdog = self._setup.profile.watchdog
-        if watchdog == "none" or not watchdog.clear:
+        has = self._has
+        if has == "none" or not has.clear:
             return
-        if watchdog.tripped == "none" or session.is_set(watchdog.tripped):
-            session.run(self._setup.bound(watchdog.clear) or watchdog.clear)
+        if has.tripped == "none" or session.is_set(has.tripped):
+            session.run(self._bound(has, has.clear) or has.clear)
 
-    def arm(self, session: ModbusSession, sample_rate_hz: float) -> None:
+    def arm(self, session: ModbusSession, ticks_per_s: float) -> None:
         """Set safe value and time-out and start it, where the experiment wants one.
 
         Raises:
-            DeviceError: A step failed, or samples come too seldom to feed it.
+            DeviceError: A step failed, or exchanges come too seldom to feed it.
         """
-        wanted, watchdog = self._setup.options.watchdog, self._setup.profile.watchdog
+        has = self._has
         self._ticks = self.feed_every = 0
-        if wanted == "none" or watchdog == "none":
+        if self._wanted == "none" or has == "none":
             return
-        ticks = check_feeds(wanted.timeout_s, sample_rate_hz)
-        safe = watchdog.safe.get(self._setup.options.output, ())
-        steps = self._setup.bound((*safe, *watchdog.arm))
+        ticks = check_feeds(self._wanted.timeout_s, ticks_per_s)
+        steps = self._bound(has, (*has.safe.get(self._setup.options.output, ()), *has.arm))
         if session.would_change(steps):
-            self._run(session, "unlock")
+            session.run(self._bound(has, has.unlock))
         session.run(steps)
-        if watchdog.kick == "strict":
+        if has.kick == "strict":
             self.feed_every = ticks
 
     def disarm(self, session: ModbusSession) -> None:
@@ -56,7 +58,8 @@ class ModbusGuard:
         Raises:
             DeviceError: A step failed.
         """
-        self._run(session, "disarm")
+        if self._has != "none":
+            session.run(self._bound(self._has, self._has.disarm))
 
     def feed(self, session: ModbusSession) -> None:
         """Feed a watchdog that exchanges don't feed; three times in its timeout.
@@ -65,10 +68,12 @@ class ModbusGuard:
             DeviceError: A step failed.
         """
         self._ticks += 1
-        if self._ticks % self.feed_every == 0:
-            self._run(session, "feed")
+        if self._ticks % self.feed_every == 0 and self._has != "none":
+            session.run(self._bound(self._has, self._has.feed))
 
-    def _run(self, session: ModbusSession, name: str) -> None:
-        watchdog = self._setup.profile.watchdog
-        if self._setup.options.watchdog != "none" and isinstance(watchdog, ModbusWatchdog):
-            session.run(self._setup.bound(getattr(watchdog, name)))
+    def _bound(self, has: ModbusWatchdog, steps: tuple[ModbusStep, ...]) -> tuple[ModbusStep, ...]:
+        """Return steps with the experiment's timeout and safe value in them; none without one."""
+        if self._wanted == "none":
+            return ()
+        safe = self._setup.chain.output(self._wanted.safe_command)
+        return has.bound(steps, self._setup.output, self._wanted.timeout_s, safe)

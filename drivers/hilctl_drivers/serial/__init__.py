@@ -1,6 +1,6 @@
-"""DACs on serial lines: text and framed messages.
+"""DACs on serial lines, whatever they speak.
 
-options.py  an experiment's options
-setup.py    held against the profile
-device.py   the device
+setup.py   an experiment's options, held against the profile
+wire.py    what a protocol must do: text/wire.py and board/wire.py do it
+device.py  the device
 """

@@ -5,7 +5,7 @@ caller took. That is how a device with a sample clock and a FIFO of its own look
 they all call themselves buffered.
 """
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -14,13 +14,15 @@ from pydantic import Field
 from hilctl.base.arrays import F64
 from hilctl.base.device import DeviceInfo, DeviceOptions
 from hilctl.base.errors import DeviceError
+from hilctl.base.strict import Strict
+from hilctl_drivers.device import DacDevice
 from hilctl_drivers.simulated.plant import Plant
 
 FIFO_DEPTH = 4096
 MAX_RATE_HZ = 200e3
 
 
-class Fault(DeviceOptions):
+class SimulatedFault(Strict):
     """A fault to inject, for trying what a run does about it. It stays once it has come."""
 
     kind: Literal["sensor_nan", "sensor_frozen", "sensor_jump", "no_answer", "refused"] = Field(
@@ -36,73 +38,48 @@ class SimulatedOptions(DeviceOptions):
 
     seed: int = Field(default=1, ge=0, description="seed of the sensor noise")
     noise: bool = Field(default=True, description="whether the sensor has noise")
-    fault: Fault | None = Field(default=None, description="fault to inject")
+    fault: SimulatedFault | None = Field(default=None, description="fault to inject")
 
 
-class SimulatedDevice(ABC):
+class SimulatedDevice(DacDevice):
     """A :class:`~hilctl.base.device.Device` around a plant; opening it puts the plant at rest."""
 
     Options: ClassVar[type[DeviceOptions]] = SimulatedOptions
 
-    def __init__(self, info: DeviceInfo, fault: Fault | None) -> None:
+    def __init__(self, info: DeviceInfo, fault: SimulatedFault | None) -> None:
         """Take what the subclass says of itself, and the fault to inject."""
-        self._info = info
+        super().__init__(info, info.name, "exchange a block", "the output")
         self._fault = fault
         self._plant: Plant | None = None
-        self._block = 0
         self._next_sample = 0
         self._last_command = 0.0
         self._last_reading_um = 0.0
-
-    @property
-    def info(self) -> DeviceInfo:
-        """What the device is and what it accepts."""
-        return self._info
 
     @property
     def last_command(self) -> float:
         """What the output is at, in ``info.command_unit``."""
         return self._last_command
 
-    def open(self, sample_rate_hz: float, block: int) -> None:
-        """Put the plant at rest, with 0 at the output and the sample count at 0.
+    def _longest_block(self) -> tuple[int, str]:
+        return FIFO_DEPTH, ""
 
-        Raises:
-            DeviceError: The rate or the block is out of range.
-        """
-        if not 0.0 < sample_rate_hz <= self._info.max_rate_hz:
-            rule = f"sample rate must be in (0, {self._info.max_rate_hz:g}] Hz"
-            raise self._error(rule, sample_rate_hz)
-        if not 1 <= block <= FIFO_DEPTH:
-            rule = f"block must be in [1, {FIFO_DEPTH}] samples"
-            raise self._error(rule, block)
+    def _open(self, sample_rate_hz: float, block: int) -> None:
+        """Put the plant at rest, with 0 at the output and the sample count at 0."""
+        del block
         self._plant = self._build(sample_rate_hz)
-        self._block = block
         self._next_sample = 0
         self._last_command = 0.0
         self._last_reading_um = 0.0
 
-    def exchange(
+    def _exchange(
         self, first_sample: int, command: F64, displacement_um: F64, measured: F64
     ) -> None:
-        """Let a period pass for each command, see :meth:`hilctl.base.device.Device.exchange`.
-
-        Samples skipped since the last block pass too, with the output held.
-
-        Raises:
-            DeviceError: Not open; a command out of range or not finite; blocks of unequal length
-                or longer than agreed; samples that have already passed; an injected fault.
-        """
+        """Let a period pass for each command; samples skipped before it pass too, output held."""
         if self._plant is None:
-            raise self._error("must be open to exchange", "closed")
-        sizes = (command.size, displacement_um.size, measured.size)
-        if not 1 <= sizes[0] <= self._block or len(set(sizes)) > 1:
-            rule = f"command, displacement and measured must be 1..{self._block} samples each"
-            raise self._error(rule, sizes)
-        self._check(command)
+            raise DeviceError("not open")
         if first_sample < self._next_sample:
             rule = f"first sample must be >= {self._next_sample}, which is next"
-            raise self._error(rule, first_sample)
+            raise DeviceError(f"{rule}, got {first_sample}")
         self._fail_exchange(first_sample + command.size)
         if first_sample > self._next_sample:
             self._plant.hold(first_sample - self._next_sample, self._last_command)
@@ -112,36 +89,25 @@ class SimulatedDevice(ABC):
         self._last_command = float(command[-1])
         self._last_reading_um = float(displacement_um[-1])
 
-    def make_safe(self, command: float) -> None:
-        """Put the output at ``command``, open or not; an injected fault does not prevent it.
-
-        Raises:
-            DeviceError: ``command`` is out of range or not finite.
-        """
-        self._check(np.array([command]))
+    def _put_out(self, command: float) -> None:
+        """Put the output there; an injected fault does not prevent it."""
         self._last_command = command
 
-    def close(self) -> None:
-        """Let go of the plant. Closing twice is fine."""
+    def _close(self) -> None:
+        """Nobody is there to take leave of."""
+
+    def _release(self) -> None:
         self._plant = None
 
     @abstractmethod
     def _build(self, sample_rate_hz: float) -> Plant:
         """Return a plant at rest."""
 
-    def _error(self, rule: str, value: object) -> DeviceError:
-        return DeviceError(f"{self._info.name}: {rule}, got {value}")
-
-    def _check(self, command: F64) -> None:
-        """Refuse a block with a command that is out of range or not a number."""
-        info = self._info
-        good = (command >= info.command_min) & (command <= info.command_max)
-        if good.all():
-            return
-        index = int(np.argmin(good))
-        unit = info.command_unit
-        rule = f"command[{index}] must be in [{info.command_min:g}, {info.command_max:g}] {unit}"
-        raise self._error(rule, f"{command[index]} {unit}, nothing was sent")
+    def _check_sizes(self, command: F64, displacement_um: F64, measured: F64) -> None:
+        """Take shorter blocks too: where a run's last one is cut, time goes on as it did."""
+        sizes = {command.size, displacement_um.size, measured.size}
+        if not self._block or len(sizes) > 1 or not 1 <= command.size <= self._block:
+            super()._check_sizes(command, displacement_um, measured)
 
     def _fail_exchange(self, end_sample: int) -> None:
         """Raise what an injected fault of the connection raises in a block that ends here."""
@@ -149,9 +115,9 @@ class SimulatedDevice(ABC):
         if fault is None or end_sample <= fault.at_sample:
             return
         if fault.kind == "no_answer":
-            raise self._error("must answer an exchange in time", "no answer (injected fault)")
+            raise DeviceError("no answer in time (injected fault)")
         if fault.kind == "refused":
-            raise self._error("must accept the block", "a refusal (injected fault)")
+            raise DeviceError("the block was refused (injected fault)")
 
     def _spoil(self, first_sample: int, displacement_um: F64) -> None:
         """Put an injected sensor fault on the readings it has reached."""

@@ -161,6 +161,7 @@ class SimulatedTerfenol(SimulatedDevice):
             buffered=True,
             fifo_depth=FIFO_DEPTH,
             measures_command=True,
+            simulated=True,
             details=_details(asdict(self._parameters), options),
         )
         super().__init__(info, options.fault)
@@ -196,6 +197,7 @@ class SimulatedPiezo(SimulatedDevice):
             buffered=True,
             fifo_depth=FIFO_DEPTH,
             measures_command=True,
+            simulated=True,
             details=_details(asdict(self._parameters), options),
         )
         super().__init__(info, options.fault)

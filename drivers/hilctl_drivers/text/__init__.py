@@ -2,7 +2,7 @@
 
 profile.py  what a profile says of one
 lines.py    lines and the numbers in them
-queries.py  questions beside the exchange
+timing.py   how long they take
 session.py  one conversation
 wire.py     sample by sample
 """

@@ -8,20 +8,13 @@ pattern is for, proves that it matches, and tells how long a reply is.
 
 import re
 from string import Formatter
-from typing import Annotated, Literal, Self, TypeAlias
+from typing import Annotated, ClassVar, Literal, Self, TypeAlias
 
 from pydantic import AfterValidator, Field, StringConstraints, model_validator
 
-from hilctl_drivers.profile_parts import (
-    BaseProfile,
-    Name,
-    Part,
-    Range,
-    WaitStep,
-    Watchdog,
-    check_channels,
-)
-from hilctl_drivers.wire.line_settings import AsciiLink
+from hilctl.base.strict import Strict
+from hilctl_drivers.profile_parts import BaseProfile, Name, Range, WaitStep, Watchdog
+from hilctl_drivers.wire.line_settings import SerialLineSettings
 
 _SAMPLES = {"value": 0.0, "safe": 0.0, "address": 1, "timeout": 1}
 
@@ -44,7 +37,7 @@ def _check_pattern(text: str) -> str:
     return text
 
 
-Template: TypeAlias = Annotated[
+LineTemplate: TypeAlias = Annotated[
     str, StringConstraints(min_length=1), AfterValidator(_check_template)
 ]
 Pattern: TypeAlias = Annotated[str, StringConstraints(min_length=1), AfterValidator(_check_pattern)]
@@ -55,7 +48,26 @@ def fields_of(template: str) -> set[str]:
     return {field for _, field, _, _ in Formatter().parse(template) if field}
 
 
-class Reply(Part):
+class AsciiLink(SerialLineSettings):
+    """Lines of text: SCPI, DCON and the like."""
+
+    kind: Literal["ascii"]
+    terminator: Literal["\r", "\n", "\r\n"] = Field(description="end of what is sent")
+    reply_terminator: Literal["\r", "\n", "\r\n"] = Field(description="end of what comes back")
+    checksum: Literal["none", "dcon", "gen"] = Field(
+        default="none", description="dcon: two hex digits; gen: $ and two hex digits"
+    )
+    echo: bool = Field(default=False, description="whether the device repeats what is sent")
+    min_gap_s: float = Field(default=0.0, ge=0.0, description="silence between commands, s")
+    max_line_chars: int | None = Field(default=None, ge=1, description="longest line it takes")
+
+    @property
+    def silence_s(self) -> float:
+        """Silence between commands, s."""
+        return self.min_gap_s
+
+
+class Reply(Strict):
     """What a good reply looks like."""
 
     pattern: Pattern = Field(description="regular expression for a whole reply, no terminator")
@@ -86,13 +98,13 @@ class NumberReply(Reply):
 class Query(NumberReply):
     """A question that is answered by a number."""
 
-    ask: Template
+    ask: LineTemplate
 
 
 class AsciiOutput(Range):
     """An output set by a line of text."""
 
-    write: Template = Field(description="sets it, with {value} in unit")
+    write: LineTemplate = Field(description="sets it, with {value} in unit")
     reply: Reply | Literal["none"] = Field(description="what a good answer looks like, or none")
     readback: Query | Literal["none"] = Field(default="none", description="asks for what was set")
 
@@ -118,14 +130,14 @@ class AsciiExchange(NumberReply):
 
     output: Name
     input: Name
-    write: Template
+    write: LineTemplate
 
 
-class SendStep(Part):
+class SendStep(Strict):
     """Send a line."""
 
     kind: Literal["send"]
-    text: Template
+    text: LineTemplate
     reply: Reply | Literal["none"] = "none"
     note: str = ""
 
@@ -134,7 +146,7 @@ class AskStep(Reply):
     """Ask, and refuse to go on where the reply doesn't match."""
 
     kind: Literal["ask"]
-    ask: Template
+    ask: LineTemplate
     note: str = ""
 
 
@@ -161,13 +173,13 @@ class ErrorReply(Reply):
 class ErrorQuery(Reply):
     """A question that tells of errors that commands left behind; the pattern means none."""
 
-    ask: Template
+    ask: LineTemplate
 
 
 class Tripped(Reply):
     """A question whose reply matches where the watchdog has tripped."""
 
-    ask: Template
+    ask: LineTemplate
 
 
 class AsciiWatchdog(Watchdog):
@@ -193,6 +205,9 @@ class AsciiWatchdog(Watchdog):
 class AsciiProfile(BaseProfile):
     """A device that speaks lines of text."""
 
+    DEVICE: ClassVar[str] = "serial_dac"
+    WIRE: ClassVar[str] = "hilctl_drivers.text.wire:AsciiWire"
+
     link: AsciiLink
     address: int | Literal["none"] = Field(description="device address as shipped, for {address}")
     outputs: dict[Name, AsciiOutput]
@@ -204,13 +219,6 @@ class AsciiProfile(BaseProfile):
     close: tuple[AsciiStep, ...] = ()
     watchdog: AsciiWatchdog | Literal["none"]
     selftest: ErrorQuery | Literal["none"] = "none"
-
-    @model_validator(mode="after")
-    def _channels(self) -> Self:
-        check_channels(self.outputs, self.inputs)
-        if self.watchdog != "none" and not self.outputs:
-            raise ValueError("watchdog must be none where there are no outputs to make safe")
-        return self
 
     @model_validator(mode="after")
     def _exchange_channels(self) -> Self:

@@ -4,56 +4,78 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from hilctl.base.arrays import F64
-from hilctl.base.errors import DeviceError
-from hilctl_drivers.feed_time import check_feeds
+from hilctl.base.errors import DeviceError, InputError
+from hilctl_drivers.profile_parts import Range
 from hilctl_drivers.serial.setup import SerialSetup
+from hilctl_drivers.serial.wire import SerialWire
 from hilctl_drivers.text.lines import parse_number
 from hilctl_drivers.text.profile import AsciiInput, AsciiOutput, AsciiProfile
 from hilctl_drivers.text.session import AsciiSession
+from hilctl_drivers.text.timing import exchange_time, feed_time, query_time
 from hilctl_drivers.wire.errors import WatchdogTripped
 from hilctl_drivers.wire.links import LostError
+from hilctl_drivers.wire.timing import RateLimit, check_feeds
 
 
-class AsciiWire:
-    """A :class:`~hilctl_drivers.board.wire.Wire` of lines.
+class AsciiWire(SerialWire):
+    """A :class:`~hilctl_drivers.serial.wire.SerialWire` of lines."""
 
-    Args:
-        setup: What the experiment says of it.
-        profile: What the device is.
-    """
-
-    def __init__(self, setup: SerialSetup, profile: AsciiProfile) -> None:
+    def __init__(self, setup: SerialSetup) -> None:
+        super().__init__(setup)
+        assert isinstance(setup.profile, AsciiProfile)
         assert isinstance(setup.output, AsciiOutput)
+        self._profile = setup.profile
+        self._reader_profile = _reader_profile(setup, setup.profile)
         assert isinstance(setup.input, AsciiInput)
-        self._setup = setup
-        self._profile = profile
         self._output, self._input = setup.output, setup.input
-        self._measure = setup.measure
+        self._measure = _measuring_input(setup.profile, setup.options.measure, setup.output)
+        self.measures = self._measure is not None
+        self._address = _address(setup.options.unit_id, self._profile)
+        reader = setup.options.reader
+        self._reader_address = _address(reader.unit_id if reader else None, self._reader_profile)
         self._link = setup.link()
-        self._writer = AsciiSession(profile, self._link, setup.address)
-        self._reader_link = self._link
+        self._writer = AsciiSession(self._profile, self._link, self._address)
+        self._reader_link = setup.reader_link(self._link)
         self._reader = self._writer
-        if setup.reader is not None:
-            if setup.options.reader_port is not None:
-                self._reader_link = setup.reader_link()
-            self._reader = AsciiSession(setup.reader, self._reader_link, setup.reader_address)
+        if setup.reads_elsewhere:
+            self._reader = AsciiSession(
+                self._reader_profile, self._reader_link, self._reader_address
+            )
         self._feed_every = 0
         self._ticks = 0
 
+    def rates(self, block: int) -> RateLimit:
+        """See :meth:`~hilctl_drivers.serial.wire.SerialWire.rates`."""
+        del block
+        options, profile, reader = self._setup.options, self._profile, self._reader_profile
+        if self._setup.reads_elsewhere:
+            wire = exchange_time(profile, options.output, None)
+            wire = wire.then(
+                query_time(reader, self._input, self._reader_address, f"to {reader.title}")
+            )
+        else:
+            wire = exchange_time(profile, options.output, options.input)
+        if self._measure is not None:
+            what = f"to measure {options.measure}"
+            wire = wire.then(query_time(profile, self._measure, self._address, what))
+        if options.watchdog != "none":
+            wire = wire.then(feed_time(profile))
+        slowest = min((profile, reader), key=lambda each: each.max_rate_hz)
+        return RateLimit.of(wire, slowest.max_rate_hz, f"the profile of {slowest.title}")
+
     def open(self, sample_rate_hz: float, block: int) -> None:
-        """See :meth:`~hilctl_drivers.board.wire.Wire.open`."""
-        if block != 1:
-            raise DeviceError(f"block must be 1 on a line of text, got {block}")
-        feed_every = check_feeds(self._setup.watchdog_timeout_s, sample_rate_hz)
+        """See :meth:`~hilctl_drivers.serial.wire.SerialWire.open`."""
+        del block
+        feed_every = check_feeds(self._setup.options.watchdog_timeout_s, sample_rate_hz)
         self._open_links()
         writer, watchdog = self._writer, self._profile.watchdog
         writer.check_selftest()
         self._clear_trip()
         writer.run(self._profile.init)
-        if self._setup.reader is not None:
+        if self._setup.reads_elsewhere:
             with self._reader_named():
                 self._reader.check_selftest()
-                self._reader.run(self._setup.reader.init)
+                self._reader.run(self._reader_profile.init)
         self._feed_every = 0
         if watchdog != "none" and self._setup.options.watchdog != "none":
             self._run("safe")
@@ -63,7 +85,7 @@ class AsciiWire:
         self._ticks = 0
 
     def exchange(self, first_sample: int, output: F64, reading: F64, measured: F64) -> None:
-        """See :meth:`~hilctl_drivers.board.wire.Wire.exchange`."""
+        """See :meth:`~hilctl_drivers.serial.wire.SerialWire.exchange`."""
         del first_sample
         value = output.item() + 0.0  # makes 0.0 of -0.0
         combined = self._profile.exchange
@@ -81,7 +103,7 @@ class AsciiWire:
         self._feed()
 
     def put_out(self, value: float) -> None:
-        """See :meth:`~hilctl_drivers.board.wire.Wire.put_out`."""
+        """See :meth:`~hilctl_drivers.serial.wire.SerialWire.put_out`."""
         try:
             self._put_out(value)
         except LostError:
@@ -91,24 +113,21 @@ class AsciiWire:
             self._put_out(value)  # a late or damaged answer must not cost the safe value
 
     def close(self) -> None:
-        """See :meth:`~hilctl_drivers.board.wire.Wire.close`."""
-        try:
-            if self._profile.watchdog != "none" and self._setup.options.watchdog != "none":
-                self._run("disarm")
-            self._writer.run(self._profile.close)
-            self._writer.check_errors()
-        finally:
-            self.release()
+        """See :meth:`~hilctl_drivers.serial.wire.SerialWire.close`."""
+        if self._profile.watchdog != "none" and self._setup.options.watchdog != "none":
+            self._run("disarm")
+        self._writer.run(self._profile.close)
+        self._writer.check_errors()
 
     def release(self) -> None:
-        """See :meth:`~hilctl_drivers.board.wire.Wire.release`."""
+        """See :meth:`~hilctl_drivers.serial.wire.SerialWire.release`."""
         self._link.close()
         self._reader_link.close()
 
     @property
     def _is_combined(self) -> bool:
         combined, options = self._profile.exchange, self._setup.options
-        if combined == "none" or self._setup.reader is not None:
+        if combined == "none" or self._setup.reads_elsewhere:
             return False
         return (combined.output, combined.input) == (options.output, options.input)
 
@@ -133,11 +152,11 @@ class AsciiWire:
 
     def _named(self, error: DeviceError) -> DeviceError:
         """Return an error that says that the reader made it, where it is another device."""
-        if self._setup.reader is None:
+        reader = self._setup.options.reader
+        if reader is None:
             return error
-        reader, options = self._setup.reader, self._setup.options
-        where = options.reader_port or f"address {self._setup.reader_address}"
-        return DeviceError(f"reader {reader.title} at {where}: {error}")
+        where = reader.serial_port or f"unit {self._reader_address}"
+        return DeviceError(f"reader {self._reader_profile.title} at {where}: {error}")
 
     def _write(self, value: float) -> None:
         text = self._writer.text(self._output.write, value=value)
@@ -175,9 +194,11 @@ class AsciiWire:
         steps = getattr(watchdog, name)
         if name == "safe":
             steps = steps.get(self._setup.options.output, ())
-        timeout_s = self._setup.watchdog_timeout_s
+        options = self._setup.options
+        timeout_s = options.watchdog_timeout_s
         counts = watchdog.counts(watchdog.min_s if timeout_s is None else timeout_s)
-        self._writer.run(steps, timeout=counts, safe=self._setup.safe_output)
+        safe = self._setup.chain.output(options.safe_command)
+        self._writer.run(steps, timeout=counts, safe=safe)
 
     def _feed(self) -> None:
         """Feed a watchdog that exchanges don't feed; three times in its timeout."""
@@ -186,3 +207,52 @@ class AsciiWire:
         self._ticks += 1
         if self._ticks % self._feed_every == 0:
             self._run("feed")
+
+
+def _address(wanted: int | None, profile: AsciiProfile) -> int:
+    """Return a device's address on a shared line; 0 where there is none."""
+    if wanted is not None:
+        return wanted
+    return 0 if profile.address == "none" else profile.address
+
+
+def _reader_profile(setup: SerialSetup, profile: AsciiProfile) -> AsciiProfile:
+    """Return the profile of the device that has the input, often the same.
+
+    Raises:
+        InputError: It speaks no lines of text, or can't share the other's line.
+    """
+    reader, options = setup.reader, setup.options.reader
+    if not isinstance(reader, AsciiProfile):
+        raise InputError("reader is for devices that speak lines of text, both of them")
+    if options is None or options.serial_port is not None:
+        return reader
+    kept = ("terminator", "reply_terminator", "checksum", "bytesize", "echo")
+    if any(getattr(profile.link, name) != getattr(reader.link, name) for name in kept):
+        rule = f"{reader.title} can't share the line of {profile.title}: {', '.join(kept)} differ"
+        raise InputError(f"{rule}; give reader.serial_port")
+    return reader
+
+
+def _measuring_input(profile: AsciiProfile, name: str | None, output: Range) -> AsciiInput | None:
+    """Return the input that measures the output itself; None where none is wanted.
+
+    Args:
+        profile: The device's profile.
+        name: Name of the input, or None.
+        output: The output in use.
+
+    Raises:
+        InputError: There is no such input, or it measures something else.
+    """
+    if name is None:
+        return None
+    measuring = {key: each for key, each in profile.inputs.items() if each.measures == "output"}
+    if name not in measuring:
+        known = ", ".join(measuring) or "none"
+        rule = f"measure must be an input of {profile.title} that measures its own output"
+        raise InputError(f"{rule}, got {name!r} (it has {known})")
+    if measuring[name].unit != output.unit:
+        rule = f"measure must be in {output.unit}, as the output is"
+        raise InputError(f"{rule}: {name} is in {measuring[name].unit}")
+    return measuring[name]

@@ -1,7 +1,8 @@
 """Bytes there and back; knows no protocol.
 
 links.py          the contract; tcp.py and serial_port.py keep it
-line_settings.py  baud, parity and framing of a line
+line_settings.py  baud and parity of a line, as a profile has them
+timing.py         how long an exchange takes, and the rate that leaves
 framing.py        COBS and length frames; splitters.py cuts them out of a stream; crc.py checks
 errors.py         what can go wrong
 """

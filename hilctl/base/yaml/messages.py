@@ -11,7 +11,7 @@ from typing import Annotated, Any, TypeAlias
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-from hilctl.base.errors import Problem
+from hilctl.base.errors import ConfigError, Problem
 from hilctl.base.yaml.plain import is_number
 
 Loc: TypeAlias = tuple[str | int, ...]
@@ -60,7 +60,15 @@ def broken_rules(
         where: Gives the ``file:line`` of a location, or of the nearest thing around it.
         at: Where in the file the model's data stand.
     """
-    broken = [_located(model, detail) for detail in error.errors(include_url=False)]
+    details = error.errors(include_url=False)
+    causes = [detail.get("ctx", {}).get("error") for detail in details]
+    # What a validator has read from another file says for itself where it stands.
+    elsewhere = [p for cause in causes if isinstance(cause, ConfigError) for p in cause.problems]
+    broken = [
+        _located(model, detail)
+        for detail, cause in zip(details, causes, strict=True)
+        if not isinstance(cause, ConfigError)
+    ]
     # A choice that was not meant says nothing, where another one says what is wrong within it.
     meant = {
         each.loc[:n] for each in broken if not each.of_choice for n in range(len(each.loc) + 1)
@@ -69,7 +77,7 @@ def broken_rules(
     for index, each in enumerate(broken):
         if not (each.of_choice and each.loc in meant):
             groups.setdefault(each.loc if each.of_choice else (index, *each.loc), []).append(each)
-    return [_problem(group, where, at) for group in groups.values()]
+    return [*elsewhere, *(_problem(group, where, at) for group in groups.values())]
 
 
 @dataclass(frozen=True, slots=True)

@@ -56,7 +56,7 @@ def recording(make_recording) -> Recording:
             Segment(f"first {NASTY}", 0, 4000, 0, 4000, 1000.0),
             Segment("second", 4000, 8000, 4000, 8000, 1000.0),
         ],
-        run={"name": f"name {NASTY}", "device": f"simulated_{NASTY}"},
+        run={"name": f"name {NASTY}", "device": f"simulated_{NASTY}", "simulated": "true"},
         end={"reason": f"reason {NASTY}"},
         events=(Event(17, "error", f"code {NASTY}", f"event {NASTY}"),),
         experiment_yaml=f"name: {NASTY}\n",

@@ -56,7 +56,7 @@ def test_floor_stands_beside_the_hysteresis(lagging) -> None:
 
 def test_simulation_is_told(lagging) -> None:
     """A simulated device is called so, a real one is not."""
-    simulated = lagging(run={"name": "x", "device": "simulated_terfenol"})
+    simulated = lagging(run={"name": "x", "device": "my_rig", "simulated": "true"})
     assert "no hardware was driven" in terminal(summarize(simulated))
     assert "no hardware was driven" not in terminal(summarize(lagging()))
 

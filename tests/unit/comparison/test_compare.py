@@ -100,7 +100,9 @@ def test_the_figure_draws_each_model_once(comparison):
 @pytest.mark.parametrize("text", ["", "device: {kind: serial_dac, port: /dev/ttyUSB9}"])
 def test_loops_of_a_real_device_are_judged_without_trials(monkeypatch, text):
     """No device is made, and table, figure and page do without compensated errors."""
-    recording = replace(read(GOLDEN), experiment_yaml=text)
+    recording = read(GOLDEN)
+    run = {**recording.run, "simulated": "false"}
+    recording = replace(recording, experiment_yaml=text, run=run)
     monkeypatch.setattr("hilctl.comparison.compare.read", lambda path: recording)
     judged = compare(Request([GOLDEN], ["straight"]), Clock(), ignore)
     assert judged.rows[0].trials == ()

@@ -11,8 +11,8 @@ import yaml
 from hilctl.base.errors import ConfigError, InputError
 from hilctl.base.yaml.plain import dump
 from hilctl_drivers.board.profile import FrameProfile
+from hilctl_drivers.modbus.channels import EnsureStep, RegisterStep
 from hilctl_drivers.modbus.profile import ModbusProfile
-from hilctl_drivers.modbus.steps import EnsureStep, RegisterStep
 from hilctl_drivers.profile import (
     FOLDER,
     load_profile,

@@ -4,7 +4,7 @@ import struct
 
 import pytest
 
-from hilctl_drivers.labjack.frames import Feedback, ReadFrame, WriteFrame
+from hilctl_drivers.labjack.frames import ModbusFeedback, ReadFrame, WriteFrame
 from hilctl_drivers.wire.errors import Refused
 from tests.fakes import InProcess
 
@@ -28,7 +28,7 @@ class Device:
     def __init__(self):
         self.emulated = InProcess.of("labjack_t7")
         self.emulated.link.open()
-        self._feedback = Feedback(self.emulated.link, 1)
+        self._feedback = ModbusFeedback(self.emulated.link, 1)
 
     def write(self, address, data):
         self._feedback.call([WriteFrame(address, data)])

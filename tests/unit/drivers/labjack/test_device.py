@@ -10,7 +10,8 @@ import pytest
 from hilctl.base.errors import DeviceError, InputError
 from hilctl_drivers.labjack import stream
 from hilctl_drivers.labjack.device import ModbusStream
-from hilctl_drivers.labjack.setup import ModbusStreamOptions, stream_time
+from hilctl_drivers.labjack.setup import ModbusStreamOptions
+from hilctl_drivers.labjack.timing import stream_time
 from hilctl_drivers.profile import load_profile
 from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
 from hilctl_drivers.wire.links import NoAnswerError
@@ -49,7 +50,7 @@ class Bench:
         self._log = log
         self.device = ModbusStream(
             chosen,
-            connect=lambda setup: setup.writer.session(emulated.link),
+            connect=lambda peer: peer.session(emulated.link),
             sleep=emulated.time.sleep,
             clock=emulated.time,
         )
@@ -89,7 +90,7 @@ def bench(tmp_path):
     def of(link=InProcessLink, message_s=MESSAGE_S, **changes):
         chosen = options(**changes)
         log = tmp_path / f"log{len(made)}.jsonl"
-        emulated = InProcess.of(chosen.profile, link=link, log=log, message_s=message_s)
+        emulated = InProcess.of(chosen.profile.name, link=link, log=log, message_s=message_s)
         made.append(Bench(emulated, log, chosen))
         return made[-1]
 
@@ -403,7 +404,7 @@ def test_samples_follow_one_another(bench):
         (RATE_HZ, 1366, {}, "block must be 1 to 1365.*8192 samples, got 1366"),
         (RATE_HZ, 0, {}, "block must be 1 to 1365"),
         (50.0, 10, {}, r"sample rate must be in \[100, .*got 50"),
-        (50_001.0, 580, {}, r"sample rate must be in \[100, 50000\] Hz with blocks of 580"),
+        (50_001.0, 580, {}, r"sample rate must be in \[100, 50000\] Hz .*580 samples in"),
         (40_000.0, 58, {}, r"in \[100, 29000\] Hz .*58 samples in 2 messages.*turnaround 2.00 ms"),
         (7_000.0, 100, {}, "scan rate was set to 7000 Hz, the device makes 6997.9"),
         (100.0, 100, {"watchdog": {"timeout_s": 2.0}}, "3 exchanges must come within"),
@@ -423,7 +424,7 @@ def test_what_the_device_can_not_do_is_refused_at_open(bench, rate_hz, block, ch
     [
         ({"profile": "labjack_t8"}, "LabJack T8 can't stream: take kind: modbus_dac"),
         ({"output": "TDAC0"}, "output must be one that LabJack T7 can stream, DAC0, DAC1"),
-        ({"reader": "labjack_t4", "reader_host": "10.0.0.9"}, "reader must be left out"),
+        ({"reader": {"profile": "labjack_t4", "host": "10.0.0.9"}}, "reader must be left out"),
     ],
 )
 def test_options_that_do_not_stream_are_refused(changes, text):

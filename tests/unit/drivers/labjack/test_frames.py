@@ -2,7 +2,7 @@
 
 import pytest
 
-from hilctl_drivers.labjack.frames import Feedback, ReadFrame, WriteFrame, frames_pdu
+from hilctl_drivers.labjack.frames import ModbusFeedback, ReadFrame, WriteFrame, frames_pdu
 from hilctl_drivers.wire.errors import BadRequest, Corrupt, Mismatch, Refused
 
 
@@ -41,7 +41,7 @@ def test_frames_stand_one_behind_the_other():
 def test_the_whole_message_is_modbus_tcp():
     """Transaction ids count up; the length covers unit and PDU."""
     link = answered(bytes.fromhex("4c 3f800000"))
-    feedback = Feedback(link, 1)
+    feedback = ModbusFeedback(link, 1)
     assert feedback.read(0, 2) == bytes.fromhex("3f800000")
     assert link.request == bytes.fromhex("0001 0000 0006 01 4c 00 0000 02")
     feedback.read(0, 2)
@@ -52,7 +52,10 @@ def test_each_read_frame_gets_its_words():
     """A reply is cut where the frames say, and writes take nothing from it."""
     link = answered(bytes.fromhex("4c 0011 22334455"))
     frames = [ReadFrame(55110, 1), WriteFrame(1000, bytes(4)), ReadFrame(55120, 2)]
-    assert Feedback(link, 1).call(frames) == [bytes.fromhex("0011"), bytes.fromhex("22334455")]
+    assert ModbusFeedback(link, 1).call(frames) == [
+        bytes.fromhex("0011"),
+        bytes.fromhex("22334455"),
+    ]
 
 
 @pytest.mark.parametrize(
@@ -68,7 +71,7 @@ def test_what_no_message_holds_is_refused(frames, text):
     """Neither request nor reply may be longer than a PDU, and nothing is sent then."""
     link = answered(b"")
     with pytest.raises(BadRequest, match=text):
-        Feedback(link, 1).call(frames)
+        ModbusFeedback(link, 1).call(frames)
     assert link.request == b""
 
 
@@ -85,14 +88,14 @@ def test_what_no_message_holds_is_refused(frames, text):
 def test_an_answer_to_something_else_is_an_error(link, error, text):
     """Refusals keep the exception code; nothing of another answer is believed."""
     with pytest.raises(error, match=text):
-        Feedback(link, 1).read(0, 2)
+        ModbusFeedback(link, 1).read(0, 2)
 
 
 def test_nonsense_is_not_waited_for():
     """Bytes that are not Modbus are refused at once."""
     link = Link(lambda request: bytes.fromhex("0001 0700 0006 01 4c00"))
     with pytest.raises(Corrupt, match="not a Modbus TCP header"):
-        Feedback(link, 1).read(0, 2)
+        ModbusFeedback(link, 1).read(0, 2)
 
 
 @pytest.mark.parametrize(
@@ -108,5 +111,5 @@ def test_a_cut_reply_is_waited_for(received, lacking):
             return super().transact(request, missing, usual)
 
     whole = answered(bytes.fromhex("4c 00000000"))
-    Feedback(Cut(whole._answer), 1).read(0, 2)
+    ModbusFeedback(Cut(whole._answer), 1).read(0, 2)
     assert asked == [lacking]

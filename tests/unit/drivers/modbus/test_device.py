@@ -15,7 +15,7 @@ from hilctl_drivers.emulator.faults import parse_fault
 from hilctl_drivers.emulator.options import EmulatorOptions
 from hilctl_drivers.emulator.setup import Emulator, build
 from hilctl_drivers.modbus.device import ModbusDac
-from hilctl_drivers.modbus.options import ModbusOptions
+from hilctl_drivers.modbus.setup import ModbusOptions
 from hilctl_drivers.profile import load_profile, shipped_profiles
 
 T7 = {
@@ -50,7 +50,8 @@ inputs:
   IN: {address: 200, type: float32, unit: V, min: -10.0, max: 10.0}
 watchdog: none
 """
-READS = {"reader": "adam_6217", "reader_unit_id": 2, "input": "AI0"}
+READER = {"profile": "adam_6217", "unit_id": 2}
+READS = {"reader": READER, "input": "AI0"}
 RTU = {
     "output": "OUT",
     "input": "IN",
@@ -89,7 +90,7 @@ class Served:
 
     def device(self, options: dict, **changes) -> ModbusDac:
         host, _, port = self.emulator.address.partition(":")
-        where = {"host": host, "port": int(port)} if port else {"serial_port": host}
+        where = {"host": host, "tcp_port": int(port)} if port else {"serial_port": host}
         given = {**options, "timeout_s": 5.0, **where, **changes}
         return ModbusDac(ModbusOptions.model_validate(given))
 
@@ -143,11 +144,14 @@ class TestOptions:
         [
             ({"serial_port": "/dev/x"}, "either host or serial_port"),
             ({"host": None}, "either host or serial_port"),
-            ({"reader_unit_id": 2}, "reader_unit_id goes with reader"),
-            ({"reader_host": "r"}, "reader_host goes with reader"),
-            ({**READS, "reader_host": "r", "reader_serial_port": "/dev/r"}, "one of reader_host"),
-            ({**READS, "reader_tcp_port": 502}, "reader_tcp_port goes with reader_host"),
-            ({**READS, "reader_baud": 9600}, "reader_baud goes with reader_serial_port"),
+            ({"host": None, "serial_port": "/dev/x", "tcp_port": 502}, "tcp_port goes with host"),
+            ({"reader": {"unit_id": 2}}, "Field required"),
+            ({"reader": {**READER, "host": "r", "serial_port": "/dev/r"}}, "one of host and"),
+            ({"reader": {**READER, "tcp_port": 502}}, "tcp_port goes with host"),
+            ({"reader": {**READER, "baud": 9600}}, "baud goes with serial_port"),
+            ({"profile": "nothing"}, "no profile 'nothing' is shipped"),
+            ({"reader": {"profile": "nothing"}}, "no profile 'nothing' is shipped"),
+            ({"profile": 7}, "valid string"),
             ({"amplifier": {"offset_a": 1.0}}, "must have one of gain_a_per_v"),
             ({"amplifier": {"gain_a_per_v": 1.0, "gain_v_per_v": 1.0}}, "must have one of"),
             ({"amplifier": {"gain_v_per_v": 1.0, "offset_a": 1.0}}, "offset must be in the unit"),
@@ -174,7 +178,6 @@ class TestOptions:
             ({"amplifier": None}, "amplifier is required: the output is in V"),
             ({"amplifier": {"gain_a_per_ma": 1.0}}, "amplifier takes mA, but the output is in V"),
             ({"sensor": {"um_per_ma": 1.0}}, "sensor gives mA, but the input is in V"),
-            ({"profile": "nothing"}, "no profile 'nothing' is shipped"),
             ({"profile": "kepco_bop"}, "is not one of a Modbus device"),
             ({"host": None, "serial_port": "/dev/x"}, "is for Modbus tcp: give host"),
             ({"watchdog": {"timeout_s": 0.5}}, "watchdog timeout_s must be"),
@@ -183,10 +186,19 @@ class TestOptions:
             ({"timeout_s": 1e-4}, "timeout_s must be > 0.001"),
             ({"baud": 9600, "parity": "E"}, "baud, parity must be left out: LabJack T7 has no"),
             ({**READS, "input": "AI9"}, "input must be one that Advantech ADAM-6217 has"),
-            ({**READS, "reader_unit_id": None}, "can't both be unit 1 at h:502: give reader_unit"),
-            ({**READS, "reader": "kepco_bop"}, "kepco_bop is not one of a Modbus device"),
+            (
+                {"reader": {"profile": "adam_6217"}, "input": "AI0"},
+                "both be unit 1 at h:502: give reader.u",
+            ),
+            (
+                {**READS, "reader": {"profile": "kepco_bop"}},
+                "kepco_bop is not one of a Modbus device",
+            ),
             ({**READS, "output": "AI0", "profile": "adam_6217"}, "output must be one that"),
-            ({**READS, "reader_serial_port": "/dev/r"}, "adam_6217 is for Modbus tcp: give reader"),
+            (
+                {**READS, "reader": {**READER, "serial_port": "/dev/r"}},
+                "is for Modbus tcp: give reader.h",
+            ),
             (
                 {**WAGO, "watchdog": {"timeout_s": 1.0, "safe_command": 3.0}},
                 "puts AO0 at 0 V, which is 0 A here",
@@ -292,7 +304,7 @@ class TestExchange:
         served = serve("labjack_t7", lacking=frozenset({76}))
         device = served.device(T7)
         device.open(500.0, 1)
-        with pytest.raises(DeviceError, match=r"\(0, 500\] Hz with a read and a write a sample"):
+        with pytest.raises(DeviceError, match=r"\(0, 500\] Hz \(a read and a write a sample; "):
             device.open(501.0, 1)
 
     def test_output_that_can_not_be_read_is_not_tried(self, serve):
@@ -300,8 +312,8 @@ class TestExchange:
         options = {**T7, "output": "TDAC0", "amplifier": {"gain_a_per_v": 1.0}}
         served = serve("labjack_t7", output="TDAC0")
         device = served.device(options)
-        assert device.info.max_rate_hz == pytest.approx(500.0)
-        device.open(500.0, 1)
+        assert device.info.max_rate_hz == pytest.approx(1e3 / 3)  # 1 ms each and 1 ms to settle
+        device.open(333.0, 1)
         assert not device.one_transaction
         assert served.events() == []
         exchange(device, 1.0)
@@ -321,10 +333,10 @@ class TestExchange:
         """There is no FIFO, so a block is one sample."""
         served = serve("labjack_t7")
         device = served.device(T7)
-        with pytest.raises(DeviceError, match="block must be 1, got 2"):
+        with pytest.raises(DeviceError, match="block must be 1 sample, got 2"):
             device.open(100.0, 2)
         device.open(100.0, 1)
-        with pytest.raises(DeviceError, match="block must be 1 sample, got 2"):
+        with pytest.raises(DeviceError, match="block must be 1 sample, as at open, got 2"):
             device.exchange(0, np.zeros(2), np.zeros(2), np.zeros(2))
         device.close()
 
@@ -388,7 +400,7 @@ class TestExchange:
 
     def test_nobody_there(self):
         """A refused connection names the device, where it should be, and what was tried."""
-        device = made(host="127.0.0.1", port=1)
+        device = made(host="127.0.0.1", tcp_port=1)
         words = r"modbus_dac labjack_t7 at 127\.0\.0\.1:1: can't connect: .* \(to open\)"
         with pytest.raises(DeviceError, match=words):
             device.open(100.0, 1)

@@ -14,19 +14,21 @@ from hilctl_drivers.emulator.faults import parse_fault
 from hilctl_drivers.emulator.options import EmulatorOptions
 from hilctl_drivers.emulator.setup import Emulator, build
 from hilctl_drivers.modbus.device import ModbusDac
-from hilctl_drivers.modbus.options import ModbusOptions
+from hilctl_drivers.modbus.setup import ModbusOptions
 
 PAIR = {
     "profile": "icp_m7024",
     "serial_port": "/dev/x",
     "output": "AO0",
     "input": "AI0",
-    "reader": "icp_m7017",
-    "reader_unit_id": 2,
+    "reader": {"profile": "icp_m7017", "unit_id": 2},
     "amplifier": {"gain_a_per_v": 1.0},
     "sensor": {"um_per_v": 12.5},
     "watchdog": "none",
 }
+READS = PAIR["reader"]
+SETTLE_S = 0.01
+"""Of an M-7024's output."""
 READER = """\
 vendor: nobody
 model: a reader that is told when it is no longer needed
@@ -146,24 +148,40 @@ class TestPlaces:
         assert served.events()[-1]["current_a"] == pytest.approx(0.0, abs=5e-3)
 
     def test_rate_counts_both(self):
-        """One read and one write at 9600 8N1: 31 characters, 4 gaps and two turnarounds."""
+        """One read and one write at 9600 8N1: 31 characters, 4 gaps, two turnarounds, settling."""
         info = made().info
-        total_s = 31 * 10 / 9600 + 4 * 3.5 * 10 / 9600 + 2 * 0.002
+        total_s = 31 * 10 / 9600 + 4 * 3.5 * 10 / 9600 + 2 * 0.002 + SETTLE_S
         assert info.max_rate_hz == pytest.approx(1.0 / total_s)
         assert "FC04 at 9600 8N1, then FC06 at 9600 8N1" in info.rate_note
 
     def test_baud_of_a_shared_line_is_that_of_both(self):
-        """The reader's own profile has another; a faster line leaves the slower device's limit."""
-        info = made(baud=115200).info
-        assert info.max_rate_hz == 60.0
-        assert info.rate_note.startswith("profile icp_m7017 says so; the wire alone: FC04 at 1152")
+        """The reader's own profile has another."""
+        assert made(baud=115200).info.rate_note.startswith(
+            "FC04 at 115200 8N1, then FC06 at 115200"
+        )
+
+    def test_slower_device_limits_a_faster_wire(self):
+        """Where the wire could do more, the note says whose limit it is."""
+        pair = {"profile": "adam_4024", "reader": {"profile": "adam_4117", "unit_id": 2}}
+        slow = made(**pair, baud=115200).info
+        assert slow.rate_note.startswith("profile adam_4024 says so; the wire alone: FC03 at 1152")
+
+    def test_baud_that_nobody_can_be_set_to_is_refused(self, tmp_path, reader):
+        """Both must keep the baud of their line; where a profile knows none, any will do."""
+        known = tmp_path / "known.yaml"
+        known.write_text(READER.replace("baud: 115200", "baud: 115200, bauds: [57600]"))
+        with pytest.raises(InputError, match=r"baud must be .*nobody.*57600, 115200, got 96"):
+            made(reader={"profile": str(known), "unit_id": 2}, input="IN")
+        made(reader={"profile": reader, "unit_id": 2}, input="IN")
+        with pytest.raises(InputError, match=r"baud must be .*M-7024.*, got 14400"):
+            made(baud=14400)
 
     def test_two_lines_are_silent_at_the_same_time(self):
         """With a line each, only the silence before the two replies counts."""
-        info = made(reader_serial_port="/dev/y").info
-        total_s = 31 * 10 / 9600 + 2 * 3.5 * 10 / 9600 + 2 * 0.002
+        info = made(reader={**READS, "serial_port": "/dev/y"}).info
+        total_s = 31 * 10 / 9600 + 2 * 3.5 * 10 / 9600 + 2 * 0.002 + SETTLE_S
         assert info.max_rate_hz == pytest.approx(1.0 / total_s)
-        faster = made(reader_serial_port="/dev/y", reader_baud=115200).info
+        faster = made(reader={**READS, "serial_port": "/dev/y", "baud": 115200}).info
         assert faster.rate_note.startswith("FC04 at 115200 8N1, then FC06 at 9600 8N1")
 
     def test_a_place_named_twice_is_one_line(self, tmp_path):
@@ -171,10 +189,10 @@ class TestPlaces:
         (tmp_path / "port").touch()
         (tmp_path / "by-id").symlink_to(tmp_path / "port")
         ours = {"serial_port": str(tmp_path / "port")}
-        theirs = {"reader_serial_port": str(tmp_path / "by-id")}
-        assert made(**ours, **theirs).info.holds == (f"serial:{tmp_path / 'port'}",)
+        theirs = {**READS, "serial_port": str(tmp_path / "by-id")}
+        assert made(**ours, reader=theirs).info.holds == (f"serial:{tmp_path / 'port'}",)
         with pytest.raises(InputError, match="can't both be unit 1"):
-            made(**ours, **theirs, reader_unit_id=1)
+            made(**ours, reader={**theirs, "unit_id": 1})
 
     def test_what_it_is_is_kept(self):
         """Description and details name both devices, and where the reader's registers are from."""
@@ -190,7 +208,7 @@ class TestPlaces:
     def test_an_input_that_measures_the_output_is_no_sensor(self, reader):
         """What a supply says of itself is not what the sensor says."""
         with pytest.raises(InputError, match=r"OWN .* measures the device's own output"):
-            made(reader=reader, input="OWN")
+            made(reader={"profile": reader, "unit_id": 2}, input="OWN")
 
 
 class TestReader:
@@ -282,7 +300,7 @@ class TestReader:
         served = serve("adam_6224", "adam_6217")
         said = r"reader adam_6217, unit 1 at 127\.0\.0\.1:1: can't connect: .* \(to open\)"
         with pytest.raises(DeviceError, match=said):
-            served.device(reader_tcp_port=1).open(5.0, 1)
+            served.device(reader={**served.emulator.options["reader"], "tcp_port": 1}).open(5.0, 1)
         assert served.events() == []
 
 

@@ -14,7 +14,7 @@ from hilctl_drivers.emulator.options import EmulatorOptions
 from hilctl_drivers.emulator.setup import emulated
 from hilctl_drivers.profile import shipped_profiles
 from hilctl_drivers.serial.device import SerialDac
-from hilctl_drivers.serial.options import SerialOptions
+from hilctl_drivers.serial.setup import SerialOptions
 
 DCON = (Path(__file__).parents[3] / "data" / "dcon_module.yaml").read_text()
 KINDS = ["dcon", "scpi", "cobs", "length"]
@@ -130,7 +130,7 @@ def test_bad_commands_are_refused_and_nothing_is_sent(rig, kind, bad):
     """Nothing reaches the device, and the next good command does."""
     bench = rig(kind)
     bench.open()
-    with pytest.raises(DeviceError, match=r"serial_dac .*: command\[0\] must be in .*nothing was"):
+    with pytest.raises(DeviceError, match=r"serial_dac .*: command must be in .*nothing was"):
         bench.exchange(bad)
     with pytest.raises(DeviceError, match="nothing was sent"):
         bench.device.make_safe(bad)
@@ -256,7 +256,7 @@ def test_the_output_is_measured_where_that_is_asked_for(rig, profile, current_a)
     bench = rig(profile, reader="agilent_34970a", own_line=True, measure="current")
     info = bench.device.info
     assert (quick.measures_command, info.measures_command) == (False, True)
-    assert "measuring current" in info.rate_note
+    assert "to measure current" in info.rate_note
     assert info.max_rate_hz < quick.max_rate_hz
     bench.device.open(10.0, 1)
     displacement_um, measured = np.full(1, np.nan), np.full(1, np.nan)
@@ -339,15 +339,14 @@ def test_impossible_rates_and_blocks_are_refused(rig):
     [
         ({"output": "AO9"}, "output must be one that nobody DCON"),
         ({"input": "AI9"}, "input must be one that nobody DCON"),
-        ({"profile": "labjack_t7"}, "use modbus_dac"),
+        ({"profile": "labjack_t7"}, "one for kind: modbus_dac"),
         ({"profile": "kepco_bop", "output": "current", "input": "current"}, "as reader"),
-        ({"reader_address": 3}, "go with reader"),
         ({"measure": "AI0"}, "measure must be an input of nobody .* measures its own output"),
         ({"profile": "cobs_board", "output": "DAC", "input": "ADC", "measure": "ADC"}, "lines of"),
         ({"watchdog": {"timeout_s": 100.0}}, "timeout_s must be 0.1 to 25.5"),
         ({"watchdog": {"timeout_s": 1.0, "safe_command": 11.0}}, "safe_command must be -10 to 10"),
         ({"sensor": {"um_per_ma": 1.0}}, "the input is in V"),
-        ({"reader": "icp_m7024_dcon"}, "can't share the line"),
+        ({"reader": {"profile": "agilent_34970a"}, "input": "AI101"}, "can't share the line"),
     ],
 )
 def test_options_that_do_not_go_together_are_refused(profiles, changes, text):

@@ -13,8 +13,8 @@ import pytest
 
 from hilctl.base.errors import DeviceError
 from hilctl_drivers.wire.links import LostError, NoAnswerError
-from hilctl_drivers.wire.serial_port import SerialLink, SerialSettings
-from hilctl_drivers.wire.tcp import TcpLink
+from hilctl_drivers.wire.serial_port import SerialLink, SerialSettings, held_port
+from hilctl_drivers.wire.tcp import TcpLink, held_address
 
 QUICK_S = 0.05
 PATIENT_S = 5.0
@@ -352,3 +352,24 @@ def test_serial_chatter_does_not_hang(line):
     with pytest.raises(DeviceError, match="does not get quiet"):
         link.transact(b"ask", missing)
     link.close()
+
+
+@pytest.mark.parametrize(
+    ("host", "held"),
+    [
+        ("10.0.0.5", "tcp:10.0.0.5:502"),
+        ("localhost", "tcp:127.0.0.1:502"),
+        ("DAC.lab", "tcp:dac.lab:502"),
+        ("fe80:0:0::0001", "tcp:[fe80::1]:502"),
+    ],
+)
+def test_addresses_have_one_name(host, held):
+    """Numbers in their shortest form; names as they are, for asking takes time."""
+    assert held_address(host, 502) == held
+
+
+def test_ports_have_one_name(tmp_path):
+    """A link under /dev/serial/by-id is the port that it leads to."""
+    (tmp_path / "ttyUSB0").touch()
+    (tmp_path / "usb-adapter").symlink_to("ttyUSB0")
+    assert held_port(str(tmp_path / "usb-adapter")) == f"serial:{tmp_path.resolve()}/ttyUSB0"

@@ -12,7 +12,6 @@ from collections.abc import Iterator
 import pytest
 
 from hilctl.base.errors import InputError
-from hilctl_drivers.device import line_settings
 from hilctl_drivers.profile import load_profile, with_link
 from hilctl_drivers.wire import serial_port as serial_link
 from hilctl_drivers.wire.links import NoAnswerError
@@ -160,11 +159,11 @@ def test_long_replies_are_put_together(line):
 def test_profiles_say_how_their_line_is_set():
     """Levels and flow control get from the profile to the port."""
     profile = with_link(load_profile("kepco_bop"), flow="xonxoff", dtr=True, rts=False)
-    settings = line_settings(profile.link)
+    settings = profile.link.settings
     assert (settings.flow, settings.dtr, settings.rts) == ("xonxoff", True, False)
-    settings = line_settings(load_profile("icp_m7024").link)
+    settings = load_profile("icp_m7024").link.settings
     assert (settings.flow, settings.dtr, settings.rts) == ("none", None, None)
-    assert line_settings(load_profile("cobs_board").link).dtr is True
+    assert load_profile("cobs_board").link.settings.dtr is True
 
 
 @pytest.mark.parametrize("name", ["icp_m7024", "cobs_board"])

@@ -20,7 +20,7 @@ from hilctl_drivers.emulator.options import EmulatorOptions
 from hilctl_drivers.emulator.setup import emulated
 from hilctl_drivers.profile import shipped_profiles
 from hilctl_drivers.serial.device import SerialDac
-from hilctl_drivers.serial.options import SerialOptions
+from hilctl_drivers.serial.setup import SerialOptions
 from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
 from tests.fakes import FakeHost
 
@@ -221,8 +221,8 @@ def test_samples_follow_one_another(board):
     [
         (RATE_HZ, 513, {}, "block must be 1 to 512 samples, got 513"),
         (RATE_HZ, 500, {"fifo_blocks": 16}, "must fit into the FIFO, 8192 .*at most 15 with this"),
-        (50.0, 10, {}, "sample rate must be >= 100 Hz, got 50"),
-        (200_000.0, 500, {}, r"sample rate must be in \(0, 100000\] Hz"),
+        (50.0, 10, {}, r"sample rate must be in \[100, .*got 50"),
+        (200_000.0, 500, {}, r"sample rate must be in \[100, 100000\] Hz"),
         (RATE_HZ, 500, {"watchdog": {"timeout_s": 0.1}}, "3 exchanges must come within"),
     ],
 )

@@ -1,14 +1,50 @@
-"""How long an exchange takes on the wire."""
-
-import dataclasses
+"""How long an exchange over Modbus takes, and feeding a strict watchdog."""
 
 import pytest
 
-from hilctl_drivers.modbus.pdu import reply_size, rtu_adu, write_pdu
-from hilctl_drivers.profile import Profile, load_profile, parse_profile, with_link
-from hilctl_drivers.wire.framing import binary_framing
-from hilctl_drivers.wire_time import WireTime, exchange_time
+from hilctl_drivers.modbus.pdu import (
+    coil_pdu,
+    read_pdu,
+    reply_size,
+    rtu_adu,
+    write_pdu,
+    write_single_pdu,
+)
+from hilctl_drivers.modbus.profile import ModbusProfile
+from hilctl_drivers.modbus.setup import ModbusOptions, ModbusSetup
+from hilctl_drivers.modbus.timing import exchange_time, feed_time
+from hilctl_drivers.profile import load_profile, parse_profile, with_link
+from hilctl_drivers.wire.timing import WireTime
 
+CHAR_S = 10 / 9600
+GAP_S = 3.5 * CHAR_S
+PROFILE = """\
+vendor: Acme
+model: DAQ-1
+source: [manual]
+verified: "yes"
+link: {kind: rtu, baud: 9600}
+address_base: 0
+exchange: none
+turnaround_s: 0.002
+max_rate_hz: 10000.0
+outputs:
+  AO: {address: 0, type: float32, unit: V, min: -10.0, max: 10.0}
+inputs:
+  AI: {address: 4, type: float32, unit: V, min: -10.0, max: 10.0}
+watchdog:
+  unit_s: 0.1
+  min_s: 0.1
+  max_s: 25.5
+  kick: strict
+  on_trip: zero
+  refuses_while_tripped: false
+  arm:
+    - {kind: write, address: 100, type: uint16, value: timeout}
+  feed:
+    - FEED
+"""
+FEED = "{kind: write, address: 101, type: uint16, value: 1}"
 RTU = """\
 vendor: Acme
 model: DAQ-1
@@ -37,7 +73,7 @@ TABLE_MS = {
 TABLE_HZ = {"gaps": (29.0, 53.0, 174.0, 264.0), "none": (37.0, 67.0, 443.0, 3545.0)}
 
 
-def rtu(baud: int = 115200, parity: str = "N", **link: object) -> Profile:
+def rtu(baud: int = 115200, parity: str = "N", **link: object) -> ModbusProfile:
     """Return a Modbus RTU device on a line."""
     return with_link(parse_profile(RTU, "acme.yaml"), baud=baud, parity=parity, **link)
 
@@ -45,6 +81,12 @@ def rtu(baud: int = 115200, parity: str = "N", **link: object) -> Profile:
 def wire_s(time: WireTime) -> float:
     """Return the time of the characters alone."""
     return time.request_s + time.reply_s
+
+
+def acme(feed=FEED, link="{kind: rtu, baud: 9600}"):
+    """Return a Modbus device that is fed by these steps."""
+    text = PROFILE.replace("FEED", feed).replace("{kind: rtu, baud: 9600}", link)
+    return parse_profile(text, "acme.yaml")
 
 
 class TestRtu:
@@ -133,88 +175,94 @@ class TestTcp:
         time = exchange_time(profile, "DAC0", "AIN0", one_transaction=False)
         assert time.highest_rate_hz == pytest.approx(500.0)
 
+    def test_settling(self) -> None:
+        """An LJTick-DAC takes a millisecond to settle: its samples can't come any closer."""
+        profile = load_profile("labjack_t7")
+        time = exchange_time(profile, "TDAC0", "AIN0", one_transaction=False)
+        assert time.answered_s == pytest.approx(2e-3)
+        assert time.total_s == pytest.approx(3e-3)
+        assert str(time).endswith("turnaround 2.00 ms, settling 1.00 ms -> at most 333 Hz")
+
     def test_no_time_at_all(self) -> None:
         """A device without turnaround on TCP has no limit that can be worked out."""
         profile = load_profile("labjack_t7").model_copy(update={"turnaround_s": 0.0})
         assert exchange_time(profile, "DAC0", "AIN0").highest_rate_hz == float("inf")
 
 
-class TestText:
-    """Lines of text."""
-
-    def test_dcon(self) -> None:
-        """#010+05.000 and > with their carriage returns are 14 characters."""
-        profile = load_profile("icp_m7024_dcon")
-        time = exchange_time(profile, "AO0", None)
-        assert wire_s(time) == pytest.approx(14 * 10 / 9600)
-        assert wire_s(exchange_time(with_link(profile, checksum="dcon"), "AO0", None)) == (
-            pytest.approx(18 * 10 / 9600)
-        )
-
-    def test_gap(self) -> None:
-        """TDK-Lambda's 5 ms come once a line."""
-        time = exchange_time(load_profile("tdk_lambda_gen"), "current", "current")
-        assert (time.gaps, time.gaps_s) == (2, 0.01)
-        assert time.request_s == pytest.approx((13 + 7) * 10 / 9600)  # PC 38.000$XX, MC?$XX
-        assert time.reply_s == pytest.approx((6 + 10) * 10 / 9600)  # OK$XX, 05.003$XX
-
-    def test_one_line(self) -> None:
-        """A line that sets and asks saves the second one."""
-        profile = load_profile("kepco_bop")
-        one = exchange_time(profile, "current", "current")
-        two = exchange_time(profile, "current", "current", one_transaction=False)
-        assert one.what == "1 line at 19200 8N1"
-        assert two.what == "2 lines at 19200 8N1"
-        assert two.turnaround_s == one.turnaround_s  # a CURR of its own is not answered
-        line = "CURR -12.000000;:MEAS:CURR?\n"
-        assert one.request_s == pytest.approx(len(line) * 10 / 19200)
+def requests_s(*pdus):
+    """Return what requests and replies take at 9600 baud, gaps and turnaround included."""
+    characters = sum(len(rtu_adu(1, pdu)) + reply_size(pdu) + 3 for pdu in pdus)
+    return characters * CHAR_S + len(pdus) * (2 * GAP_S + 0.002)
 
 
-class TestBoards:
-    """Binary frames."""
-
-    def test_serial(self) -> None:
-        """On a real serial line each byte counts, COBS overhead and CRC too."""
-        profile = with_link(load_profile("cobs_board"), usb=False)
-        framing = binary_framing("cobs", "crc16_ccitt_false")
-        request, reply = 1 + 1 + 2 + 4, 1 + 1 + 1 + 2 + 4 + 2 + 2
-        time = exchange_time(profile, "DAC", "ADC")
-        assert time.request_s == pytest.approx(framing.wire_size(request) * 10 / 115200)
-        assert time.reply_s == pytest.approx(framing.wire_size(reply) * 10 / 115200)
-        assert time.gaps_s == 0.0
-
-    def test_usb(self) -> None:
-        """Over USB the frame counts, not the baud."""
-        slow = load_profile("cobs_board")
-        fast = with_link(slow, usb_frame_s=125e-6)
-        assert exchange_time(slow, "DAC", "ADC").gaps_s == 1e-3
-        assert exchange_time(fast, "DAC", "ADC").gaps_s == 125e-6
-        assert exchange_time(with_link(slow, baud=9600), "DAC", "ADC") == (
-            exchange_time(slow, "DAC", "ADC")
-        )
-
-    def test_block(self) -> None:
-        """A stream of blocks carries more samples in the time of one frame."""
-        profile = load_profile("cobs_board_fifo")
-        one, many = (exchange_time(profile, "DAC", "ADC", block=block) for block in (1, 100))
-        assert many.samples == 100
-        assert many.highest_rate_hz > 50 * one.highest_rate_hz
-        assert many.highest_rate_hz > 50e3
+READ, WRITE = read_pdu(3, 101, 1), write_single_pdu(101, bytes(2))
 
 
-class TestSum:
-    """Exchanges one after the other."""
+@pytest.mark.parametrize(
+    ("feed", "seconds"),
+    [
+        (FEED, requests_s(WRITE)),
+        (FEED.replace("}", ", verify: true}"), requests_s(WRITE, READ)),
+        (FEED.replace("write", "ensure"), requests_s(READ, WRITE, READ)),
+        (FEED.replace("write", "expect"), requests_s(READ)),
+        ("{kind: wait, seconds: 0.25}", 0.25),
+        (f"{FEED}\n    - {{kind: wait, seconds: 0.25}}", requests_s(WRITE) + 0.25),
+        (
+            "{kind: write, area: coil, address: 7, type: bit, value: 1}",
+            requests_s(coil_pdu(7, True)),
+        ),
+    ],
+)
+def test_each_kind_of_step_counts_with_all_that_it_may_send(feed, seconds):
+    """A step that writes only what differs counts as if it did."""
+    assert feed_time(acme(feed)).total_s == pytest.approx(seconds)
 
-    def test_then(self) -> None:
-        """All parts add up, for the samples of the first."""
-        first = WireTime("A", 1.0, 2.0, 1, 3.0, 4.0, samples=10)
-        both = first.then(WireTime("B", 0.1, 0.2, 2, 0.3, 0.4))
-        assert both.what == "A, then B"
-        assert both.total_s == pytest.approx(11.0)
-        assert (both.gaps, both.samples) == (3, 10)
 
-    def test_frozen(self) -> None:
-        """A worked-out time can't be changed by accident."""
-        time = exchange_time(rtu(), "AO", "AI")
-        with pytest.raises(dataclasses.FrozenInstanceError):
-            time.gaps_s = 0.0  # type: ignore[misc]
+def test_over_tcp_the_turnaround_counts():
+    """There are no characters to wait for, but the device takes its time."""
+    assert feed_time(acme(link="{kind: tcp}")).total_s == pytest.approx(0.002)
+
+
+@pytest.mark.parametrize("name", ["labjack_t7", "wago_750", "adam_6024"])
+def test_watchdogs_that_exchanges_feed_cost_nothing(name):
+    """Nor do devices without one."""
+    assert feed_time(load_profile(name)) is None
+
+
+def test_a_tick_that_feeds_must_fit():
+    """The rate that is left is that of an exchange and a feeding, one after the other."""
+    profile = acme()
+    exchange = exchange_time(profile, "AO", "AI")
+    both = exchange.then(feed_time(profile))
+    assert both.total_s == pytest.approx(exchange.total_s + requests_s(WRITE))
+    assert (both.gaps, both.samples) == (6, 1)
+    assert str(both).startswith(
+        "FC03+FC16 at 9600 8N1, then FC06 at 9600 8N1 to feed the watchdog: request "
+    )
+
+
+def modbus_rate(path, watchdog):
+    """Return the highest rate and its reason that modbus_dac gives for a profile."""
+    options = {
+        "profile": str(path),
+        "serial_port": "/dev/ttyUSB0",
+        "output": "AO",
+        "input": "AI",
+        "amplifier": {"gain_a_per_v": 1.0},
+        "sensor": {"um_per_v": 10.0},
+        "timeout_s": 1.0,
+        "watchdog": watchdog,
+    }
+    info = ModbusSetup.of(ModbusOptions.model_validate(options)).info()
+    return info.max_rate_hz, info.rate_note
+
+
+def test_modbus_dac_leaves_room_for_feeding(tmp_path):
+    """Only where the experiment uses the watchdog."""
+    path = tmp_path / "acme.yaml"
+    path.write_text(PROFILE.replace("FEED", FEED))
+    exchange = exchange_time(acme(), "AO", "AI")
+    assert modbus_rate(path, "none")[0] == pytest.approx(exchange.highest_rate_hz)
+    rate_hz, note = modbus_rate(path, {"timeout_s": 1.0})
+    assert rate_hz == pytest.approx(1.0 / (exchange.total_s + requests_s(WRITE)))
+    assert "to feed the watchdog" in note

@@ -1,33 +1,37 @@
-"""What Modbus and serial devices share: watchdogs that can't do what is asked, ports in use."""
+"""Watchdogs that can't do what is asked of them, and channels that can't be wired so."""
 
 from typing import Any
 
 import pytest
 
 from hilctl.base.errors import InputError
-from hilctl_drivers.device import (
-    HostWatchdog,
-    channel,
-    check_senses,
-    check_watchdog,
-    held_address,
-    held_port,
-    line_settings,
-)
 from hilctl_drivers.profile import load_profile
 from hilctl_drivers.profile_parts import Range, Watchdog
-from hilctl_drivers.text.profile import AsciiProfile, AsciiWatchdog
-from hilctl_drivers.wiring import Amplifier, Sensor, SignalChain
+from hilctl_drivers.text.profile import AsciiWatchdog
+from hilctl_drivers.wiring import (
+    DacOptions,
+    SignalChain,
+    channel,
+    check_watchdog,
+)
 
 VOLTS = Range(unit="V", min=-10.0, max=10.0)
 
 
 def asked(has: Watchdog | str, offset_a: float = 0.0, **wanted: float) -> None:
     """Hold a wanted watchdog against what a device has, on output B."""
-    amplifier = Amplifier(gain_a_per_v=2.0, offset_a=offset_a)
-    chain = SignalChain(VOLTS, VOLTS, amplifier, Sensor(um_per_v=1.0))
-    want = HostWatchdog.model_validate({"timeout_s": 1.0, **wanted})
-    check_watchdog("Acme", "B", VOLTS, chain, want, has)
+    options = DacOptions.model_validate(
+        {
+            "profile": "generic_float32",
+            "output": "B",
+            "input": "I",
+            "amplifier": {"gain_a_per_v": 2.0, "offset_a": offset_a},
+            "sensor": {"um_per_v": 1.0},
+            "watchdog": {"timeout_s": 1.0, **wanted},
+        }
+    )
+    chain = SignalChain(VOLTS, VOLTS, options.amplifier, options.sensor)
+    check_watchdog("Acme", options, VOLTS, chain, has)
 
 
 def watchdog(**changes: Any) -> AsciiWatchdog:
@@ -63,32 +67,12 @@ def test_watchdog_that_does_is_taken(has):
     asked(has)
 
 
-@pytest.mark.parametrize(
-    ("host", "held"),
-    [
-        ("10.0.0.5", "tcp:10.0.0.5:502"),
-        ("localhost", "tcp:127.0.0.1:502"),
-        ("DAC.lab", "tcp:dac.lab:502"),
-        ("fe80:0:0::0001", "tcp:[fe80::1]:502"),
-    ],
-)
-def test_addresses_have_one_name(host, held):
-    """Numbers in their shortest form; names as they are, for asking takes time."""
-    assert held_address(host, 502) == held
-
-
-def test_ports_have_one_name(tmp_path):
-    """A link under /dev/serial/by-id is the port that it leads to."""
-    (tmp_path / "ttyUSB0").touch()
-    (tmp_path / "usb-adapter").symlink_to("ttyUSB0")
-    assert held_port(str(tmp_path / "usb-adapter")) == f"serial:{tmp_path.resolve()}/ttyUSB0"
-
-
 def test_channels_are_found_by_name():
     """An unknown name lists those that there are; none is said where there are none."""
-    assert channel("input", "A", {"A": 1, "B": 2}, "Acme") == 1
+    assert channel("input", "A", {"A": VOLTS}, "Acme") is VOLTS
+    two = {"A": VOLTS, "B": VOLTS}
     with pytest.raises(InputError, match=r"must be one that Acme has, got 'C' \(it has A, B\)"):
-        channel("input", "C", {"A": 1, "B": 2}, "Acme")
+        channel("input", "C", two, "Acme")
     with pytest.raises(InputError, match=r"\(it has none\)"):
         channel("input", "C", {}, "Acme")
 
@@ -96,14 +80,5 @@ def test_channels_are_found_by_name():
 def test_input_of_its_own_output_is_no_sensor():
     """A supply's own meter can't be the displacement sensor."""
     supply = load_profile("kepco_bop")
-    assert isinstance(supply, AsciiProfile)
     with pytest.raises(InputError, match="name the device that reads the sensor as reader"):
-        check_senses("current", next(iter(supply.inputs.values())), supply.title)
-
-
-def test_lines_are_set_as_their_profiles_say():
-    """Baud, characters, silence and levels; a line of text keeps its gap between commands."""
-    settings = line_settings(load_profile("tdk_lambda_gen").link)
-    assert (settings.baud, settings.parity, settings.gap_s) == (9600, "N", 0.005)
-    assert line_settings(load_profile("adam_4024").link).gap_s == pytest.approx(35 / 9600)
-    assert line_settings(load_profile("cobs_board").link).dtr is True
+        channel("input", "current", supply.inputs, supply.title)

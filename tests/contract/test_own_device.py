@@ -1,0 +1,105 @@
+"""A device in a package of its own: installed, listed and run, with the public names alone."""
+
+import ast
+import json
+import os
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from hilctl.analysis.replay import replay
+from hilctl.recording.reader import read
+
+SOURCE = Path(__file__).parents[1] / "data" / "own_device"
+PUBLIC = {"Device", "DeviceError", "DeviceInfo", "DeviceOptions"}
+EXPERIMENT = {
+    "name": "own_device",
+    "device": {"kind": "spring", "um_per_a": 20.0},
+    "sample_rate_hz": 200,
+    "waveform": {"kind": "sine", "unit": "A", "amplitude": 2.0, "frequency_hz": 4.0,
+                 "duration_s": 0.5, "soft_start_s": 0.1},
+    "compensator": "none",
+    "limits": {"peak_current_a": 3.0, "slew_a_per_s": 500.0, "stroke_um": [-90.0, 90.0]},
+    "safe": {"value": 0.0, "ramp_s": 0.1},
+}  # fmt: skip
+
+
+@pytest.fixture
+def installed(tmp_path) -> dict[str, str]:
+    """The environment of a computer on which the package is installed.
+
+    What an installer would unpack and write, from the package's own project file: building it would
+    need a network.
+    """
+    project = tomllib.loads((SOURCE / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    site = tmp_path / "site"
+    facts = site / f"{project['name'].replace('-', '_')}-{project['version']}.dist-info"
+    facts.mkdir(parents=True)
+    (site / "own_device").symlink_to(SOURCE / "own_device")
+    name, version = project["name"], project["version"]
+    (facts / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n")
+    lines = [
+        f"[{group}]\n" + "".join(f"{key} = {value}\n" for key, value in points.items())
+        for group, points in project["entry-points"].items()
+    ]
+    (facts / "entry_points.txt").write_text("\n".join(lines))
+    before = os.environ.get("PYTHONPATH", "")
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, (str(site), before)))}
+
+
+def hilctl(environment: dict[str, str], *words: object) -> subprocess.CompletedProcess[str]:
+    """Run a command of hilctl to its end."""
+    command = [sys.executable, "-m", "hilctl.cli", *map(str, words)]
+    return subprocess.run(command, capture_output=True, text=True, env=environment)
+
+
+def experiment(folder: Path, **device: object) -> Path:
+    """Write an experiment with the device."""
+    path = folder / "own.yaml"
+    changed = {**EXPERIMENT, "device": {**EXPERIMENT["device"], **device}}
+    path.write_text(yaml.safe_dump(changed), encoding="utf-8")
+    return path
+
+
+def test_is_listed(installed):
+    """Beside the built-in ones, by the name of its entry point."""
+    devices = json.loads(hilctl(installed, "devices", "--json").stdout)["devices"]
+    assert devices["spring"] == "own_device.spring:Spring"
+
+
+def test_is_run(installed, tmp_path):
+    """A whole run in hilctl's own processes, recorded and replayed."""
+    output = tmp_path / "own.mcap"
+    done = hilctl(installed, "run", experiment(tmp_path), "--output", output, "--json")
+    assert done.returncode == 0, done.stderr
+    recording = read(output)
+    assert (recording.run["device"], recording.run["simulated"]) == ("spring", "true")
+    assert recording.run["device.um_per_a"] == "20"
+    assert np.abs(recording.samples.displacement_um).max() == pytest.approx(40.0, rel=0.05)
+    assert replay(recording).identical
+
+
+def test_its_options_are_checked_like_any_other(installed, tmp_path):
+    """With file and line, and nothing moved."""
+    done = hilctl(installed, "check", experiment(tmp_path, um_per_a=-1.0, um_per_b=2.0))
+    assert done.returncode == 2
+    assert "device.um_per_a: must be > 0.0, got -1.0" in done.stderr
+    assert "device.um_per_b: unknown key (did you mean 'um_per_a'?)" in done.stderr
+    assert "own.yaml:" in done.stderr
+
+
+def test_it_needs_the_public_names_only():
+    """So does any other device: the example imports no more of hilctl."""
+    found = set()
+    for path in (SOURCE / "own_device").glob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("hilctl"):
+                found |= {f"{node.module}.{each.name}" for each in node.names}
+            elif isinstance(node, ast.Import):
+                assert not any(each.name.startswith("hilctl") for each in node.names)
+    assert found == {f"hilctl.base.{name}" for name in PUBLIC}

@@ -1,0 +1,1 @@
+"""A device of one's own for hilctl, as an example."""
