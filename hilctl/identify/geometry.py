@@ -1,10 +1,12 @@
 """Figures of a loop: its area, its peak hysteresis, and the published weighting by it."""
 
+from typing import Literal
+
 import numpy as np
 
 from hilctl.base.arrays import F64
 from hilctl.base.errors import DataError
-from hilctl.identify.data import Loop, Records
+from hilctl.identify.data.records import Records, SteadyLoop
 
 REVERSAL = 1e-3  # change against the branch's direction that is still noise, of the peak-to-peak
 
@@ -17,7 +19,7 @@ def loop_area(command: F64, displacement_um: F64) -> float:
     )
 
 
-def peak_hysteresis_percent(loop: Loop) -> float:
+def peak_hysteresis_percent(loop: SteadyLoop) -> float:
     """Return the largest width of a loop at one command, in percent of its peak-to-peak output.
 
     Raises:
@@ -46,6 +48,20 @@ def peak_hysteresis_percent(loop: Loop) -> float:
     return 100.0 * width / float(np.ptp(loop.displacement_um))
 
 
+def weight_roots(data: Records, weight_by: Literal["equal", "hysteresis"]) -> F64:
+    """Return the square root of each judged sample's weight: float64[N].
+
+    Raises:
+        DataError: See :func:`hysteresis_weights`.
+    """
+    sizes = [
+        record.command.size - (0 if isinstance(record, SteadyLoop) else record.ignore)
+        for record in data
+    ]
+    weights = np.ones(len(sizes)) if weight_by == "equal" else hysteresis_weights(data)
+    return np.repeat(np.sqrt(weights), sizes)
+
+
 def hysteresis_weights(data: Records) -> F64:
     """Return the published weight A of each record's squared errors (5.14).
 
@@ -58,7 +74,7 @@ def hysteresis_weights(data: Records) -> F64:
     Raises:
         DataError: A record is not a loop, or see :func:`peak_hysteresis_percent`.
     """
-    loops = [record for record in data if isinstance(record, Loop)]
+    loops = [record for record in data if isinstance(record, SteadyLoop)]
     if len(loops) < len(data):
         raise DataError(
             "weights by hysteresis need steady loops, and there is a whole time history among the "

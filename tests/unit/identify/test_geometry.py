@@ -1,4 +1,4 @@
-"""Loop figures against shapes whose figures are known."""
+"""SteadyLoop figures against shapes whose figures are known."""
 
 from dataclasses import replace
 
@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 from hilctl.base.errors import DataError
-from hilctl.identify.data import History, Loop
+from hilctl.identify.data.records import History, SteadyLoop
 from hilctl.identify.geometry import hysteresis_weights, loop_area, peak_hysteresis_percent
 
 TURN = 2.0 * np.pi * np.arange(400) / 400
 
 
-def ellipse(lag: float, *, frequency_hz: float = 1.0, amplitude: float = 2.0) -> Loop:
+def ellipse(lag: float, *, frequency_hz: float = 1.0, amplitude: float = 2.0) -> SteadyLoop:
     """Return y = 10 sin(t - lag) over v = amplitude sin t."""
-    return Loop(
+    return SteadyLoop(
         f"{frequency_hz:g} Hz", amplitude * np.sin(TURN), 10.0 * np.sin(TURN - lag), frequency_hz
     )
 
@@ -41,7 +41,7 @@ def test_peak_hysteresis_of_an_ellipse(start: int) -> None:
 
 def test_peak_hysteresis_needs_two_branches() -> None:
     """A command with minor loops has more than two branches and is refused."""
-    loop = Loop("two tones", np.sin(TURN) + np.sin(3.0 * TURN), np.sin(TURN), 1.0)
+    loop = SteadyLoop("two tones", np.sin(TURN) + np.sin(3.0 * TURN), np.sin(TURN), 1.0)
     with pytest.raises(DataError, match=r"two tones: .* one maximum and one minimum"):
         peak_hysteresis_percent(loop)
 

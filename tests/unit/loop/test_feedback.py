@@ -25,7 +25,7 @@ from hilctl.loop.feedback import (
     rate_needed_hz,
 )
 from hilctl.loop.in_flight import DelayLine
-from hilctl.models.ppi import PpiModel
+from hilctl.models.plays import PpiModel
 from hilctl.models.staged import FieldLag, StagedModel, Structure
 
 RATE_HZ = 5000.0
