@@ -16,8 +16,8 @@ from hilctl.cli.options import (
 )
 
 IdentifyInput = Annotated[list[Path], typer.Argument(help="Recordings (MCAP) or text tables.")]
-Unit = Annotated[str | None, typer.Option(help="Unit of a table's command, A or V.")]
-Column = Annotated[str | None, typer.Option(help="Column of a table: name, or number from 1.")]
+TableUnit = Annotated[str | None, typer.Option(help="Unit of a table's command, A or V.")]
+TableColumn = Annotated[str | None, typer.Option(help="Column of a table: name, or number from 1.")]
 RateHz = Annotated[float | None, typer.Option(help="Of a table without a time column.")]
 Whole = Annotated[bool, typer.Option(help="Judge whole histories, not steady cycles.")]
 Validate = Annotated[
@@ -123,10 +123,10 @@ def identify(
     output: Annotated[Path | None, typer.Option(help="Model file to write.")] = None,
     settings: FitTexts = None,
     list_settings: ListSettings = False,
-    unit: Unit = None,
-    command_column: Column = None,
-    displacement_column: Column = None,
-    time_column: Column = None,
+    unit: TableUnit = None,
+    command_column: TableColumn = None,
+    displacement_column: TableColumn = None,
+    time_column: TableColumn = None,
     rate_hz: RateHz = None,
     whole: Whole = False,
     validate: Validate = None,
@@ -143,17 +143,21 @@ def identify(
 
     del list_settings
     check_page(html, overwrite=overwrite)
-    columns = {"command": command_column, "displacement": displacement_column, "time": time_column}
-    texts = [f"table.{name}_column={_column(text)}" for name, text in columns.items() if text]
-    texts += [f"table.{name}={value}" for name, value in (("unit", unit), ("rate_hz", rate_hz))
-              if value is not None] + ["whole=true"] * whole  # fmt: skip
+    table = {
+        "table.unit": unit,
+        "table.command_column": _column(command_column),
+        "table.displacement_column": _column(displacement_column),
+        "table.time_column": _column(time_column),
+        "table.rate_hz": rate_hz,
+        "whole": whole or None,
+    }
+    texts = [f"{key}={json.dumps(value)}" for key, value in table.items() if value is not None]
     chosen = settings_from(model, [*texts, *(settings or [])])
     finish_orphans()
     with shown_progress("identify", quiet=as_json) as progress:
         found = identify_files(
-            files, chosen, output, validate=validate or [], scheduler=scheduler,
-            overwrite=overwrite, progress=progress,
-        )  # fmt: skip
+            files, chosen, output, validate or [], scheduler, overwrite=overwrite, progress=progress
+        )
     if html is not None:
         write_identification(found, html)
     if as_json:
@@ -162,9 +166,8 @@ def identify(
         print_identification(found, output)
 
 
-def _column(text: str) -> str:
-    """Return a column as YAML: a number as it is, a name in quotes, whatever it is spelt like."""
-    return text if text.isdecimal() else json.dumps(text)
+def _column(text: str | None) -> str | int | None:
+    return int(text) if text is not None and text.isdecimal() else text
 
 
 def export(

@@ -68,9 +68,9 @@ def identify_files(
     paths: Sequence[Path],
     settings: IdentifySettings,
     output: Path | None,
-    *,
     validate: Sequence[Path] = (),
     scheduler: str = "none",
+    *,
     overwrite: bool = False,
     progress: OnProgress = ignore_progress,
 ) -> Identification:

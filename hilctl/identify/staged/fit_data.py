@@ -232,7 +232,7 @@ def _harmonics(run: _Run) -> Spectrum:
     if run.s is None:
         raise DataError(
             "lag, structure and delay are found from steady loops: leave out --whole, or give "
-            "--lag none without --structure and --delay"
+            "--set lag=none, structure=false and delay=false"
         )
     return run.s
 

@@ -106,16 +106,7 @@ def find_staged(
         DataError: A stage has dynamics, and a record is not a steady cycle, or sample rates
             differ.
     """
-    if layers.dynamic and not data.all_steady:
-        raise DataError(
-            "lag, structure and delay are found from steady loops, and there is a whole time "
-            "history among the data: leave out --whole"
-        )
-    if layers.dynamic and not data.one_rate:
-        raise DataError(
-            "lag, structure and delay are found from runs at one sample rate: give those of one "
-            "rate, since a loop's own delay depends on it"
-        )
+    _check(data, layers)
     progress(0.0, "weights for a few lags")
     few, few_scale = data.thinned(scale, FEW_POINTS)
     ranked = sorted(_grid(few, layers, few_scale), key=lambda start: start.rms_um)[:starts]
@@ -139,6 +130,19 @@ def find_staged(
     errors, slopes = error_and_slopes(data, layers, point)
     free = np.asarray((high > low) & (x > low + margin) & (x < high - margin))
     return StagedEnd(point, errors, slopes, free, scale, tuple(outcomes))
+
+
+def _check(data: StagedFitData, layers: Layers) -> None:
+    if layers.dynamic and not data.all_steady:
+        raise DataError(
+            "lag, structure and delay are found from steady loops, and there is a whole time "
+            "history among the data: leave out --whole"
+        )
+    if layers.dynamic and not data.one_rate:
+        raise DataError(
+            "lag, structure and delay are found from runs at one sample rate: give those of one "
+            "rate, since a loop's own delay depends on it"
+        )
 
 
 def _grid(data: StagedFitData, layers: Layers, scale: F64) -> list[WeightedStart]:
