@@ -24,7 +24,8 @@ def print_identification(found: Identification, output: Path | None) -> None:
     if held_out is not None:
         console.print(_errors_table("not fitted, to check the model", held_out.errors))
     rows = ", ".join(f"{name} {text}" for name, text in parameter_texts(fit))
-    console.print(f"parameters: {rows}", highlight=False)
+    if rows:
+        console.print(f"parameters: {rows}", highlight=False)
     for line in summary(found):
         console.print(line, highlight=False)
     if output is not None:
