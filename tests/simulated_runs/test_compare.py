@@ -45,7 +45,7 @@ def models(folder):
         ],
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=240,
     )
     assert ended.returncode == 0, ended.stderr
     return {model["name"]: model for model in json.loads(ended.stdout)["models"]}
