@@ -1,11 +1,12 @@
 """Commands about recordings: report, recover, replay, identify, export."""
 
+import json
 from pathlib import Path
-from typing import Annotated, Literal, TypeAlias
+from typing import Annotated
 
 import typer
 
-from hilctl.base.errors import InputError
+from hilctl.cli.comparing import check_page
 from hilctl.cli.options import (
     AsJson,
     Overwrite,
@@ -14,13 +15,21 @@ from hilctl.cli.options import (
     print_json,
 )
 
-Kind: TypeAlias = Literal["integrated", "rdpi", "ppi", "staged"]
-Weights: TypeAlias = Literal["exponential", "free"]
-Layout: TypeAlias = Literal["even", "midpoint"]
-WeightBy: TypeAlias = Literal["equal", "hysteresis"]
-Unit: TypeAlias = Literal["A", "V"]
-Core: TypeAlias = Literal["integrated", "preisach"]
-Lag: TypeAlias = Literal["growth", "plain", "none"]
+IdentifyInput = Annotated[list[Path], typer.Argument(help="Recordings (MCAP) or text tables.")]
+TableUnit = Annotated[str | None, typer.Option(help="Unit of a table's command, A or V.")]
+TableColumn = Annotated[str | None, typer.Option(help="Column of a table: name, or number from 1.")]
+RateHz = Annotated[float | None, typer.Option(help="Of a table without a time column.")]
+Whole = Annotated[bool, typer.Option(help="Judge whole histories, not steady cycles.")]
+Validate = Annotated[
+    list[Path] | None, typer.Option(help="File to judge the model on; may be repeated.")
+]
+Scheduler = Annotated[
+    str, typer.Option(help="none, threads, processes, or a Dask scheduler's address.")
+]
+FitTexts = Annotated[
+    list[str] | None,
+    typer.Option("--set", help="key=value; --settings lists all of them. May be repeated."),
+]
 
 
 def report(
@@ -41,8 +50,7 @@ def report(
     if html is not None:
         from hilctl.analysis.html import write_html
 
-        if html.exists() and not overwrite:
-            raise InputError(f"{html}: exists already: give another name, or --overwrite")
+        check_page(html, overwrite=overwrite)
         write_html(contents, summary, html)
     if as_json:
         print_json(summary.to_mapping())
@@ -93,128 +101,74 @@ def replay(
         raise typer.Exit(1)
 
 
+def _list_settings(wanted: bool) -> None:
+    if wanted:
+        from hilctl.cli.identify_view import print_settings
+
+        print_settings()
+        raise typer.Exit
+
+
+ListSettings = Annotated[
+    bool,
+    typer.Option(
+        "--settings", callback=_list_settings, is_eager=True,
+        help="Print all kinds of model and all settings.",
+    ),
+]  # fmt: skip
+
+
 def identify(
-    files: Annotated[list[Path], typer.Argument(help="Recordings (MCAP) or text tables.")],
-    model: Annotated[Kind, typer.Option(help="Model to find.")] = "integrated",
+    files: IdentifyInput,
+    model: Annotated[str, typer.Option(help="Kind of model.")] = "integrated",
     output: Annotated[Path | None, typer.Option(help="Model file to write.")] = None,
-    plays: Annotated[
-        str | None, typer.Option(help="Play operators, or auto: by loops held out.")
-    ] = None,
-    deadbands: Annotated[int | None, typer.Option(help="Deadbands on each side of 0.")] = None,
-    weights: Annotated[Weights | None, typer.Option(help="Else as published.")] = None,
-    layout: Annotated[
-        Layout, typer.Option(help="Thresholds alpha i, or alpha (i - 1/2).")
-    ] = "even",
-    weight_by: Annotated[WeightBy | None, typer.Option(help="Weight of each loop.")] = None,
-    offset: Annotated[bool, typer.Option(help="Find a constant displacement too.")] = False,
-    creep: Annotated[
-        bool, typer.Option(help="A constant and creep of each file beside ppi and rdpi.")
-    ] = False,
-    hysteresis: Annotated[
-        Core | None, typer.Option(help="Of a staged model; else plays and deadbands.")
-    ] = None,
-    lines: Annotated[int | None, typer.Option(help="Lines of a Preisach triangle.")] = None,
-    lag: Annotated[Lag | None, typer.Option(help="Field lag of a staged model.")] = None,
-    structure: Annotated[
-        bool | None, typer.Option(help="Structure of a staged model.", show_default=False)
-    ] = None,
-    delay: Annotated[
-        bool | None, typer.Option(help="Transport delay of a staged model.", show_default=False)
-    ] = None,
-    starts: Annotated[int | None, typer.Option(help="Starts of the search.")] = None,
-    peak_goal_percent: Annotated[
-        float | None, typer.Option(help="Go on reweighting until no error is larger.")
-    ] = None,
-    seed: Annotated[int, typer.Option(help="Seed of the random starts.")] = 1,
-    points: Annotated[int | None, typer.Option(help="Points a loop; else as published.")] = None,
-    unit: Annotated[Unit | None, typer.Option(help="Unit of a table's command.")] = None,
-    command_column: Annotated[str, typer.Option(help="Name, or number from 1.")] = "current_a",
-    displacement_column: Annotated[str, typer.Option(help="In um.")] = "displacement_um",
-    time_column: Annotated[str | None, typer.Option(help="In s.")] = None,
-    rate_hz: Annotated[float | None, typer.Option(help="Of a table without time.")] = None,
-    rows: Annotated[str, typer.Option(help="FIRST:LAST data rows of a table, from 1.")] = ":",
-    ignore: Annotated[int, typer.Option(help="Rows at the start run but not judged.")] = 0,
-    whole: Annotated[bool, typer.Option(help="Judge whole histories, not steady cycles.")] = False,
-    lag_samples: Annotated[str, typer.Option(help="Lag of a table's displacement, or auto.")] = "0",
-    validate: Annotated[
-        list[Path] | None, typer.Option(help="Files to judge the model on; may be repeated.")
-    ] = None,
-    scheduler: Annotated[
-        str, typer.Option(help="none, threads, processes, or a Dask scheduler's address.")
-    ] = "none",
+    settings: FitTexts = None,
+    list_settings: ListSettings = False,
+    unit: TableUnit = None,
+    command_column: TableColumn = None,
+    displacement_column: TableColumn = None,
+    time_column: TableColumn = None,
+    rate_hz: RateHz = None,
+    whole: Whole = False,
+    validate: Validate = None,
+    scheduler: Scheduler = "none",
     html: Annotated[Path | None, typer.Option(help="Page of model against data to write.")] = None,
     overwrite: Overwrite = False,
     as_json: AsJson = False,
 ) -> None:
     """Find a model's parameters from recordings or measured tables."""
-    from hilctl.cli.identify_view import print_finding
-    from hilctl.identify.command import find
-    from hilctl.identify.request import Request
+    from hilctl.cli.identify_view import print_identification
+    from hilctl.cli.progress import shown_progress
+    from hilctl.identify.command import identify_files, settings_from
+    from hilctl.identify.page import write_identification
 
+    del list_settings
+    check_page(html, overwrite=overwrite)
+    table = {
+        "table.unit": unit,
+        "table.command_column": _column(command_column),
+        "table.displacement_column": _column(displacement_column),
+        "table.time_column": _column(time_column),
+        "table.rate_hz": rate_hz,
+        "whole": whole or None,
+    }
+    texts = [f"{key}={json.dumps(value)}" for key, value in table.items() if value is not None]
+    chosen = settings_from(model, [*texts, *(settings or [])])
     finish_orphans()
-    if html is not None and html.exists() and not overwrite:
-        raise InputError(f"{html}: exists already: give another name, or --overwrite")
-    first_row, last_row = _rows(rows)
-    request = Request(
-        kind=model,
-        points=points,
-        seed=seed,
-        plays=None if plays is None else _count("--plays", plays),
-        deadbands=deadbands,
-        weights=weights,
-        layout=layout,
-        weight_by=weight_by,
-        offset=offset,
-        creep=creep,
-        hysteresis=hysteresis,
-        lines=lines,
-        lag=lag,
-        structure=structure,
-        delay=delay,
-        starts=starts,
-        peak_goal_percent=peak_goal_percent,
-        unit=unit,
-        command_column=_column(command_column),
-        displacement_column=_column(displacement_column),
-        time_column=None if time_column is None else _column(time_column),
-        rate_hz=rate_hz,
-        first_row=first_row,
-        last_row=last_row,
-        ignore=ignore,
-        whole=whole,
-        lag_samples=_count("--lag-samples", lag_samples),
-        scheduler=scheduler,
-    )
-    finding = find(
-        files, request, output, validate=validate or [], overwrite=overwrite, quiet=as_json
-    )
+    with shown_progress("identify", quiet=as_json) as progress:
+        found = identify_files(
+            files, chosen, output, validate or [], scheduler, overwrite=overwrite, progress=progress
+        )
     if html is not None:
-        from hilctl.identify.page import write_finding
-
-        write_finding(finding, html)
+        write_identification(found, html)
     if as_json:
-        print_json({"output": str(output) if output else None, **finding.to_mapping()})
+        print_json({"output": str(output) if output else None, **found.to_mapping()})
     else:
-        print_finding(finding, output)
+        print_identification(found, output)
 
 
-def _rows(text: str) -> tuple[int, int | None]:
-    first, colon, last = text.partition(":")
-    if colon and (first or "1").isdecimal() and (last or "1").isdecimal() and first != "0":
-        return int(first or 1), int(last) if last else None
-    raise InputError(f"--rows must be FIRST:LAST, counted from 1, either may be left out: {text!r}")
-
-
-def _count(option: str, text: str) -> int | Literal["auto"]:
-    if text == "auto":
-        return "auto"
-    if text.isdecimal():
-        return int(text)
-    raise InputError(f"{option} must be a whole number or auto: {text!r}")
-
-
-def _column(text: str) -> str | int:
-    return int(text) if text.isdecimal() else text
+def _column(text: str | None) -> str | int | None:
+    return int(text) if text is not None and text.isdecimal() else text
 
 
 def export(

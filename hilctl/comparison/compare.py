@@ -1,38 +1,68 @@
 """Models found on the same loops, judged on them, and tried before the same device."""
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 from hilctl.base.errors import InputError
+from hilctl.base.files import write_text
 from hilctl.base.yaml.document import Document
-from hilctl.comparison.catalogue import CATALOGUE, entry
-from hilctl.comparison.data import Fitted, Frame, read_loops
-from hilctl.comparison.judging import ModelError, inverse_ns, model_error
-from hilctl.comparison.trials import Bench, Trial, full_stroke, waveforms_of
+from hilctl.comparison.trials import (
+    InverseTrial,
+    TrialDevice,
+    full_stroke,
+    inverse_ns,
+    waveforms_of,
+)
 from hilctl.experiment.load import LoadedExperiment, load_experiment, resolve
-from hilctl.identify.data import Loop
+from hilctl.identify.catalogue import entry
+from hilctl.identify.data.cycles import loops_from_recording
+from hilctl.identify.data.records import SteadyLoop
+from hilctl.identify.fit_data import FitData
+from hilctl.identify.fit_model import FittedModel, fit_model
+from hilctl.identify.job import OnProgress
+from hilctl.identify.judge import Judgement, judge
+from hilctl.identify.settings import FitKind, FitSettings
 from hilctl.models.base import HysteresisModel
-from hilctl.models.files import load_model
+from hilctl.models.files import dump_model, load_model
 from hilctl.recording.data import Recording
 from hilctl.recording.reader import read
-
-Progress: TypeAlias = Callable[[float, str], None]
-"""Called with the part that is done (0 to 1) and what is being done."""
 
 FREQUENCIES_HZ = (10.0, 100.0, 200.0)
 POINTS = 300
 _FILES = (".yaml", ".yml")
 
+# The simpler ones get every weight by itself and a constant displacement, which Omega as published
+# has not: what they lack is not for want of freedom.
+_FREE: Mapping[str, Any] = {"plays": 12, "weights": "free", "weight_by": "equal", "offset": True}
+_FEW: Mapping[str, Any] = {"plays": 12}
+
+COMPARED: Mapping[FitKind, Mapping[str, Any]] = {
+    "integrated": {"starts": 3},
+    "staged": {},
+    "rdpi": _FREE,
+    "asymmetric": _FEW,
+    "ppi": _FREE,
+    "generalised": _FEW,
+    "preisach": {},
+    "kp": {},
+    "bouc_wen": {},
+    "duhem": {},
+    "straight": {},
+}
+"""Kinds that are compared where none are named, the one that the others are held against first, and
+the settings that make them comparable. Left out: what has the same loops as another (spi), and what
+is for rods without a bias (butterfly)."""
+
 
 @dataclass(frozen=True, slots=True)
-class Request:
+class ComparisonRequest:
     """What to compare.
 
     Attributes:
         recordings: Recordings that hold the loops.
-        models: Names of the catalogue, or model files; all of the catalogue where empty.
+        models: Kinds of model, or model files; :data:`COMPARED` where empty.
         experiment: Experiment that gives device, limits and waveform of the trials; where None,
             device and limits are those of the first recording and the waveform is a sine over
             nearly the whole stroke.
@@ -51,14 +81,14 @@ class Request:
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class ComparedModel:
     """One model of the comparison.
 
     Attributes:
         name: Name in the catalogue, or of the model file.
         title: What it is, for people.
         model: The model.
-        parameters: Numbers that were found for it; None for a model file.
+        numbers: How many numbers were found for it; None for a model file.
         identify_s: Time that took; None for a model file.
         error: How far it is from the loops.
         inverse_ns: Time that one sample of its inverse takes.
@@ -68,11 +98,11 @@ class Row:
     name: str
     title: str
     model: HysteresisModel
-    parameters: int | None
+    numbers: int | None
     identify_s: float | None
-    error: ModelError
+    error: Judgement
     inverse_ns: float
-    trials: tuple[Trial, ...]
+    trials: tuple[InverseTrial, ...]
 
     @property
     def compensated_percent(self) -> float | None:
@@ -95,8 +125,8 @@ class Comparison:
 
     sources: tuple[str, ...]
     device: str
-    loops: tuple[Loop, ...]
-    rows: tuple[Row, ...]
+    loops: tuple[SteadyLoop, ...]
+    rows: tuple[ComparedModel, ...]
 
     def to_mapping(self) -> dict[str, Any]:
         """Return all of it as plain mappings, lists and numbers, for JSON."""
@@ -104,38 +134,30 @@ class Comparison:
             "sources": list(self.sources),
             "device": self.device or None,
             "loops": [loop.label for loop in self.loops],
-            "models": [_row_mapping(row) for row in self.rows],
+            "models": [_row_mapping(self.loops, row) for row in self.rows],
         }
 
 
-def _row_mapping(row: Row) -> dict[str, Any]:
-    loops = [
-        {
-            "label": loop.label,
-            "frequency_hz": loop.frequency_hz,
-            "peak_to_peak_um": loop.peak_to_peak_um,
-            "peak_percent": loop.peak_percent,
-            "rms_percent": loop.rms_percent,
-        }
-        for loop in row.error.loops
-    ]
-    trials = [{key: getattr(trial, key) for key in Trial.__slots__} for trial in row.trials]
+def _row_mapping(loops: Sequence[SteadyLoop], row: ComparedModel) -> dict[str, Any]:
+    errors = zip(loops, row.error.errors, strict=True)
     return {
         "name": row.name,
         "title": row.title,
-        "parameters": row.parameters,
+        "numbers": row.numbers,
         "identify_s": row.identify_s,
         "inverse_ns": row.inverse_ns,
         "peak_percent": row.error.peak_percent,
         "rms_percent": row.error.rms_percent,
         "compensated_peak_percent": row.compensated_percent,
-        "loops": loops,
-        "compensated": trials,
+        "loops": [{"frequency_hz": loop.frequency_hz, **asdict(error)} for loop, error in errors],
+        "compensated": [asdict(trial) for trial in row.trials],
         "model": {"kind": getattr(row.model, "kind"), **row.model.to_mapping()},  # noqa: B009
     }
 
 
-def compare(request: Request, clock: Callable[[], float], progress: Progress) -> Comparison:
+def compare(
+    request: ComparisonRequest, clock: Callable[[], float], progress: OnProgress
+) -> Comparison:
     """Find each model on the loops, judge it on them, and try its inverse before the device.
 
     Args:
@@ -146,65 +168,77 @@ def compare(request: Request, clock: Callable[[], float], progress: Progress) ->
     Raises:
         InputError: Something asked for can't be used.
     """
-    names = tuple(request.models) or tuple(CATALOGUE)
+    names = tuple(request.models) or tuple(COMPARED)
     for name in names:
         if not name.endswith(_FILES):
             entry(name)
     recordings = [read(path) for path in request.recordings]
-    loops, unit = read_loops(recordings, request.points)
-    frame = Frame(loops, unit)
-    bench = _bench(request, recordings[0], frame)
-    rows: list[Row] = []
+    data = _loops(recordings, request.points)
+    sources = tuple(path.name for path in request.recordings)
+    device = _device(request, recordings[0], data)
+    rows: list[ComparedModel] = []
     for i, name in enumerate(names):
 
         def tell(part: float, text: str, i: int = i, name: str = name) -> None:
             progress((i + part) / len(names), f"{name}: {text}")
 
-        rows.append(_row(name, frame, recordings[0].sample_rate_hz, bench, clock, tell))
+        rows.append(_row(name, data, sources, recordings[0].sample_rate_hz, device, clock, tell))
     progress(1.0, "done")
-    sources = tuple(path.name for path in request.recordings)
-    return Comparison(sources, bench.device if bench else "", frame.loops, tuple(rows))
+    described = device.description if device else ""
+    return Comparison(sources, described, data.loops, tuple(rows))
+
+
+def _loops(recordings: Sequence[Recording], points: int) -> FitData:
+    units = {recording.command_unit for recording in recordings}
+    if len(units) != 1:
+        raise InputError("recordings of devices driven in A and in V can't be compared on together")
+    loops = [loop for recording in recordings for loop in loops_from_recording(recording, points)]
+    return FitData(loops, units.pop())
 
 
 def _row(
     name: str,
-    frame: Frame,
+    data: FitData,
+    sources: Sequence[str],
     rate_hz: float,
-    bench: Bench | None,
+    device: TrialDevice | None,
     clock: Callable[[], float],
-    tell: Progress,
-) -> Row:
+    tell: OnProgress,
+) -> ComparedModel:
     tell(0.0, "identified")
-    begin = clock()
-    from_file = name.endswith(_FILES)
-    found = Fitted(load_model(Path(name)), 0) if from_file else entry(name).fit(frame)
-    identify_s = clock() - begin
-    model = found.model
-    if model.input_unit != frame.unit:
-        raise InputError(f"{name}: must take commands in {frame.unit}, as the loops do")
+    found: FittedModel | None = None
+    if name.endswith(_FILES):
+        model, title = load_model(Path(name)), "model file"
+        if model.input_unit != data.unit:
+            raise InputError(f"{name}: must take commands in {data.unit}, as the loops do")
+    else:
+        kind, known = entry(name)
+        settings = FitSettings(kind=kind, **COMPARED.get(kind, {}))
+        found = fit_model(data.records, settings, clock, unit=data.unit, source=sources)
+        model, title = found.model, known.title
     tell(0.4, "judged")
-    error = model_error(model, frame.loops)
-    fastest = max(frame.loops, key=lambda loop: loop.frequency_hz)
-    took_ns = inverse_ns(model, fastest, rate_hz, clock)
-    return Row(
-        name=Path(name).name if from_file else name,
-        title="model file" if from_file else entry(name).title,
+    fastest = max(data.loops, key=lambda loop: loop.frequency_hz)
+    return ComparedModel(
+        name=name if found else Path(name).name,
+        title=title,
         model=model,
-        parameters=None if from_file else found.parameters,
-        identify_s=None if from_file else identify_s,
-        error=error,
-        inverse_ns=took_ns,
-        trials=tuple(_trials(bench, model, tell)) if bench else (),
+        numbers=found.numbers if found else None,
+        identify_s=found.elapsed_s if found else None,
+        error=found or judge(model, data),
+        inverse_ns=inverse_ns(model, fastest, rate_hz, clock),
+        trials=tuple(_trials(device, model, tell)) if device else (),
     )
 
 
-def _trials(bench: Bench, model: HysteresisModel, tell: Progress) -> Iterator[Trial]:
-    for k, reference in enumerate(bench.references):
-        tell(0.5 + 0.5 * k / len(bench.references), f"tried, {reference.segments[0].label}")
-        yield from bench.try_out(model, reference)
+def _trials(
+    device: TrialDevice, model: HysteresisModel, tell: OnProgress
+) -> Iterator[InverseTrial]:
+    for k, reference in enumerate(device.references):
+        tell(0.5 + 0.5 * k / len(device.references), f"tried, {reference.segments[0].label}")
+        yield from device.run(model, reference)
 
 
-def _bench(request: Request, recording: Recording, frame: Frame) -> Bench | None:
+def _device(request: ComparisonRequest, recording: Recording, data: FitData) -> TrialDevice | None:
     """Return where inverses are tried; None where the recording's own device is a real one."""
     frequencies = request.frequencies_hz
     if request.experiment is not None:
@@ -212,12 +246,12 @@ def _bench(request: Request, recording: Recording, frame: Frame) -> Bench | None
         waveform = loaded.config.waveform
         if frequencies is None and waveform.kind in ("sine", "triangle"):
             frequencies = FREQUENCIES_HZ
-        return Bench(loaded, waveforms_of(waveform, frequencies), loaded.folder)
+        return TrialDevice(loaded, waveforms_of(waveform, frequencies), loaded.folder)
     recorded = _recorded(recording, request.settings)
     if recorded is None:
         return None
-    waveforms = waveforms_of(full_stroke(frame.loops), frequencies or FREQUENCIES_HZ)
-    return Bench(recorded, waveforms, recorded.folder)
+    waveforms = waveforms_of(full_stroke(data.loops), frequencies or FREQUENCIES_HZ)
+    return TrialDevice(recorded, waveforms, recorded.folder)
 
 
 def _recorded(recording: Recording, settings: Sequence[str]) -> LoadedExperiment | None:
@@ -231,3 +265,47 @@ def _recorded(recording: Recording, settings: Sequence[str]) -> LoadedExperiment
     hold = f"{{kind: hold, unit: {recording.command_unit}, level: 0.0, duration_s: 1.0}}"
     plain = ("compensator=none", f"waveform={hold}")
     return resolve(document, recording.path.parent, (*plain, *settings))
+
+
+def check_free(names: Sequence[str], folder: Path, *, overwrite: bool) -> None:
+    """Refuse a folder in which a file of one of these models stands already.
+
+    Raises:
+        InputError: One does, and may not be replaced.
+    """
+    taken = [str(folder / f"{name}.yaml") for name in names if (folder / f"{name}.yaml").exists()]
+    if taken and not overwrite:
+        raise InputError(f"{taken[0]}: exists already: give another --save, or --overwrite")
+
+
+def save_models(
+    comparison: Comparison, folder: Path, *, created: str, overwrite: bool
+) -> tuple[Path, ...]:
+    """Write each model that was found here to ``folder/NAME.yaml``, ready to run.
+
+    Args:
+        comparison: The models; those that came from files are left out.
+        folder: Made where it is not there.
+        created: Date and time in ISO 8601, UTC, for the provenance.
+        overwrite: Whether a file of that name may be replaced.
+
+    Returns:
+        The files.
+
+    Raises:
+        InputError: One exists already, and nothing is written, or the folder can't be written to.
+    """
+    rows = [row for row in comparison.rows if row.identify_s is not None]
+    check_free([row.name for row in rows], folder, overwrite=overwrite)
+    paths = []
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for row in rows:
+            path = folder / f"{row.name}.yaml"
+            provenance = row.model.provenance.model_copy(update={"created": created})
+            model = row.model.model_copy(update={"provenance": provenance})
+            write_text(path, dump_model(model), overwrite=overwrite)
+            paths.append(path)
+    except OSError as error:
+        raise InputError(f"{folder}: can't be written: {error.strerror}") from None
+    return tuple(paths)

@@ -2,8 +2,8 @@
 
 from collections.abc import Iterator, Sequence
 
-from hilctl.comparison.compare import Comparison, Row
-from hilctl.comparison.trials import Trial
+from hilctl.comparison.compare import ComparedModel, Comparison
+from hilctl.comparison.trials import InverseTrial
 
 
 def headings(comparison: Comparison) -> list[str]:
@@ -15,7 +15,7 @@ def _trial_names(comparison: Comparison) -> list[str]:
     return [f"{trial.frequency_hz:.4g} Hz" for trial in _most_trials(comparison)]
 
 
-def _most_trials(comparison: Comparison) -> Sequence[Trial]:
+def _most_trials(comparison: Comparison) -> Sequence[InverseTrial]:
     return max((row.trials for row in comparison.rows), key=len, default=())
 
 
@@ -24,7 +24,7 @@ def table_rows(comparison: Comparison) -> Iterator[list[str]]:
     for row in comparison.rows:
         figures = [
             row.name,
-            "-" if row.parameters is None else str(row.parameters),
+            "-" if row.numbers is None else str(row.numbers),
             "-" if row.identify_s is None else f"{row.identify_s:.2f}",
             f"{row.inverse_ns:.0f}",
             f"{row.error.peak_percent:.2f}",
@@ -33,7 +33,7 @@ def table_rows(comparison: Comparison) -> Iterator[list[str]]:
         yield [*figures, *(_trial_text(trial) for trial in row.trials)]
 
 
-def _trial_text(trial: Trial) -> str:
+def _trial_text(trial: InverseTrial) -> str:
     if trial.peak_error_percent is None:
         return "-"
     return f"{trial.peak_error_percent:.2f}{'*' if trial.limited_samples else ''}"
@@ -55,6 +55,6 @@ def notes(comparison: Comparison) -> list[str]:
     return [*found, "*: the limiter changed judged commands"] if limited else found
 
 
-def titles(rows: Sequence[Row]) -> list[tuple[str, str]]:
+def titles(rows: Sequence[ComparedModel]) -> list[tuple[str, str]]:
     """Return each model's name and what it is."""
     return [(row.name, row.title) for row in rows]

@@ -1,11 +1,11 @@
-"""Each inverse before a simulated device, in this process: what a run would come to.
+"""Each inverse before a simulated device, in this process: what a run would come to, and how fast.
 
 The device is made by its registered name and driven through :class:`hilctl.base.device.Device`,
 with compensator and limiter as a run has them; feedback is left out. Nothing is recorded, nothing
 keeps the pace: that is for devices whose time is the sample count, so any other is refused.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,8 +15,8 @@ from hilctl.analysis.metrics import fold, peak, peak_hysteresis_percent, peak_to
 from hilctl.base.arrays import F64, U32
 from hilctl.base.errors import InputError
 from hilctl.base.samples import Flag
-from hilctl.comparison.data import Loops
 from hilctl.experiment.load import LoadedExperiment
+from hilctl.identify.data.records import SteadyLoop
 from hilctl.loop.compensator import Compensator
 from hilctl.loop.limiter import Limiter
 from hilctl.models.base import HysteresisModel
@@ -29,12 +29,14 @@ CYCLES = 4
 STROKE = 0.98
 """Part of the measured stroke that a trial covers where no experiment says otherwise."""
 
+TIMED_SAMPLES = 20_000
+_ROUNDS = 5
 _SOFT_S = 0.2
 _LIMITED = int(Flag.RANGE_LIMITED | Flag.SLEW_LIMITED | Flag.INVALID)
 
 
 @dataclass(frozen=True, slots=True)
-class Trial:
+class InverseTrial:
     """What came of one model's inverse before the device, on the average steady cycle.
 
     Attributes:
@@ -81,7 +83,7 @@ def waveforms_of(
     ]
 
 
-def full_stroke(loops: Loops) -> Sine:
+def full_stroke(loops: Sequence[SteadyLoop]) -> Sine:
     """Return a sine in um that covers nearly the stroke of the widest loop."""
     widest = max(loops, key=lambda loop: float(np.ptp(loop.displacement_um)))
     low, high = float(widest.displacement_um.min()), float(widest.displacement_um.max())
@@ -97,7 +99,7 @@ def full_stroke(loops: Loops) -> Sine:
     )
 
 
-class Bench:
+class TrialDevice:
     """A simulated device and the limits of its experiment, for one trial after another.
 
     Args:
@@ -128,7 +130,7 @@ class Bench:
                 raise InputError(f"a trial needs a waveform in um that repeats: {label}")
 
     @property
-    def device(self) -> str:
+    def description(self) -> str:
         """The device, for people."""
         return self._device.info.description
 
@@ -137,7 +139,7 @@ class Bench:
         """Samples a second."""
         return self._config.sample_rate_hz
 
-    def try_out(self, model: HysteresisModel, reference: Reference) -> list[Trial]:
+    def run(self, model: HysteresisModel, reference: Reference) -> list[InverseTrial]:
         """Run one model's inverse before the device from rest, and judge each segment.
 
         Raises:
@@ -167,7 +169,7 @@ class Bench:
         return displacement_um
 
 
-def _judged(reference: Reference, displacement_um: F64, flags: U32) -> list[Trial]:
+def _judged(reference: Reference, displacement_um: F64, flags: U32) -> list[InverseTrial]:
     trials = []
     for segment in reference.segments:
         start, stop, cycles = segment.steady_cycles()
@@ -178,7 +180,7 @@ def _judged(reference: Reference, displacement_um: F64, flags: U32) -> list[Tria
         wanted, moved = cycle.signals
         swing = peak_to_peak(moved)
         trials.append(
-            Trial(
+            InverseTrial(
                 label=segment.label,
                 frequency_hz=reference.sample_rate_hz / segment.period,
                 peak_hysteresis_percent=peak_hysteresis_percent(wanted, moved),
@@ -188,3 +190,31 @@ def _judged(reference: Reference, displacement_um: F64, flags: U32) -> list[Tria
             )
         )
     return trials
+
+
+def inverse_ns(
+    model: HysteresisModel, loop: SteadyLoop, sample_rate_hz: float, clock: Callable[[], float]
+) -> float:
+    """Measure what one sample of a model's inverse takes, in ns.
+
+    The reference is a sine of the loop's stroke and frequency; the shortest of some rounds counts,
+    because whatever else the machine does only adds to it.
+
+    Args:
+        model: Any model.
+        loop: Gives stroke and frequency.
+        sample_rate_hz: Samples a second.
+        clock: Time in s.
+    """
+    low, high = float(loop.displacement_um.min()), float(loop.displacement_um.max())
+    angle = 2.0 * np.pi * loop.frequency_hz / sample_rate_hz * np.arange(TIMED_SAMPLES)
+    reference_um = 0.5 * (low + high) + 0.5 * (high - low) * np.sin(angle)
+    operator = model.inverse(sample_rate_hz)
+    out = np.empty_like(reference_um)
+    operator.process(reference_um, out)
+    times = []
+    for _ in range(_ROUNDS):
+        begin = clock()
+        operator.process(reference_um, out)
+        times.append(clock() - begin)
+    return 1e9 * min(times) / TIMED_SAMPLES

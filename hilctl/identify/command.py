@@ -1,4 +1,4 @@
-"""The identify command: settings together, progress shown, the model written and judged."""
+"""Identify from files: settings from texts, records in, the model written and judged."""
 
 import time
 from collections.abc import Sequence
@@ -7,24 +7,23 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-
 from hilctl.base.errors import InputError
-from hilctl.identify.data import Record
-from hilctl.identify.files import PUBLISHED_POINTS, load_records, write_model
-from hilctl.identify.fit import Fit, Judgement, judge
-from hilctl.identify.identify import identify
+from hilctl.base.files import write_text
+from hilctl.base.yaml.document import Document
+from hilctl.identify.catalogue import entry
+from hilctl.identify.data.files import load_records
+from hilctl.identify.data.records import Record
+from hilctl.identify.fit_model import FittedModel, fit_model
+from hilctl.identify.job import OnProgress, ignore_progress
+from hilctl.identify.judge import Judgement, judge
 from hilctl.identify.model_size import OrderError, choose_lag, choose_order
-from hilctl.identify.request import Request
-from hilctl.identify.search import Progress as Tell
-from hilctl.identify.settings import Settings
+from hilctl.identify.settings import FitSettings, IdentifySettings
 from hilctl.identify.workers import Map, workers
+from hilctl.models.files import dump_model
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class Identification:
     """What was found, and how it does on data that it was not fitted to.
 
     Attributes:
@@ -36,7 +35,7 @@ class Finding:
         lag_samples: Samples by which tables' displacements were taken to lag.
     """
 
-    fit: Fit
+    fit: FittedModel
     data: Sequence[Record]
     held_out: Judgement | None
     held_out_data: Sequence[Record]
@@ -47,87 +46,83 @@ class Finding:
         """Return all figures as plain mappings, lists and numbers, for JSON."""
         return {
             **self.fit.to_mapping(),
-            "held_out": None if self.held_out is None else asdict(self.held_out),
+            "held_out": None if self.held_out is None else self.held_out.to_mapping(),
             "orders": [asdict(order) for order in self.orders],
             "lag_samples": self.lag_samples,
         }
 
 
-def find(
+def settings_from(kind: str, texts: Sequence[str]) -> IdentifySettings:
+    """Return the choices of a fit, those of the kind changed by ``key=value`` texts.
+
+    Raises:
+        InputError: There is no such kind, or a choice breaks a rule; all that do are listed.
+    """
+    known, _ = entry(kind)
+    document = Document("hilctl identify", f"kind: {known}")
+    for text in texts:
+        document.set(text)
+    return document.validate(IdentifySettings)
+
+
+def identify_files(
     paths: Sequence[Path],
-    request: Request,
+    settings: IdentifySettings,
     output: Path | None,
-    *,
     validate: Sequence[Path] = (),
-    overwrite: bool,
-    quiet: bool,
-) -> Finding:
+    scheduler: str = "none",
+    *,
+    overwrite: bool = False,
+    progress: OnProgress = ignore_progress,
+) -> Identification:
     """Fit a model to files, write it, and judge it on other files.
+
+    Args:
+        paths: Recordings and text tables.
+        settings: The choices.
+        output: Model file to write; None for none.
+        validate: Files to judge the model on.
+        scheduler: Where independent fits run, see :func:`hilctl.identify.workers.workers`.
+        overwrite: Whether a model file of that name may be replaced.
+        progress: Called with what is being done.
 
     Raises:
         InputError: A file or a setting can't be used; nothing is written.
     """
     if output is not None and output.exists() and not overwrite:
         raise InputError(f"{output}: exists already: give another --output, or --overwrite")
-    points = request.points or PUBLISHED_POINTS[request.kind]
-    console = Console(stderr=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
-    hidden = quiet or not console.is_terminal
-    with (
-        workers(request.scheduler) as run,
-        Progress(*columns, console=console, disable=hidden, transient=True) as bar,
-    ):
-        task = bar.add_task("identify", total=1.0)
-
-        def tell(done: float, text: str) -> None:
-            bar.update(task, completed=done, description=text)
-
-        lag = _lag(paths, points, request, run, tell)
-        records, unit = load_records(paths, points, request, lag)
-        held_out, _ = load_records(validate, points, request, lag)
-        settings, orders = _sized(request, records, request.settings(unit), run, tell)
-        fit = _identified(request, records, settings, paths, run, tell)
+    with workers(scheduler) as run:
+        lag = _lag(paths, settings, run, progress)
+        records, recorded = load_records(paths, settings, lag)
+        asked = settings.table.unit
+        if recorded and asked and recorded != asked:
+            raise InputError(f"--unit must be {recorded}, that of the recordings: {asked}")
+        held_out, _ = load_records(validate, settings, lag)
+        chosen: FitSettings = settings
+        orders: tuple[OrderError, ...] = ()
+        if settings.size == "auto":
+            chosen, orders = choose_order(records, settings, run, progress)
+        fit = fit_model(
+            records,
+            chosen,
+            time.perf_counter,
+            unit=settings.unit(recorded),
+            source=[path.name for path in paths],
+            created=datetime.now(UTC).isoformat(timespec="seconds"),
+            progress=progress,
+            run=run,
+        )
     if output is not None:
-        write_model(fit, output, overwrite=overwrite)
+        write_text(output, dump_model(fit.model), overwrite=overwrite)
     judged = judge(fit.model, held_out, creep=settings.creep) if held_out else None
-    return Finding(fit, records, judged, held_out, orders, lag)
+    return Identification(fit, records, judged, held_out, orders, lag)
 
 
-def _lag(paths: Sequence[Path], points: int, request: Request, run: Map, tell: Tell) -> int:
-    if request.lag_samples != "auto":
-        return request.lag_samples
-    _, unit = load_records(paths, points, request, 0)
+def _lag(paths: Sequence[Path], settings: IdentifySettings, run: Map, progress: OnProgress) -> int:
+    if not settings.table.find_lag:
+        return settings.table.lag_samples
 
     def load(lag: int) -> Sequence[Record]:
-        return load_records(paths, points, request, lag)[0]
+        return load_records(paths, settings, lag)[0]
 
-    return choose_lag(request.kind, load, request.settings(unit), run, tell)
-
-
-def _sized(
-    request: Request, records: Sequence[Record], settings: Settings, run: Map, tell: Tell
-) -> tuple[Settings, tuple[OrderError, ...]]:
-    if request.plays != "auto":
-        return settings, ()
-    return choose_order(request.kind, records, settings, run, tell)
-
-
-def _identified(
-    request: Request,
-    records: Sequence[Record],
-    settings: Settings,
-    paths: Sequence[Path],
-    run: Map,
-    tell: Tell,
-) -> Fit:
-    return identify(
-        request.kind,
-        records,
-        settings,
-        np.random.default_rng(request.seed),
-        time.perf_counter,
-        source=[path.name for path in paths],
-        created=datetime.now(UTC).isoformat(timespec="seconds"),
-        progress=tell,
-        run=run,
-    )
+    return choose_lag(load, settings, run, progress)

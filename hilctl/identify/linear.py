@@ -1,10 +1,17 @@
 """Weights that follow from a linear least-squares problem with lower bounds."""
 
+from typing import TypeAlias
+
 import numpy as np
+import numpy.typing as npt
 from scipy.linalg import qr
 from scipy.optimize import nnls
 
-from hilctl.base.arrays import F64
+from hilctl.base.arrays import F64, I64
+
+Mask: TypeAlias = npt.NDArray[np.bool_]
+
+RIDGE = 1e-3  # weight of the densities themselves, relative to the longest column
 
 
 def bounded_weights(
@@ -59,3 +66,48 @@ def bounded_and_free(
         return least + extra, np.zeros(0)
     rest_inside = inside[:, size] - inside[:, :size] @ extra
     return least + extra, np.asarray(np.linalg.solve(corner, rest_inside), dtype=np.float64)
+
+
+def smooth_densities(
+    columns: F64, target: F64, scale: F64, least: F64, table: I64, smoothness: float
+) -> tuple[F64, float]:
+    """Minimise the sum of (scale (columns w + c - target))^2 over densities w >= least, and c.
+
+    Loops leave many of the densities of a triangle open: least squares alone would make spikes of
+    them, other ones on every processor. So differences of neighbours count too, and, far less, the
+    densities themselves, which leaves one solution.
+
+    Args:
+        columns: float64[N, m].
+        target: float64[N].
+        scale: float64[N], square root of each sample's weight.
+        least: float64[m], lower bounds.
+        table: int64[lines, cells], for each place of the triangle its density; -1 for none.
+        smoothness: Weight of the differences along a line, relative to the longest column.
+
+    Returns:
+        The densities float64[m] and the constant.
+    """
+    size, samples = columns.shape[1], target.size
+    longest = float(np.linalg.norm(columns * scale[:, None], axis=0).max())
+    rows = smoothness * _differences(table, size), RIDGE * np.eye(size)
+    held = np.vstack([columns * scale[:, None], *(longest * part for part in rows)])
+    free, right = np.zeros((len(held), 1)), np.zeros(len(held))
+    free[:samples, 0], right[:samples] = scale, target * scale
+    weights, constant = bounded_and_free(held, free, right, np.ones(len(held)), least)
+    return weights, float(constant[0])
+
+
+def _differences(table: I64, size: int) -> F64:
+    """Return what takes differences of densities beside each other in a line: float64[k, size]."""
+    left, right = table[:, :-1].ravel(), table[:, 1:].ravel()
+    both = (left >= 0) & (right >= 0)
+    out = np.zeros((int(both.sum()), size))
+    rows = np.arange(len(out))
+    out[rows, left[both]], out[rows, right[both]] = -1.0, 1.0
+    return out
+
+
+def numbered(moved: Mask) -> I64:
+    """Return the number of each density that is fitted, and -1 where none is: int64[m]."""
+    return np.where(moved, np.cumsum(moved) - 1, -1)

@@ -1,17 +1,16 @@
 """How many plays and deadbands the data bear, and by how many samples they lag."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from hilctl.base.errors import DataError
-from hilctl.identify.bench import Bench
-from hilctl.identify.data import Record, Records
-from hilctl.identify.fit import judge
-from hilctl.identify.identify import identify
-from hilctl.identify.search import Progress
-from hilctl.identify.settings import Kind, Settings
+from hilctl.identify.data.records import Record, Records
+from hilctl.identify.fit_model import fit_model
+from hilctl.identify.job import OnProgress
+from hilctl.identify.judge import judge
+from hilctl.identify.settings import FitSettings
 from hilctl.identify.workers import Map
 
 ORDERS = ((6, 4), (8, 6), (12, 8), (16, 10), (20, 12), (28, 16))
@@ -41,26 +40,24 @@ class OrderError:
 
 
 @dataclass(frozen=True, slots=True)
-class _Trial:
-    kind: Kind
-    settings: Settings
+class _HeldOut:
+    settings: FitSettings
     fitted: tuple[Record, ...]
     held_out: tuple[Record, ...]
 
 
 def choose_order(
-    kind: Kind, data: Records, settings: Settings, run: Map, progress: Progress
-) -> tuple[Settings, tuple[OrderError, ...]]:
+    data: Records, settings: FitSettings, run: Map, progress: OnProgress
+) -> tuple[FitSettings, tuple[OrderError, ...]]:
     """Find the smallest model whose error on loops that it did not see is near the least.
 
     Every loop is held out once, a quarter of them at a time.
 
     Args:
-        kind: The model's kind.
         data: Four loops or more.
         settings: All other choices.
         run: Runs fits that do not depend on each other.
-        progress: Told what is being done.
+        progress: Called with what is being done.
 
     Returns:
         The settings with that order, and what every order did.
@@ -73,8 +70,8 @@ def choose_order(
             f"choosing the number of plays holds out a quarter of the loops: needs at least "
             f"{FOLDS}, got {len(data)}"
         )
-    tried = _tried(replace(settings, starts=1))
-    trials = [_trial(kind, each, data, fold) for each in tried for fold in range(FOLDS)]
+    tried = _tried(settings.model_copy(update={"starts": 1}))
+    trials = [_trial(each, data, fold) for each in tried for fold in range(FOLDS)]
     progress(0.0, f"{len(trials)} fits for the number of plays")
     sums = np.array(run(_errors, trials)).reshape(len(tried), FOLDS, 3)
     rms_um = np.sqrt(sums[:, :, 0].sum(axis=1) / sums[:, :, 1].sum(axis=1))
@@ -88,52 +85,49 @@ def choose_order(
     )
     best = int(np.argmax(rms_um <= WORTH * rms_um.min()))
     chosen = tried[best]
-    return replace(chosen, starts=settings.starts), errors
+    return chosen.model_copy(update={"starts": settings.starts}), errors
 
 
-def _tried(settings: Settings) -> list[Settings]:
+def _tried(settings: FitSettings) -> list[FitSettings]:
     if settings.hysteresis == "preisach":
-        return [replace(settings, lines=lines) for lines in LINES]
-    deadbands = settings.deadbands_a_side > 0
-    return [replace(settings, plays=n, deadbands_a_side=k if deadbands else 0) for n, k in ORDERS]
+        return [settings.model_copy(update={"lines": lines}) for lines in LINES]
+    return [settings.model_copy(update={"plays": n, "deadbands": k}) for n, k in ORDERS]
 
 
-def _order(settings: Settings) -> tuple[int, int]:
+def _order(settings: FitSettings) -> tuple[int, int]:
     if settings.hysteresis == "preisach":
         return settings.lines, 0
-    return settings.plays, settings.deadbands_a_side
+    return settings.plays, settings.deadbands if settings.has("deadbands") else 0
 
 
 def choose_lag(
-    kind: Kind, load: Callable[[int], Records], settings: Settings, run: Map, progress: Progress
+    load: Callable[[int], Records], settings: FitSettings, run: Map, progress: OnProgress
 ) -> int:
     """Find by how many samples the displacement lags: the lag that leaves the least error.
 
     Args:
-        kind: The model's kind.
         load: Gives the data with the displacement taken that many samples earlier.
         settings: The choices of the fit.
         run: Runs fits that do not depend on each other.
-        progress: Told what is being done.
+        progress: Called with what is being done.
     """
     progress(0.0, f"{MOST_LAG + 1} fits for the lag of the displacement")
-    lean = replace(settings, starts=1, peak_goal_percent=None)
+    lean = settings.model_copy(update={"starts": 1, "peak_goal_percent": None})
     loaded = [tuple(load(lag)) for lag in range(MOST_LAG + 1)]
-    sums = np.array(run(_errors, [_Trial(kind, lean, data, data) for data in loaded]))
+    sums = np.array(run(_errors, [_HeldOut(lean, data, data) for data in loaded]))
     return int(np.argmin(sums[:, 0] / sums[:, 1]))
 
 
-def _trial(kind: Kind, settings: Settings, data: Sequence[Record], fold: int) -> _Trial:
+def _trial(settings: FitSettings, data: Sequence[Record], fold: int) -> _HeldOut:
     fitted = tuple(record for i, record in enumerate(data) if i % FOLDS != fold)
-    return _Trial(kind, settings, fitted, tuple(data[fold::FOLDS]))
+    return _HeldOut(settings, fitted, tuple(data[fold::FOLDS]))
 
 
-def _errors(trial: _Trial) -> tuple[float, float, float]:
+def _errors(trial: _HeldOut) -> tuple[float, float, float]:
     """Return the sum of squares in um^2, the samples, and the largest error in um."""
-    rng = np.random.default_rng(1)
-    found = identify(trial.kind, trial.fitted, trial.settings, rng, lambda: 0.0)
+    found = fit_model(trial.fitted, trial.settings, lambda: 0.0)
     judged = judge(found.model, trial.held_out, creep=trial.settings.creep)
     stroke_um = max(error.peak_to_peak_um for error in judged.errors)
-    samples = Bench(trial.held_out).target_um.size
+    samples = sum(response.size for response in judged.modelled_um)
     squares = samples * (judged.rms_percent * stroke_um / 100.0) ** 2
     return squares, float(samples), judged.peak_percent * stroke_um / 100.0

@@ -2,8 +2,9 @@
 
 from collections.abc import Sequence
 
-from hilctl.identify.command import Finding
-from hilctl.identify.fit import Fit, LoopError
+from hilctl.identify.command import Identification
+from hilctl.identify.fit_model import FittedModel
+from hilctl.identify.judge import LoopError
 
 HEADINGS = ("loop", "p-p um", "peak %", "rms %", "area %")
 
@@ -18,7 +19,7 @@ def error_rows(errors: Sequence[LoopError]) -> list[tuple[str, ...]]:
     return rows
 
 
-def parameter_texts(fit: Fit) -> list[tuple[str, str]]:
+def parameter_texts(fit: FittedModel) -> list[tuple[str, str]]:
     """Return names and values, with standard errors where there are any."""
     sure = fit.standard_errors
     return [
@@ -27,13 +28,15 @@ def parameter_texts(fit: Fit) -> list[tuple[str, str]]:
     ]
 
 
-def summary(finding: Finding) -> list[str]:
+def summary(found: Identification) -> list[str]:
     """Return the result in a few lines."""
-    fit, held_out = finding.fit, finding.held_out
+    fit, held_out = found.fit, found.held_out
     spread = [start.rms_percent for start in fit.starts]
+    ended = f"{fit.numbers} numbers found"
+    if spread:
+        ended = f"{len(spread)} starts ended at rms {min(spread):.3f} to {max(spread):.3f} %"
     lines = [
-        f"{len(spread)} starts ended at rms {min(spread):.3f} to {max(spread):.3f} %, "
-        f"in {fit.elapsed_s:.2f} s",
+        f"{ended}, in {fit.elapsed_s:.2f} s",
         f"peak error {fit.peak_percent:.2f} %, rms {fit.rms_percent:.2f} % of the largest "
         f"peak-to-peak; {fit.own_peak_percent:.2f} % of a loop's own",
     ]
@@ -42,6 +45,6 @@ def summary(finding: Finding) -> list[str]:
             f"not fitted: peak error {held_out.peak_percent:.2f} %, "
             f"rms {held_out.rms_percent:.2f} % of the largest peak-to-peak"
         )
-    if finding.lag_samples:
-        lines.append(f"displacements taken {finding.lag_samples} samples later than the commands")
+    if found.lag_samples:
+        lines.append(f"displacements taken {found.lag_samples} samples later than the commands")
     return lines

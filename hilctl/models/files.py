@@ -16,13 +16,14 @@ from hilctl.models.duhem import DuhemModel
 from hilctl.models.generalised import GeneralisedModel
 from hilctl.models.integrated import IntegratedModel
 from hilctl.models.kp import KrasnoselskiiPokrovskiiModel
-from hilctl.models.ppi import PpiModel
+from hilctl.models.plays import PpiModel, RdpiModel
 from hilctl.models.preisach import PreisachModel
-from hilctl.models.rdpi import RdpiModel
+from hilctl.models.spi import SpiModel
 from hilctl.models.staged import StagedModel
 
 AnyModel: TypeAlias = Annotated[
     PpiModel
+    | SpiModel
     | RdpiModel
     | IntegratedModel
     | StagedModel
@@ -36,6 +37,7 @@ AnyModel: TypeAlias = Annotated[
 ]
 KINDS: tuple[str, ...] = (
     "ppi",
+    "spi",
     "rdpi",
     "integrated",
     "staged",

@@ -1,9 +1,9 @@
-"""Sums of play operators: what the PPI, the RDPI and the integrated model have in common."""
+"""Sums of play operators: what they have in common, and the PPI and the RDPI (chapters 3 and 5)."""
 
-from typing import Self
+from typing import Literal, Self
 
 import numpy as np
-from pydantic import model_validator
+from pydantic import Field, model_validator
 
 from hilctl.base.arrays import F64
 from hilctl.base.errors import ModelError
@@ -111,3 +111,28 @@ class PlayModel(HysteresisModel):
             play_sum(x, rate_gain, direct, thresholds, weights, memory, out)
 
         return Operator(run, self.operators, input_offset=-self.output_offset_um)
+
+
+class PpiModel(PlayModel):
+    """Phi[v] = p_0 v + sum p_i F_i[v], rate-independent and symmetric (3.6)."""
+
+    kind: Literal["ppi"] = "ppi"
+
+
+class RdpiModel(PlayModel):
+    """Pi[v] = a_0 v + sum a_i Gamma_i[v], thresholds r_i + gamma |v'| (5.5, 6.18).
+
+    All thresholds grow alike, so their distances stay what they are and the dilation condition
+    for the inverse (5.7) holds at every rate.
+
+    Attributes:
+        gamma_s: Growth of every threshold with the input's rate, in s, >= 0.
+    """
+
+    kind: Literal["rdpi"] = "rdpi"
+    gamma_s: float = Field(default=0.0, ge=0.0)
+
+    @property
+    def threshold_growth_s(self) -> float:
+        """Growth of every threshold with the input's rate, gamma, in s."""
+        return self.gamma_s

@@ -6,8 +6,7 @@ from hilctl.base.arrays import F64
 from hilctl.models.base import Provenance
 from hilctl.models.deadband import DeadbandFunction
 from hilctl.models.integrated import IntegratedModel
-from hilctl.models.ppi import PpiModel
-from hilctl.models.rdpi import RdpiModel
+from hilctl.models.plays import PpiModel, RdpiModel
 
 _DISSERTATION = (
     "Modeling and Compensation of Rate-Dependent Asymmetric Hysteresis Nonlinearities of "

@@ -1,53 +1,44 @@
-"""The stop-operator compensator of a PPI: published thresholds and weights (3.11-3.24)."""
+"""A PPI compensated by stop operators: published thresholds and weights (3.11-3.24)."""
 
-from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
 from hilctl.base.arrays import F64
 from hilctl.kernels.hysteresis import stop_sum
 from hilctl.models.base import Operator
-from hilctl.models.ppi import PpiModel
+from hilctl.models.plays import PlayModel
 
 
-@dataclass(frozen=True, slots=True)
-class SpiCompensator:
-    """Psi[v] = w_0 v + sum w_i E_i[v], which undoes the PPI it is made from.
+class SpiModel(PlayModel):
+    """Phi[v] of a PPI (3.6), undone by Psi[y] = w_0 y + sum w_i E_i[y].
 
-    It is the same operator as the inverse PPI: w_0 + sum w_i = 1/p_0, and w_i is minus the weight
+    Psi is the same operator as the inverse PPI: w_0 + sum w_i = 1/p_0, and w_i is minus the weight
     of the inverse's i-th play.
-
-    Attributes:
-        direct: w_0, weight of the stop operator whose threshold is never reached.
-        weights: float64[n], w_1 to w_n, command per um, >= 0.
-        thresholds: float64[n], s_1 to s_n, um, rising.
-        offset_um: Displacement that belongs to a command of 0.
     """
 
-    direct: float
-    weights: F64
-    thresholds: F64
-    offset_um: float = 0.0
+    kind: Literal["spi"] = "spi"
 
-    @classmethod
-    def of(cls, model: PpiModel) -> "SpiCompensator":
-        """Work out thresholds (3.18) and weights (3.19, 3.24) from a PPI's.
+    def stop_parameters(self) -> tuple[float, F64, F64]:
+        """Return w_0, w_1 to w_n and s_1 to s_n, both float64[n] (3.18, 3.19, 3.24).
 
-        The thresholds are the PPI's initial loading curve at its own thresholds; the weights solve
+        The thresholds are the PPI's initial loading curve at its own thresholds. The weights solve
         ``sum_j min(s_i, s_j) w_j + s_i w_0 = r_i``.
+
+        Raises:
+            ModelError: The numbers of the inverse are not finite.
         """
-        r = np.concatenate(([0.0], model.thresholds))
-        p = np.concatenate(([model.direct], model.weights))
-        loading = np.maximum(0.0, r[1:, None] - r[None, :]) @ p
-        direct = 1.0 / float(p.sum())
-        weights = np.linalg.solve(np.minimum.outer(loading, loading), r[1:] - direct * loading)
-        return cls(direct, weights, loading, model.output_offset_um)
+        # Solved in closed form by the inverse plays: a linear solver's last bits are the
+        # processor's own, and a recording must replay to the same bits on any.
+        _, weights, thresholds = self.inverse_parameters()
+        return 1.0 / (self.direct + float(np.sum(self.weights))), -weights, thresholds
 
-    def operator(self) -> Operator:
-        """Return the operator from displacement in um to command, at rest."""
-        direct, weights, thresholds = self.direct, self.weights.copy(), self.thresholds.copy()
+    def inverse(self, sample_rate_hz: float) -> Operator:
+        """Return the operator from um to command, at rest; no rate makes a difference."""
+        del sample_rate_hz
+        direct, weights, thresholds = self.stop_parameters()
 
-        def run(v: F64, memory: F64, out: F64) -> None:
-            stop_sum(v, direct, thresholds, weights, memory, out)
+        def run(y: F64, memory: F64, out: F64) -> None:
+            stop_sum(y, direct, thresholds, weights, memory, out)
 
-        return Operator(run, weights.size, input_offset=-self.offset_um)
+        return Operator(run, weights.size, input_offset=-self.output_offset_um)

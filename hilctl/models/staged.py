@@ -27,12 +27,10 @@ from hilctl.kernels.dynamics import (
     weigh_block,
 )
 from hilctl.models.base import HysteresisModel, Operator, Provenance, refuse
-from hilctl.models.chain import Chain, between, delayed
+from hilctl.models.chain import Chain, between, delayed, smoothing_weights
 from hilctl.models.integrated import IntegratedModel
-from hilctl.models.ppi import PpiModel
+from hilctl.models.plays import PpiModel, RdpiModel
 from hilctl.models.preisach import PreisachModel
-from hilctl.models.rdpi import RdpiModel
-from hilctl.models.smoothing import smoothing_weights
 
 AnyHysteresis = Annotated[
     PpiModel | RdpiModel | IntegratedModel | PreisachModel, Field(discriminator="kind")

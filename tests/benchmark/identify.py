@@ -9,19 +9,18 @@ import argparse
 import os
 import sys
 import time
-from dataclasses import replace
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 from scipy.optimize import least_squares
 
-from hilctl.identify.bench import Bench
-from hilctl.identify.cycles import average_cycle
-from hilctl.identify.data import Loop
-from hilctl.identify.fit import Judgement, judge
-from hilctl.identify.identify import identify
-from hilctl.identify.settings import Settings
+from hilctl.identify.data.cycles import average_cycle
+from hilctl.identify.data.records import SteadyLoop
+from hilctl.identify.fit_data import FitData
+from hilctl.identify.fit_model import fit_model
+from hilctl.identify.judge import Judgement, judge
+from hilctl.identify.settings import FitSettings
 from hilctl.kernels.hysteresis import deadband_block
 from hilctl.models.integrated import IntegratedModel
 from hilctl.models.published import exponential_integrated
@@ -38,7 +37,7 @@ HIGH = np.array([0.48, 2e-3, 20.0, 20.0, 3.0, 0.9, 3.0, 15.0, 3.0, 3.0, 15.0])
 EVALUATIONS = 300
 
 
-def measured(amplitude_a: float, frequency_hz: float, points: int, seed: int) -> Loop:
+def measured(amplitude_a: float, frequency_hz: float, points: int, seed: int) -> SteadyLoop:
     """Return the simulated rig's averaged loop under a sine."""
     period = RATE_HZ / frequency_hz
     cycles = 2 + max(3, round(0.1 * frequency_hz))
@@ -53,22 +52,22 @@ def measured(amplitude_a: float, frequency_hz: float, points: int, seed: int) ->
     label = f"{amplitude_a:g} A {frequency_hz:g} Hz"
     values = np.stack([command[first:], displacement_um[first:]])
     v, y = average_cycle(label, phase, values, period, points)
-    return Loop(label, v, y, frequency_hz, RATE_HZ)
+    return SteadyLoop(label, v, y, frequency_hz, RATE_HZ)
 
 
-def published(data: list[Loop], starts: int, seed: int) -> tuple[IntegratedModel, float]:
+def published(data: list[SteadyLoop], starts: int, seed: int) -> tuple[IntegratedModel, float]:
     """Fit all parameters by bounded least squares from several starts; return model and seconds."""
     begin = time.perf_counter()
-    bench = Bench(data)
-    steps, out = np.arange(1, PLAYS + 1), np.empty(bench.target_um.size)
+    prepared = FitData(data)
+    steps, out = np.arange(1, PLAYS + 1), np.empty(prepared.target_um.size)
     k = np.arange(1, DEADBANDS + 1)
 
     def errors(x: np.ndarray) -> np.ndarray:
         alpha, gamma_s, a_0, alpha_0, beta_0, alpha_1, beta_1, d_p, alpha_2, beta_2, d_n = x
-        inner = bench.play_sum(a_0, alpha * steps, alpha_0 * np.exp(-beta_0 * steps), gamma_s)
+        inner = prepared.play_sum(a_0, alpha * steps, alpha_0 * np.exp(-beta_0 * steps), gamma_s)
         up, down = -alpha_1 * np.exp(-beta_1 * k), alpha_2 * np.exp(-beta_2 * k)
         deadband_block(inner, 1.0, d_p * k, up, -d_n * k, down, out)
-        return out - bench.target_um
+        return out - prepared.target_um
 
     rng = np.random.default_rng(seed)
     ends = []
@@ -88,13 +87,12 @@ def published(data: list[Loop], starts: int, seed: int) -> tuple[IntegratedModel
     return exponential_integrated(**values, g_0=1.0), elapsed_s
 
 
-def fast(data: list[Loop], repeats: int = 10) -> tuple[IntegratedModel, float]:
+def fast(data: list[SteadyLoop], repeats: int = 10) -> tuple[IntegratedModel, float]:
     """Fit the same operators by the package; return model and mean seconds."""
-    settings = replace(Settings.published("integrated"), weights="free", starts=1)
+    settings = FitSettings(kind="integrated", weights="free", starts=1)
     begin = time.perf_counter()
     for _ in range(repeats):
-        rng = np.random.default_rng(1)
-        found = identify("integrated", data, settings, rng, time.perf_counter)
+        found = fit_model(data, settings, time.perf_counter)
     assert isinstance(found.model, IntegratedModel)
     return found.model, (time.perf_counter() - begin) / repeats
 

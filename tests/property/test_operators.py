@@ -12,9 +12,8 @@ from hilctl.kernels.hysteresis import play_sum_shared, rest_memory
 from hilctl.models.deadband import DeadbandFunction
 from hilctl.models.files import dump_model, parse_model
 from hilctl.models.integrated import IntegratedModel
-from hilctl.models.ppi import PpiModel
-from hilctl.models.rdpi import RdpiModel
-from hilctl.models.spi import SpiCompensator
+from hilctl.models.plays import PpiModel, RdpiModel
+from hilctl.models.spi import SpiModel
 
 SAMPLE_RATE_HZ = 20_000.0
 LEVEL = st.floats(-100.0, 100.0)
@@ -141,7 +140,7 @@ def test_with_shared_thresholds_plays_cancel(parameters, v, data):
 def test_stops_and_plays_are_one_inverse(parameters, y):
     """The stop-operator compensator of a PPI is its inverse (3.11-3.24, 5.8-5.10)."""
     model = PpiModel(**parameters)
-    by_stops = SpiCompensator.of(model).operator().process(y)
+    by_stops = SpiModel(**parameters).inverse(SAMPLE_RATE_HZ).process(y)
     by_plays = model.inverse(SAMPLE_RATE_HZ).process(y)
     scale = (np.max(np.abs(y)) + abs(model.output_offset_um) + 1.0) / model.direct
     assert np.max(np.abs(by_stops - by_plays)) <= 1e-8 * scale

@@ -5,11 +5,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from hilctl.models.chain import smoothing_weights
 from hilctl.models.files import dump_model, parse_model
 from hilctl.models.integrated import IntegratedModel
-from hilctl.models.ppi import PpiModel
-from hilctl.models.rdpi import RdpiModel
-from hilctl.models.smoothing import smoothing_weights
+from hilctl.models.plays import PpiModel, RdpiModel
 from hilctl.models.staged import FieldLag, StagedModel, Structure
 
 LEVEL = st.floats(-100.0, 100.0)

@@ -8,9 +8,10 @@ import pytest
 
 from hilctl.analysis.replay import replay
 from hilctl.analysis.report import summarize
-from hilctl.identify.butterfly import identify_butterfly
-from hilctl.identify.cycles import average_cycle
-from hilctl.identify.data import Loop
+from hilctl.identify.data.cycles import average_cycle
+from hilctl.identify.data.records import SteadyLoop
+from hilctl.identify.fit_model import fit_model
+from hilctl.identify.settings import FitSettings
 from hilctl.models.files import dump_model
 from hilctl.recording.reader import read
 from hilctl.run.start import start_run
@@ -35,7 +36,7 @@ def loop(amplitude_a, frequency_hz, bias_a=0.0):
     signals = np.stack([command[first:], displacement_um[first:]])
     label = f"{amplitude_a:g} A {frequency_hz:g} Hz around {bias_a:g} A"
     v, y = average_cycle(label, phase, signals, period, 300)
-    return Loop(label, v, y, frequency_hz, RATE_HZ)
+    return SteadyLoop(label, v, y, frequency_hz, RATE_HZ)
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +45,8 @@ def found():
     tones = [(a, f, 0.0) for a in (3.0, 6.0) for f in (10.0, 100.0)]
     tones += [(a, f, 3.5) for a in (2.0, 3.5) for f in (10.0, 100.0)]
     loops = [loop(*tone) for tone in tones]
-    return identify_butterfly(loops, plays=24, corners=16, turning_um=0.0, magnets=False)
+    settings = FitSettings(kind="butterfly", plays=24, turning_um=0.0, magnets=False)
+    return fit_model(loops, settings, lambda: 0.0)
 
 
 def test_displacement_repeats_twice_a_cycle_without_bias():

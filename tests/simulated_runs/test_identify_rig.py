@@ -5,7 +5,6 @@ figures rest on the simulation; those beside them are of the dissertation's own 
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -14,11 +13,11 @@ import pytest
 
 from hilctl.analysis.metrics import fold, peak_hysteresis_percent
 from hilctl.base.arrays import F64
-from hilctl.identify.cycles import average_cycle
-from hilctl.identify.data import Loop
-from hilctl.identify.fit import Fit, judge
-from hilctl.identify.identify import identify
-from hilctl.identify.settings import Kind, Settings
+from hilctl.identify.data.cycles import average_cycle
+from hilctl.identify.data.records import SteadyLoop
+from hilctl.identify.fit_model import FittedModel, fit_model
+from hilctl.identify.judge import judge
+from hilctl.identify.settings import FitKind, FitSettings
 from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
 
 pytestmark = pytest.mark.rig
@@ -38,7 +37,7 @@ def drive(command_a: Callable[[F64], F64], seconds: float, seed: int = 3) -> tup
 
 
 @cache
-def measured_loop(*tones: Tone, points: int = 300) -> Loop:
+def measured_loop(*tones: Tone, points: int = 300) -> SteadyLoop:
     """Return the rig's averaged cycle under a sum of tones; the first is the fundamental."""
     fundamental_hz = tones[0][1]
 
@@ -53,20 +52,21 @@ def measured_loop(*tones: Tone, points: int = 300) -> Loop:
     values = np.stack([command[first:], displacement_um[first:]])
     label = " + ".join(f"{a:g} A {f:g} Hz" for a, f in tones)
     v, y = average_cycle(label, phase, values, period, points)
-    return Loop(label, v, y, fundamental_hz, RATE_HZ)
+    return SteadyLoop(label, v, y, fundamental_hz, RATE_HZ)
 
 
-def sines(amplitudes: Sequence[float], frequencies: Sequence[float], points: int) -> list[Loop]:
+def sines(
+    amplitudes: Sequence[float], frequencies: Sequence[float], points: int
+) -> list[SteadyLoop]:
     return [measured_loop((a, f), points=points) for a in amplitudes for f in frequencies]
 
 
-def fit(kind: Kind, data: list[Loop], **choices: Any) -> Fit:
-    settings = replace(Settings.published(kind), **choices)
-    return identify(kind, data, settings, np.random.default_rng(1), lambda: 0.0)
+def fit(kind: FitKind, data: list[SteadyLoop], **choices: Any) -> FittedModel:
+    return fit_model(data, FitSettings(kind=kind, **choices), lambda: 0.0)
 
 
 @cache
-def published_omega() -> Fit:
+def published_omega() -> FittedModel:
     """Return Omega, 12 plays and 17 deadbands, on the published grid (6.24)."""
     return fit("integrated", sines([3.0, 6.0], [10.0, 50.0, 100.0, 150.0, 250.0], 300))
 
@@ -123,7 +123,7 @@ def test_free_weights_and_more_plays_are_better() -> None:
 
 
 @cache
-def staged() -> Fit:
+def staged() -> FittedModel:
     """Return the staged model of a short campaign."""
     tones = [(3.0, 1.0), (3.0, 250.0), (5.0, 100.0), (6.6, 1.0), (6.6, 50.0), (6.6, 100.0)]
     data = [measured_loop(tone) for tone in (*tones, (6.6, 150.0), (6.6, 250.0), (6.0, 400.0))]
@@ -170,7 +170,7 @@ def test_without_rate_or_deadbands_the_model_is_far_off() -> None:
     """At 6 A up to 200 Hz a PPI misses the rate and an RDPI the asymmetry (4.5: 13.5 and 9.6 %)."""
     data = sines([3.0, 6.0], [10.0, 100.0, 200.0], 200)
     omega = fit("integrated", data, starts=3)
-    no_rate = fit("ppi", data, plays=12, weights="exponential", starts=3, output_offset=True)
+    no_rate = fit("ppi", data, plays=12, weights="exponential", starts=3, offset=True)
     no_deadbands = fit("rdpi", data, plays=12, weights="exponential", starts=3)
     assert omega.peak_percent < 3.0
     assert no_rate.peak_percent > 3.0 * omega.peak_percent
@@ -185,7 +185,7 @@ def test_rdpi_at_small_amplitude() -> None:
     """
     data = sines([2.3], [1.0, 50.0, 100.0, 200.0], 400)
     plain = fit("rdpi", data)
-    offset = fit("rdpi", data, output_offset=True)
+    offset = fit("rdpi", data, offset=True)
     assert plain.parameters["alpha"] == pytest.approx(0.309, rel=0.2)
     assert plain.parameters["gamma"] == pytest.approx(2.73e-4, rel=0.25)
     assert plain.peak_percent <= 6.0

@@ -10,12 +10,13 @@ import pytest
 import yaml
 
 from hilctl.models.files import load_model
-from hilctl.models.ppi import PpiModel
+from hilctl.models.plays import PpiModel
 
 DATA = Path(__file__).parents[3] / "shared" / "data" / "yan9a_DBO"
 FIT = shlex.split(
     "--model ppi --unit V --command-column 1 --displacement-column 5 --rate-hz 200 --whole "
-    "--weights free --layout midpoint --plays 25 --creep --lag-samples auto --json"
+    "--set weights=free --set layout=midpoint --set plays=25 --set creep=true "
+    "--set table.lag_samples=auto --json"
 )
 
 pytestmark = [
@@ -41,7 +42,7 @@ def found(tmp_path_factory):
     """The PPI of the model file, judged on the test file, and where it was written."""
     path = tmp_path_factory.mktemp("yan9a") / "model.yaml"
     model, test = DATA / "Model_Vi_Do.dat", DATA / "Test_Vi_Do_Di.dat"
-    arguments = (model, *FIT, "--ignore", 500, "--validate", test, "--output", path)
+    arguments = (model, *FIT, "--set", "table.ignore=500", "--validate", test, "--output", path)
     return hilctl("identify", *arguments), path
 
 
@@ -63,7 +64,8 @@ def test_measured_reference_runs_through_it(found, tmp_path):
     _, compensator = found
     stage_path = tmp_path / "stage.yaml"
     test = DATA / "Test_Vi_Do_Di.dat"
-    hilctl("identify", test, *FIT, "--rows", "1:7000", "--ignore", 600, "--output", stage_path)
+    rows = ("--set", "table.last_row=7000", "--set", "table.ignore=600")
+    hilctl("identify", test, *FIT, *rows, "--output", stage_path)
     stage = load_model(stage_path)
     assert isinstance(stage, PpiModel)
     experiment = {

@@ -5,7 +5,7 @@ import pytest
 
 from hilctl.analysis import metrics
 from hilctl.base.arrays import F64
-from hilctl.models.ppi import PpiModel
+from hilctl.models.plays import PpiModel
 
 PERIODS = [50_000.0, 200.0, 1000.0 / 3.0, 20.0, 1234.567]
 

@@ -10,11 +10,9 @@ from hilctl.base.errors import InputError
 from hilctl.cli.compare_view import headings, notes, render, table_rows
 from hilctl.cli.comparing import _numbers
 from hilctl.cli.comparing import compare as command
-from hilctl.comparison.catalogue import CATALOGUE, entry
-from hilctl.comparison.compare import Request, compare
-from hilctl.comparison.figure import comparison_figure
-from hilctl.comparison.page import comparison_page
-from hilctl.comparison.saving import save_models
+from hilctl.comparison.compare import COMPARED, ComparisonRequest, compare, save_models
+from hilctl.comparison.page import comparison_figure, comparison_page
+from hilctl.identify.catalogue import CATALOGUE, entry
 from hilctl.models.files import load_model
 from hilctl.recording.reader import read
 
@@ -41,14 +39,14 @@ def ignore(done, text):
 @pytest.fixture(scope="module")
 def comparison():
     """Two models of the catalogue and one of a file, tried at 100 Hz."""
-    request = Request([GOLDEN], ["duhem", "straight", str(OMEGA)], frequencies_hz=[100.0])
+    request = ComparisonRequest([GOLDEN], ["duhem", "straight", str(OMEGA)], frequencies_hz=[100.0])
     return compare(request, Clock(), ignore)
 
 
 def test_rows_come_as_asked_for(comparison):
     """One row a model, in that order; a model file was not identified here."""
     assert [row.name for row in comparison.rows] == ["duhem", "straight", "terfenol_omega.yaml"]
-    assert [row.parameters for row in comparison.rows] == [4, 2, None]
+    assert [row.numbers for row in comparison.rows] == [4, 2, None]
     assert comparison.rows[2].identify_s is None
     assert comparison.rows[0].identify_s == pytest.approx(1e-3)
 
@@ -104,7 +102,7 @@ def test_loops_of_a_real_device_are_judged_without_trials(monkeypatch, text):
     run = {**recording.run, "simulated": "false"}
     recording = replace(recording, experiment_yaml=text, run=run)
     monkeypatch.setattr("hilctl.comparison.compare.read", lambda path: recording)
-    judged = compare(Request([GOLDEN], ["straight"]), Clock(), ignore)
+    judged = compare(ComparisonRequest([GOLDEN], ["straight"]), Clock(), ignore)
     assert judged.rows[0].trials == ()
     assert judged.rows[0].compensated_percent is None
     assert judged.to_mapping()["device"] is None
@@ -115,14 +113,16 @@ def test_loops_of_a_real_device_are_judged_without_trials(monkeypatch, text):
 def test_a_compensated_recording_gives_device_and_limits():
     """Its own waveform and compensator, whose file may be elsewhere, are not needed."""
     path = GOLDEN.with_name("terfenol_compensated.mcap")
-    judged = compare(Request([path], ["straight"], frequencies_hz=[200.0]), Clock(), ignore)
+    judged = compare(
+        ComparisonRequest([path], ["straight"], frequencies_hz=[200.0]), Clock(), ignore
+    )
     assert judged.rows[0].trials[0].frequency_hz == pytest.approx(200.0)
 
 
 def test_progress_rises_to_the_end():
     """Whoever waits is told what is being done, and how far it is."""
     told = []
-    request = Request([GOLDEN], ["straight"], frequencies_hz=[100.0])
+    request = ComparisonRequest([GOLDEN], ["straight"], frequencies_hz=[100.0])
     compare(request, Clock(), lambda done, text: told.append((done, text)))
     parts = [done for done, _ in told]
     assert parts == sorted(parts)
@@ -133,16 +133,17 @@ def test_progress_rises_to_the_end():
 def test_unknown_models_are_refused_at_once():
     """A misspelt name is refused before any file is read, with the nearest one."""
     with pytest.raises(InputError, match="did you mean 'preisach'"):
-        compare(Request([Path("nowhere.mcap")], ["presach"]), Clock(), ignore)
+        compare(ComparisonRequest([Path("nowhere.mcap")], ["presach"]), Clock(), ignore)
+    assert set(COMPARED) <= set(CATALOGUE)
     for name in CATALOGUE:
-        assert entry(name).title
+        assert entry(name)[1].title
 
 
 def test_a_model_of_another_unit_is_refused():
     """A stage's model in V can't stand beside loops in A."""
     model = ROOT / "configs" / "models" / "piezo_ppi.yaml"
     with pytest.raises(InputError, match="commands in A"):
-        compare(Request([GOLDEN], [str(model)]), Clock(), ignore)
+        compare(ComparisonRequest([GOLDEN], [str(model)]), Clock(), ignore)
 
 
 def test_frequencies_are_numbers():
@@ -161,6 +162,7 @@ def test_saved_models_are_model_files(comparison, tmp_path):
         saved = load_model(path)
         assert saved.model_copy(update={"provenance": row.model.provenance}) == row.model
         assert saved.provenance.source == (GOLDEN.name,)
+        assert saved.provenance.created == "2026-01-01"
         assert saved.provenance.errors_percent["peak"] == row.error.peak_percent
     with pytest.raises(InputError, match="--overwrite"):
         save_models(comparison, tmp_path / "models", created="2026-01-01", overwrite=False)

@@ -1,5 +1,6 @@
 """Inverses before a simulated device, without a run's processes and files."""
 
+import itertools
 from pathlib import Path
 
 import numpy as np
@@ -7,9 +8,17 @@ import pytest
 
 from hilctl.base.errors import InputError
 from hilctl.base.yaml.document import Document
-from hilctl.comparison.trials import CYCLES, Bench, full_stroke, waveforms_of
+from hilctl.comparison.trials import (
+    CYCLES,
+    TIMED_SAMPLES,
+    TrialDevice,
+    full_stroke,
+    inverse_ns,
+    waveforms_of,
+)
 from hilctl.experiment.load import load_experiment, resolve
-from hilctl.models.ppi import PpiModel
+from hilctl.identify.data.records import SteadyLoop
+from hilctl.models.plays import PpiModel
 from hilctl.models.published import piezo_ppi
 from hilctl.waveforms.spec import Chirp, Sine, Triangle
 
@@ -29,13 +38,13 @@ SINE = Sine(
 )  # fmt: skip
 
 
-def bench(*waveforms, text=TEXT):
-    return Bench(resolve(Document("stage.yaml", text), CONFIGS), waveforms, CONFIGS)
+def device(*waveforms, text=TEXT):
+    return TrialDevice(resolve(Document("stage.yaml", text), CONFIGS), waveforms, CONFIGS)
 
 
 def test_the_stage_follows_through_its_own_model():
     """The inverse of the model that the stage is compensates it to a fraction of a percent."""
-    (trial,) = (rig := bench(SINE)).try_out(piezo_ppi(), rig.references[0])
+    (trial,) = (rig := device(SINE)).run(piezo_ppi(), rig.references[0])
     assert trial.frequency_hz == pytest.approx(10.0)
     assert trial.peak_error_percent < 1.0
     assert trial.limited_samples == 0
@@ -44,22 +53,22 @@ def test_the_stage_follows_through_its_own_model():
 def test_a_straight_line_leaves_the_hysteresis():
     """Without a hysteresis model the stage shows its hysteresis."""
     straight = PpiModel(input_unit="V", direct=0.4, weights=(), thresholds=())
-    (trial,) = (rig := bench(SINE)).try_out(straight, rig.references[0])
+    (trial,) = (rig := device(SINE)).run(straight, rig.references[0])
     assert trial.peak_hysteresis_percent > 5.0
 
 
 def test_trials_start_from_rest():
     """One trial leaves nothing behind for the next."""
-    rig = bench(SINE)
-    first = rig.try_out(piezo_ppi(), rig.references[0])
-    rig.try_out(PpiModel(input_unit="V", direct=0.3, weights=(), thresholds=()), rig.references[0])
-    assert rig.try_out(piezo_ppi(), rig.references[0]) == first
+    rig = device(SINE)
+    first = rig.run(piezo_ppi(), rig.references[0])
+    rig.run(PpiModel(input_unit="V", direct=0.3, weights=(), thresholds=()), rig.references[0])
+    assert rig.run(piezo_ppi(), rig.references[0]) == first
 
 
 def test_the_limiter_is_between():
     """Commands beyond the limits never reach the device, and are counted."""
     steep = PpiModel(input_unit="V", direct=0.1, weights=(), thresholds=())
-    (trial,) = (rig := bench(SINE)).try_out(steep, rig.references[0])
+    (trial,) = (rig := device(SINE)).run(steep, rig.references[0])
     assert trial.limited_samples > 100
 
 
@@ -67,7 +76,7 @@ def test_a_real_device_is_refused():
     """Nothing but a simulated device is driven from here."""
     loaded = load_experiment(CONFIGS / "modbus_labjack_t7.yaml")
     with pytest.raises(InputError, match="simulated devices only"):
-        Bench(loaded, [SINE], CONFIGS)
+        TrialDevice(loaded, [SINE], CONFIGS)
 
 
 def test_what_does_not_repeat_is_refused():
@@ -76,7 +85,7 @@ def test_what_does_not_repeat_is_refused():
         kind="chirp", unit="um", amplitude=1.0, start_hz=1.0, stop_hz=10.0, duration_s=1.0
     )
     with pytest.raises(InputError, match="repeats"):
-        bench(chirp)
+        device(chirp)
 
 
 def test_waveforms_take_the_frequencies_asked_for():
@@ -106,10 +115,21 @@ def test_frequencies_need_a_shape_that_has_one():
             waveforms_of(SINE, [wrong])
 
 
-def test_the_stroke_is_that_of_the_widest_loop(loop_of):
+def test_the_stroke_is_that_of_the_widest_loop():
     """Where no experiment says otherwise a sine covers nearly all of what was measured."""
-    model = PpiModel(direct=3.0, weights=(), thresholds=(), output_offset_um=2.0)
-    sine = full_stroke([loop_of(model, 2.0), loop_of(model, 6.0), loop_of(model, 4.0)])
+    wave = np.sin(2.0 * np.pi * np.arange(300) / 300)
+    sine = full_stroke(
+        [SteadyLoop("sine", a * wave, 3.0 * a * wave + 2.0, 50.0) for a in (2, 6, 4)]
+    )
     assert sine.offset == pytest.approx(2.0, abs=1e-2)
     assert sine.amplitude == pytest.approx(0.98 * 18.0, rel=1e-3)
     assert np.isclose(sine.frequency_hz, 50.0)
+
+
+def test_the_shortest_round_counts():
+    """The time of a sample is that of the round that nothing disturbed."""
+    ticks = itertools.accumulate([0.0, 9e-3, 0.0, 2e-3, 0.0, 5e-3, 0.0, 4e-3, 0.0, 8e-3])
+    command = 6.0 * np.sin(2.0 * np.pi * np.arange(300) / 300)
+    loop = SteadyLoop("sine", command, 4.0 * command, 50.0)
+    took = inverse_ns(piezo_ppi(), loop, 50_000.0, lambda: next(ticks))
+    assert took == pytest.approx(2e6 / TIMED_SAMPLES)

@@ -15,8 +15,8 @@ from hilctl.base.yaml.document import Document
 from hilctl.experiment.check import Checked, check, check_tuned
 from hilctl.experiment.load import LoadedExperiment, resolve
 from hilctl.models.base import HysteresisModel, Operator
+from hilctl.models.plays import RdpiModel
 from hilctl.models.published import piezo_ppi, terfenol_rdpi
-from hilctl.models.rdpi import RdpiModel
 from hilctl.models.staged import FieldLag, StagedModel
 
 CURRENT = """\

@@ -12,8 +12,7 @@ from hilctl.base.errors import ConfigError, InputError
 from hilctl.base.yaml.document import Document
 from hilctl.experiment import registry
 from hilctl.experiment.load import LoadedExperiment, load_experiment, resolve
-from hilctl.models.ppi import PpiModel
-from hilctl.models.rdpi import RdpiModel
+from hilctl.models.plays import PpiModel, RdpiModel
 from hilctl.waveforms.spec import Sine
 
 FULL = """\

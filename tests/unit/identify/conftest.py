@@ -9,8 +9,10 @@ import pytest
 from hilctl.base.arrays import F64, I64
 from hilctl.base.samples import Samples
 from hilctl.base.segments import Segment
-from hilctl.identify.cycles import average_cycle
-from hilctl.identify.data import Loop
+from hilctl.identify.data.cycles import average_cycle
+from hilctl.identify.data.records import SteadyLoop
+from hilctl.identify.fit_data import FitData
+from hilctl.models.base import HysteresisModel
 from hilctl.models.plays import PlayModel
 from hilctl.recording.data import Recording, Ticks
 
@@ -18,7 +20,7 @@ RATE_HZ = 50_000.0
 
 
 @pytest.fixture
-def loops_of() -> Callable[..., list[Loop]]:
+def loops_of() -> Callable[..., list[SteadyLoop]]:
     """Return a function that runs a model on sines and averages the steady cycles."""
 
     def make(
@@ -27,7 +29,7 @@ def loops_of() -> Callable[..., list[Loop]]:
         points: int = 300,
         centre: float = 0.0,
         rate_hz: float = 300 * 250.0,
-    ) -> list[Loop]:
+    ) -> list[SteadyLoop]:
         loops = []
         for amplitude, frequency_hz in sines:
             period = rate_hz / frequency_hz
@@ -39,7 +41,7 @@ def loops_of() -> Callable[..., list[Loop]]:
             phase = np.arange(command.size - start) / period
             label = f"{amplitude:g} at {frequency_hz:g} Hz"
             v, y = average_cycle(label, phase, values, period, points)
-            loops.append(Loop(label, v, y, frequency_hz, rate_hz))
+            loops.append(SteadyLoop(label, v, y, frequency_hz, rate_hz))
         return loops
 
     return make
@@ -85,3 +87,26 @@ def recording_of() -> Callable[..., Recording]:
         )
 
     return make
+
+
+def made_loop(
+    model: HysteresisModel, amplitude: float, frequency_hz: float = 50.0, points: int = 300
+) -> SteadyLoop:
+    """Return the third cycle of a model under a sine, each point a sample."""
+    command = amplitude * np.sin(2.0 * np.pi * np.arange(points) / points)
+    operator = model.forward(points * frequency_hz)
+    displacement_um = operator.process(np.tile(command, 4))[-points:]
+    label = f"sine {amplitude:g} A {frequency_hz:g} Hz"
+    return SteadyLoop(label, command, displacement_um, frequency_hz, RATE_HZ)
+
+
+@pytest.fixture
+def loop_of() -> Callable[..., SteadyLoop]:
+    """A maker of one loop, given model, amplitude and frequency."""
+    return made_loop
+
+
+@pytest.fixture
+def data_of() -> Callable[[HysteresisModel], FitData]:
+    """A maker of loops at 2, 4 and 6 A from a model."""
+    return lambda model: FitData([made_loop(model, a) for a in (2.0, 4.0, 6.0)], "A")

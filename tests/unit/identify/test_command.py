@@ -6,13 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilctl.base.errors import InputError
-from hilctl.cli.identify_view import print_finding
-from hilctl.identify.command import find
-from hilctl.identify.page import write_finding
-from hilctl.identify.request import Request
+from hilctl.base.errors import ConfigError, InputError
+from hilctl.cli.identify_view import print_identification, print_settings
+from hilctl.identify.command import identify_files, settings_from
+from hilctl.identify.page import write_identification
+from hilctl.identify.settings import IdentifySettings
 from hilctl.models.files import load_model
-from hilctl.models.ppi import PpiModel
+from hilctl.models.plays import PpiModel
 
 STAGE = PpiModel(input_unit="V", direct=1.0, weights=(0.6, 0.3, 0.2), thresholds=(0.3, 0.7, 1.2))
 
@@ -34,56 +34,67 @@ def tables(tmp_path: Path) -> list[Path]:
     return paths
 
 
-def request(**choices: object) -> Request:
-    return Request(
-        kind="ppi", weights="free", offset=True, unit="V", command_column="drive",
-        displacement_column="um", rate_hz=200.0, ignore=10, whole=True, **choices,  # type: ignore[arg-type]
-    )  # fmt: skip
+TABLE = ("table.unit=V", "table.command_column=drive", "table.displacement_column=um",
+         "table.rate_hz=200", "table.ignore=10", "whole=true")  # fmt: skip
 
 
-def test_order_and_lag_are_found_and_told(
+def settings(*texts: str) -> IdentifySettings:
+    return settings_from("ppi", [*TABLE, "weights=free", "offset=true", *texts])
+
+
+def test_order_and_lag_are_found_and_reported(
     tables: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """With plays and lag on auto, the model is written, and figures, page and JSON say what was
     chosen."""
     output, page = tmp_path / "model.yaml", tmp_path / "page.html"
-    asked = request(plays="auto", lag_samples="auto", scheduler="threads")
-    finding = find(
-        tables[:3] + tables[3:], asked, output, validate=tables[:1], overwrite=False, quiet=True
-    )
-    assert finding.lag_samples == 2
-    assert finding.fit.peak_percent < 2.0
+    asked = settings("plays=auto", "table.lag_samples=auto")
+    found = identify_files(tables, asked, output, validate=tables[:1], scheduler="threads")
+    assert found.lag_samples == 2
+    assert found.fit.peak_percent < 2.0
     model = load_model(output)
-    assert model == finding.fit.model
-    assert model.operators in {order.plays for order in finding.orders}
-    mapping = json.loads(json.dumps(finding.to_mapping(), allow_nan=False))
+    assert model == found.fit.model
+    assert model.operators in {order.plays for order in found.orders}
+    mapping = json.loads(json.dumps(found.to_mapping(), allow_nan=False))
     assert mapping["lag_samples"] == 2
-    assert len(mapping["orders"]) == len(finding.orders)
-    print_finding(finding, output)
-    told = capsys.readouterr().out
-    assert "loops held out" in told
-    assert "2 samples later" in told
-    write_finding(finding, page)
+    assert len(mapping["orders"]) == len(found.orders)
+    print_identification(found, output)
+    shown = capsys.readouterr().out
+    assert "loops held out" in shown
+    assert "2 samples later" in shown
+    write_identification(found, page)
     text = page.read_text()
     assert text.count("data:image/png;base64,") == 2
     assert "sine3.csv" in text
     assert "<script" not in text
     with pytest.raises(InputError, match="exists already"):
-        find(tables, asked, output, overwrite=False, quiet=True)
+        identify_files(tables, asked, output)
 
 
-def test_contradicting_requests_are_refused() -> None:
-    """Deadbands can't be given where the order is found; a number of plays is kept."""
-    with pytest.raises(InputError, match="--plays auto finds the number of deadbands"):
-        Request(plays="auto", deadbands=4).settings("A")
-    assert request(plays=7).settings(None).plays == 7
+def test_a_unit_that_was_not_recorded_is_refused() -> None:
+    """The recordings know it better."""
+    golden = Path(__file__).parents[3] / "recordings" / "golden" / "terfenol_uncompensated.mcap"
     with pytest.raises(InputError, match="--unit must be A"):
-        request().settings("A")
+        identify_files([golden], settings_from("straight", ["table.unit=V"]), None)
 
 
-def test_staged_request_has_its_stages_unless_told_otherwise() -> None:
-    """A staged model has lag, structure and delay by default, and each can be left out."""
-    full = Request(kind="staged").settings("A")
-    assert (full.lag, full.structure, full.delay) == ("growth", True, True)
-    less = Request(kind="staged", lag="none", structure=False, delay=False).settings("A")
-    assert (less.lag, less.structure, less.delay) == ("none", False, False)
+def test_settings_are_checked_together() -> None:
+    """Every broken rule is listed at once, with its key, its value and where it was given."""
+    texts = ["plays=0", "weigths=free", "lag=none", "table.rate_hz=fast", "starts=2.5"]
+    with pytest.raises(ConfigError) as caught:
+        settings_from("ppi", texts)
+    problems = {problem.key: str(problem) for problem in caught.value.problems}
+    assert problems.keys() == {"plays", "weigths", "lag", "table.rate_hz", "starts"}
+    assert problems["plays"] == "--set plays=0: plays: must be >= 1, got 0"
+    assert "did you mean 'weights'" in problems["weigths"]
+    assert "is a setting of staged, not of ppi" in problems["lag"]
+    with pytest.raises(InputError, match=r"unknown kind of model 'presach' .*'preisach'"):
+        settings_from("presach", [])
+
+
+def test_every_setting_is_listed(capsys: pytest.CaptureFixture[str]) -> None:
+    """The list has each setting's name, where --help says that it is."""
+    print_settings()
+    shown = capsys.readouterr().out
+    for name in (*IdentifySettings.model_fields.keys() - {"table"}, "table.rate_hz"):
+        assert f" {name} " in shown, name

@@ -4,15 +4,15 @@ import numpy as np
 import pytest
 
 from hilctl.base.errors import DataError
-from hilctl.identify.data import History, Loop
+from hilctl.identify.data.records import History, SteadyLoop
 from hilctl.identify.geometry import hysteresis_weights
 
 TURN = 2.0 * np.pi * np.arange(400) / 400
 
 
-def ellipse(lag: float, *, frequency_hz: float = 1.0, amplitude: float = 2.0) -> Loop:
+def ellipse(lag: float, *, frequency_hz: float = 1.0, amplitude: float = 2.0) -> SteadyLoop:
     """Return y = 10 sin(t - lag) over v = amplitude sin t."""
-    return Loop(
+    return SteadyLoop(
         f"{frequency_hz:g} Hz", amplitude * np.sin(TURN), 10.0 * np.sin(TURN - lag), frequency_hz
     )
 
@@ -21,7 +21,10 @@ def test_loops_with_minor_loops_have_a_weight() -> None:
     """All pairs of branches count, so a command of two tones is weighted like any other."""
     command = np.sin(TURN) + 0.5 * np.sin(3.0 * TURN)
     lagging = np.roll(command, 10)
-    slow, fast = Loop("slow", command, lagging, 1.0), Loop("fast", command, command, 2.0)
+    slow, fast = (
+        SteadyLoop("slow", command, lagging, 1.0),
+        SteadyLoop("fast", command, command, 2.0),
+    )
     np.testing.assert_allclose(hysteresis_weights([slow, fast]), [1.0, 0.0], atol=1e-12)
 
 

@@ -7,15 +7,14 @@ Figures are percent of the output range of the judged rows.
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
-from hilctl.identify.cycles import find_cycles
-from hilctl.identify.data import History
-from hilctl.identify.fit import Fit, judge
-from hilctl.identify.identify import identify
-from hilctl.identify.settings import Settings
-from hilctl.identify.tables import read_table
+from hilctl.identify.data.cycles import find_cycles
+from hilctl.identify.data.records import History
+from hilctl.identify.data.tables import read_table
+from hilctl.identify.fit_model import FittedModel, fit_model
+from hilctl.identify.judge import judge
+from hilctl.identify.settings import FitSettings
 
 FOLDER = Path(__file__).resolve().parents[4] / "shared" / "data" / "yan9a_DBO"
 START_TRANSIENT = 500  # rows of the model file; the test file settles after 600
@@ -38,17 +37,17 @@ def test_file() -> History:
     return read_table(FOLDER / "Test_Vi_Do_Di.dat", 1, 5, rate_hz=RATE_HZ, ignore=600)
 
 
-def piezo_fit(history: History, **choices: Any) -> Fit:
-    settings = Settings(
+def piezo_fit(history: History, **choices: Any) -> FittedModel:
+    settings = FitSettings(
+        kind="ppi",
         plays=25,
         weights="free",
         layout="midpoint",
-        output_offset=True,
+        offset=True,
         starts=2,
-        input_unit="V",
         **choices,
     )
-    return identify("ppi", [history], settings, np.random.default_rng(1), lambda: 0.0)
+    return fit_model([history], settings, lambda: 0.0, unit="V")
 
 
 def test_model_and_test_file_within_the_published_baseline(
@@ -91,7 +90,7 @@ def test_published_weights_describe_it_too(model_file: History) -> None:
     """Ten plays with exponential weights (3.25, 3.26) reach 2.8 % peak on the averaged cycle."""
     loop = find_cycles(model_file.without_lag(1))
     assert loop.frequency_hz == pytest.approx(1.0, rel=1e-5)
-    settings = Settings(plays=10, output_offset=True, starts=3, input_unit="V")
-    found = identify("ppi", [loop], settings, np.random.default_rng(1), lambda: 0.0)
+    settings = FitSettings(kind="ppi", offset=True, starts=3)
+    found = fit_model([loop], settings, lambda: 0.0, unit="V")
     assert found.peak_percent <= 2.8
     assert set(found.parameters) == {"sigma", "alpha", "beta", "p_0", "output_offset_um"}

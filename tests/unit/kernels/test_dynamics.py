@@ -9,7 +9,7 @@ from scipy.signal import StateSpace, lsim
 
 from hilctl.kernels import dynamics
 from hilctl.kernels.hysteresis import rest_memory
-from hilctl.models.smoothing import smoothing_weights
+from hilctl.models.chain import smoothing_weights
 from hilctl.models.staged import FieldLag, Structure
 
 RATE_HZ = 20_000.0

@@ -23,7 +23,7 @@ from hilctl.loop.feedback import (
     margins,
     rate_needed_hz,
 )
-from hilctl.models.ppi import PpiModel
+from hilctl.models.plays import PpiModel
 from hilctl.models.staged import FieldLag, StagedModel, Structure
 from tests.fakes import made_block
 

@@ -7,8 +7,8 @@ from hilctl.base.errors import ModelError
 from hilctl.models.base import HysteresisModel
 from hilctl.models.deadband import DeadbandFunction
 from hilctl.models.integrated import IntegratedModel
-from hilctl.models.ppi import PpiModel
-from hilctl.models.rdpi import RdpiModel
+from hilctl.models.plays import PpiModel, RdpiModel
+from hilctl.models.spi import SpiModel
 
 GOOD = {"direct": 1.0, "weights": (0.5, 0.0, 0.2), "thresholds": (0.1, 0.2, 0.5)}
 DEADBAND = {
@@ -20,6 +20,7 @@ DEADBAND = {
 }
 KINDS = [
     (PpiModel, {}),
+    (SpiModel, {}),
     (RdpiModel, {"gamma_s": 1e-4}),
     (IntegratedModel, {"gamma_s": 1e-4, "deadband": DEADBAND}),
 ]

@@ -10,12 +10,14 @@ from hilctl.models.base import Provenance
 from hilctl.models.files import KINDS, dump_model, load_model, parse_model
 from hilctl.models.integrated import IntegratedModel
 from hilctl.models.published import exponential_integrated, piezo_ppi, terfenol_rdpi
+from hilctl.models.spi import SpiModel
 
 OMEGA = exponential_integrated(
     alpha=0.3, gamma_s=2e-4, a_0=1.0, alpha_0=0.2, beta_0=0.3, g_0=6.0, alpha_1=0.3, beta_1=0.1,
     d_p=0.8, alpha_2=0.4, beta_2=0.1, d_n=0.8, plays=3, deadbands_a_side=2,
 )  # fmt: skip
-MODELS = [piezo_ppi(), terfenol_rdpi(), OMEGA]
+SPI = SpiModel(**piezo_ppi().model_dump(exclude={"kind"}))
+MODELS = [piezo_ppi(), SPI, terfenol_rdpi(), OMEGA]
 RDPI = """\
 model:
   kind: rdpi
@@ -130,7 +132,7 @@ def test_every_problem_is_told_at_once():
     ("  direct: 2.7\n", "", "m.yaml:1: model.direct: is required"),
     ("  kind: rdpi\n", "", "m.yaml:1: model: needs a 'kind'"),
     ("kind: rdpi", "kind: rpdi",
-     "m.yaml:2: model.kind: must be one of 'ppi', 'rdpi', 'integrated', "),
+     "m.yaml:2: model.kind: must be one of 'ppi', 'spi', 'rdpi', 'integrated', "),
     ("kind: rdpi", "kind: ppi", "m.yaml:6: model.gamma_s: unknown key"),
     ("gamma_s", "rdpi", "m.yaml:6: model.rdpi: unknown key"),
     ("[0.3, 0.6]", "0.3", "m.yaml:5: model.thresholds: must be a list, got 0.3"),

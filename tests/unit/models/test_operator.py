@@ -6,8 +6,7 @@ import pytest
 from hilctl.base.errors import ModelError
 from hilctl.models.deadband import DeadbandFunction
 from hilctl.models.integrated import IntegratedModel
-from hilctl.models.ppi import PpiModel
-from hilctl.models.rdpi import RdpiModel
+from hilctl.models.plays import PpiModel, RdpiModel
 
 SAMPLE_RATE_HZ = 10_000.0
 PLAYS = {"direct": 2.0, "weights": (0.5, 0.3, 0.8), "thresholds": (0.2, 0.5, 1.1)}

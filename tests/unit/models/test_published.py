@@ -7,7 +7,7 @@ from hilctl.kernels.hysteresis import play_sum_shared, rest_memory
 from hilctl.models.deadband import DeadbandFunction
 from hilctl.models.plays import inverse_plays
 from hilctl.models.published import exponential_integrated, piezo_ppi, terfenol_rdpi
-from hilctl.models.spi import SpiCompensator
+from hilctl.models.spi import SpiModel
 
 SAMPLE_RATE_HZ = 50_000.0
 SPI_DIRECT = 2.146
@@ -56,27 +56,33 @@ def widening_of(model, v):
     return model.threshold_growth_s * np.abs(np.diff(v, prepend=v[0])) * SAMPLE_RATE_HZ
 
 
+def spi(ppi):
+    """Return the same PPI, compensated by stops."""
+    return SpiModel(**ppi.model_dump(exclude={"kind"}))
+
+
 def test_spi_direct_weight_from_the_published_ppi():
     """w_0 from the published PPI is the published one."""
-    assert SpiCompensator.of(piezo_ppi()).direct == pytest.approx(SPI_DIRECT, abs=0.002)
+    assert spi(piezo_ppi()).stop_parameters()[0] == pytest.approx(SPI_DIRECT, abs=0.002)
 
 
 @pytest.mark.parametrize("i", range(10))
 def test_spi_from_the_published_ppi(i):
     """Each threshold and weight is the published one, within its inputs' rounding."""
-    spi = SpiCompensator.of(piezo_ppi())
-    assert spi.thresholds[i] == pytest.approx(SPI_THRESHOLDS[i], abs=0.002)
-    assert spi.weights[i] == pytest.approx(SPI_WEIGHTS[i], abs=0.002)
+    _, weights, thresholds = spi(piezo_ppi()).stop_parameters()
+    assert thresholds[i] == pytest.approx(SPI_THRESHOLDS[i], abs=0.002)
+    assert weights[i] == pytest.approx(SPI_WEIGHTS[i], abs=0.002)
 
 
-def test_spi_weights_are_those_of_the_inverse_ppi():
-    """w_0 + sum w_i = 1/p_0, w_i is minus the inverse's i-th weight, the thresholds agree."""
+def test_spi_weights_solve_the_published_equations():
+    """sum_j min(s_i, s_j) w_j + s_i w_0 = r_i (3.19), s the initial loading curve at r (3.18)."""
     ppi = piezo_ppi()
-    spi = SpiCompensator.of(ppi)
-    direct, weights, thresholds = ppi.inverse_parameters()
-    assert spi.direct + spi.weights.sum() == pytest.approx(direct, rel=1e-12)
-    np.testing.assert_allclose(spi.weights, -weights, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(spi.thresholds, thresholds, rtol=1e-13)
+    direct, weights, thresholds = spi(ppi).stop_parameters()
+    r, p = np.array((0.0, *ppi.thresholds)), np.array((ppi.direct, *ppi.weights))
+    loading = np.maximum(0.0, r[1:, None] - r[None, :]) @ p
+    np.testing.assert_allclose(thresholds, loading, rtol=1e-13)
+    left = np.minimum.outer(thresholds, thresholds) @ weights + thresholds * direct
+    np.testing.assert_allclose(left, ppi.thresholds, rtol=1e-12)
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -85,7 +91,7 @@ def test_spi_is_the_inverse_ppi(seed):
     rng = np.random.default_rng(seed)
     y = 12.0 * rng.uniform(-1.0, 1.0, 400).repeat(3) + 0.3 * rng.standard_normal(1_200)
     ppi = piezo_ppi().model_copy(update={"output_offset_um": 1.5 * (seed % 2)})
-    by_stops = SpiCompensator.of(ppi).operator().process(y)
+    by_stops = spi(ppi).inverse(SAMPLE_RATE_HZ).process(y)
     by_plays = ppi.inverse(SAMPLE_RATE_HZ).process(y)
     assert np.max(np.abs(by_stops - by_plays)) <= 1e-12 * np.max(np.abs(by_plays))
 
@@ -94,7 +100,8 @@ def test_spi_of_a_model_without_hysteresis_is_a_gain():
     """No plays, no stops: the compensator divides by p_0."""
     ppi = piezo_ppi().model_copy(update={"weights": (), "thresholds": ()})
     y = sine(3.0, 50.0)
-    np.testing.assert_allclose(SpiCompensator.of(ppi).operator().process(y), y / 0.2567, rtol=1e-15)
+    command = spi(ppi).inverse(SAMPLE_RATE_HZ).process(y)
+    np.testing.assert_allclose(command, y / 0.2567, rtol=1e-15)
 
 
 @pytest.mark.parametrize(("frequency_hz", "percent"), [(1.0, 18.0), (100.0, 26.6), (200.0, 34.3)])

@@ -6,9 +6,9 @@ from pydantic import ValidationError
 
 from hilctl.base.errors import ModelError
 from hilctl.models.base import Provenance
+from hilctl.models.chain import smoothing_weights
 from hilctl.models.files import dump_model, parse_model
 from hilctl.models.published import exponential_integrated, piezo_ppi, terfenol_rdpi
-from hilctl.models.smoothing import smoothing_weights
 from hilctl.models.staged import FieldLag, StagedModel, Structure
 
 RATE_HZ = 50_000.0

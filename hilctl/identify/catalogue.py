@@ -1,0 +1,84 @@
+"""Every kind of model that can be found: its name, how it is found, and what data that takes."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+from hilctl.base.errors import InputError
+from hilctl.base.yaml.messages import did_you_mean
+from hilctl.identify.job import FitJob, FoundModel
+from hilctl.identify.literature.asymmetric import fit_asymmetric
+from hilctl.identify.literature.differential import fit_bouc_wen, fit_duhem
+from hilctl.identify.literature.envelopes import fit_generalised
+from hilctl.identify.literature.operators import fit_kp, fit_preisach, fit_straight
+from hilctl.identify.searched.butterfly import fit_butterfly
+from hilctl.identify.searched.fits import fit_exponential, fit_plays
+from hilctl.identify.settings import FitKind
+from hilctl.identify.staged.fits import fit_free, fit_staged
+
+ANY = "steady loops, or whole histories"
+LOOPS = "steady loops"
+STAGES = "steady loops at one sample rate; whole histories without lag, structure and delay"
+
+
+@dataclass(frozen=True, slots=True)
+class CatalogueEntry:
+    """A kind of model.
+
+    Attributes:
+        title: What it is, for people.
+        found_by: How it is found, for people.
+        data: What that takes, for people.
+        fit: Finds it.
+    """
+
+    title: str
+    found_by: str
+    data: str
+    fit: Callable[[FitJob], FoundModel]
+
+
+def _fit_integrated(job: FitJob) -> FoundModel:
+    return fit_free(job) if job.settings.weights == "free" else fit_exponential(job)
+
+
+_SEARCH = "least squares from several starts"
+_NNLS = "non-negative least squares, held smooth"
+_WEIGHTS_FOLLOW = "least squares on the shape, the weights follow"
+
+CATALOGUE: Mapping[FitKind, CatalogueEntry] = {
+    "integrated": CatalogueEntry(
+        "integrated, Omega: rate, asymmetry (6.18-6.24)", _SEARCH, ANY, _fit_integrated
+    ),
+    "staged": CatalogueEntry(
+        "Omega between field lag, structure and delay", "all found together", STAGES, fit_staged
+    ),
+    "rdpi": CatalogueEntry("rate-dependent PI: no deadbands (5.11, 5.14)", _SEARCH, ANY, fit_plays),
+    "asymmetric": CatalogueEntry(
+        "Omega with gamma = 0: no rate (1.14-1.16)", _WEIGHTS_FOLLOW, ANY, fit_asymmetric
+    ),
+    "ppi": CatalogueEntry("PI: no rate, no deadbands (3.25-3.27)", _SEARCH, ANY, fit_plays),
+    "spi": CatalogueEntry("PI, undone by stop operators (3.11-3.24)", _SEARCH, ANY, fit_plays),
+    "generalised": CatalogueEntry(
+        "generalised PI, tanh envelopes (1.17-1.20)", _WEIGHTS_FOLLOW, ANY, fit_generalised
+    ),
+    "preisach": CatalogueEntry("Preisach (1.1-1.2)", _NNLS, ANY, fit_preisach),
+    "kp": CatalogueEntry("Krasnosel'skii-Pokrovskii (1.3-1.5)", _NNLS, ANY, fit_kp),
+    "bouc_wen": CatalogueEntry("Bouc-Wen (1.21)", _WEIGHTS_FOLLOW, ANY, fit_bouc_wen),
+    "duhem": CatalogueEntry("Duhem, Coleman-Hodgdon (1.22)", _WEIGHTS_FOLLOW, ANY, fit_duhem),
+    "butterfly": CatalogueEntry(
+        "plays, then an even function: rods without bias", _WEIGHTS_FOLLOW, LOOPS, fit_butterfly
+    ),
+    "straight": CatalogueEntry("straight line: no hysteresis", "least squares", ANY, fit_straight),
+}
+
+
+def entry(name: str) -> tuple[FitKind, CatalogueEntry]:
+    """Return a kind of model and what is known of it.
+
+    Raises:
+        InputError: There is none of that name.
+    """
+    for kind, known in CATALOGUE.items():
+        if kind == name:
+            return kind, known
+    raise InputError(f"unknown kind of model '{name}' ({did_you_mean(name, list(CATALOGUE))})")

@@ -1,0 +1,8 @@
+"""What models are fitted to.
+
+records.py  steady loops and whole time histories
+cycles.py   loops from recordings and from histories that repeat
+period.py   the period of a command, and where it is steady
+tables.py   histories from text tables
+files.py    recordings and tables in
+"""

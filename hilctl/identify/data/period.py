@@ -1,0 +1,117 @@
+"""The period of a command, and the stretch over which it repeats."""
+
+import math
+
+import numpy as np
+from scipy.fft import irfft, next_fast_len, rfft
+from scipy.optimize import minimize_scalar
+
+from hilctl.base.arrays import F64, I64
+from hilctl.base.errors import DataError
+from hilctl.identify.data.records import FEWEST_POINTS
+
+LIKELY = 0.3  # least similarity worth a closer look; a decay lowers it
+CANDIDATES = 50  # periods looked at, from the shortest
+STEADY = 0.02  # largest change from cycle to cycle in a steady part, of the peak-to-peak command
+FULL = 0.5  # least peak-to-peak command of the steady part, of that of all
+
+
+def similarity(signal: F64) -> F64:
+    """Return the autocorrelation of a signal with its mean taken out.
+
+    Each lag is divided by the energy of the two parts it compares, so that 1 is a perfect
+    repetition however few samples are left to compare.
+
+    Returns:
+        float64[n // 2 + 1], for lags from 0.
+    """
+    x = signal - signal.mean()
+    n = x.size
+    spectrum = rfft(x, next_fast_len(2 * n, real=True))
+    products = irfft(np.abs(spectrum) ** 2, next_fast_len(2 * n, real=True))[: n // 2 + 1]
+    energy = np.concatenate(([0.0], np.cumsum(x * x)))
+    lags = np.arange(n // 2 + 1)
+    early, late = energy[n - lags], energy[n] - energy[lags]
+    scale = np.sqrt(np.maximum(early * late, np.finfo(np.float64).tiny))
+    return np.asarray(products / scale, dtype=np.float64)
+
+
+def find_period(label: str, command: F64) -> tuple[float, int, int]:
+    """Find the shortest period with which a command repeats at full amplitude, and where it does.
+
+    Returns:
+        Period in samples, not necessarily whole; first sample and sample after the last of the
+        steady part, which is at least two periods long.
+
+    Raises:
+        DataError: It does not repeat.
+    """
+    alike = similarity(command)
+    for top in _tops(alike)[:CANDIDATES]:
+        period = _parabola(alike, int(top))
+        stretch = steady_stretch(command, period)
+        if stretch is None:
+            continue
+        period = _refined(command[slice(*stretch)], period)
+        stretch = steady_stretch(command, period)
+        if stretch is not None:
+            return period, *stretch
+    raise DataError(
+        f"{label}: no steady part in {command.size} samples: the command doesn't repeat at full "
+        "amplitude for two cycles: judge it as a whole history instead"
+    )
+
+
+def _tops(alike: F64) -> I64:
+    """Return the lags of the maxima beyond the first zero: nearer ones are noise."""
+    first = max(int(np.argmax(alike <= 0.0)), FEWEST_POINTS)
+    inner = alike[1:-1]
+    tops = 1 + np.flatnonzero((inner > alike[:-2]) & (inner >= alike[2:]) & (inner > LIKELY))
+    return tops[tops >= first]
+
+
+def _parabola(values: F64, top: int) -> float:
+    left, middle, right = values[top - 1 : top + 2]
+    return top + 0.5 * float((left - right) / (left - 2.0 * middle + right))
+
+
+def _refined(command: F64, period: float) -> float:
+    """Sharpen a period on as many cycles as there are: their spectral line is the strongest."""
+    window = np.hanning(command.size) * (command - command.mean())
+    time = np.arange(command.size)
+
+    def missing(candidate: float) -> float:
+        turns = np.exp(-2j * np.pi * np.outer(harmonics, time) / candidate)
+        return -float(np.sum(np.abs(turns @ window) ** 2))
+
+    harmonics = np.arange(1, 4)
+    width = 0.5 * period * period / command.size
+    found = minimize_scalar(
+        missing, bounds=(period - width, period + width), options={"xatol": 1e-6 * period}
+    )
+    return float(found.x)
+
+
+def steady_stretch(command: F64, period: float) -> tuple[int, int] | None:
+    """Return the longest stretch over which a command repeats at full amplitude.
+
+    Args:
+        command: float64[n].
+        period: Samples a period.
+
+    Returns:
+        First sample and sample after the last, at least two periods; None where there is none.
+    """
+    span = float(np.ptp(command))
+    later = np.arange(command.size - math.ceil(period))
+    again = np.interp(later + period, np.arange(command.size), command)
+    same = np.abs(again - command[later]) <= STEADY * span
+    edges = np.flatnonzero(np.diff(np.concatenate(([0], same.astype(np.int8), [0]))))
+    best: tuple[int, int] | None = None
+    for start, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+        stop = min(int(end + period), command.size)
+        if end - start < period or np.ptp(command[start:stop]) < FULL * span:
+            continue
+        if best is None or stop - start > best[1] - best[0]:
+            best = (start, stop)
+    return best

@@ -1,0 +1,134 @@
+"""How far a model is from data: one judge for every kind of model."""
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from hilctl.analysis.metrics import loop_area
+from hilctl.base.arrays import F64
+from hilctl.identify.data.records import Record, Records, SteadyLoop
+from hilctl.identify.fit_data import PERIODS, FitData
+from hilctl.identify.staged.fit_data import StagedFitData
+from hilctl.identify.staged.model import response_um
+from hilctl.models.base import HysteresisModel
+from hilctl.models.plays import PlayModel
+from hilctl.models.staged import StagedModel
+
+
+@dataclass(frozen=True, slots=True)
+class LoopError:
+    """How far a model is from one record.
+
+    Attributes:
+        label: The record's.
+        peak_percent: Largest displacement error, in percent of the record's own peak-to-peak.
+        rms_percent: Root mean square displacement error, in percent of the same.
+        area_error_percent: Area of the modelled loop less that of the measured one, in percent of
+            the latter; None for a whole time history.
+        peak_to_peak_um: The record's peak-to-peak displacement.
+    """
+
+    label: str
+    peak_percent: float
+    rms_percent: float
+    area_error_percent: float | None
+    peak_to_peak_um: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Judgement:
+    """How far a model is from all records.
+
+    Attributes:
+        errors: One for each record.
+        modelled_um: The model's displacement of each record's judged samples, float64[n].
+        peak_percent: Largest displacement error of all, in percent of the largest peak-to-peak
+            displacement of a record, as publications report it.
+        rms_percent: Root mean square displacement error of all, in percent of the same.
+        own_peak_percent: The largest of the records' own ``peak_percent``.
+    """
+
+    errors: tuple[LoopError, ...]
+    modelled_um: tuple[F64, ...]
+    peak_percent: float
+    rms_percent: float
+    own_peak_percent: float
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return the figures as plain mappings, lists and numbers, for JSON."""
+        return {
+            "errors": [asdict(error) for error in self.errors],
+            "peak_percent": self.peak_percent,
+            "rms_percent": self.rms_percent,
+            "own_peak_percent": self.own_peak_percent,
+        }
+
+
+def judge(model: HysteresisModel, data: Records | FitData, *, creep: bool = False) -> Judgement:
+    """Work out a model's errors on records, those it was fitted to or others.
+
+    Loops are compared in their periodic steady state, with the rate as :meth:`SteadyLoop.rate` has
+    it.
+
+    Args:
+        model: The model.
+        data: The records, prepared already or not.
+        creep: Whether each record has a constant displacement of its own, and a whole history
+            creep of its own as well; what is judged is the rest.
+
+    Raises:
+        DataError: There are no records.
+    """
+    data = data if isinstance(data, FitData) else FitData(data)
+    responses_um = _modelled_um(model, data)
+    if creep:
+        own = np.linalg.lstsq(data.creep, data.target_um - responses_um, rcond=None)[0]
+        responses_um = responses_um + data.creep @ own
+    errors_um = responses_um - data.target_um
+    errors = tuple(
+        _loop_error(record, responses_um[place], data.target_um[place])
+        for record, place in zip(data.records, data.places, strict=True)
+    )
+    to_percent = 100.0 / data.stroke_um
+    return Judgement(
+        errors=errors,
+        modelled_um=tuple(responses_um[place] for place in data.places),
+        peak_percent=float(np.max(np.abs(errors_um))) * to_percent,
+        rms_percent=float(np.sqrt(np.mean(errors_um**2))) * to_percent,
+        own_peak_percent=max(error.peak_percent for error in errors),
+    )
+
+
+def _modelled_um(model: HysteresisModel, data: FitData) -> F64:
+    """Return a model's displacement of all judged samples: float64[N]."""
+    if isinstance(model, PlayModel):
+        return data.response_um(model)
+    parts: list[F64] = []
+    for record, speed in zip(data.records, data.speeds, strict=True):
+        if isinstance(model, StagedModel) and isinstance(record, SteadyLoop):
+            parts.append(response_um(model, StagedFitData([record], [speed])))
+        elif isinstance(record, SteadyLoop):
+            points, rate_hz = record.command.size, record.command.size * record.frequency_hz
+            periods = np.tile(record.command, PERIODS)
+            parts.append(model.forward(rate_hz).process(periods)[-points:])
+        else:
+            command, _, ignored = record.run()
+            parts.append(model.forward(record.sample_rate_hz).process(command)[ignored:])
+    return np.concatenate(parts)
+
+
+def _loop_error(record: Record, response_um: F64, target_um: F64) -> LoopError:
+    error_um = response_um - target_um
+    peak_to_peak = float(np.ptp(target_um))
+    area_error: float | None = None
+    if isinstance(record, SteadyLoop):
+        measured = loop_area(record.command, target_um)
+        area_error = 100.0 * (loop_area(record.command, response_um) / measured - 1.0)
+    return LoopError(
+        label=record.label,
+        peak_percent=100.0 * float(np.max(np.abs(error_um))) / peak_to_peak,
+        rms_percent=100.0 * float(np.sqrt(np.mean(error_um**2))) / peak_to_peak,
+        area_error_percent=area_error,
+        peak_to_peak_um=peak_to_peak,
+    )

@@ -1,0 +1,218 @@
+"""Least squares from several starts, within bounds, and a refinement for the peak error."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from hilctl.base.arrays import F64
+from hilctl.identify.job import OnProgress, StartOutcome
+from hilctl.models.plays import PlayModel
+
+DRAWS_A_START = 12  # random points looked at for each start that is followed
+EVALUATIONS = 60  # of the residuals, derivatives apart, for each start
+POLISH = 300  # the same for the best of them
+ROUNDS = 30  # of the refinement for the peak error
+ROUND = 15  # evaluations of the residuals in a round, derivatives apart
+EMPHASIS = 0.3  # what a sample beyond the goal gains in weight in each round
+NEARLY = 0.96  # of the goal: where samples begin to gain
+SAME = 1e-6  # relative difference of two ends that are one and the same minimum
+
+
+@dataclass(frozen=True, slots=True)
+class SearchSpace:
+    """The parameters that are searched, in units that make all of them about 1.
+
+    Attributes:
+        low: float64[p], lower bounds.
+        high: float64[p], upper bounds.
+        guess: float64[p], rough values from the data, within the bounds.
+    """
+
+    low: F64
+    high: F64
+    guess: F64
+
+    def draw(self, rng: np.random.Generator) -> F64:
+        """Return a random point: each parameter up to 4 times below or above its rough value."""
+        drawn = self.guess * np.exp(rng.uniform(-1.4, 1.4, self.guess.size))
+        inside = self.low + (self.high - self.low) * rng.uniform(0.02, 0.98, self.guess.size)
+        return np.where((drawn > self.low) & (drawn < self.high), drawn, inside)
+
+
+class SearchProblem(Protocol):
+    """A model family with its data, as the search sees it."""
+
+    @property
+    def space(self) -> SearchSpace:
+        """What is searched."""
+        ...
+
+    def error_um(self, x: F64, scale: F64) -> F64:
+        """Return modelled minus measured displacement.
+
+        Args:
+            x: float64[p], a point of the space.
+            scale: float64[N], what each error will be multiplied with; a family whose weights
+                follow from a linear solution needs it.
+
+        Returns:
+            float64[N].
+        """
+        ...
+
+    def slopes_um(self, x: F64, scale: F64) -> F64:
+        """Return the derivatives of the error, float64[N, p]; arguments as for the error."""
+        ...
+
+    def build(self, x: F64, scale: F64) -> PlayModel:
+        """Return the model at a point of the space; arguments as for :meth:`error_um`."""
+        ...
+
+    def parameters(self, x: F64, scale: F64) -> dict[str, float]:
+        """Return the parameters at a point under their published names."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class SearchEnd:
+    """Where the search ended: the point, the scale of the errors there, and all starts."""
+
+    x: F64
+    scale: F64
+    starts: tuple[StartOutcome, ...]
+
+
+def search(
+    problem: SearchProblem,
+    scale: F64,
+    stroke_um: float,
+    starts: int,
+    rng: np.random.Generator,
+    progress: OnProgress,
+) -> SearchEnd:
+    """Minimise the sum of the squared, scaled errors.
+
+    The rough values from the data are followed, and the best of some random points; the best
+    result is followed to the end.
+
+    Args:
+        problem: What is fitted.
+        scale: float64[N], square root of each sample's weight.
+        stroke_um: Largest peak-to-peak output, for the figures.
+        starts: Number of starts.
+        rng: Source of the random points.
+        progress: Called at each start.
+    """
+
+    def percent(x: F64) -> float:
+        errors = problem.error_um(x, scale) * scale
+        return 100.0 * float(np.sqrt(np.mean(errors**2))) / stroke_um
+
+    draws = [problem.space.draw(rng) for _ in range(DRAWS_A_START * (starts - 1))]
+    ranked = sorted(draws, key=percent)[: starts - 1]
+    points = [problem.space.guess, *ranked]
+    ends: list[F64] = []
+    outcomes: list[StartOutcome] = []
+    for i, point in enumerate(points):
+        name = f"random {i}" if i else "data"
+        progress(i / (starts + 1), f"start {i + 1} of {starts}")
+        x, evaluations = polished(problem, point, scale, EVALUATIONS)
+        ends.append(x)
+        outcomes.append(StartOutcome(name, percent(point), percent(x), evaluations))
+    progress(starts / (starts + 1), "following the best start to its end")
+    best = ends[first_least([outcome.rms_percent for outcome in outcomes])]
+    best, _ = polished(problem, best, scale, POLISH)
+    return SearchEnd(best, scale, tuple(outcomes))
+
+
+def polished(problem: SearchProblem, x: F64, scale: F64, evaluations: int) -> tuple[F64, int]:
+    """Return where least squares within the bounds ends from ``x``, and the evaluations it took."""
+    space = problem.space
+
+    def residuals(point: F64) -> F64:
+        return problem.error_um(point, scale) * scale
+
+    def slopes(point: F64) -> F64:
+        return problem.slopes_um(point, scale) * scale[:, None]
+
+    return converged(residuals, x, space.low, space.high, evaluations, slopes)
+
+
+def converged(
+    errors: Callable[[F64], F64],
+    x: F64,
+    low: F64,
+    high: F64,
+    evaluations: int,
+    slopes: Callable[[F64], F64] | None = None,
+) -> tuple[F64, int]:
+    """Return where bounded least squares ends from ``x``, and the evaluations it took.
+
+    Where derivatives are differences, they are central ones: those to one side are known to eight
+    digits only, and what rounding makes of the rest, another thing on every processor, grows from
+    step to step.
+
+    Args:
+        errors: From a point float64[p] to float64[N].
+        x: float64[p], where to start.
+        low: float64[p].
+        high: float64[p].
+        evaluations: Most of the errors, derivatives apart.
+        slopes: Derivatives float64[N, p]; differences where None.
+    """
+    margin = 1e-9 * (high - low)
+    found = least_squares(
+        errors,
+        np.clip(x, low + margin, high - margin),
+        jac=slopes or "3-point",
+        bounds=(low, high),
+        x_scale="jac",
+        max_nfev=evaluations,
+    )
+    return np.asarray(found.x, dtype=np.float64), int(found.nfev)
+
+
+def first_least(values: Sequence[float]) -> int:
+    """Return the first of the values that are the least but for rounding.
+
+    Starts that end at one minimum differ in the last digits only, and those are another thing on
+    every processor: the first of them is taken.
+    """
+    return int(np.argmax(np.array(values) <= min(values) * (1.0 + SAME)))
+
+
+def refine_peak(
+    problem: SearchProblem, found: SearchEnd, goal_um: float, progress: OnProgress
+) -> SearchEnd:
+    """Give weight to samples whose error is beyond a goal, until none is.
+
+    After Lawson's algorithm for the smallest peak error, stopped as soon as the goal is met, so
+    that the fit stays as near to least squares as the goal allows.
+
+    Args:
+        problem: What is fitted.
+        found: Where least squares ended.
+        goal_um: Largest error wanted.
+        progress: Called at each round.
+
+    Returns:
+        The point with the smallest peak error that was met on the way.
+    """
+    best, x, scale = found, found.x, found.scale
+    peak = lowest = float(np.max(np.abs(problem.error_um(x, scale))))
+    for i in range(ROUNDS):
+        if peak <= goal_um:
+            break
+        progress(i / ROUNDS, f"peak error {peak:.3g} um, goal {goal_um:.3g} um")
+        # Samples gain little by little as they near the goal: with a sharp border, rounding would
+        # decide on which side a sample is.
+        near = np.abs(problem.error_um(x, scale)) / goal_um
+        scale = scale * (1.0 + EMPHASIS * np.clip((near - NEARLY) / (1.0 - NEARLY), 0.0, 1.0))
+        x, _ = polished(problem, x, scale, ROUND)
+        peak = float(np.max(np.abs(problem.error_um(x, scale))))
+        if peak < lowest:
+            best, lowest = SearchEnd(x, scale, found.starts), peak
+    return best

@@ -1,0 +1,248 @@
+"""Records made ready for a fit with dynamics: lag in time, structure and delay by harmonics.
+
+A steady cycle repeats, so a linear stage multiplies each of its harmonics by a number, exactly and
+whatever the cycle's frequency; only the lag, which may grow with its distance, is followed in time.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from copy import copy
+from dataclasses import dataclass, replace
+from typing import TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+from scipy.fft import irfft, rfft
+
+from hilctl.base.arrays import F64
+from hilctl.base.errors import DataError
+from hilctl.identify.data.records import Record, Records, SteadyLoop
+from hilctl.identify.staged.sensitivity import PARAMETERS, lagged, plays_and_slopes
+from hilctl.models.base import Operator
+
+Spectrum: TypeAlias = npt.NDArray[np.complex128]
+SETTLED = 20.0  # time constants after which a lag has forgotten its start
+MOST_SUBSTEPS = 200
+
+
+@dataclass(frozen=True, slots=True)
+class Linear:
+    """1 / (1 + c s + q s^2) and a delay, each 0 where there is none.
+
+    Attributes:
+        delay_s: Transport delay.
+        c_s: 2 zeta / w of a structure.
+        q_s2: 1 / w^2.
+    """
+
+    delay_s: float = 0.0
+    c_s: float = 0.0
+    q_s2: float = 0.0
+
+    @property
+    def none(self) -> bool:
+        """Whether nothing is done."""
+        return self.delay_s == 0.0 and self.c_s == 0.0 and self.q_s2 == 0.0
+
+    def response(self, s: Spectrum) -> Spectrum:
+        """Return what each s = j w is multiplied with."""
+        return np.asarray(np.exp(-s * self.delay_s) / (1.0 + s * (self.c_s + s * self.q_s2)))
+
+
+@dataclass(frozen=True, slots=True)
+class _Run:
+    """One record: signals float64[n], judged samples, place among all, s of each harmonic."""
+
+    command: F64
+    speed: F64
+    judged: slice
+    place: slice
+    step_s: float
+    s: Spectrum | None
+
+    def every(self, step: int) -> "_Run":
+        """Return every ``step``-th point of a steady cycle."""
+        if step == 1 or self.s is None:
+            return self
+        command, speed = self.command[::step].copy(), self.speed[::step].copy()
+        part = slice(0, command.size)
+        step_s = self.step_s * self.command.size / command.size
+        return _Run(command, speed, part, part, step_s, self.s[: command.size // 2 + 1])
+
+
+class StagedFitData:
+    """All records' commands and displacements, judged samples one after the other.
+
+    Attributes:
+        target_um: float64[N], measured displacement.
+        places: For each record, its part of the N samples.
+        reach: Half the largest peak-to-peak command.
+        top_speed: Largest |rate| of the command.
+        top_hz: Highest fundamental of a loop; of histories, that of a sine as fast as they are.
+        stroke_um: Largest peak-to-peak displacement.
+        one_rate: Whether all records are of runs at one sample rate.
+        half_period_s: Half a sample period of the runs; 0.0 where it is not known.
+        input_range: Lowest and highest command.
+        output_range_um: Lowest and highest judged displacement.
+    """
+
+    def __init__(self, data: Records, speeds: Sequence[F64]) -> None:
+        """Prepare records.
+
+        Args:
+            data: One record or more.
+            speeds: |rate| of each, see :attr:`hilctl.identify.fit_data.FitData.speeds`.
+        """
+        runs = [_run(record, speed) for record, speed in zip(data, speeds, strict=True)]
+        targets = [r.displacement_um[run.judged] for r, run in zip(data, runs, strict=True)]
+        self._keep(runs, np.concatenate(targets))
+        self.reach = max(0.5 * float(np.ptp(run.command)) for run in self._runs)
+        self.top_speed = max(float(run.speed.max()) for run in self._runs)
+        loops = [record for record in data if isinstance(record, SteadyLoop)]
+        turning = self.top_speed / (2.0 * math.pi * self.reach)
+        self.top_hz = max((loop.frequency_hz for loop in loops), default=turning)
+        self.stroke_um = max(float(np.ptp(target)) for target in targets)
+        rates = {record.sample_rate_hz for record in data}
+        self.one_rate = len(rates) == 1
+        self.half_period_s = 0.5 / max(rates) if min(rates) > 0.0 else 0.0
+        self.input_range = (
+            min(float(run.command.min()) for run in self._runs),
+            max(float(run.command.max()) for run in self._runs),
+        )
+        self.output_range_um = (float(self.target_um.min()), float(self.target_um.max()))
+
+    def thinned(self, scale: F64, points: int) -> tuple["StagedFitData", F64]:
+        """Return the data with fewer points a loop, and ``scale``, float64[N], of these.
+
+        Args:
+            scale: Square root of each sample's weight.
+            points: About as many are left of each loop; of histories, all are.
+        """
+        kept, runs = np.zeros(scale.size, dtype=bool), []
+        for run in self._runs:
+            step = max(_size(run.place) // points, 1) if run.s is not None else 1
+            kept[run.place][::step] = True
+            runs.append(run.every(step))
+        few = copy(self)
+        few._keep(runs, self.target_um[kept])  # noqa: SLF001  a copy of the same class
+        return few, scale[kept]
+
+    def _keep(self, runs: Sequence[_Run], target_um: F64) -> None:
+        self._runs = _placed(runs)
+        self.target_um = target_um
+        self.places = tuple(run.place for run in self._runs)
+
+    @property
+    def gain(self) -> float:
+        """Largest stroke over largest peak-to-peak command, in um per command unit."""
+        return self.stroke_um / (2.0 * self.reach)
+
+    @property
+    def all_steady(self) -> bool:
+        """Whether every record is a steady cycle, as stages with dynamics need it."""
+        return all(run.s is not None for run in self._runs)
+
+    def lagged(self, lag_s: float, growth: float) -> tuple[list[F64], list[F64]]:
+        """Return each record's command after a lag, and its derivatives float64[n, 4]."""
+        out = [run.command.copy() for run in self._runs]
+        slopes = [np.zeros((run.command.size, PARAMETERS)) for run in self._runs]
+        for run, w, dw in zip(self._runs, out, slopes, strict=True):
+            if lag_s > 0.0:
+                substeps = min(max(1, math.ceil(run.step_s / lag_s)), MOST_SUBSTEPS)
+                settle = min(run.command.size, math.ceil(SETTLED * lag_s / run.step_s))
+                lagged(run.command, run.step_s, lag_s, growth, substeps, settle, w, dw)
+        return out, slopes
+
+    def plays(
+        self, lagged: tuple[list[F64], list[F64]], before: F64, numbers: F64, weights: F64
+    ) -> tuple[F64, F64, F64]:
+        """Run plays on commands after a lag.
+
+        Args:
+            lagged: What :meth:`lagged` returned.
+            before: float64[4], of which the spacing of thresholds and gamma in s count here.
+            numbers: float64[n], thresholds in units of the spacing.
+            weights: float64[n].
+
+        Returns:
+            The lagged command float64[N], each play's output float64[N, n], and the derivatives
+            of the lagged command and of the weighted sum of the plays, float64[2, N, 4].
+        """
+        size = self.target_um.size
+        inputs, outputs = np.empty(size), np.empty((size, numbers.size))
+        slopes = np.empty((2, size, PARAMETERS))
+        for run, w, dw in zip(self._runs, *lagged, strict=True):
+            out, by = np.empty((w.size, numbers.size)), np.empty((w.size, PARAMETERS))
+            turns = 1 if run.s is None else 2
+            spacing, gamma_s = float(before[2]), float(before[3])
+            plays_and_slopes(w, dw, run.speed, spacing, gamma_s, numbers, weights, turns, out, by)
+            inputs[run.place], outputs[run.place] = w[run.judged], out[run.judged]
+            slopes[0, run.place], slopes[1, run.place] = dw[run.judged], by[run.judged]
+        return inputs, outputs, slopes
+
+    def respond(self, lagged: list[F64], operator: Callable[[], Operator]) -> F64:
+        """Run an operator, new for each record, on commands after a lag: float64[N]."""
+        out = np.empty(self.target_um.size)
+        for run, w in zip(self._runs, lagged, strict=True):
+            signal = w if run.s is None else np.tile(w, 2)
+            out[run.place] = operator().process(signal)[signal.size - w.size :][run.judged]
+        return out
+
+    def through(self, signals: F64, linear: Linear) -> F64:
+        """Send signals float64[N, k] through the linear stages."""
+        if linear.none:
+            return signals
+        out = np.empty_like(signals)
+        for run in self._runs:
+            response = linear.response(_harmonics(run))[:, None]
+            spectrum = rfft(signals[run.place], axis=0) * response
+            out[run.place] = irfft(spectrum, _size(run.place), axis=0)
+        return out
+
+    def undelayed(self, delay_s: float) -> F64:
+        """Return the measured displacements that much earlier: float64[N]."""
+        return self.through(self.target_um[:, None], Linear(-delay_s))[:, 0]
+
+    def linear_slopes(self, signal: F64, linear: Linear) -> F64:
+        """Return the derivatives of a signal's response by delay, c and q: float64[N, 3]."""
+        out = np.zeros((signal.size, 3))
+        for run in self._runs:
+            if run.s is None:
+                continue
+            s = run.s
+            spectrum = rfft(signal[run.place]) * linear.response(s)
+            stage = 1.0 / (1.0 + s * (linear.c_s + s * linear.q_s2))
+            stacked = np.stack([-s * spectrum, -s * stage * spectrum, -s * s * stage * spectrum], 1)
+            out[run.place] = irfft(stacked, _size(run.place), axis=0)
+        return out
+
+
+def _placed(runs: Sequence[_Run]) -> list[_Run]:
+    """Put the judged samples of each run behind those of the one before."""
+    ends = np.cumsum([0, *(_size(run.judged) for run in runs)]).tolist()
+    places = map(slice, ends[:-1], ends[1:])
+    return [replace(run, place=place) for run, place in zip(runs, places, strict=True)]
+
+
+def _size(place: slice) -> int:
+    return int(place.stop - place.start)
+
+
+def _harmonics(run: _Run) -> Spectrum:
+    if run.s is None:
+        raise DataError(
+            "lag, structure and delay are found from steady loops: leave out --whole, or give "
+            "--set lag=none, structure=false and delay=false"
+        )
+    return run.s
+
+
+def _run(record: Record, speed: F64) -> _Run:
+    size, command = record.command.size, np.ascontiguousarray(record.command)
+    if isinstance(record, SteadyLoop):
+        harmonics = np.arange(size // 2 + 1)
+        s = np.asarray(2j * math.pi * record.frequency_hz * harmonics, dtype=np.complex128)
+        whole = slice(0, size)
+        return _Run(command, speed, whole, whole, 1.0 / (size * record.frequency_hz), s)
+    judged = slice(record.ignore, size)
+    return _Run(command, speed, judged, judged, 1.0 / record.sample_rate_hz, None)

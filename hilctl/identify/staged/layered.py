@@ -1,0 +1,189 @@
+"""The staged model as one sum of squares with analytic derivatives.
+
+Lag -> plays -> deadbands -> structure -> delay; all parameters in one row of numbers.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hilctl.base.arrays import F64
+from hilctl.identify.staged.fit_data import Linear, StagedFitData
+from hilctl.identify.staged.sensitivity import PARAMETERS
+
+STEEPEST = 5.0  # largest slope of the deadband function, relative to that around 0
+DYNAMIC = PARAMETERS + 3
+RADIAN = 0.16  # 1 / (2 pi)
+
+
+@dataclass(frozen=True, slots=True)
+class Layers:
+    """What is in the model.
+
+    Attributes:
+        plays: Number n of plays.
+        deadbands: Number k of deadbands on each side.
+        lag: Whether there is a field lag.
+        growth: Whether it grows with its distance.
+        gamma: Whether thresholds grow with the rate.
+        structure: Whether there is a second-order structure.
+        delay: Whether a transport delay is fitted.
+        least_delay_s: Delay that a sampled loop has in any case.
+        offset: Whether a constant displacement is fitted.
+        midpoint: Whether thresholds are alpha (i - 1/2) instead of alpha i.
+        least_slope: Smallest slope anywhere, relative to the mean slope of the data.
+    """
+
+    plays: int
+    deadbands: int
+    lag: bool = True
+    growth: bool = True
+    gamma: bool = False
+    structure: bool = True
+    delay: bool = True
+    least_delay_s: float = 0.0
+    offset: bool = True
+    midpoint: bool = False
+    least_slope: float = 0.01
+
+    @property
+    def numbers(self) -> F64:
+        """What the spacing is multiplied with to give the thresholds: float64[n]."""
+        first = 0.5 if self.midpoint else 1.0
+        return np.arange(self.plays, dtype=np.float64) + first
+
+    def spacing_limit(self, reach: float) -> float:
+        """Return the largest spacing at which every play still moves in a full cycle."""
+        return reach / (self.plays + (0.0 if self.midpoint else 0.5))
+
+    @property
+    def dynamic(self) -> bool:
+        """Whether any stage has dynamics."""
+        return self.lag or self.structure or self.delay or self.least_delay_s > 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Point:
+    """Parameters of the layers, in their own units.
+
+    Attributes:
+        before: float64[4]: lag in s, its growth, spacing of the thresholds, gamma in s.
+        linear: Structure and delay.
+        direct: a_0 in um per command unit.
+        weights: float64[n], a_1 to a_n.
+        spacings_um: d_p and d_n, distances of the deadbands above and below 0.
+        up: float64[k], slopes of Lambda beyond each deadband above 0; 1 around 0.
+        down: float64[k], the same below 0.
+        offset_um: Constant displacement.
+    """
+
+    before: F64
+    linear: Linear
+    direct: float
+    weights: F64
+    spacings_um: tuple[float, float]
+    up: F64
+    down: F64
+    offset_um: float
+
+    def pack(self) -> F64:
+        """Return all that is fitted as float64[p]."""
+        linear = (self.linear.delay_s, self.linear.c_s, self.linear.q_s2)
+        inner = (self.direct, *self.weights, *self.up, *self.down)
+        return np.array([*self.before, *linear, *inner, *self.spacings_um, self.offset_um])
+
+    def unpack(self, x: F64) -> "Point":
+        """Return the point with other values."""
+        n, k = self.weights.size, self.up.size
+        tail = x[DYNAMIC:]
+        return replace(
+            self,
+            before=x[:PARAMETERS].copy(),
+            linear=Linear(*map(float, x[PARAMETERS:DYNAMIC])),
+            direct=float(tail[0]),
+            weights=tail[1 : n + 1].copy(),
+            up=tail[n + 1 : n + 1 + k].copy(),
+            down=tail[n + 1 + k : n + 1 + 2 * k].copy(),
+            spacings_um=(float(x[-3]), float(x[-2])),
+            offset_um=float(x[-1]),
+        )
+
+    @property
+    def corners_um(self) -> F64:
+        """Thresholds of the deadbands, from the lowest up: float64[2 k]."""
+        d_p, d_n = self.spacings_um
+        k = self.up.size
+        return np.concatenate((-d_n * np.arange(k, 0, -1), d_p * np.arange(1, k + 1)))
+
+
+def bounds(data: StagedFitData, layers: Layers, point: Point) -> tuple[F64, F64]:
+    """Return the lowest and highest values, float64[p]; equal where nothing is fitted."""
+    radian_s = RADIAN / data.top_hz
+    limit, steepest = layers.spacing_limit(data.reach), 4.0 * data.gain
+    apart = data.stroke_um / (layers.deadbands + 1)
+    free = [
+        (1e-3 * radian_s, 3.0 * radian_s, layers.lag),
+        (0.0, 20.0 / data.reach, layers.lag and layers.growth),
+        (0.05 * limit, limit, True),
+        (0.0, data.reach / data.top_speed, layers.gamma),
+        (layers.least_delay_s, layers.least_delay_s + radian_s, layers.delay),
+        (1e-3 * radian_s, 2.0 * radian_s, layers.structure),
+        (1e-4 * radian_s**2, 4.0 * radian_s**2, layers.structure),
+        (layers.least_slope * data.gain, steepest, True),
+        *[(0.0, steepest, True)] * layers.plays,
+        *[(layers.least_slope, STEEPEST, True)] * (2 * layers.deadbands),
+        *[(0.04 * apart, 2.0 * apart, True)] * 2,
+        (-data.stroke_um, data.stroke_um, layers.offset),
+    ]
+    at = point.pack()
+    low = np.array([row[0] if row[2] else now for row, now in zip(free, at, strict=True)])
+    high = np.array([row[1] if row[2] else now for row, now in zip(free, at, strict=True)])
+    return low, high
+
+
+def error_and_slopes(data: StagedFitData, layers: Layers, point: Point) -> tuple[F64, F64]:
+    """Return modelled minus measured displacement float64[N] and derivatives float64[N, p]."""
+    lagged = data.lagged(float(point.before[0]), float(point.before[1]))
+    w, outputs, by = data.plays(lagged, point.before, layers.numbers, point.weights)
+    inner = point.direct * w + outputs @ point.weights
+    k, corners = point.up.size, point.corners_um
+    parts = segments(inner, corners)
+    rates = np.concatenate((point.down[::-1], [1.0], point.up))
+    gain = rates[np.searchsorted(corners, inner)][:, None]
+    bare = parts @ rates
+    outwards = np.concatenate((np.arange(k + 1, 2 * k + 1), np.arange(k - 1, -1, -1)))
+    first = PARAMETERS + 1
+    inside = np.empty((w.size, first + 3 + outputs.shape[1] + 2 * k))
+    inside[:, 0] = bare
+    inside[:, 1:first] = gain * (point.direct * by[0] + by[1])
+    inside[:, first] = gain[:, 0] * w
+    inside[:, first + 1 : first + 1 + outputs.shape[1]] = gain * outputs
+    inside[:, first + 1 + outputs.shape[1] : -2] = parts[:, outwards]
+    inside[:, -2:] = _by_spacings(inner, point)
+    out = data.through(inside, point.linear)
+    slopes = np.empty((w.size, out.shape[1] + 3))
+    slopes[:, :PARAMETERS] = out[:, 1:first]
+    slopes[:, PARAMETERS:DYNAMIC] = 0.0
+    if layers.structure or layers.delay:
+        slopes[:, PARAMETERS:DYNAMIC] = data.linear_slopes(bare, point.linear)
+    slopes[:, DYNAMIC:-1] = out[:, first:]
+    slopes[:, -1] = 1.0
+    return out[:, 0] + (point.offset_um - data.target_um), slopes
+
+
+def _by_spacings(x: F64, point: Point) -> F64:
+    """Return the derivatives of Lambda(x) by d_p and d_n: float64[N, 2]."""
+    out = np.empty((x.size, 2))
+    sides = (point.spacings_um[0], point.up, x, -1.0), (point.spacings_um[1], point.down, -x, 1.0)
+    for i, (spacing, slopes, outwards, sign) in enumerate(sides):
+        numbers = np.arange(1, slopes.size + 1)
+        moved = np.concatenate(([0.0], np.cumsum(np.diff(slopes, prepend=1.0) * numbers)))
+        out[:, i] = sign * moved[np.searchsorted(spacing * numbers, outwards)]
+    return out
+
+
+def segments(x: F64, corners: F64) -> F64:
+    """Cut x at corners into parts that sum to x, each 0 where x is: float64[..., corners + 1]."""
+    low = np.concatenate(([-np.inf], corners))
+    high = np.concatenate((corners, [np.inf]))
+    return np.asarray(np.clip(x[..., None], low, high) - np.clip(0.0, low, high))

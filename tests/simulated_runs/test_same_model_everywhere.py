@@ -1,0 +1,152 @@
+"""Every kind of fit gives the same model, whatever arithmetic the processor has.
+
+OpenBLAS picks its kernels by processor, and sums in another order on each. What a fit makes of that
+must stay rounding. Each set of kernels runs in a process of its own.
+"""
+
+import ctypes
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy
+
+from hilctl.base.arrays import F64
+from hilctl.identify.catalogue import CATALOGUE
+from hilctl.identify.data.cycles import average_cycle
+from hilctl.identify.data.records import SteadyLoop
+from hilctl.identify.fit_model import fit_model
+from hilctl.identify.settings import FitSettings
+from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
+
+pytestmark = pytest.mark.rig
+
+RATE_HZ = 50_000.0
+POINTS = 64
+TONES = [(a, f) for a in (3.0, 7.0) for f in (10.0, 100.0, 200.0)]
+FITS = {
+    **{kind: {"kind": kind} for kind in CATALOGUE},
+    "rdpi, exponential": {"kind": "rdpi", "weights": "exponential", "weight_by": "equal"},
+    "rdpi, peak": {"kind": "rdpi", "offset": True, "peak_goal_percent": 4.0},
+    "integrated, free": {"kind": "integrated", "weights": "free"},
+    "integrated, hysteresis": {"kind": "integrated", "weight_by": "hysteresis"},
+    "staged, preisach": {"kind": "staged", "hysteresis": "preisach"},
+    "staged, no lag": {"kind": "staged", "lag": "none"},
+    "staged, peak": {"kind": "staged", "peak_goal_percent": 0.4},
+}
+KERNELS = ("Nehalem", "Haswell", "Zen", "SkylakeX")
+NEEDS = {"Haswell": "avx2", "Zen": "avx2", "SkylakeX": "avx512f"}
+CLOSE = 1e-6  # relative to the largest of the values that belong together
+
+
+def measured(amplitude_a: float, frequency_hz: float) -> SteadyLoop:
+    """Return the rig's averaged cycle under a sine."""
+    time = np.arange(round(5.0 / frequency_hz * RATE_HZ)) / RATE_HZ
+    start = np.clip(time * frequency_hz, 0.0, 1.0)
+    command = start * amplitude_a * np.sin(2.0 * np.pi * frequency_hz * time)
+    displacement_um, current_a = np.empty_like(command), np.empty_like(command)
+    TerfenolActuator(TerfenolParameters(), RATE_HZ, seed=3).step(
+        command, displacement_um, current_a
+    )
+    period = RATE_HZ / frequency_hz
+    first = round(2 * period)
+    phase = np.arange(command.size - first) / period
+    signals = np.stack([command[first:], displacement_um[first:]])
+    v, y = average_cycle("rig", phase, signals, period, POINTS)
+    label = f"{amplitude_a:g} A {frequency_hz:g} Hz"
+    return SteadyLoop(label, v, y, frequency_hz, RATE_HZ)
+
+
+def kernels_in_use() -> list[str]:
+    """Return the kernels that NumPy's and SciPy's OpenBLAS have taken, as they say themselves."""
+    names = []
+    for package in (np, scipy):
+        folder = Path(package.__file__).parents[1] / f"{package.__name__}.libs"
+        for path in folder.glob("*openblas*"):
+            library = ctypes.CDLL(str(path))
+            for name in ("scipy_openblas_get_corename64_", "scipy_openblas_get_corename"):
+                if hasattr(library, name):
+                    get = getattr(library, name)
+                    get.restype = ctypes.c_char_p
+                    names.append(get().decode())
+    return names
+
+
+def fit_all() -> None:
+    """Fit every kind and print all models: what the processes of this test do."""
+    loops = [measured(*tone) for tone in TONES]
+    models = {
+        name: fit_model(loops, FitSettings(**choices), lambda: 0.0).model.model_dump(
+            mode="json", exclude={"provenance"}
+        )
+        for name, choices in FITS.items()
+    }
+    print(json.dumps(models))
+
+
+def numbers(value: object, name: str = "") -> dict[str, F64]:
+    """Return all numbers of a model, those that belong together in one array."""
+    if isinstance(value, dict):
+        parts = [numbers(inner, f"{name}.{key}") for key, inner in value.items()]
+        return {key: array for part in parts for key, array in part.items()}
+    if isinstance(value, list) and value:
+        rows = [numbers(row).get("", np.zeros(0)) for row in value]  # of a triangle, of any length
+        return {name: np.concatenate(rows)}
+    return {name: np.array([value], dtype=np.float64)} if isinstance(value, float | int) else {}
+
+
+@pytest.fixture(scope="module")
+def models_by() -> dict[str, dict[str, object]]:
+    """Return all models by the kernels that they were found with."""
+    flags = Path("/proc/cpuinfo").read_text()
+    found: dict[str, dict[str, object]] = {}
+    for kernels in KERNELS:
+        if NEEDS.get(kernels, "") not in flags:
+            continue
+        if set(run_with(kernels, "--kernels")) == {kernels}:  # else this build has none for it
+            found[kernels] = run_with(kernels)
+    return found
+
+
+def run_with(kernels: str, *options: str) -> dict[str, object]:
+    """Run this file in a process of its own that takes these kernels; return what it printed."""
+    done = subprocess.run(
+        [sys.executable, __file__, *options],
+        env={**os.environ, "OPENBLAS_CORETYPE": kernels, "OPENBLAS_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert done.returncode == 0, done.stderr
+    answer: dict[str, object] = json.loads(done.stdout)
+    return answer
+
+
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize("name", FITS)
+def test_a_model_is_the_same_on_every_processor(
+    models_by: dict[str, dict[str, object]], name: str
+) -> None:
+    """Each parameter, to a millionth of the largest of its kind."""
+    if len(models_by) < 2:
+        pytest.skip("this processor has one set of kernels only")
+    first, *others = models_by.values()
+    expected = numbers(first[name])
+    assert len(expected) >= 3
+    for other in others:
+        found = numbers(other[name])
+        assert found.keys() == expected.keys()
+        for key, values in expected.items():
+            size = max(float(np.abs(values).max()), 1e-300)
+            np.testing.assert_allclose(found[key], values, rtol=0.0, atol=CLOSE * size, err_msg=key)
+
+
+if __name__ == "__main__":
+    if "--kernels" in sys.argv:
+        print(json.dumps(dict.fromkeys(kernels_in_use())))
+    else:
+        fit_all()

@@ -1,0 +1,124 @@
+"""Steady cycles: averaged from recordings and found in tables."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from hilctl.base.errors import DataError
+from hilctl.base.segments import Segment
+from hilctl.identify.data.cycles import average_cycle, find_cycles, loops_from_recording
+from hilctl.identify.data.records import History
+from hilctl.recording.data import Recording
+
+RATE_HZ = 50_000.0
+
+
+def sine_segment(frequency_hz: float, cycles: int, start: int = 0) -> tuple[np.ndarray, Segment]:
+    """Return a 6 A sine without a soft start, and its segment."""
+    period = RATE_HZ / frequency_hz
+    n = round(cycles * period)
+    command = 6.0 * np.sin(2.0 * np.pi * np.arange(n) / period)
+    label = f"sine 6 A {frequency_hz:g} Hz"
+    return command, Segment(label, start, start + n, start, start + n, period)
+
+
+@pytest.mark.parametrize("frequency_hz", [10.0, 150.0, 250.0, 173.7])
+def test_loops_keep_the_waveform_at_any_period(
+    frequency_hz: float, recording_of: Callable[..., Recording]
+) -> None:
+    """300 points come out right whether a cycle has 5000, 333.3, 200 or 287.9 samples."""
+    command, segment = sine_segment(frequency_hz, 8)
+    (loop,) = loops_from_recording(recording_of(command, -5.0 * command, [segment]))
+    first = segment.steady_cycles()[0]
+    turn = 2.0 * np.pi * (np.arange(300) / 300 + first / segment.period)
+    np.testing.assert_allclose(loop.command, 6.0 * np.sin(turn), atol=6e-4)
+    np.testing.assert_allclose(loop.displacement_um, -30.0 * np.sin(turn), atol=3e-3)
+    assert loop.frequency_hz == pytest.approx(frequency_hz)
+    assert loop.sample_rate_hz == RATE_HZ
+    assert loop.label == segment.label
+
+
+def test_averaging_takes_noise_out(recording_of: Callable[..., Recording]) -> None:
+    """Noise falls with the root of the samples in a bin: 19 cycles x 16.7 samples a point here."""
+    command, segment = sine_segment(10.0, 20)
+    noise = np.random.default_rng(5).normal(0.0, 1.0, command.size)
+    (loop,) = loops_from_recording(recording_of(command, command + noise, [segment]))
+    left = loop.displacement_um - loop.command
+    assert np.std(left) == pytest.approx(1.0 / np.sqrt(19 * 5000 / 300), rel=0.2)
+
+
+def test_samples_missing_from_some_cycles_do_no_harm(
+    recording_of: Callable[..., Recording],
+) -> None:
+    """A gap in one cycle is filled by the others."""
+    command, segment = sine_segment(100.0, 6)
+    kept = np.flatnonzero((np.arange(command.size) < 900) | (np.arange(command.size) > 1100))
+    recording = recording_of(command[kept], command[kept], [segment], index=kept)
+    (loop,) = loops_from_recording(recording)
+    start = segment.steady_cycles()[0] / segment.period
+    expected = 6.0 * np.sin(2.0 * np.pi * (np.arange(300) / 300 + start))
+    np.testing.assert_allclose(loop.command, expected, atol=1e-3)
+
+
+def test_a_phase_missing_from_all_cycles_is_refused() -> None:
+    """Where no cycle has a sample around a phase, the place is named."""
+    phase = np.arange(0, 500) / 100
+    phase = phase[(phase % 1.0 < 0.4) | (phase % 1.0 > 0.5)]
+    with pytest.raises(DataError, match=r"run: no sample at 0\.4\d* of the cycle"):
+        average_cycle("run", phase, np.sin(phase)[None, :], 100.0, 300)
+
+
+def test_a_segment_without_steady_cycle_is_named(recording_of: Callable[..., Recording]) -> None:
+    """A step segment or one that is too short can't give a loop."""
+    command, segment = sine_segment(10.0, 2)
+    short = Segment("step 1 A", 0, 5000, 0, 5000, 0.0)
+    recording = recording_of(command, command, [segment, short])
+    with pytest.raises(DataError, match=r"grid.mcap: segment 'step 1 A': no steady cycle"):
+        loops_from_recording(recording)
+    assert len(loops_from_recording(recording, labels=[segment.label])) == 1
+
+
+def test_unknown_labels_are_refused_with_the_known_ones(
+    recording_of: Callable[..., Recording],
+) -> None:
+    """A label that isn't there is reported beside those that are."""
+    command, segment = sine_segment(10.0, 2)
+    recording = recording_of(command, command, [segment])
+    with pytest.raises(DataError, match="no segment 'sine 7 A'; it has 'sine 6 A 10 Hz'"):
+        loops_from_recording(recording, labels=["sine 7 A"])
+    with pytest.raises(DataError, match="it has none"):
+        loops_from_recording(recording_of(command, command, []))
+
+
+def test_find_cycles_skips_rest_and_decay() -> None:
+    """The steady part between a rest and a decay is found, with a period that is not whole."""
+    period, rate_hz = 73.3, 200.0
+    time = np.arange(2000)
+    envelope = np.interp(time, [0, 300, 301, 1200, 1900], [0.0, 0.0, 1.0, 1.0, 0.0])
+    wave = 1.8 * np.sin(2.0 * np.pi * time / period)
+    loop = find_cycles(History("table", 1.8 + envelope * wave, 5.0 * envelope * wave, rate_hz), 60)
+    assert loop.frequency_hz == pytest.approx(rate_hz / period, rel=1e-5)
+    np.testing.assert_allclose(loop.displacement_um, 5.0 * (loop.command - 1.8), atol=0.02)
+    assert np.ptp(loop.command) == pytest.approx(3.6, rel=0.01)
+
+
+def test_find_cycles_takes_the_whole_period_of_two_tones() -> None:
+    """Two tones at 50 and 100 Hz repeat at 50 Hz, though the second is the stronger."""
+    time = np.arange(4000) / 10_000.0
+    command = np.sin(2 * np.pi * 50.0 * time) + 5.0 * np.sin(2 * np.pi * 100.0 * time)
+    loop = find_cycles(History("table", command, command, 10_000.0))
+    assert loop.frequency_hz == pytest.approx(50.0, rel=1e-4)
+
+
+@pytest.mark.parametrize("kind", ["noise", "ramp", "sweep"])
+def test_find_cycles_refuses_what_does_not_repeat(kind: str) -> None:
+    """Noise, a ramp and a sweep have no steady cycle."""
+    time = np.arange(3000)
+    command = {
+        "noise": np.random.default_rng(1).normal(size=3000),
+        "ramp": time / 3000.0,
+        "sweep": np.sin(2e-5 * time**2),
+    }[kind]
+    with pytest.raises(DataError, match="table: "):
+        find_cycles(History("table", command, command, 100.0))

@@ -1,0 +1,86 @@
+"""Loops and histories: what they refuse, and the rate that a model sees."""
+
+import numpy as np
+import pytest
+
+from hilctl.base.errors import DataError
+from hilctl.identify.data.records import History, SteadyLoop
+
+PHASE = 2.0 * np.pi * np.arange(300) / 300
+
+
+def test_rate_is_that_of_a_run_one_sample_apart() -> None:
+    """A loop's rate equals the backward difference that a 50 kHz run makes, not its own points'."""
+    frequency_hz, rate_hz = 250.0, 50_000.0
+    loop = SteadyLoop("x", 6.0 * np.sin(PHASE), np.cos(PHASE), frequency_hz, rate_hz)
+    time = PHASE / (2.0 * np.pi * frequency_hz)
+    before = 6.0 * np.sin(2.0 * np.pi * frequency_hz * (time - 1.0 / rate_hz))
+    expected = (6.0 * np.sin(PHASE) - before) * rate_hz
+    np.testing.assert_allclose(loop.rate(), expected, atol=1e-5 * 6.0 * 2 * np.pi * frequency_hz)
+
+
+def test_rate_without_a_run_is_not_late() -> None:
+    """Where the run's rate is unknown, the rate is the derivative at the point itself."""
+    loop = SteadyLoop("x", np.sin(PHASE), np.cos(PHASE), 10.0)
+    expected = 2.0 * np.pi * 10.0 * np.cos(PHASE)
+    np.testing.assert_allclose(loop.rate(), expected, atol=1e-5 * 63)
+
+
+def test_run_of_a_loop_judges_the_second_period() -> None:
+    """A loop is run twice and the first period is not judged."""
+    loop = SteadyLoop("x", np.sin(PHASE), np.cos(PHASE), 10.0)
+    command, rate, ignored = loop.run()
+    assert (command.size, rate.size, ignored) == (600, 600, 300)
+    np.testing.assert_array_equal(command[300:], loop.command)
+
+
+def test_run_of_a_history_takes_rates_as_models_do() -> None:
+    """A history's rate is the backward difference, zero at its first sample."""
+    history = History("x", np.arange(20.0) ** 2, np.arange(20.0), 100.0, ignore=3)
+    _, rate, ignored = history.run()
+    assert ignored == 3
+    np.testing.assert_allclose(rate[:4], [0.0, 100.0, 300.0, 500.0])
+
+
+def test_without_lag_pairs_a_command_with_a_later_displacement() -> None:
+    """Taking out a lag of 2 samples undoes a displacement that came 2 samples late."""
+    command = np.sin(0.3 * np.arange(50))
+    late = np.concatenate(([0.0, 0.0], command[:-2]))
+    history = History("x", command, late, 100.0, ignore=5).without_lag(2)
+    np.testing.assert_array_equal(history.command, history.displacement_um)
+    assert history.ignore == 5
+
+
+@pytest.mark.parametrize("lag", [-1, 49])
+def test_impossible_lags_are_refused(lag: int) -> None:
+    """A negative lag, or one that leaves almost nothing, is a data error."""
+    with pytest.raises(DataError, match="x: "):
+        History("x", np.arange(50.0), np.arange(50.0), 100.0).without_lag(lag)
+
+
+@pytest.mark.parametrize(
+    ("command", "displacement_um", "text"),
+    [
+        (np.arange(20.0), np.arange(21.0), "equally long"),
+        (np.arange(8.0), np.arange(8.0), "at least 16 samples, has 8"),
+        (np.where(np.arange(20) == 7, np.nan, 1.0), np.arange(20.0), "nan at sample 7"),
+        (np.arange(20.0), np.full(20, 3.0), "displacement_um never changes, it is 3.0"),
+    ],
+)
+def test_unusable_signals_are_refused(
+    command: np.ndarray, displacement_um: np.ndarray, text: str
+) -> None:
+    """Signals that can't be judged are refused with the label and the reason."""
+    with pytest.raises(DataError, match=rf"wobble: .*{text}".replace("(", r"\(")):
+        History("wobble", command, displacement_um, 100.0)
+
+
+def test_impossible_rates_and_ignored_parts_are_refused() -> None:
+    """Frequency and rate must be positive, and something must be left to judge."""
+    y = np.arange(20.0)
+    with pytest.raises(DataError, match="frequency_hz must be > 0: 0"):
+        SteadyLoop("x", y, y, 0.0)
+    with pytest.raises(DataError, match="sample_rate_hz must be > 0"):
+        History("x", y, y, float("nan"))
+    with pytest.raises(DataError, match="ignore must leave at least 16 of 20 samples: 5"):
+        History("x", y, y, 1.0, ignore=5)

@@ -1,0 +1,264 @@
+"""Models whose parameters are known are found again from their own loops."""
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hilctl.base.device import CommandUnit
+from hilctl.base.errors import DataError
+from hilctl.identify.data.records import History, Records, SteadyLoop
+from hilctl.identify.fit_model import FittedModel, fit_model
+from hilctl.identify.judge import judge
+from hilctl.identify.settings import FitKind, FitSettings
+from hilctl.models.files import dump_model, parse_model
+from hilctl.models.integrated import IntegratedModel
+from hilctl.models.plays import PpiModel, RdpiModel
+from hilctl.models.published import (
+    even_thresholds,
+    exponential_integrated,
+    piezo_ppi,
+    terfenol_rdpi,
+)
+
+Loops = Callable[..., list[SteadyLoop]]
+GRID = [(a, f) for a in (3.0, 6.0) for f in (10.0, 50.0, 100.0, 150.0, 250.0)]
+
+
+def fit(kind: FitKind, data: Records, unit: CommandUnit = "A", **choices: Any) -> FittedModel:
+    return fit_model(data, FitSettings(kind=kind, **choices), lambda: 0.0, unit=unit)
+
+
+def omega() -> IntegratedModel:
+    """Return an asymmetric, saturating Omega; g_0 = 1, as identification has it."""
+    return exponential_integrated(
+        alpha=0.33,
+        gamma_s=2.5e-4,
+        a_0=3.0,
+        alpha_0=1.4,
+        beta_0=0.23,
+        g_0=1.0,
+        alpha_1=0.08,
+        beta_1=0.15,
+        d_p=4.0,
+        alpha_2=0.1,
+        beta_2=0.4,
+        d_n=3.0,
+    )
+
+
+def check(found: FittedModel, peak_percent: float = 0.1) -> None:
+    assert found.own_peak_percent < peak_percent
+    assert found.peak_percent <= found.own_peak_percent
+    assert all(abs(error.area_error_percent or 0.0) < 1.0 for error in found.errors)
+
+
+def test_published_piezo_ppi_is_found_again(loops_of: Loops) -> None:
+    """The PPI of the piezo stage comes back from its loop under 30 sin + 40 V (section 3.4.2).
+
+    Its tenth threshold is beyond 30 V and never moves in that loop, so the drive is 38 V here.
+    """
+    loops = loops_of(piezo_ppi(), [(38.0, 1.0), (20.0, 1.0)], centre=40.0)
+    found = fit("ppi", loops, "V", offset=True)
+    check(found)
+    expected = {"sigma": 3.548, "alpha": 0.0383, "beta": 0.1206, "p_0": 0.2567}
+    for name, value in expected.items():
+        assert found.parameters[name] == pytest.approx(value, rel=0.02), name
+    assert isinstance(found.model, PpiModel)
+    assert found.model.input_unit == "V"
+    assert found.model.input_range == pytest.approx((2.0, 78.0), abs=1e-3)
+
+
+def test_published_rdpi_is_found_again(loops_of: Loops) -> None:
+    """The n = 4 RDPI of the magnetostrictive actuator comes back from 1 to 200 Hz (section 5.3)."""
+    truth = terfenol_rdpi()
+    found = fit("rdpi", loops_of(truth, [(2.3, f) for f in (1.0, 10.0, 50.0, 100.0, 200.0)], 400))
+    check(found)
+    assert isinstance(found.model, RdpiModel)
+    assert found.model.gamma_s == pytest.approx(truth.gamma_s, rel=0.01)
+    assert found.model.direct == pytest.approx(truth.direct, rel=0.01)
+    np.testing.assert_allclose(found.model.thresholds, truth.thresholds, rtol=0.01)
+    np.testing.assert_allclose(found.model.weights, truth.weights, atol=0.02 * truth.direct)
+    assert found.parameters["a_4"] == found.model.weights[3]
+
+
+@pytest.mark.parametrize("layout", ["even", "midpoint"])
+def test_rdpi_with_exponential_weights(loops_of: Loops, layout: str) -> None:
+    """Exponential weights on either layout of thresholds come back, constant displacement too."""
+    shift = 0.5 if layout == "midpoint" else 0.0
+    truth = RdpiModel(
+        direct=2.0,
+        weights=tuple((1.5 * np.exp(-0.3 * np.arange(1, 7))).tolist()),
+        thresholds=tuple((0.4 * (np.arange(1, 7) - shift)).tolist()),
+        gamma_s=2e-4,
+        output_offset_um=-3.0,
+    )
+    loops = loops_of(truth, [(3.0, 10.0), (3.0, 100.0)])
+    found = fit("rdpi", loops, plays=6, weights="exponential", layout=layout, offset=True)
+    check(found)
+    assert found.parameters["alpha"] == pytest.approx(0.4, rel=0.01)
+    assert found.parameters["gamma"] == pytest.approx(2e-4, rel=0.01)
+    assert found.parameters["beta_0"] == pytest.approx(0.3, rel=0.03)
+    assert found.model.output_offset_um == pytest.approx(-3.0, abs=0.02)
+
+
+def test_ppi_with_free_weights_from_a_decaying_history() -> None:
+    """Weights of any shape come back from a decaying history run from its first sample."""
+    truth = PpiModel(
+        input_unit="V",
+        direct=1.0,
+        weights=(0.2, 1.5, 0.0, 0.7),
+        thresholds=tuple(even_thresholds(0.4, 4).tolist()),
+        output_offset_um=-12.0,
+    )
+    time = np.arange(3000)
+    command = 1.8 + 1.8 * np.sin(2 * np.pi * time / 200) * np.interp(time, [1000, 2800], [1, 0])
+    displacement_um = truth.forward(200.0).process(command)
+    history = History("decay", command, displacement_um, 200.0, ignore=100)
+    found = fit("ppi", [history], plays=4, weights="free", offset=True)
+    assert found.own_peak_percent < 0.01
+    np.testing.assert_allclose(found.model.weights, truth.weights, atol=2e-3)
+    assert found.errors[0].area_error_percent is None
+
+
+def test_published_parametrisation_of_omega_is_found_again(loops_of: Loops) -> None:
+    """Eleven parameters of the integrated model come back from the published grid (6.24)."""
+    truth = omega()
+    found = fit("integrated", loops_of(truth, GRID))
+    check(found)
+    assert isinstance(found.model, IntegratedModel)
+    expected = {"alpha": 0.33, "gamma": 2.5e-4, "a_0": 3.0, "alpha_0": 1.4, "beta_0": 0.23}
+    for name, value in expected.items():
+        assert found.parameters[name] == pytest.approx(value, rel=0.05), name
+    x = np.linspace(-45.0, 30.0, 50)
+    np.testing.assert_allclose(found.model.deadband(x), truth.deadband(x), atol=0.1)
+
+
+def test_omega_with_free_weights(loops_of: Loops) -> None:
+    """Free weights describe loops that exponential ones can't, within 0.1 % of the stroke."""
+    base = omega()
+    weights = np.array(base.weights) * (1.0 + 0.4 * np.cos(np.arange(12)))
+    truth = base.model_copy(update={"weights": tuple(weights.tolist())})
+    loops = loops_of(truth, [(3.0, 10.0), (6.0, 10.0), (6.0, 100.0), (6.0, 250.0)])
+    published = fit("integrated", loops, starts=2)
+    free = fit("integrated", loops, starts=2, weights="free")
+    assert free.peak_percent < 0.1 < published.peak_percent
+    assert min(free.model.weights) >= 0.0
+    IntegratedModel.model_validate(free.model.model_dump())
+
+
+def test_same_seed_same_model(loops_of: Loops) -> None:
+    """With the same seed the result is the same bit for bit; another seed ends nearby."""
+    loops = loops_of(omega(), GRID[:2] + GRID[5:7])
+    first, again, other = (fit("integrated", loops, seed=seed, starts=2) for seed in (4, 4, 5))
+    assert first.model == again.model
+    assert first.starts == again.starts
+    assert other.starts[1] != first.starts[1]
+
+
+@pytest.mark.parametrize(("rate_hz", "rest"), [(75_000.0, 0.01), (50_000.0, 0.25)])
+def test_errors_are_those_of_the_run_at_its_own_rate(
+    loops_of: Loops, rate_hz: float, rest: float
+) -> None:
+    """Loops of 300 points predict what the model does sample by sample in the run.
+
+    At 250 Hz a cycle has 300 samples at 75 kHz, which leaves nothing; it has 200 at 50 kHz, whose
+    turns lie at other phases, which leaves 0.2 % of the stroke.
+    """
+    wrong = omega().model_copy(update={"gamma_s": 4e-4})
+    (measured,) = loops_of(omega(), [(6.0, 250.0)], rate_hz=rate_hz)
+    (modelled,) = loops_of(wrong, [(6.0, 250.0)], rate_hz=rate_hz)
+    judged = judge(wrong, [measured])
+    difference = modelled.displacement_um - measured.displacement_um
+    expected = 100.0 * np.max(np.abs(difference)) / np.ptp(measured.displacement_um)
+    assert expected > 3.0
+    assert judged.peak_percent == pytest.approx(expected, abs=rest)
+    assert judge(omega(), [measured]).peak_percent < rest
+
+
+def test_histories_are_judged_as_models_run_them() -> None:
+    """A history's error is zero to the last bits for the model that made it, rate included."""
+    command = 3.0 * np.sin(0.02 * np.arange(2000)) * np.linspace(0.0, 1.0, 2000)
+    made = omega().forward(10_000.0).process(command)
+    judged = judge(omega(), [History("growing", command, made, 10_000.0, ignore=10)])
+    assert judged.peak_percent < 1e-9
+
+
+def test_errors_count_against_own_and_largest_stroke(loops_of: Loops) -> None:
+    """One micrometre weighs more against a small loop's stroke than against the largest."""
+    small, large = loops_of(omega(), [(3.0, 10.0), (6.0, 10.0)])
+    shifted = replace(small, displacement_um=small.displacement_um + 1.0)
+    judged = judge(omega(), [shifted, large])
+    spans = [float(np.ptp(loop.displacement_um)) for loop in (small, large)]
+    assert judged.own_peak_percent == pytest.approx(100.0 / spans[0], rel=0.02)
+    assert judged.peak_percent == pytest.approx(100.0 / spans[1], rel=0.02)
+    assert [error.peak_to_peak_um for error in judged.errors] == pytest.approx(spans)
+
+
+def test_hysteresis_weights_shift_the_fit_to_wide_loops(loops_of: Loops) -> None:
+    """Weighted as in (5.14), the loop with most hysteresis is fitted better than unweighted."""
+    loops = loops_of(omega(), [(6.0, f) for f in (1.0, 50.0, 250.0)])
+    even = fit("rdpi", loops, weight_by="equal")
+    weighted = fit("rdpi", loops, weight_by="hysteresis")
+    assert weighted.errors[2].rms_percent < even.errors[2].rms_percent
+    assert weighted.errors[0].rms_percent > even.errors[0].rms_percent
+
+
+def test_peak_goal_lowers_the_peak(loops_of: Loops) -> None:
+    """With a goal the peak error falls and the rms rises."""
+    loops = loops_of(omega(), [(6.0, 10.0), (6.0, 150.0)])
+    plain = fit("rdpi", loops, weight_by="equal", offset=True)
+    goal = 0.9 * plain.peak_percent
+    refined = fit("rdpi", loops, weight_by="equal", offset=True, peak_goal_percent=goal)
+    assert refined.peak_percent <= goal
+    assert refined.rms_percent > plain.rms_percent
+
+
+def test_no_slope_falls_below_the_least(loops_of: Loops) -> None:
+    """Loops of pure plays would have a_0 = 0; it stays at the least slope, so it inverts."""
+    play = PpiModel(direct=1e-6, weights=(2.0,), thresholds=(0.7,), input_unit="V")
+    loops = loops_of(play, [(2.0, 1.0)])
+    found = fit("ppi", loops, plays=3, weights="free", least_slope=0.05)
+    assert found.model.input_range is not None
+    low, high = found.model.input_range
+    gain = found.errors[0].peak_to_peak_um / (high - low)
+    assert found.model.direct == pytest.approx(0.05 * gain, rel=1e-9)
+    found.model.inverse(1000.0)
+
+
+def test_provenance_and_mapping_say_where_the_model_is_from(loops_of: Loops) -> None:
+    """Model file and JSON hold sources, method, grid, errors, versions, date and time taken."""
+    ticks = iter([10.0, 12.5])
+    parts: list[float] = []
+    found = fit_model(
+        loops_of(omega(), GRID[:1] + GRID[5:6]),
+        FitSettings(kind="integrated", starts=1),
+        lambda: next(ticks),
+        source=["grid.mcap"],
+        created="2025-01-02T03:04:05Z",
+        progress=lambda done, text: parts.append(done),
+    )
+    provenance = found.model.provenance
+    assert provenance.source == ("grid.mcap",)
+    assert found.model.output_range_um is not None
+    low, high = found.model.output_range_um
+    assert high - low == pytest.approx(found.errors[1].peak_to_peak_um)
+    assert provenance.method == "integrated, Omega: rate, asymmetry (6.18-6.24); starts=1"
+    assert provenance.grid[1].startswith("6 at 10 Hz: -6 to 6, 300 points")
+    assert provenance.errors_percent["peak"] == found.peak_percent
+    assert set(provenance.versions) == {"hilctl", "numpy", "scipy"}
+    assert parse_model("x.yaml", dump_model(found.model)) == found.model
+    mapping = json.loads(json.dumps(found.to_mapping(), allow_nan=False))
+    assert mapping["elapsed_s"] == 2.5
+    assert mapping["model"]["kind"] == "integrated"
+    assert mapping["errors"][0]["label"] == "3 at 10 Hz"
+    assert parts[-1] == 1.0
+
+
+def test_no_data_are_refused() -> None:
+    """Nothing comes of an empty list."""
+    with pytest.raises(DataError, match="the list of loops is empty"):
+        fit("ppi", [])

@@ -1,0 +1,56 @@
+"""Model errors as a run would have them, and the time of a sample."""
+
+import numpy as np
+import pytest
+
+from hilctl.identify.data.records import SteadyLoop
+from hilctl.identify.judge import judge
+from hilctl.models.plays import PpiModel, RdpiModel
+
+PLAYS = {"direct": 4.0, "weights": (1.0, 2.0), "thresholds": (0.5, 1.5)}
+PPI = PpiModel(**PLAYS)
+RATE_HZ = 50_000.0
+
+
+@pytest.mark.parametrize("frequency_hz", [1.0, 50.0, 150.0])
+def test_a_model_meets_its_own_loop(loop_of, frequency_hz):
+    """Whole and broken numbers of samples a period alike."""
+    error = judge(PPI, [loop_of(PPI, 6.0, frequency_hz)])
+    assert error.peak_percent <= 0.1
+    assert error.errors[0].peak_to_peak_um == pytest.approx(
+        error.modelled_um[0].max() * 2.0, rel=0.01
+    )
+
+
+def test_the_rate_is_that_of_the_run():
+    """A rate-dependent model is run at the loop's sample rate, as its inverse will be."""
+    model = RdpiModel(**PLAYS, gamma_s=3e-4)
+    samples = 6.0 * np.sin(2.0 * np.pi * 200.0 * np.arange(750) / RATE_HZ)
+    ran = model.forward(RATE_HZ).process(samples)[500:]
+    command = 6.0 * np.sin(2.0 * np.pi * np.arange(300) / 300)
+    loop = SteadyLoop("sine", command, command, 200.0, RATE_HZ)
+    at = np.arange(300) * (250 / 300)
+    expected = np.interp(at, np.arange(251), np.append(ran, ran[0]))
+    (modelled_um,) = judge(model, [loop]).modelled_um
+    np.testing.assert_allclose(modelled_um, expected, atol=0.1)
+
+
+def test_without_a_rate_each_point_is_a_sample(loop_of):
+    """Loops whose run is not known are run point by point."""
+    loop = loop_of(PPI, 6.0)
+    unknown = SteadyLoop(loop.label, loop.command, loop.displacement_um, loop.frequency_hz)
+    (modelled_um,) = judge(PPI, [unknown]).modelled_um
+    np.testing.assert_allclose(modelled_um, loop.displacement_um, atol=1e-9)
+
+
+def test_errors_are_of_the_right_stroke(loop_of):
+    """The overall error is of the widest loop, a loop's own is of itself."""
+    small, large = loop_of(PPI, 1.0), loop_of(PPI, 6.0)
+    raised = SteadyLoop("raised", small.command, small.displacement_um + 1.0, 50.0, RATE_HZ)
+    error = judge(PPI, [raised, large])
+    assert error.errors[0].peak_percent == pytest.approx(
+        100.0 / np.ptp(small.displacement_um), 1e-3
+    )
+    assert error.peak_percent == pytest.approx(100.0 / np.ptp(large.displacement_um), 1e-3)
+    expected = np.sqrt(0.5) * 100.0 / np.ptp(large.displacement_um)
+    assert error.rms_percent == pytest.approx(expected, 1e-3)

@@ -1,0 +1,92 @@
+"""The settings of a fit: defaults of each kind, what belongs to which, and what is reported."""
+
+from typing import Any, get_args
+
+import pytest
+from pydantic import ValidationError
+
+from hilctl.identify.catalogue import CATALOGUE
+from hilctl.identify.settings import (
+    PUBLISHED,
+    FitKind,
+    FitSettings,
+    IdentifySettings,
+    kinds_of,
+    setting_rows,
+)
+
+
+def test_every_kind_has_an_entry_and_known_settings() -> None:
+    """Kinds are one list, and no setting or default names another."""
+    assert set(CATALOGUE) == set(get_args(FitKind))
+    assert set(PUBLISHED) <= set(CATALOGUE)
+    for field in FitSettings.model_fields.values():
+        assert set(kinds_of(field)) <= set(CATALOGUE)
+    for kind in CATALOGUE:
+        assert FitSettings(kind=kind).changes() == ""
+
+
+def test_published_choices_of_a_kind_are_its_defaults() -> None:
+    """Sections 3.4.2, 5.3 and 6.4."""
+    assert FitSettings(kind="ppi").plays == 10
+    rdpi = FitSettings(kind="rdpi")
+    assert (rdpi.plays, rdpi.weights, rdpi.weight_by, rdpi.points) == (4, "free", "hysteresis", 400)
+    omega = FitSettings()
+    assert (omega.plays, omega.deadbands, omega.weights) == (12, 8, "exponential")
+    assert FitSettings(kind="rdpi", plays=6).plays == 6
+
+
+def test_staged_models_have_their_stages_unless_left_out() -> None:
+    """Lag, structure and delay by default, and each can be left out."""
+    full = FitSettings(kind="staged")
+    assert (full.lag, full.structure, full.delay) == ("growth", True, True)
+    less = FitSettings(kind="staged", lag="none", structure=False, delay=False)
+    assert less.changes() == "lag=none, structure=false, delay=false"
+
+
+@pytest.mark.parametrize(
+    ("choices", "reason"),
+    [
+        ({"kind": "integrated", "lag": "plain"}, "is a setting of staged, not of integrated"),
+        ({"kind": "ppi", "deadbands": 8}, "not of ppi: leave it out"),
+        ({"kind": "integrated", "deadbands": 0}, "greater than or equal to 1"),
+        ({"kind": "staged", "weights": "exponential"}, "not of staged"),
+        ({"kind": "staged", "creep": True}, "not of staged"),
+        ({"kind": "staged", "hysteresis": "preisach", "lag": "none"}, "it needs a lag"),
+        ({"kind": "ppi", "least_slope": 0.0}, "greater than 0"),
+        ({"kind": "ppi", "peak_goal_percent": -1.0}, "greater than 0"),
+        ({"kind": "integrated", "plays": "auto", "deadbands": 4}, "finds the number of deadbands"),
+        ({"kind": "kp", "plays": "auto"}, "not of kp"),
+    ],
+)
+def test_impossible_choices_are_refused(choices: dict[str, Any], reason: str) -> None:
+    """What does not belong to a kind, or is out of range, is refused with the reason."""
+    with pytest.raises(ValidationError, match=reason):
+        FitSettings(**choices)
+
+
+def test_auto_is_a_size_and_a_lag() -> None:
+    """The word stands where a number would."""
+    settings = IdentifySettings(kind="ppi", plays="auto", table={"lag_samples": "auto"})  # type: ignore[arg-type]
+    assert settings.size == "auto"
+    assert settings.plays == 10
+    assert settings.table.find_lag
+    assert settings.changes() == "size=auto, table.find_lag=true"
+
+
+def test_the_unit_is_that_of_the_recordings() -> None:
+    """Else the one given, else the published one of the kind."""
+    assert IdentifySettings(kind="ppi").unit("A") == "A"
+    assert IdentifySettings(kind="ppi").unit(None) == "V"
+    assert IdentifySettings(kind="rdpi").unit(None) == "A"
+
+
+def test_rows_have_defaults_limits_and_kinds() -> None:
+    """What --settings prints follows from the fields."""
+    rows = {name: rest for name, *rest in setting_rows()}
+    assert rows["plays"][0].startswith("12, 10 for ppi")
+    assert rows["plays"][1] == "1 to 200"
+    assert rows["weights"][1] == "exponential, free"
+    assert rows["peak_goal_percent"][:2] == ["-", "> 0.0"]
+    assert rows["lag"][2] == "staged"
+    assert "table.time_column" in rows
