@@ -10,19 +10,18 @@ from hypothesis import strategies as st
 from hilctl.base.errors import ConfigError, InputError
 from hilctl.base.yaml.document import Document
 from hilctl.experiment.check import check
-from hilctl.experiment.feedback import make_feedback
+from hilctl.experiment.feedback import (
+    gains_for,
+    highest_bandwidth_hz,
+    make_feedback,
+    margins,
+    rate_needed_hz,
+)
 from hilctl.experiment.feedback_keys import FeedbackConfig
 from hilctl.experiment.file import Experiment
 from hilctl.experiment.load import resolve
 from hilctl.loop.compensator import Compensator
-from hilctl.loop.feedback import (
-    Feedback,
-    Gains,
-    gains_for,
-    highest_bandwidth_hz,
-    margins,
-    rate_needed_hz,
-)
+from hilctl.loop.feedback import Feedback, Gains
 from hilctl.models.plays import PpiModel
 from hilctl.models.staged import FieldLag, StagedModel, Structure
 from tests.fakes import made_block
