@@ -15,11 +15,11 @@ from hilctl.machine import latency as module
 from hilctl.machine.diagnosis import Diagnosis, lateness_counts
 from hilctl.machine.files import Finding
 from hilctl.machine.latency import Latency, measure, watch
-from hilctl.machine.realtime import Step
+from hilctl.machine.realtime import SetUpStep
 from hilctl.machine.settings import Realtime
 
 MS = 1_000_000
-STEPS = (Step("fifo", "refused", "SCHED_FIFO 80: Operation not permitted", "rtprio"),)
+STEPS = (SetUpStep("fifo", "refused", "SCHED_FIFO 80: Operation not permitted", "rtprio"),)
 
 
 def latency(late_ns, rate_hz=1000.0):
