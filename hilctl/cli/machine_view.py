@@ -12,7 +12,7 @@ from rich.text import Text
 from hilctl.experiment.inventory import Inventory, Probed
 from hilctl.machine.diagnosis import Diagnosis, lateness_counts
 from hilctl.machine.latency import Latency
-from hilctl.machine.realtime import Step
+from hilctl.machine.realtime import SetUpStep
 
 _COLOURS = {
     "ok": "green",
@@ -54,7 +54,7 @@ def _add(table: Table, name: str, level: str, text: str, remedy: str) -> None:
     table.add_row(name, Text(level, style=_COLOURS[level]), said)
 
 
-def _steps(steps: tuple[Step, ...]) -> Table:
+def _steps(steps: tuple[SetUpStep, ...]) -> Table:
     table = _table("set-up of the loop's process")
     for step in steps:
         _add(table, step.name, step.outcome, step.detail, step.remedy)

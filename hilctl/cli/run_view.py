@@ -10,6 +10,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from hilctl.analysis.figures import RunReport
 from hilctl.analysis.report import summarize
 from hilctl.cli.report_view import render
 from hilctl.experiment.check import Checked
@@ -81,11 +82,21 @@ def _live_text(progress: RunProgress) -> str:
     )
 
 
-def run_mapping(result: RunResult) -> dict[str, Any]:
+def report_of(result: RunResult, *, whole: bool) -> RunReport | None:
+    """Return the report of a run that has ended.
+
+    Args:
+        result: How it ended.
+        whole: Whether it is wanted of a very long run too.
+    """
+    shown = whole or 0 < result.samples <= _LARGEST_REPORTED
+    return summarize(read(result.path)) if shown else None
+
+
+def run_mapping(result: RunResult, report: RunReport | None) -> dict[str, Any]:
     """Return a run's end and its report as plain values."""
-    summary = summarize(read(result.path)).to_mapping()
     return {
-        **summary,
+        **(report.to_mapping() if report else {}),
         "recorded_samples": result.samples,
         "dropped": result.missing,  # a recording that was cut short can't say it
         "output": str(result.path),
@@ -95,7 +106,7 @@ def run_mapping(result: RunResult) -> dict[str, Any]:
     }
 
 
-def print_run(result: RunResult) -> None:
+def print_run(result: RunResult, report: RunReport | None) -> None:
     """Print how a run ended and, unless it is very long, its report."""
     console = Console()
     colour = {"completed": "green", "stopped": "yellow"}.get(result.code, "red")
@@ -104,8 +115,8 @@ def print_run(result: RunResult) -> None:
         console.print("[bold red]The output is not known to be at its safe value.[/]")
     if result.samples == 0:
         console.print("no sample was recorded")
-    elif result.samples <= _LARGEST_REPORTED:
-        console.print(render(summarize(read(result.path))))
+    elif report is not None:
+        console.print(render(report))
     console.print(f"recorded: {result.path}", soft_wrap=True, highlight=False)
     console.print(f"  hilctl report {result.path} --html run.html", soft_wrap=True, highlight=False)
 

@@ -35,7 +35,7 @@ def run(
     if detach:
         _detach(experiment, output, settings or [], overwrite=overwrite, as_json=as_json)
         return
-    from hilctl.cli.run_view import LiveView, print_run, run_mapping
+    from hilctl.cli.run_view import LiveView, print_run, report_of, run_mapping
     from hilctl.run.start import start_run
 
     finish_orphans()
@@ -43,10 +43,11 @@ def run(
         result = start_run(experiment, settings or [], output, overwrite, view.update)
         if result.stop_signal:  # impatience must not cost the result of a run that has ended
             signal.signal(result.stop_signal, signal.SIG_IGN)
+    report = report_of(result, whole=as_json)
     if as_json:
-        print_json(run_mapping(result))
+        print_json(run_mapping(result, report))
     else:
-        print_run(result)
+        print_run(result, report)
     if result.code == "fault":
         raise typer.Exit(3)
     if result.stop_signal:

@@ -13,8 +13,8 @@ from hilctl.base.arrays import F64
 from hilctl.base.errors import ConfigError, DataError, InputError, ModelError, Problem
 from hilctl.experiment.feedback import feedback_problems
 from hilctl.experiment.forecast import Forecast, forecast_of
-from hilctl.experiment.initial_state import InitialState, initial_state_after
-from hilctl.experiment.interlocks import HeatForecast, interlock_problems
+from hilctl.experiment.initial_state import Begun, begin
+from hilctl.experiment.interlocks import interlock_problems
 from hilctl.experiment.load import LoadedExperiment
 from hilctl.loop.compensator import Compensator
 from hilctl.waveforms.build import Reference, build
@@ -28,17 +28,23 @@ class Checked:
         loaded: The experiment.
         reference: Every sample of its waveform.
         forecast: What it will do.
-        input_um: float64[n], the compensator's input; the reference's own array where that is it.
-        state: The compensator's memory before the first sample; None where it is at rest.
-        initial_state: What a run before left in the actuator; None where it is at rest.
+        begun: What the compensator is given, and what it begins with.
     """
 
     loaded: LoadedExperiment
     reference: Reference
     forecast: Forecast
-    input_um: F64
-    state: F64 | None = None
-    initial_state: InitialState | None = None
+    begun: Begun
+
+    @property
+    def input_um(self) -> F64:
+        """The compensator's input: float64[n]; the reference's own array where that is it."""
+        return self.begun.input_um
+
+    @property
+    def state(self) -> F64 | None:
+        """The compensator's memory before the first sample; None where it is at rest."""
+        return self.begun.state
 
     @property
     def state_size(self) -> int:
@@ -70,52 +76,26 @@ def check(loaded: LoadedExperiment) -> Checked:
         problems.append(_problem(loaded, "waveform", str(error)))
         raise ConfigError(problems) from None
     problems += _reference_problems(loaded, reference)
-    heat = HeatForecast(config)
     try:
-        compensator = Compensator(loaded.model, config.sample_rate_hz)
-        problems += feedback_problems(loaded, compensator.preview)
-        corrected = _corrected(loaded, reference, problems)
-        initial_state = _initial_state(loaded, problems)
-        input_um, state = _input(loaded, corrected, compensator, initial_state)
-        forecast = forecast_of(loaded, reference, input_um, heat, state)
+        problems += feedback_problems(loaded)
+        begun = _begun(loaded, _corrected(loaded, reference, problems), problems)
+        forecast = forecast_of(loaded, reference, begun.input_um, begun.state)
     except ModelError as error:
         problems.append(_problem(loaded, "compensator.model", str(error)))
         raise ConfigError(problems) from None
-    problems += _command_problems(loaded, forecast) + heat.problems(loaded)
+    problems += _command_problems(loaded, forecast)
     if problems:
         raise ConfigError(problems)
-    return Checked(loaded, reference, forecast, input_um, state, initial_state)
+    return Checked(loaded, reference, forecast, begun)
 
 
-def _input(
-    loaded: LoadedExperiment,
-    values: F64,
-    compensator: Compensator,
-    initial_state: InitialState | None,
-) -> tuple[F64, F64 | None]:
-    """Return the compensator's input, and its memory before that where it is not at rest."""
-    config = loaded.config
-    if initial_state is not None:
-        compensator.restore(initial_state.state)
-        samples = max(1, round(config.safe.ramp_s * config.sample_rate_hz))
-        values = initial_state.lead_in(values, samples)
-    compensator.begin(values)
-    at_rest = initial_state is None and not compensator.preview
-    return compensator.ahead(values), None if at_rest else compensator.state()
-
-
-def _initial_state(loaded: LoadedExperiment, problems: list[Problem]) -> InitialState | None:
-    """Return what the run before left in the actuator, where one is named."""
-    config = loaded.config
-    if config.compensator is None or config.compensator.initial_state is None:
-        return None
-    assert loaded.model is not None
-    path = loaded.folder / config.compensator.initial_state
+def _begun(loaded: LoadedExperiment, values: F64, problems: list[Problem]) -> Begun:
+    """Return the compensator's input; without the run before where that can't be used."""
     try:
-        return initial_state_after(path, loaded.model, config.sample_rate_hz)
+        return begin(loaded, values)
     except DataError as error:
         problems.append(_problem(loaded, "compensator.initial_state", str(error)))
-        return None
+        return begin(loaded, values, at_rest=True)
 
 
 def _corrected(loaded: LoadedExperiment, reference: Reference, problems: list[Problem]) -> F64:
@@ -150,10 +130,8 @@ def check_tuned(
     values = _led_in(plain.values * wanted[0] + wanted[1], samples)
     input_um = _led_in(checked.input_um * wanted[0] + wanted[1], samples)
     tuned = Reference(values, plain.unit, plain.sample_rate_hz, plain.segments)
-    heat = HeatForecast(loaded.config)
     problems = _reference_problems(loaded, tuned)
-    problems += _command_problems(loaded, forecast_of(loaded, tuned, input_um, heat))
-    problems += heat.problems(loaded)
+    problems += _command_problems(loaded, forecast_of(loaded, tuned, input_um))
     if loaded.model is None:
         fastest = change / samples * plain.sample_rate_hz + checked.forecast.slew_per_s
         if fastest > loaded.config.limits.slew_per_s:
@@ -255,4 +233,16 @@ def _command_problems(loaded: LoadedExperiment, forecast: Forecast) -> list[Prob
         hint = f"{times:.3g} times the limit: lower the frequency, soften the start, or raise it"
         rule = f"the run must change no faster than {limits.slew_per_s:g} {unit}/s"
         found.append(_problem(loaded, key, rule, value, hint))
-    return found
+    return found + _budget_problems(loaded, forecast)
+
+
+def _budget_problems(loaded: LoadedExperiment, forecast: Forecast) -> list[Problem]:
+    limits, highest_a = loaded.config.limits, forecast.heating_rms_a
+    if forecast.budget_used_s is None or highest_a is None or limits.rms_current_a is None:
+        return []
+    key, rms_a = "limits.rms_current_a", limits.rms_current_a
+    rule = f"the coil must stay within {rms_a:g} A rms over {limits.thermal_time_constant_s:g} s"
+    when = f"the budget is used up after {forecast.budget_used_s:.4g} s"
+    excess = f"{highest_a - rms_a:.3g} A too much"
+    hint = f"{excess}, and {when}: lower the waveform's amplitude, or shorten the run"
+    return [_problem(loaded, key, rule, f"{highest_a:.4g} A", hint)]

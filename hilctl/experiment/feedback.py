@@ -1,24 +1,28 @@
-"""Feedback from an experiment: what it needs is refused before a run, and built for it."""
+"""Feedback from an experiment: its design, what it can't be without, and the controller.
+
+With the compensator before it, the actuator is a gain of about 1 and a delay, so what limits the
+bandwidth is the delay, and with it the rate.
+"""
 
 import cmath
 import math
+
+import numpy as np
 
 from hilctl.base.errors import Problem
 from hilctl.experiment.feedback_keys import FeedbackConfig
 from hilctl.experiment.file import Experiment
 from hilctl.experiment.load import LoadedExperiment
 from hilctl.loop.compensator import Compensator
-from hilctl.loop.feedback import (
-    LEAST_GAIN_MARGIN,
-    LEAST_PHASE_MARGIN_DEG,
-    Feedback,
-    Gains,
-    gains_for,
-    highest_bandwidth_hz,
-    margins,
-    rate_needed_hz,
-)
+from hilctl.loop.feedback import Feedback, Gains
 
+LOOP_DELAY = 2
+"""Samples from a correction to the first tick that sees its effect: one until the sensor can show
+it, and one until the displacement that came with that exchange is used."""
+
+LEAST_GAIN_MARGIN = 2.0
+LEAST_PHASE_MARGIN_DEG = 60.0
+_FREQUENCIES = 4096
 _HIGHEST_RATE_HZ = 1e6
 
 
@@ -32,12 +36,11 @@ def make_feedback(config: Experiment, compensator: Compensator) -> Feedback | No
     return Feedback(_gains(wanted, rate_hz), rate_hz, wanted.limit_um, due_after)
 
 
-def feedback_problems(loaded: LoadedExperiment, preview: int) -> list[Problem]:
+def feedback_problems(loaded: LoadedExperiment) -> list[Problem]:
     """Return why an experiment can't have the feedback that it asks for.
 
-    Args:
-        loaded: The experiment.
-        preview: Samples by which its compensator looks ahead: a correction takes as long to show.
+    Raises:
+        ModelError: The model has no inverse.
     """
     config, info = loaded.config, loaded.device.info
     wanted = config.feedback
@@ -54,6 +57,8 @@ def feedback_problems(loaded: LoadedExperiment, preview: int) -> list[Problem]:
         hint = "a block's first displacement would be as old as the block"
         found.append(("block", "must be 1 with feedback", str(config.block), hint))
     if not found:
+        # As far as the compensator looks ahead, so long a correction takes to show.
+        preview = Compensator(loaded.model, config.sample_rate_hz).preview
         delay_s = wanted.sensor_delay_s + max(0, preview - 1) / config.sample_rate_hz
         found += _gain_problems(wanted, config.sample_rate_hz, delay_s)
         found += _resonance_problems(loaded, wanted)
@@ -132,3 +137,53 @@ def _resonance_problems(
     where = f"{natural_hz:g} Hz, damping {damping:g}"
     hint = f"at most bandwidth_hz {damping * natural_hz:.3g}, or ki_per_s of 2 pi times that"
     return [("feedback", rule, f"{size:.3g} at {where}", hint)]
+
+
+def gains_for(bandwidth_hz: float, rate_hz: float) -> Gains:
+    """Return the gains whose open loop crosses 1 at ``bandwidth_hz``, below half the rate.
+
+    An actuator that is a gain of 1 and a delay needs no proportional part: the integral alone
+    crosses 1 at ``ki / (2 pi)``, and falls from there on.
+    """
+    return Gains(0.0, 2.0 * rate_hz * math.sin(math.pi * bandwidth_hz / rate_hz))
+
+
+def highest_bandwidth_hz(rate_hz: float, extra_delay_s: float = 0.0) -> float:
+    """Return the largest bandwidth that leaves the least phase margin.
+
+    The integral is 90 degrees late less half a sample, the loop two samples: together 1.5 samples.
+    The margin of 60 degrees leaves 30 degrees for these and the extra delay.
+
+    Args:
+        rate_hz: Samples a second.
+        extra_delay_s: What link and sensor add.
+    """
+    share = (90.0 - LEAST_PHASE_MARGIN_DEG) / 360.0
+    return share / ((LOOP_DELAY - 0.5) / rate_hz + extra_delay_s)
+
+
+def rate_needed_hz(bandwidth_hz: float, extra_delay_s: float = 0.0) -> float:
+    """Return the sample rate that a bandwidth needs; infinite where the extra delay forbids it."""
+    share = (90.0 - LEAST_PHASE_MARGIN_DEG) / 360.0
+    left_s = share / bandwidth_hz - extra_delay_s
+    return (LOOP_DELAY - 0.5) / left_s if left_s > 0.0 else math.inf
+
+
+def margins(gains: Gains, rate_hz: float, extra_delay_s: float = 0.0) -> tuple[float, float]:
+    """Return gain margin and phase margin, in degrees, on an actuator of gain 1.
+
+    The gain margin is 1 over the largest open-loop gain wherever the loop is later than 180
+    degrees; 0 degrees of phase margin stand for a loop gain that never falls below 1.
+    """
+    angle = np.geomspace(1e-6, math.pi, _FREQUENCIES)
+    controller = gains.kp + gains.ki_per_s / rate_hz / (1.0 - np.exp(-1j * angle))
+    size = np.abs(controller)
+    late = angle * (LOOP_DELAY + extra_delay_s * rate_hz) - np.angle(controller)
+    beyond = size[late >= math.pi]
+    gain_margin = float(1.0 / beyond.max()) if beyond.size else math.inf
+    above = np.flatnonzero(size >= 1.0)
+    if not above.size:
+        return gain_margin, 180.0
+    if above[-1] == angle.size - 1:
+        return gain_margin, 0.0
+    return gain_margin, math.degrees(math.pi - float(late[: above[-1] + 1].max()))

@@ -1,4 +1,4 @@
-"""What a run before left in the actuator, as the memory that a compensator has to begin with."""
+"""What a compensator begins with: the memory that a run before left in the actuator, or rest."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -7,11 +7,54 @@ import numpy as np
 
 from hilctl.base.arrays import F64
 from hilctl.base.errors import DataError
+from hilctl.experiment.load import LoadedExperiment
+from hilctl.loop.compensator import Compensator
 from hilctl.models.base import HysteresisModel
 from hilctl.recording.data import Recording
 from hilctl.recording.reader import read
 
 _STILL_S = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Begun:
+    """What the compensator of a run is given, and what it begins with.
+
+    Attributes:
+        input_um: float64[n], its input; the values themselves where it is those.
+        state: float64[state_size], its memory before the first sample; None where it is at rest.
+        run_id: The run that left this memory; empty where the actuator is at rest.
+    """
+
+    input_um: F64
+    state: F64 | None = None
+    run_id: str = ""
+
+
+def begin(loaded: LoadedExperiment, values: F64, *, at_rest: bool = False) -> Begun:
+    """Return the compensator's input, begun from where the run before left the actuator.
+
+    Args:
+        loaded: The experiment.
+        values: float64[n], the reference with what is added to it.
+        at_rest: Whether a run before that the experiment names is left out.
+
+    Raises:
+        DataError: That run can't be used, see :func:`initial_state_after`.
+        ModelError: The model has no inverse.
+    """
+    config, model = loaded.config, loaded.model
+    compensator = Compensator(model, config.sample_rate_hz)
+    named = config.compensator.initial_state if config.compensator and not at_rest else None
+    before = None
+    if named is not None and model is not None:
+        before = initial_state_after(loaded.folder / named, model, config.sample_rate_hz)
+        compensator.restore(before.state)
+        samples = max(1, round(config.safe.ramp_s * config.sample_rate_hz))
+        values = before.lead_in(values, samples)
+    compensator.begin(values)
+    state = None if before is None and not compensator.preview else compensator.state()
+    return Begun(compensator.ahead(values), state, before.run_id if before else "")
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,16 +1,10 @@
 """Interlocks from an experiment: what they are set to, and what is known of them before a run."""
 
-import math
-
-import numpy as np
-
-from hilctl.base.arrays import F64
 from hilctl.base.device import DeviceInfo
 from hilctl.base.errors import Problem
 from hilctl.experiment.file import Experiment
 from hilctl.experiment.load import LoadedExperiment
-from hilctl.kernels.interlock import heat_block
-from hilctl.loop.interlocks import InterlockContext, InterlockSettings, Needs, warming
+from hilctl.loop.interlocks import InterlockContext, InterlockSettings, Needs
 
 _TRAVEL = 0.02  # of the command's range: far beyond noise, and far less than any run worth watching
 
@@ -61,49 +55,3 @@ def _unmet(needs: Needs, loaded: LoadedExperiment) -> list[str]:
     if needs.measured and not info.measures_command:
         rules.append(f"needs a device that measures its command: {info.name} does not")
     return rules
-
-
-class HeatForecast:
-    """Follows the thermal budget of the coil through the commands of a run, before it starts.
-
-    Args:
-        config: The experiment; without a thermal budget nothing is done.
-    """
-
-    def __init__(self, config: Experiment) -> None:
-        limits = config.limits
-        self._rate_hz = config.sample_rate_hz
-        self._rms_a = limits.rms_current_a or math.inf
-        self._tau_s = limits.thermal_time_constant_s
-        self._heat = config.safe.value**2
-        self._highest = self._heat
-        self._samples = 0
-        self._trip: int | None = None
-
-    def add(self, command: F64) -> None:
-        """Go on with the next commands: float64[n], in A."""
-        if self._tau_s is None:
-            return
-        heat = np.empty(command.size)
-        self._heat = heat_block(command, warming(self._tau_s, self._rate_hz), self._heat, heat)
-        over = np.flatnonzero(heat > self._rms_a**2)
-        if self._trip is None and over.size:
-            self._trip = self._samples + int(over[0])
-        self._highest = max(self._highest, float(heat.max()))
-        self._samples += command.size
-
-    @property
-    def rms_a(self) -> float | None:
-        """Highest running rms of the current so far, in A; None without a thermal budget."""
-        return None if self._tau_s is None else math.sqrt(self._highest)
-
-    def problems(self, loaded: LoadedExperiment) -> list[Problem]:
-        """Return when and by how much the budget would be overdrawn; nothing where it is kept."""
-        if self._trip is None or self.rms_a is None:
-            return []
-        where = loaded.document.where(("limits", "rms_current_a"))
-        rule = f"the coil must stay within {self._rms_a:g} A rms over {self._tau_s:g} s"
-        excess = f"{self.rms_a - self._rms_a:.3g} A too much"
-        when = f"the budget is used up after {self._trip / self._rate_hz:.4g} s"
-        hint = f"{excess}, and {when}: lower the waveform's amplitude, or shorten the run"
-        return [Problem(where, "limits.rms_current_a", rule, f"{self.rms_a:.4g} A", hint)]

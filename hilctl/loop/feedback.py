@@ -9,18 +9,8 @@ import math
 from collections import deque
 from dataclasses import dataclass
 
-import numpy as np
-
 from hilctl.base.errors import InputError
 from hilctl.loop.block import Block
-
-LOOP_DELAY = 2
-"""Samples from a correction to the first tick that sees its effect: one until the sensor can show
-it, and one until the displacement that came with that exchange is used."""
-
-LEAST_GAIN_MARGIN = 2.0
-LEAST_PHASE_MARGIN_DEG = 60.0
-_FREQUENCIES = 4096
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,56 +28,6 @@ class Gains:
     def __post_init__(self) -> None:
         if not (0.0 <= self.kp < math.inf and 0.0 < self.ki_per_s < math.inf):
             raise InputError(f"kp must be >= 0 and ki_per_s > 0: {self.kp}, {self.ki_per_s}")
-
-
-def gains_for(bandwidth_hz: float, rate_hz: float) -> Gains:
-    """Return the gains whose open loop crosses 1 at ``bandwidth_hz``, below half the rate.
-
-    An actuator that is a gain of 1 and a delay needs no proportional part: the integral alone
-    crosses 1 at ``ki / (2 pi)``, and falls from there on.
-    """
-    return Gains(0.0, 2.0 * rate_hz * math.sin(math.pi * bandwidth_hz / rate_hz))
-
-
-def highest_bandwidth_hz(rate_hz: float, extra_delay_s: float = 0.0) -> float:
-    """Return the largest bandwidth that leaves the least phase margin.
-
-    The integral is 90 degrees late less half a sample, the loop two samples: together 1.5 samples.
-    The margin of 60 degrees leaves 30 degrees for these and the extra delay.
-
-    Args:
-        rate_hz: Samples a second.
-        extra_delay_s: What link and sensor add.
-    """
-    share = (90.0 - LEAST_PHASE_MARGIN_DEG) / 360.0
-    return share / ((LOOP_DELAY - 0.5) / rate_hz + extra_delay_s)
-
-
-def rate_needed_hz(bandwidth_hz: float, extra_delay_s: float = 0.0) -> float:
-    """Return the sample rate that a bandwidth needs; infinite where the extra delay forbids it."""
-    share = (90.0 - LEAST_PHASE_MARGIN_DEG) / 360.0
-    left_s = share / bandwidth_hz - extra_delay_s
-    return (LOOP_DELAY - 0.5) / left_s if left_s > 0.0 else math.inf
-
-
-def margins(gains: Gains, rate_hz: float, extra_delay_s: float = 0.0) -> tuple[float, float]:
-    """Return gain margin and phase margin, in degrees, on an actuator of gain 1.
-
-    The gain margin is 1 over the largest open-loop gain wherever the loop is later than 180
-    degrees; 0 degrees of phase margin stand for a loop gain that never falls below 1.
-    """
-    angle = np.geomspace(1e-6, math.pi, _FREQUENCIES)
-    controller = gains.kp + gains.ki_per_s / rate_hz / (1.0 - np.exp(-1j * angle))
-    size = np.abs(controller)
-    late = angle * (LOOP_DELAY + extra_delay_s * rate_hz) - np.angle(controller)
-    beyond = size[late >= math.pi]
-    gain_margin = float(1.0 / beyond.max()) if beyond.size else math.inf
-    above = np.flatnonzero(size >= 1.0)
-    if not above.size:
-        return gain_margin, 180.0
-    if above[-1] == angle.size - 1:
-        return gain_margin, 0.0
-    return gain_margin, math.degrees(math.pi - float(late[: above[-1] + 1].max()))
 
 
 class Feedback:

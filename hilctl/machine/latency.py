@@ -22,7 +22,7 @@ from hilctl.base.arrays import I64
 from hilctl.base.device import Clock
 from hilctl.base.errors import InputError, RunError
 from hilctl.loop.pacer import Pacer, SystemClock
-from hilctl.machine.realtime import Step, prepare
+from hilctl.machine.realtime import SetUpStep, prepare
 from hilctl.machine.settings import Realtime
 
 MAX_RATE_HZ = 20e3
@@ -47,7 +47,7 @@ class Latency:
 
     rate_hz: float
     late_ns: I64
-    steps: tuple[Step, ...]
+    steps: tuple[SetUpStep, ...]
 
     @property
     def longest_period_ns(self) -> float:
@@ -101,7 +101,7 @@ def measure(
             "parent": os.getpid(),
         }
         answer = _ask(json.dumps(job), seconds, on_progress)
-        steps = tuple(Step(**step) for step in json.loads(answer))
+        steps = tuple(SetUpStep(**step) for step in json.loads(answer))
         return Latency(rate_hz, np.load(output), steps)
 
 
@@ -151,7 +151,7 @@ def watch(pacer: Pacer, late_ns: I64, clock: Clock, supervised: Callable[[], boo
     return late_ns.size
 
 
-def _run(job: dict[str, Any]) -> tuple[Step, ...]:
+def _run(job: dict[str, Any]) -> tuple[SetUpStep, ...]:
     clock = SystemClock()
     period_ns = 1e9 / job["rate_hz"]
     pacer = Pacer(clock, period_ns, "catch_up", period_ns)

@@ -15,7 +15,7 @@ from hilctl.base.errors import InputError
 from hilctl.machine.linux import DMA_LATENCY, LinuxProcess
 from hilctl.machine.settings import Realtime
 
-Outcome: TypeAlias = Literal["done", "refused", "not asked"]
+StepOutcome: TypeAlias = Literal["done", "refused", "not asked"]
 
 REQUIRED = ("fifo", "memory")
 LIMITS_FILE = "/etc/security/limits.d/99-realtime.conf"
@@ -28,7 +28,7 @@ _HEADROOM_BYTES = 256 << 20
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
+class SetUpStep:
     """One step of the set-up.
 
     Attributes:
@@ -39,7 +39,7 @@ class Step:
     """
 
     name: str
-    outcome: Outcome
+    outcome: StepOutcome
     detail: str
     remedy: str = ""
 
@@ -100,37 +100,37 @@ class System(Protocol):
         ...
 
 
-def _step(name: str, detail: str, take: Callable[[], object], remedy: str = "") -> Step:
+def _step(name: str, detail: str, take: Callable[[], object], remedy: str = "") -> SetUpStep:
     try:
         take()
     except OSError as error:
-        return Step(name, "refused", f"{detail}: {error.strerror}", remedy)
-    return Step(name, "done", detail)
+        return SetUpStep(name, "refused", f"{detail}: {error.strerror}", remedy)
+    return SetUpStep(name, "done", detail)
 
 
-def _lock_memory(system: System) -> Step:
+def _lock_memory(system: System) -> SetUpStep:
     """Lock all memory, unless what is claimed later would hit a limit in the middle of a run."""
     remedy = f"put '@realtime - memlock unlimited' into {LIMITS_FILE}, join that group, log in anew"
     limit = system.lockable_bytes()
     needed = system.mapped_bytes() + _HEADROOM_BYTES
     if limit is not None and limit < needed:
         detail = f"only {limit >> 20} MB may be locked, {needed >> 20} MB are needed"
-        return Step("memory", "refused", detail, remedy)
+        return SetUpStep("memory", "refused", detail, remedy)
     return _step("memory", "all locked, present and future", system.lock_memory, remedy)
 
 
-def _pin(settings: Realtime, system: System) -> Step:
+def _pin(settings: Realtime, system: System) -> SetUpStep:
     cpu = settings.cpu
     if cpu is None:
         with suppress(OSError):
             cpu = min(cpu_numbers(system.read(ISOLATED)), default=None)
         if cpu is None:
-            return Step("cpu", "not asked", "no CPU is isolated: any may be used")
+            return SetUpStep("cpu", "not asked", "no CPU is isolated: any may be used")
     remedy = "name a CPU of this machine that this process may use under realtime.cpu"
     return _step("cpu", f"CPU {cpu}", lambda: system.pin(cpu), remedy)
 
 
-def _set_fifo(settings: Realtime, system: System) -> Step:
+def _set_fifo(settings: Realtime, system: System) -> SetUpStep:
     priority = settings.priority
     try:
         system.set_fifo(priority)
@@ -141,8 +141,8 @@ def _set_fifo(settings: Realtime, system: System) -> Step:
                 "this control group has no real-time share: "
                 "write 950000 to its cpu.rt_runtime_us, or boot with rt_group_sched=0"
             )
-        return Step("fifo", "refused", f"SCHED_FIFO {priority}: {error.strerror}", remedy)
-    return Step("fifo", "done", f"SCHED_FIFO {priority}{_throttling(system)}")
+        return SetUpStep("fifo", "refused", f"SCHED_FIFO {priority}: {error.strerror}", remedy)
+    return SetUpStep("fifo", "done", f"SCHED_FIFO {priority}{_throttling(system)}")
 
 
 def _throttling(system: System) -> str:
@@ -156,7 +156,7 @@ def _throttling(system: System) -> str:
 _THIS_PROCESS = LinuxProcess()
 
 
-def prepare(settings: Realtime, system: System = _THIS_PROCESS) -> tuple[Step, ...]:
+def prepare(settings: Realtime, system: System = _THIS_PROCESS) -> tuple[SetUpStep, ...]:
     """Take every step that is allowed; call it last, when all memory is mapped and warm.
 
     Args:
@@ -191,7 +191,7 @@ def undo(system: System = _THIS_PROCESS) -> None:
     system.undo()
 
 
-def require(steps: Sequence[Step]) -> None:
+def require(steps: Sequence[SetUpStep]) -> None:
     """Refuse a run that has to be real-time and would not be.
 
     SCHED_FIFO and locked memory are required. The idle states of the CPU are not: virtual machines
@@ -208,7 +208,7 @@ def require(steps: Sequence[Step]) -> None:
         )
 
 
-def step_facts(steps: Sequence[Step]) -> dict[str, str]:
+def step_facts(steps: Sequence[SetUpStep]) -> dict[str, str]:
     """Return the steps for a recording's metadata: ``rt.fifo`` and so on, to text."""
     return {f"rt.{step.name}": f"{step.outcome}: {step.detail}" for step in steps}
 

@@ -14,7 +14,7 @@ from hilctl.loop.plan import Outcome
 from hilctl.run.job import Job
 from hilctl.run.ring import SampleRing
 from hilctl.run.run_folder import RunFolder
-from hilctl.run.shared_page import Field, Phase, Text
+from hilctl.run.shared_page import Field, PageText, Phase
 
 _READY_TIMEOUT_S = 120.0
 
@@ -71,9 +71,9 @@ class LoopChild:
                 raise RunError(f"the loop was not ready within {_READY_TIMEOUT_S:g} s")
             time.sleep(0.005)
         if page.get(Field.PHASE) == Phase.REFUSED:
-            raise InputError(page.read_text(Text.ERROR))
+            raise InputError(page.read_text(PageText.ERROR))
         if page.get(Field.PHASE) == Phase.FAILED:
-            raise RunError(page.read_text(Text.ERROR))
+            raise RunError(page.read_text(PageText.ERROR))
         if page.get(Field.PHASE) != Phase.READY:
             raise RunError(f"the loop process died before the start: {self._death()}")
 
@@ -92,7 +92,7 @@ class LoopChild:
         if (outcome := self._page.outcome()) is not None:
             return outcome
         if self._page.get(Field.PHASE) == Phase.FAILED:
-            return self._page.read_text(Text.ERROR)
+            return self._page.read_text(PageText.ERROR)
         return f"the loop process died: {self._death()}"
 
     def _death(self) -> str:

@@ -19,7 +19,7 @@ from hilctl.run.assemble import assemble
 from hilctl.run.host import RingHost
 from hilctl.run.job import Job
 from hilctl.run.ring import SampleRing
-from hilctl.run.shared_page import Field, Phase, SharedPage, Text
+from hilctl.run.shared_page import Field, PageText, Phase, SharedPage
 
 
 def main() -> int:
@@ -37,14 +37,14 @@ def main() -> int:
         return _failed(page, str(error))
     except Exception as error:  # noqa: BLE001  the supervisor must know it and make the rig safe
         return _failed(page, f"the loop broke: {type(error).__name__}: {error}")
-    page.write_text(Text.OUTCOME, json.dumps(asdict(outcome)))
+    page.write_text(PageText.OUTCOME, json.dumps(asdict(outcome)))
     page.put(Field.PHASE, Phase.ENDED)
     return 0
 
 
 def _failed(page: SharedPage, text: str, phase: Phase = Phase.FAILED) -> int:
     # The text first: the phase says that it is there.
-    page.write_text(Text.ERROR, text)
+    page.write_text(PageText.ERROR, text)
     page.put(Field.PHASE, phase)
     return 1
 
@@ -63,7 +63,7 @@ def run_job(job: Job, ring: SampleRing, loaded: LoadedExperiment) -> Outcome:
         require(steps)
     device.open(config.sample_rate_hz, config.block)
     try:
-        page.write_text(Text.SET_UP, json.dumps(step_facts(steps)))
+        page.write_text(PageText.SET_UP, json.dumps(step_facts(steps)))
         page.put(Field.PHASE, Phase.READY)
         _await_go(page, host)
         page.put(Field.PHASE, Phase.RUNNING)

@@ -55,7 +55,7 @@ def run_facts(checked: "Checked", started: str, model_yaml: str) -> dict[str, st
         "block": str(config.block),
         "waveform_samples": str(checked.forecast.samples),
         "compensator": getattr(loaded.model, "kind", "none"),
-        "initial_state_run_id": checked.initial_state.run_id if checked.initial_state else "",
+        "initial_state_run_id": checked.begun.run_id,
         "experiment_sha256": _sha256(loaded.yaml_text),
         "model_sha256": _sha256(model_yaml) if model_yaml else "",
         "limits": config.limits.model_dump_json(exclude_none=True),

@@ -14,7 +14,7 @@ from hilctl.recording.recover import recover_recording
 from hilctl.run.metadata import end_facts
 from hilctl.run.ring import SampleRing
 from hilctl.run.run_folder import RunFolder, runs, taken_over
-from hilctl.run.shared_page import Field, Phase, Text
+from hilctl.run.shared_page import Field, PageText, Phase
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +77,7 @@ def _left_behind(
     page = ring.page
     outcome = page.outcome() or died
     if page.get(Field.PHASE) == Phase.FAILED:
-        outcome = replace(died, reason=page.read_text(Text.ERROR))
+        outcome = replace(died, reason=page.read_text(PageText.ERROR))
     if page.get(Field.PHASE) != Phase.ENDED:
         last = batches[-1].heads[-1] if batches else None
         next_sample = 0 if last is None else int(last[Head.FIRST_SAMPLE]) + ring.block

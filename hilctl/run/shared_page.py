@@ -22,7 +22,7 @@ _EVENT_BYTES = 1024
 _EVENT_SLOTS = 32
 
 
-class Text(IntEnum):
+class PageText(IntEnum):
     """Texts that the loop leaves for the supervisor, each in a place of its own."""
 
     SET_UP = 0
@@ -33,7 +33,7 @@ class Text(IntEnum):
     """Why it could not start or go on, for people."""
 
 
-_EVENTS_AT = _PAGE + len(Text) * _TEXT_BYTES
+_EVENTS_AT = _PAGE + len(PageText) * _TEXT_BYTES
 SIZE = _EVENTS_AT + _EVENT_SLOTS * _EVENT_BYTES
 """Bytes that the numbers, the texts and the events take."""
 
@@ -139,11 +139,11 @@ class SharedPage:
         """Set a number that is no whole one."""
         self._floats[field] = value
 
-    def write_text(self, place: Text, text: str) -> None:
+    def write_text(self, place: PageText, text: str) -> None:
         """Leave a text for the other side, cut to what fits."""
         self._write(_PAGE + place * _TEXT_BYTES, _TEXT_BYTES, text)
 
-    def read_text(self, place: Text) -> str:
+    def read_text(self, place: PageText) -> str:
         """Return the text that the other side left."""
         return self._read(_PAGE + place * _TEXT_BYTES, _TEXT_BYTES)
 
@@ -170,7 +170,7 @@ class SharedPage:
         if self.get(Field.PHASE) != Phase.ENDED:
             return None
         with suppress(ValueError, TypeError):  # damaged
-            return Outcome(**json.loads(self.read_text(Text.OUTCOME)))
+            return Outcome(**json.loads(self.read_text(PageText.OUTCOME)))
         return None
 
     def push_event(self, event: Event) -> None:

@@ -28,7 +28,7 @@ from hilctl.run.requests import Requests
 from hilctl.run.result import Progress, RunResult
 from hilctl.run.ring import SampleRing
 from hilctl.run.run_folder import RunFolder, held_devices, run_folder
-from hilctl.run.shared_page import Field, Stop, Text
+from hilctl.run.shared_page import Field, PageText, Stop
 from hilctl.run.systemd import Notifier
 
 _POLL_S = 0.02
@@ -109,7 +109,7 @@ class Supervisor:
             child.await_ready(lambda: self._stop_signal != 0)
             start_ns = time.monotonic_ns() + _START_DELAY_NS
             unix_ns = time.time_ns() + start_ns - time.monotonic_ns()
-            recorder.begin(unix_ns, json.loads(page.read_text(Text.SET_UP)))
+            recorder.begin(unix_ns, json.loads(page.read_text(PageText.SET_UP)))
         except (RunError, InputError):
             child.kill()  # it waits for the word to start, so nothing has moved
             recorder.give_back()

@@ -99,7 +99,7 @@ class SerialDevice(Protocol):
         ...
 
 
-class SerialWire:
+class EmulatedLine:
     """Devices on a serial line.
 
     Args:

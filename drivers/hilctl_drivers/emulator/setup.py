@@ -20,7 +20,7 @@ from hilctl_drivers.emulator.modbus_device import EmulatedModbus
 from hilctl_drivers.emulator.modbus_wire import ModbusWire
 from hilctl_drivers.emulator.options import EmulatorOptions
 from hilctl_drivers.emulator.rig import Rig, Wiring, WriteLog
-from hilctl_drivers.emulator.serial_wire import FrameFraming, SerialWire, TextFraming
+from hilctl_drivers.emulator.serial_wire import EmulatedLine, FrameFraming, TextFraming
 from hilctl_drivers.emulator.server import EmulatorServer
 from hilctl_drivers.emulator.text_device import EmulatedText
 from hilctl_drivers.emulator.wire import EmulatedWire
@@ -282,9 +282,9 @@ class _TextPlan(_Plan):
             device = self._device(self._profile, rig, log, self._output, None)
             reader = self._device(self._reader, rig, log, None, self._sensor)
         first = [device] if self._apart or reader is device else [device, reader]
-        ports = [Port(SerialWire(TextFraming(self._profile), first))]
+        ports = [Port(EmulatedLine(TextFraming(self._profile), first))]
         if self._apart:
-            ports.append(Port(SerialWire(TextFraming(self._reader), [reader]), faulty=False))
+            ports.append(Port(EmulatedLine(TextFraming(self._reader), [reader]), faulty=False))
         return device, reader, ports
 
     def _device(
@@ -312,7 +312,7 @@ class _BoardPlan(_Plan):
     def devices(self, rig: Rig, log: WriteLog) -> tuple[AnyDevice, AnyDevice, list[Port]]:
         noise = self._options.noise
         board = EmulatedBoard(self._profile, rig, log, self._wiring, noise=noise)
-        return board, board, [Port(SerialWire(FrameFraming(self._profile), [board]))]
+        return board, board, [Port(EmulatedLine(FrameFraming(self._profile), [board]))]
 
     def places(self, addresses: list[str]) -> dict[str, Any]:
         return {"serial_port": addresses[0]}

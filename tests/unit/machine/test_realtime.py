@@ -15,7 +15,7 @@ from hilctl.machine.realtime import (
     ISOLATED,
     RT_PERIOD,
     RT_RUNTIME,
-    Step,
+    SetUpStep,
     be_ordinary,
     cpu_numbers,
     prepare,
@@ -345,6 +345,6 @@ def test_command_line_requires_real_time(monkeypatch):
 
 def test_steps_cannot_be_changed():
     """A step is a record of what happened."""
-    step = Step("fifo", "done", "SCHED_FIFO 80")
+    step = SetUpStep("fifo", "done", "SCHED_FIFO 80")
     with pytest.raises(AttributeError):
         step.outcome = "refused"  # type: ignore[misc]

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from hilctl.base.samples import Flag, Head
 from hilctl.run.ring import SampleRing
-from hilctl.run.shared_page import Field, Text
+from hilctl.run.shared_page import Field, PageText
 
 BLOCK, STATE = 3, 2
 
@@ -169,7 +169,7 @@ def test_damaged_ring_is_survived(tmp_path_factory, garbage, at):
         other.skip_damaged()
         other.release()
     other.unanswered(0)
-    other.page.read_text(Text.ERROR)
+    other.page.read_text(PageText.ERROR)
     other.page.outcome()
 
 

@@ -9,7 +9,7 @@ import pytest
 from hilctl.base.events import Event
 from hilctl.loop.pacer import Lateness
 from hilctl.loop.plan import Outcome
-from hilctl.run.shared_page import SIZE, Field, Phase, SharedPage, Stop, Text
+from hilctl.run.shared_page import SIZE, Field, PageText, Phase, SharedPage, Stop
 
 
 @pytest.fixture
@@ -30,12 +30,12 @@ def test_numbers_are_shared(sides):
 def test_each_text_has_a_place_of_its_own(sides):
     """No text is read in the place of another; one that is too long is cut at a character."""
     one, other = sides
-    for place in Text:
+    for place in PageText:
         one.write_text(place, f"{place.name}: öffnen")
-    assert [other.read_text(place) for place in Text] == [f"{p.name}: öffnen" for p in Text]
-    one.write_text(Text.SET_UP, "µ" * 10_000)
-    assert set(other.read_text(Text.SET_UP)) == {"µ"}
-    assert other.read_text(Text.OUTCOME) == "OUTCOME: öffnen"
+    assert [other.read_text(place) for place in PageText] == [f"{p.name}: öffnen" for p in PageText]
+    one.write_text(PageText.SET_UP, "µ" * 10_000)
+    assert set(other.read_text(PageText.SET_UP)) == {"µ"}
+    assert other.read_text(PageText.OUTCOME) == "OUTCOME: öffnen"
 
 
 def test_events_come_once_and_are_cut_to_what_fits(sides):
@@ -58,11 +58,11 @@ def test_outcome_counts_only_at_the_end(sides):
     """A text that is not there yet, or damaged, is no outcome."""
     one, other = sides
     outcome = Outcome("stopped", "stopped by a test", 7, True, 2)
-    one.write_text(Text.OUTCOME, json.dumps(asdict(outcome)))
+    one.write_text(PageText.OUTCOME, json.dumps(asdict(outcome)))
     assert other.outcome() is None
     one.put(Field.PHASE, Phase.ENDED)
     assert other.outcome() == outcome
-    one.write_text(Text.OUTCOME, '{"code": "sto')
+    one.write_text(PageText.OUTCOME, '{"code": "sto')
     assert other.outcome() is None
 
 
