@@ -90,7 +90,7 @@ class Kill:
         return self.lost == 0 and self.safe_ms <= within_ms and agree
 
 
-class Bench:
+class KilledRuns:
     """An emulated device and experiments that use it."""
 
     def __init__(self, folder: Path, seed: int) -> None:
@@ -200,15 +200,15 @@ def main() -> int:
     options = parser.parse_args()
     kills: list[Kill] = []
     with tempfile.TemporaryDirectory(prefix="hilctl-kills-") as folder:
-        bench = Bench(Path(folder), options.seed)
+        killed = KilledRuns(Path(folder), options.seed)
         try:
             for victim in options.victims:
                 for number in range(options.count):
-                    kills.append(bench.kill(victim, number))
+                    kills.append(killed.kill(victim, number))
                     if not options.json:
                         print(kills[-1], flush=True)
         finally:
-            bench.close()
+            killed.close()
     if options.json:
         print(json.dumps([asdict(kill) for kill in kills], indent=2))
     else:

@@ -42,7 +42,7 @@ MODBUS = (
 
 
 @dataclass
-class Bench:
+class DrivenDevice:
     """A device and how to use it.
 
     Attributes:
@@ -79,9 +79,9 @@ class Bench:
         return 0.5 * (info.command_max + max(0.0, info.command_min))
 
 
-def simulated(kind: str) -> Bench:
+def simulated(kind: str) -> DrivenDevice:
     chosen = device_class(kind)
-    return Bench(chosen(chosen.Options()), SAMPLES, RATE_HZ)
+    return DrivenDevice(chosen(chosen.Options()), SAMPLES, RATE_HZ)
 
 
 RTU_PROFILE = """\
@@ -103,7 +103,7 @@ watchdog: none
 """
 
 
-def modbus(words: list[str], stack: list[Callable[[], None]]) -> Bench:
+def modbus(words: list[str], stack: list[Callable[[], None]]) -> DrivenDevice:
     """Return a modbus_dac that is wired to an emulator of the profile, or of two."""
     clock = ManualClock()
     name, reader, line = [*words, None, None][:3]
@@ -126,7 +126,7 @@ def modbus(words: list[str], stack: list[Callable[[], None]]) -> Bench:
     def pass_time() -> None:
         clock.now_ns += round(1e9 / rate_hz)
 
-    return Bench(device, 1, rate_hz, pass_time)
+    return DrivenDevice(device, 1, rate_hz, pass_time)
 
 
 def _fast(section: dict) -> dict:
@@ -138,12 +138,12 @@ CASES = [*SIMULATED, *(f"modbus_dac {words}" for words in MODBUS)]
 
 
 @pytest.fixture
-def make(tmp_path) -> Iterator[Callable[[str], Bench]]:
+def make(tmp_path) -> Iterator[Callable[[str], DrivenDevice]]:
     """Return a function that makes a device of a kind; all are closed afterwards."""
-    benches: list[Bench] = []
+    benches: list[DrivenDevice] = []
     stack: list[Callable[[], None]] = []
 
-    def of(case: str) -> Bench:
+    def of(case: str) -> DrivenDevice:
         kind, *words = case.split()
         if words == ["rtu"]:
             path = tmp_path / "rtu.yaml"
@@ -153,8 +153,8 @@ def make(tmp_path) -> Iterator[Callable[[str], Bench]]:
         return benches[-1]
 
     yield of
-    for bench in benches:
-        bench.device.close()
+    for driven in benches:
+        driven.device.close()
     for stop in stack:
         stop()
 
@@ -166,7 +166,7 @@ def case(request) -> str:
 
 
 @pytest.fixture
-def bench(make, case) -> Bench:
+def driven(make, case) -> DrivenDevice:
     """A device that was not opened yet."""
     return make(case)
 
@@ -189,9 +189,9 @@ def test_no_modbus_profile_is_left_out():
     assert only_read == {pair[1] for pair in pairs if len(pair) == 2}
 
 
-def test_says_what_it_is_before_it_is_opened(bench):
+def test_says_what_it_is_before_it_is_opened(driven):
     """Info is complete and sensible without a connection."""
-    info = bench.device.info
+    info = driven.device.info
     assert info.name in BUILTIN
     assert info.description
     assert info.command_unit in {"A", "V"}
@@ -202,14 +202,14 @@ def test_says_what_it_is_before_it_is_opened(bench):
     assert all(isinstance(text, str) for text in info.details.values())
 
 
-def test_exchanges_blocks(bench):
+def test_exchanges_blocks(driven):
     """Every displacement is filled with a number in the sensor's range, and commands move it."""
-    bench.open()
-    info = bench.device.info
-    rest, _ = bench.exchange(0, np.zeros(SAMPLES))
-    ramp = np.linspace(0.0, bench.middle, SAMPLES)
-    bench.exchange(SAMPLES, ramp)
-    moved, measured = bench.exchange(2 * SAMPLES, np.full(SAMPLES, ramp[-1]))
+    driven.open()
+    info = driven.device.info
+    rest, _ = driven.exchange(0, np.zeros(SAMPLES))
+    ramp = np.linspace(0.0, driven.middle, SAMPLES)
+    driven.exchange(SAMPLES, ramp)
+    moved, measured = driven.exchange(2 * SAMPLES, np.full(SAMPLES, ramp[-1]))
     for values in (rest, moved):
         assert np.isfinite(values).all()
         assert (values >= info.sensor_min_um).all()
@@ -218,92 +218,92 @@ def test_exchanges_blocks(bench):
     assert np.isfinite(measured).all() == info.measures_command
 
 
-def test_displacement_is_sampled_before_the_command_acts(bench):
+def test_displacement_is_sampled_before_the_command_acts(driven):
     """The first sample after a jump still shows the rest; a later one does not."""
-    bench.open()
-    rest, _ = bench.exchange(0, np.zeros(SAMPLES))
-    moved, _ = bench.exchange(SAMPLES, np.full(SAMPLES, bench.middle))
+    driven.open()
+    rest, _ = driven.exchange(0, np.zeros(SAMPLES))
+    moved, _ = driven.exchange(SAMPLES, np.full(SAMPLES, driven.middle))
     assert abs(moved[0] - rest.mean()) < 0.5
     assert moved[-1] > rest.mean() + 1.0
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, "above", "below"])
-def test_refuses_what_it_can_not_do(bench, bad):
+def test_refuses_what_it_can_not_do(driven, bad):
     """A value that is not finite or out of range is refused whole: nothing of the block is sent."""
-    bench.open()
-    info = bench.device.info
+    driven.open()
+    info = driven.device.info
     value = {"above": info.command_max * 1.001 + 1e-6, "below": info.command_min * 1.001 - 1e-6}
-    command = np.full(bench.block, bench.middle)
-    command[bench.block // 2] = value.get(bad, bad) if isinstance(bad, str) else bad
+    command = np.full(driven.block, driven.middle)
+    command[driven.block // 2] = value.get(bad, bad) if isinstance(bad, str) else bad
     with pytest.raises(DeviceError, match=info.name):
-        bench.exchange(0, command)
-    after, _ = bench.exchange(0, np.zeros(SAMPLES))
+        driven.exchange(0, command)
+    after, _ = driven.exchange(0, np.zeros(SAMPLES))
     assert np.abs(after).max() < 0.5
 
 
-def test_takes_its_whole_range(bench):
+def test_takes_its_whole_range(driven):
     """Both ends of the stated range are accepted."""
-    bench.open()
-    for k, value in enumerate((bench.device.info.command_min, bench.device.info.command_max)):
-        bench.exchange(k * SAMPLES, np.full(SAMPLES, value))
+    driven.open()
+    for k, value in enumerate((driven.device.info.command_min, driven.device.info.command_max)):
+        driven.exchange(k * SAMPLES, np.full(SAMPLES, value))
 
 
-def test_does_not_change_the_command(bench):
+def test_does_not_change_the_command(driven):
     """The command array is read, never written."""
-    bench.open()
-    command = np.linspace(0.0, bench.middle, SAMPLES)
+    driven.open()
+    command = np.linspace(0.0, driven.middle, SAMPLES)
     before = command.copy()
-    bench.exchange(0, command)
+    driven.exchange(0, command)
     assert np.array_equal(command, before)
 
 
-def test_use_before_open_and_after_close_is_refused(bench):
+def test_use_before_open_and_after_close_is_refused(driven):
     """Exchange needs an open device; closing twice is fine, and opening again too."""
     with pytest.raises(DeviceError):
-        bench.exchange(0, np.zeros(SAMPLES))
-    bench.open()
-    bench.device.close()
-    bench.device.close()
+        driven.exchange(0, np.zeros(SAMPLES))
+    driven.open()
+    driven.device.close()
+    driven.device.close()
     with pytest.raises(DeviceError):
-        bench.exchange(0, np.zeros(SAMPLES))
-    bench.open()
-    bench.exchange(0, np.zeros(SAMPLES))
+        driven.exchange(0, np.zeros(SAMPLES))
+    driven.open()
+    driven.exchange(0, np.zeros(SAMPLES))
 
 
-def test_opening_does_not_move_the_output(bench):
+def test_opening_does_not_move_the_output(driven):
     """What was put out before stays through closing and opening; simulated ones start at rest."""
-    bench.open()
-    bench.exchange(0, np.full(SAMPLES, bench.middle))
-    held, _ = bench.exchange(SAMPLES, np.full(SAMPLES, bench.middle))
-    bench.device.close()
-    bench.open()
-    first, _ = bench.exchange(0, np.zeros(bench.block))
-    expected = 0.0 if bench.device.info.name in SIMULATED else held[-1]
+    driven.open()
+    driven.exchange(0, np.full(SAMPLES, driven.middle))
+    held, _ = driven.exchange(SAMPLES, np.full(SAMPLES, driven.middle))
+    driven.device.close()
+    driven.open()
+    first, _ = driven.exchange(0, np.zeros(driven.block))
+    expected = 0.0 if driven.device.info.name in SIMULATED else held[-1]
     assert first[0] == pytest.approx(expected, abs=0.5)
 
 
-def test_rate_beyond_its_limit_is_refused(bench):
+def test_rate_beyond_its_limit_is_refused(driven):
     """A sample rate that it can't keep is refused at open."""
     with pytest.raises(DeviceError):
-        bench.device.open(bench.device.info.max_rate_hz * 1.01, bench.block)
+        driven.device.open(driven.device.info.max_rate_hz * 1.01, driven.block)
 
 
-def test_make_safe_works_open_or_closed(bench):
+def test_make_safe_works_open_or_closed(driven):
     """The last resort needs no open connection."""
-    bench.device.make_safe(0.0)
-    bench.open()
-    bench.exchange(0, np.full(SAMPLES, bench.middle))
-    bench.device.make_safe(0.0)
-    bench.device.close()
-    bench.device.make_safe(0.0)
+    driven.device.make_safe(0.0)
+    driven.open()
+    driven.exchange(0, np.full(SAMPLES, driven.middle))
+    driven.device.make_safe(0.0)
+    driven.device.close()
+    driven.device.make_safe(0.0)
 
 
-def test_two_of_a_kind_agree(bench, make, case):
+def test_two_of_a_kind_agree(driven, make, case):
     """A second one with the same options gives the same bits: runs can be repeated."""
     other = make(case)
-    command = np.linspace(0.0, bench.middle, SAMPLES)
+    command = np.linspace(0.0, driven.middle, SAMPLES)
     results = []
-    for each in (bench, other):
+    for each in (driven, other):
         each.open()
         results.append(each.exchange(0, command)[0])
     assert np.array_equal(*results)

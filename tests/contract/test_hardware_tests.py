@@ -42,7 +42,7 @@ safe: {{value: 0.0, ramp_s: 0.25}}
 """
 
 
-class Bench:
+class HardwareTestRun:
     """An emulated device and what the hardware tests make of it."""
 
     def __init__(self, emulator: Emulator, folder: Path) -> None:
@@ -70,7 +70,7 @@ class Bench:
 
 
 @pytest.fixture
-def bench(tmp_path, request) -> Iterator[Bench]:
+def suite(tmp_path, request) -> Iterator[HardwareTestRun]:
     """An emulated device; the test's parameter is its fault."""
     fault = getattr(request, "param", None)
     faults = (parse_fault(fault),) if fault else ()
@@ -78,18 +78,18 @@ def bench(tmp_path, request) -> Iterator[Bench]:
     emulator = build(options)
     thread = threading.Thread(target=emulator.server.run)
     thread.start()
-    yield Bench(emulator, tmp_path)
+    yield HardwareTestRun(emulator, tmp_path)
     emulator.server.stop()
     thread.join()
     emulator.log.close()
 
 
-def test_keeps_to_a_tenth_of_the_limits(bench):
+def test_keeps_to_a_tenth_of_the_limits(suite):
     """All pass, no current is beyond a tenth of the peak, but for one step ramps are slow."""
-    done = bench.run()
+    done = suite.run()
     assert done.returncode == 0, done.stdout
     assert "9 passed" in done.stdout
-    currents_a = bench.currents_a()
+    currents_a = suite.currents_a()
     assert max(currents_a) == pytest.approx(TENTH_A, rel=1e-3)
     assert min(currents_a) == 0.0
     assert currents_a[-1] == 0.0
@@ -98,23 +98,23 @@ def test_keeps_to_a_tenth_of_the_limits(bench):
     assert steps_a[-2] <= PEAK_A / RAMP_S / RATE_HZ * 1.001
 
 
-@pytest.mark.parametrize("bench", ["exception@150"], indirect=True)
-def test_failure_ends_at_the_safe_value(bench):
+@pytest.mark.parametrize("suite", ["exception@150"], indirect=True)
+def test_failure_ends_at_the_safe_value(suite):
     """A device that refuses in the middle of a move fails its test and is made safe."""
-    done = bench.run(only="small_move")
+    done = suite.run(only="small_move")
     assert done.returncode == 1
     assert "refused with exception 4" in done.stdout
-    currents_a = bench.currents_a()
+    currents_a = suite.currents_a()
     assert 0.0 < max(currents_a) <= TENTH_A * 1.001
     assert currents_a[-1] == 0.0
 
 
-def test_sensor_that_shows_nothing_is_found(bench):
+def test_sensor_that_shows_nothing_is_found(suite):
     """With the sensor on another input the tests fail and say what to look at."""
-    done = bench.run(sensor="AIN1", only="small_move")
+    done = suite.run(sensor="AIN1", only="small_move")
     assert done.returncode == 1
     assert "nothing moved: is the amplifier on, the sensor wired?" in done.stdout
-    assert bench.currents_a()[-1] == 0.0
+    assert suite.currents_a()[-1] == 0.0
 
 
 def test_without_a_device_nothing_is_run():

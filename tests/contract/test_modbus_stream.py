@@ -27,7 +27,7 @@ def streaming_profiles():
     ]
 
 
-class Bench:
+class DrivenStream:
     """A device that was not opened yet, and how to use it."""
 
     def __init__(self, profile):
@@ -70,9 +70,9 @@ class Bench:
 
 
 @pytest.fixture(params=streaming_profiles())
-def bench(request):
+def driven(request):
     """A device on an emulated one, for each profile."""
-    made = Bench(request.param)
+    made = DrivenStream(request.param)
     yield made
     made.device.close()
 
@@ -82,9 +82,9 @@ def test_profiles_are_found():
     assert set(streaming_profiles()) >= {"labjack_t4", "labjack_t7"}
 
 
-def test_says_what_it_is_before_it_is_opened(bench):
+def test_says_what_it_is_before_it_is_opened(driven):
     """Info is complete and sensible without a connection."""
-    info = bench.device.info
+    info = driven.device.info
     assert info.name == "modbus_stream"
     assert info.buffered
     assert info.fifo_depth > 0
@@ -93,14 +93,14 @@ def test_says_what_it_is_before_it_is_opened(bench):
     assert info.command_min < info.command_max
     assert info.sensor_min_um < info.sensor_max_um
     assert all(isinstance(text, str) for text in info.details.values())
-    assert bench.emulated.link.requests == []
+    assert driven.emulated.link.requests == []
 
 
-def test_displacements_come_that_many_blocks_later(bench):
+def test_displacements_come_that_many_blocks_later(driven):
     """The first exchanges leave their arrays alone; then each sample has its displacement."""
-    bench.open()
-    n, info = 10 * BLOCK, bench.device.info
-    displacement_um, measured = bench.exchange(0, np.linspace(0.0, bench.middle, n))
+    driven.open()
+    n, info = 10 * BLOCK, driven.device.info
+    displacement_um, measured = driven.exchange(0, np.linspace(0.0, driven.middle, n))
     late = FIFO_BLOCKS * BLOCK
     assert np.isnan(displacement_um[:late]).all()
     assert np.isfinite(displacement_um[late:]).all()
@@ -109,95 +109,95 @@ def test_displacements_come_that_many_blocks_later(bench):
     assert np.isnan(measured).all()
 
 
-def test_displacement_is_sampled_before_the_command_acts(bench):
+def test_displacement_is_sampled_before_the_command_acts(driven):
     """The sample of a jump still shows the rest; a later one does not."""
-    bench.open()
+    driven.open()
     command = np.zeros(10 * BLOCK)
-    command[2 * BLOCK :] = bench.middle
-    found = bench.exchange(0, command)[0][FIFO_BLOCKS * BLOCK :]
+    command[2 * BLOCK :] = driven.middle
+    found = driven.exchange(0, command)[0][FIFO_BLOCKS * BLOCK :]
     assert abs(found[2 * BLOCK]) < 0.5
     assert found[2 * BLOCK + 20] > 1.0
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, "above", "below"])
-def test_refuses_what_it_can_not_do(bench, bad):
+def test_refuses_what_it_can_not_do(driven, bad):
     """A value that is not finite or out of range is refused whole: nothing of the block is sent."""
-    bench.open()
-    info = bench.device.info
+    driven.open()
+    info = driven.device.info
     value = {"above": info.command_max * 1.001 + 1e-6, "below": info.command_min * 1.001 - 1e-6}
-    command = np.full(BLOCK, bench.middle)
+    command = np.full(BLOCK, driven.middle)
     command[BLOCK // 2] = value.get(bad, bad) if isinstance(bad, str) else bad
     with pytest.raises(DeviceError, match=info.name):
-        bench.exchange(0, command)
-    after, _ = bench.exchange(0, np.zeros(6 * BLOCK))
+        driven.exchange(0, command)
+    after, _ = driven.exchange(0, np.zeros(6 * BLOCK))
     assert np.abs(after[FIFO_BLOCKS * BLOCK :]).max() < 0.5
 
 
-def test_takes_its_whole_range_and_leaves_the_command_alone(bench):
+def test_takes_its_whole_range_and_leaves_the_command_alone(driven):
     """Both ends of the stated range are accepted, and the array is not written."""
-    bench.open()
-    info = bench.device.info
+    driven.open()
+    info = driven.device.info
     command = np.linspace(info.command_min, info.command_max, 4 * BLOCK)
     before = command.copy()
-    bench.exchange(0, command)
+    driven.exchange(0, command)
     assert np.array_equal(command, before)
 
 
-def test_use_before_open_and_after_close_is_refused(bench):
+def test_use_before_open_and_after_close_is_refused(driven):
     """Exchange needs an open device; closing twice is fine, and opening again too."""
     with pytest.raises(DeviceError):
-        bench.exchange(0, np.zeros(BLOCK))
-    bench.open()
-    bench.device.close()
-    bench.device.close()
+        driven.exchange(0, np.zeros(BLOCK))
+    driven.open()
+    driven.device.close()
+    driven.device.close()
     with pytest.raises(DeviceError):
-        bench.exchange(0, np.zeros(BLOCK))
-    bench.open()
-    bench.exchange(0, np.zeros(5 * BLOCK))
+        driven.exchange(0, np.zeros(BLOCK))
+    driven.open()
+    driven.exchange(0, np.zeros(5 * BLOCK))
 
 
-def test_a_block_of_another_size_is_refused(bench):
+def test_a_block_of_another_size_is_refused(driven):
     """Its size was agreed at open."""
-    bench.open()
+    driven.open()
     with pytest.raises(DeviceError, match="block must be 50 samples"):
-        bench.exchange(0, np.zeros(BLOCK - 1))
+        driven.exchange(0, np.zeros(BLOCK - 1))
 
 
-def test_opening_does_not_move_the_output(bench):
+def test_opening_does_not_move_the_output(driven):
     """What was put out before stays through closing and opening."""
-    bench.open()
-    bench.exchange(0, np.full(10 * BLOCK, bench.middle))
-    held = bench.emulated.rig.current_a
-    bench.device.close()
-    bench.open()
-    bench.emulated.time.sleep(1.0)
-    assert bench.emulated.rig.current_a == held != 0.0
+    driven.open()
+    driven.exchange(0, np.full(10 * BLOCK, driven.middle))
+    held = driven.emulated.rig.current_a
+    driven.device.close()
+    driven.open()
+    driven.emulated.time.sleep(1.0)
+    assert driven.emulated.rig.current_a == held != 0.0
 
 
-def test_rate_beyond_its_limit_is_refused(bench):
+def test_rate_beyond_its_limit_is_refused(driven):
     """A sample rate that it can't keep is refused at open."""
     with pytest.raises(DeviceError):
-        bench.device.open(bench.device.info.max_rate_hz * 1.01, BLOCK)
+        driven.device.open(driven.device.info.max_rate_hz * 1.01, BLOCK)
 
 
-def test_make_safe_works_open_or_closed(bench):
+def test_make_safe_works_open_or_closed(driven):
     """The last resort needs no open connection, and what is queued is not put out after it."""
-    bench.device.make_safe(0.0)
-    bench.open()
-    bench.exchange(0, np.full(6 * BLOCK, bench.middle))
-    bench.device.make_safe(0.0)
-    bench.emulated.time.sleep(1.0)
-    bench.device.close()
-    bench.device.make_safe(0.0)
-    assert bench.emulated.rig.current_a == pytest.approx(0.0, abs=1e-9)
+    driven.device.make_safe(0.0)
+    driven.open()
+    driven.exchange(0, np.full(6 * BLOCK, driven.middle))
+    driven.device.make_safe(0.0)
+    driven.emulated.time.sleep(1.0)
+    driven.device.close()
+    driven.device.make_safe(0.0)
+    assert driven.emulated.rig.current_a == pytest.approx(0.0, abs=1e-9)
 
 
-def test_two_of_a_kind_agree(bench):
+def test_two_of_a_kind_agree(driven):
     """A second one with the same options gives the same bits: runs can be repeated."""
-    other = Bench(bench.profile)
-    command = np.linspace(0.0, bench.middle, 8 * BLOCK)
+    other = DrivenStream(driven.profile)
+    command = np.linspace(0.0, driven.middle, 8 * BLOCK)
     results = []
-    for each in (bench, other):
+    for each in (driven, other):
         each.open()
         results.append(each.exchange(0, command)[0])
     assert np.array_equal(*results, equal_nan=True)

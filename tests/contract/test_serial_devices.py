@@ -73,7 +73,7 @@ def serial_profiles():
     return [name for name, kind in kinds.items() if kind in {"ascii", "frames"}]
 
 
-class Clock:
+class EmulatorClock:
     """The emulator's time: for streams the machine's, else it passes one sample an exchange."""
 
     def __init__(self, *, real):
@@ -84,7 +84,7 @@ class Clock:
         return time.monotonic_ns() if self._real else self.now_ns
 
 
-class SerialBench:
+class DrivenSerial:
     """A serial_dac and how to use it, as the checks expect it.
 
     Behind a FIFO it holds the last command until the answers of what was sent have come. Where a
@@ -150,7 +150,7 @@ def wired(case, tmp_path, stack):
         reader = str(tmp_path / "only_reads.yaml")
         Path(reader).write_text(ONLY_READS)
     stream = getattr(profile, "exchange", "none") == "stream"
-    clock = Clock(real=stream)
+    clock = EmulatorClock(real=stream)
     wanted = EmulatorOptions(str(path), reader=reader, reader_line=line)
     emulator = stack.enter_context(emulated(wanted, clock))
     options = {**emulator.options, "timeout_s": 5.0, "fifo_blocks": FIFO_BLOCKS}
@@ -161,7 +161,7 @@ def wired(case, tmp_path, stack):
     silent = getattr(profile.outputs[options["output"]], "reply", "") == "none"
     apart = silent and line == "own"
     rig = emulator.device._rig
-    return SerialBench(device, rate_hz, clock, (lambda: rig.current_a) if apart else None)
+    return DrivenSerial(device, rate_hz, clock, (lambda: rig.current_a) if apart else None)
 
 
 @pytest.fixture
@@ -178,21 +178,21 @@ def case(request):
 
 
 @pytest.fixture
-def bench(make, case):
+def driven(make, case):
     """A device that was not opened yet."""
     return make(case)
 
 
-def test_opening_does_not_move_the_output(bench, case):
+def test_opening_does_not_move_the_output(driven, case):
     """Supplies that must be set up at 0 A are refused while current flows; others stay put."""
     if case.split()[0] not in MUST_BE_AT_REST:
-        CHECKS.test_opening_does_not_move_the_output(bench)
+        CHECKS.test_opening_does_not_move_the_output(driven)
         return
-    bench.open()
-    bench.exchange(0, np.full(5, bench.middle))
-    bench.device.close()
+    driven.open()
+    driven.exchange(0, np.full(5, driven.middle))
+    driven.device.close()
     with pytest.raises(DeviceError, match="no current may flow when it is taken over"):
-        bench.open()
+        driven.open()
 
 
 def test_no_serial_profile_is_left_out():

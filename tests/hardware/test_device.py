@@ -35,7 +35,7 @@ HOLD_SAMPLES = 20
 CLEARLY = 6.0
 
 
-class Bench:
+class RealDevice:
     """A device under gentle commands.
 
     Args:
@@ -145,9 +145,9 @@ class Bench:
 
 
 @pytest.fixture
-def bench(request) -> Iterator[Bench]:
+def real(request) -> Iterator[RealDevice]:
     """The device of the experiment, not open."""
-    made = Bench(load_experiment(request.config.getoption("--device")))
+    made = RealDevice(load_experiment(request.config.getoption("--device")))
     yield made
     made.end()
 
@@ -173,62 +173,62 @@ def test_answers_a_probe(request):
     assert first.max_rate_hz >= load_experiment(path).config.sample_rate_hz
 
 
-def test_small_move_is_seen_and_comes_back(bench):
+def test_small_move_is_seen_and_comes_back(real):
     """The displacement follows a tenth of the range beyond noise, and most of it comes back."""
-    bench.open()
-    rest = bench.go(bench.safe)
-    there = bench.go(bench.target)
-    back = bench.go(bench.safe)
+    real.open()
+    rest = real.go(real.safe)
+    there = real.go(real.target)
+    back = real.go(real.safe)
     assert distance_um(rest, back) < 0.5 * step_um(rest, there)
 
 
-def test_opening_and_closing_move_nothing(bench):
+def test_opening_and_closing_move_nothing(real):
     """The output stays where it was left while the device is closed, opened and probed."""
-    if bench.device.info.simulated:
+    if real.device.info.simulated:
         pytest.skip("opening a simulated device puts it at rest")
-    bench.open()
-    rest = bench.go(bench.safe)
-    there = bench.go(bench.target)
-    bench.close()
+    real.open()
+    rest = real.go(real.safe)
+    there = real.go(real.target)
+    real.close()
     try:
-        bench.open()
+        real.open()
     except DeviceError as refusal:
-        bench.make_safe()
+        real.make_safe()
         pytest.skip(f"it is opened at its safe value only: {refusal}")
-    bench.close()
-    bench.open()
-    assert distance_um(bench.look(), there) < 0.5 * step_um(rest, there)
+    real.close()
+    real.open()
+    assert distance_um(real.look(), there) < 0.5 * step_um(rest, there)
 
 
-def test_exchange_needs_an_open_device(bench):
+def test_exchange_needs_an_open_device(real):
     """Commands before open and after close are refused; closing twice is fine."""
-    command = np.full(1, bench.safe)
+    command = np.full(1, real.safe)
     with pytest.raises(DeviceError):
-        bench.device.exchange(0, command, np.empty(1), np.empty(1))
-    bench.open()
-    bench.go(bench.safe)
-    bench.close()
-    bench.device.close()
+        real.device.exchange(0, command, np.empty(1), np.empty(1))
+    real.open()
+    real.go(real.safe)
+    real.close()
+    real.device.close()
     with pytest.raises(DeviceError):
-        bench.device.exchange(0, command, np.empty(1), np.empty(1))
+        real.device.exchange(0, command, np.empty(1), np.empty(1))
 
 
-def test_make_safe_needs_no_open_device(bench):
+def test_make_safe_needs_no_open_device(real):
     """The last resort takes the output from a small command to the safe value."""
-    bench.open()
-    rest = bench.go(bench.safe)
-    there = bench.go(bench.target)
-    bench.close()
-    bench.make_safe()
-    bench.open()
-    back = bench.go(bench.safe)
+    real.open()
+    rest = real.go(real.safe)
+    there = real.go(real.target)
+    real.close()
+    real.make_safe()
+    real.open()
+    back = real.go(real.safe)
     assert distance_um(rest, back) < 0.5 * step_um(rest, there)
 
 
 @pytest.mark.parametrize("bad", ["not a number", "infinite", "above", "below"])
-def test_refuses_what_it_can_not_do(bench, bad):
+def test_refuses_what_it_can_not_do(real, bad):
     """A command that is no number or out of range is refused before anything is sent."""
-    info = bench.device.info
+    info = real.device.info
     beyond = 1e-3 * (info.command_max - info.command_min)
     command = {
         "not a number": np.nan,
@@ -236,10 +236,10 @@ def test_refuses_what_it_can_not_do(bench, bad):
         "above": info.command_max + beyond,
         "below": info.command_min - beyond,
     }[bad]
-    bench.open()
-    rest = bench.go(bench.safe)
+    real.open()
+    rest = real.go(real.safe)
     with pytest.raises(DeviceError, match=info.name):
-        bench.ask(command)
-    after = bench.go(bench.safe)
-    spread_um = CLEARLY * (rest.std() + after.std()) + 1e-3 * np.ptp(bench.stroke_um)
+        real.ask(command)
+    after = real.go(real.safe)
+    spread_um = CLEARLY * (rest.std() + after.std()) + 1e-3 * np.ptp(real.stroke_um)
     assert distance_um(rest, after) < spread_um

@@ -52,7 +52,7 @@ INFO = DeviceInfo(
 )
 
 
-class FakeDevice:
+class DescribedDevice:
     """A device that only says what it is."""
 
     Options: ClassVar[type[DeviceOptions]] = DeviceOptions
@@ -116,7 +116,7 @@ def loaded(
     """Read an experiment and put a fake device and a model in."""
     without_model = text.replace("{model: model.yaml}", "none").replace("unit: um", "unit: A")
     made = resolve(Document("x.yaml", text if model is None else without_model), Path(), settings)
-    device = FakeDevice(replace(INFO, **info))
+    device = DescribedDevice(replace(INFO, **info))
     if model is None:
         return replace(made, device=device)
     waveform = made.config.waveform.model_copy(update={"unit": "um"})

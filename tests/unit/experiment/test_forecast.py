@@ -52,7 +52,7 @@ INFO = DeviceInfo(
 )
 
 
-class FakeDevice:
+class DescribedDevice:
     """A device that only says what it is."""
 
     Options: ClassVar[type[DeviceOptions]] = DeviceOptions
@@ -87,7 +87,7 @@ def loaded(
     """Read an experiment and put a fake device and a model in."""
     without_model = text.replace("{model: model.yaml}", "none").replace("unit: um", "unit: A")
     made = resolve(Document("x.yaml", text if model is None else without_model), Path(), settings)
-    device = FakeDevice(replace(INFO, **info))
+    device = DescribedDevice(replace(INFO, **info))
     if model is None:
         return replace(made, device=device)
     waveform = made.config.waveform.model_copy(update={"unit": "um"})
@@ -189,7 +189,7 @@ class TestForecast:
         text = DISPLACEMENT.replace("{model: model.yaml}", "{model: m, initial_state: gone.mcap}")
         made = resolve(Document("x.yaml", text.replace("model: m,", f"model: {MODEL},")), Path())
         with pytest.raises(ConfigError, match=r"initial_state: gone\.mcap: no such"):
-            check(replace(made, device=FakeDevice(INFO)))
+            check(replace(made, device=DescribedDevice(INFO)))
 
     def test_to_mapping(self) -> None:
         """A forecast can be printed as JSON."""

@@ -42,7 +42,7 @@ class Limits(Strict):
     slow: bool = False
 
 
-class Bench(Strict):
+class SetUp(Strict):
     name: str
     limits: Limits
     parts: tuple[Annotated[Round | Square, Field(discriminator="kind")], ...] = ()
@@ -56,7 +56,7 @@ def document(text=TEXT):
 def problems(text, **settings):
     """Return every problem of a text, or of the settings made on it."""
     with pytest.raises(ConfigError) as caught:
-        document(text).validate(Bench, **settings)
+        document(text).validate(SetUp, **settings)
     return str(caught.value).split("\n")
 
 
@@ -79,7 +79,7 @@ def test_values_are_plain():
 
 def test_a_good_document_becomes_a_model():
     """All of it, lists and unions included, is built."""
-    bench = document().validate(Bench)
+    bench = document().validate(SetUp)
     assert bench.limits == Limits(peak_a=6.0, steps=(1, 2, 3))
     assert bench.parts == (Round(radius_um=2.5), Square(side_um=4.0))
 
@@ -298,7 +298,7 @@ def test_settings_add_up():
     one.set("limits={peak_a: 1.0}")
     one.set("limits.steps=[1]")
     one.set("limits.steps.0=3")
-    assert one.validate(Bench).limits == Limits(peak_a=1.0, steps=(3,))
+    assert one.validate(SetUp).limits == Limits(peak_a=1.0, steps=(3,))
 
 
 def test_problems_of_a_setting_point_to_it():
@@ -307,7 +307,7 @@ def test_problems_of_a_setting_point_to_it():
     for assignment in ("limits.peak_a=1_0", "parts.0={kind: round, radius: 1.0}", "colors.red=1"):
         one.set(assignment)
     with pytest.raises(ConfigError) as caught:
-        one.validate(Bench)
+        one.validate(SetUp)
     assert str(caught.value).split("\n") == [
         "--set limits.peak_a=1_0: limits.peak_a: must be a number, got '1_0' "
         "(write a plain number, such as 1000, 0.5 or 1e-3)",

@@ -97,10 +97,10 @@ def test_says_that_it_streams(board):
 
 def test_each_displacement_belongs_to_its_command(board):
     """What comes back is what the same actuator does sample by sample, as many blocks later."""
-    bench = board()
-    bench.open()
+    driven = board()
+    driven.open()
     commands = sine(20 * BLOCK)
-    back = [bench.exchange(part) for part in np.split(commands, 20)]
+    back = [driven.exchange(part) for part in np.split(commands, 20)]
     assert np.isnan(np.concatenate(back[:FIFO_BLOCKS])).all()
     found = np.concatenate(back[FIFO_BLOCKS:])
     actuator = TerfenolActuator(replace(TerfenolParameters(), sensor_noise_um=0.0), RATE_HZ)
@@ -112,38 +112,38 @@ def test_each_displacement_belongs_to_its_command(board):
 
 def test_the_board_keeps_the_pace(board):
     """Blocks go out at once until the FIFO is filled, then one for each that was put out."""
-    bench = board()
-    bench.open()
-    bench.hold(1.0, FIFO_BLOCKS)
-    assert bench.emulator.device.fifo.played < BLOCK
+    driven = board()
+    driven.open()
+    driven.hold(1.0, FIFO_BLOCKS)
+    assert driven.emulator.device.fifo.played < BLOCK
     start = time.monotonic()
-    bench.hold(1.0, 10)
+    driven.hold(1.0, 10)
     assert time.monotonic() - start > 0.9 * 10 * BLOCK / RATE_HZ
-    assert bench.device.wire.fifo_level_min > (FIFO_BLOCKS - 1) * BLOCK
+    assert driven.device.wire.fifo_level_min > (FIFO_BLOCKS - 1) * BLOCK
 
 
 def test_a_stall_of_this_machine_costs_fifo_and_no_sample(board):
     """After a stall shorter than the FIFO holds, blocks go out in a burst and none is missing."""
-    bench = board(fifo_blocks=20)  # 200 ms, of which this machine may take some for itself
-    bench.open()
-    bench.hold(1.0, 25)
-    bench.clock.extra_ns += 100 * MS
-    assert all(np.isfinite(each).all() for each in bench.hold(1.0, 20))
-    assert bench.emulator.device.fifo.underruns == 0
-    bench.device.close()
+    driven = board(fifo_blocks=20)  # 200 ms, of which this machine may take some for itself
+    driven.open()
+    driven.hold(1.0, 25)
+    driven.clock.extra_ns += 100 * MS
+    assert all(np.isfinite(each).all() for each in driven.hold(1.0, 20))
+    assert driven.emulator.device.fifo.underruns == 0
+    driven.device.close()
 
 
 def test_an_underrun_is_told_with_its_length(board):
     """A stall longer than the FIFO holds ends in an error that says by how many samples."""
-    bench = board()
-    bench.open()
-    bench.hold(1.0, 10)
-    bench.clock.extra_ns += 80 * MS
+    driven = board()
+    driven.open()
+    driven.hold(1.0, 10)
+    driven.clock.extra_ns += 80 * MS
     with pytest.raises(DeviceError, match=r"underrun: .* nothing to put out for (\d+) sample") as e:
-        bench.hold(1.0, 1)
+        driven.hold(1.0, 1)
     assert 100 <= int(str(e.value).split("put out for ")[1].split()[0]) <= 600
-    bench.device.make_safe(0.0)
-    assert bench.events()[-1]["event"] == "safe"
+    driven.device.make_safe(0.0)
+    assert driven.events()[-1]["event"] == "safe"
 
 
 @pytest.mark.parametrize(
@@ -159,51 +159,51 @@ def test_an_underrun_is_told_with_its_length(board):
 )
 def test_a_bad_answer_is_an_error_and_the_output_can_still_be_made_safe(board, fault, text):
     """No wrong reading is taken, and what is queued is dropped for the safe value."""
-    bench = board(faults=[f"{fault}@15"])
-    bench.open()
+    driven = board(faults=[f"{fault}@15"])
+    driven.open()
     with pytest.raises(DeviceError, match=text):
-        bench.hold(2.0, 20)
-    bench.device.make_safe(0.0)
-    last = bench.events()[-1]
+        driven.hold(2.0, 20)
+    driven.device.make_safe(0.0)
+    last = driven.events()[-1]
     assert (last["event"], last["current_a"]) == ("safe", 0.0)
-    bench.open()
-    bench.hold(0.0, 8)
+    driven.open()
+    driven.hold(0.0, 8)
 
 
 def test_a_silent_host_is_noticed_by_the_board(board):
     """Its watchdog drops what is queued and goes to the safe value; blocks are refused then."""
-    bench = board(watchdog={"timeout_s": 0.2, "safe_command": -1.0})
-    bench.open()
-    bench.hold(2.0, 10)
-    bench.clock.extra_ns += 200 * MS
+    driven = board(watchdog={"timeout_s": 0.2, "safe_command": -1.0})
+    driven.open()
+    driven.hold(2.0, 10)
+    driven.clock.extra_ns += 200 * MS
     with pytest.raises(DeviceError, match="watchdog has tripped"):
-        bench.hold(2.0, 1)
-    last = bench.events()[-1]
+        driven.hold(2.0, 1)
+    last = driven.events()[-1]
     assert (last["event"], last["current_a"]) == ("watchdog", -1.0)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, 10.01, -10.01])
 def test_a_block_with_a_bad_value_is_refused_whole(board, bad):
     """Nothing of it is queued, and the run can go on."""
-    bench = board()
-    bench.open()
-    bench.hold(1.0, 2)
+    driven = board()
+    driven.open()
+    driven.hold(1.0, 2)
     command = np.full(BLOCK, 1.0)
     command[40] = bad
     with pytest.raises(DeviceError, match=r"command\[40\] must be in"):
-        bench.exchange(command)
-    assert bench.emulator.device.queued == 2 * BLOCK
-    bench.hold(1.0, 2)
+        driven.exchange(command)
+    assert driven.emulator.device.queued == 2 * BLOCK
+    driven.hold(1.0, 2)
 
 
 def test_samples_follow_one_another(board):
     """A jump is refused: the board puts samples out one after the other, whatever their index."""
-    bench = board()
-    bench.open()
-    bench.hold(1.0, 2)
-    bench.sent += BLOCK
+    driven = board()
+    driven.open()
+    driven.hold(1.0, 2)
+    driven.sent += BLOCK
     with pytest.raises(DeviceError, match="samples must follow one another, 200 is next, got 300"):
-        bench.hold(1.0, 1)
+        driven.hold(1.0, 1)
 
 
 @pytest.mark.parametrize(
@@ -218,46 +218,46 @@ def test_samples_follow_one_another(board):
 )
 def test_what_the_fifo_can_not_do_is_refused_at_open(board, rate_hz, block, options, text):
     """With what would be possible; nothing was put out."""
-    bench = board(**options)
+    driven = board(**options)
     with pytest.raises(DeviceError, match=text):
-        bench.device.open(rate_hz, block)
-    assert bench.events() == []
+        driven.device.open(rate_hz, block)
+    assert driven.events() == []
 
 
 def test_opening_again_starts_at_zero_and_keeps_the_output(board):
     """After close the output holds; the next run counts from 0 and starts where it is."""
-    bench = board()
-    bench.open()
-    held = bench.hold(2.0, 20)[-1]
-    bench.device.close()
-    bench.open()
-    first = bench.hold(2.0, FIFO_BLOCKS + 1)[-1]
+    driven = board()
+    driven.open()
+    held = driven.hold(2.0, 20)[-1]
+    driven.device.close()
+    driven.open()
+    first = driven.hold(2.0, FIFO_BLOCKS + 1)[-1]
     assert first[0] == pytest.approx(held[-1], abs=0.5)
 
 
-def run_loop(bench, n):
+def run_loop(driven, n):
     """Run a sine of n samples through the real loop; return its outcome and what it recorded."""
     host = FakeHost(SystemClock(), BLOCK)
     limits = CommandLimits(low=-5.0, high=5.0, slew_per_s=1e5, safe=0.0, ramp_per_s=1e3)
-    bench.open()
+    driven.open()
     plan = Plan(
         reference=sine(n),
         input_um=sine(n),
         block=BLOCK,
-        latency_blocks=bench.device.info.latency_blocks,
+        latency_blocks=driven.device.info.latency_blocks,
         sample_rate_hz=RATE_HZ,
         compensator=Compensator(None, RATE_HZ),
         limits=limits,
         interlocks=InterlockContext(stroke_um=(-100.0, 100.0)),
         late_policy="follow",
     )
-    return Loop(plan, bench.device, host).run(host.clock.now_ns()), host
+    return Loop(plan, driven.device, host).run(host.clock.now_ns()), host
 
 
 def test_a_whole_run_loses_nothing(board):
     """Every sample of the waveform and the ramp is recorded with the displacement it caused."""
-    bench = board(noise=True)
-    outcome, host = run_loop(bench, 5_050)
+    driven = board(noise=True)
+    outcome, host = run_loop(driven, 5_050)
     assert (outcome.code, outcome.safe, outcome.dropped) == ("completed", True, 0)
     firsts = [head[Head.FIRST_SAMPLE] for head in host.heads]
     assert firsts == list(range(0, outcome.ended_at, BLOCK))
@@ -265,16 +265,16 @@ def test_a_whole_run_loses_nothing(board):
     assert columns[2, :5_050].tolist() == sine(5_050).tolist()
     assert np.isfinite(columns[3]).all()
     assert columns[2, -1] == 0.0
-    played = [event for event in bench.events() if event["event"] == "played"]
+    played = [event for event in driven.events() if event["event"] == "played"]
     assert sum(event["samples"] for event in played) >= outcome.ended_at
-    bench.device.close()
+    driven.device.close()
 
 
 @pytest.mark.parametrize("fault", ["silence", "corrupt", "cut", "unplug"])
 def test_a_run_that_loses_the_board_leaves_by_the_one_way_out(board, fault):
     """The reason is kept, blocks under way are recorded as unanswered, the coil is at 0 A."""
-    bench = board(faults=[f"{fault}@40"], watchdog={"timeout_s": 0.3, "safe_command": 0.0})
-    outcome, host = run_loop(bench, 100_000)
+    driven = board(faults=[f"{fault}@40"], watchdog={"timeout_s": 0.3, "safe_command": 0.0})
+    outcome, host = run_loop(driven, 100_000)
     assert outcome.code == "fault"
     assert outcome.safe == (fault != "unplug")
     flags = np.concatenate(host.flags)
@@ -283,10 +283,10 @@ def test_a_run_that_loses_the_board_leaves_by_the_one_way_out(board, fault):
     lost = (FIFO_BLOCKS + 1) * BLOCK  # those in the FIFO, and the one being sent
     assert unanswered.sum() == lost
     assert unanswered[-lost:].all()
-    bench.clock.extra_ns += 400 * MS
+    driven.clock.extra_ns += 400 * MS
     deadline = time.monotonic() + 5.0
-    while bench.events()[-1]["event"] == "played" and time.monotonic() < deadline:
+    while driven.events()[-1]["event"] == "played" and time.monotonic() < deadline:
         time.sleep(0.005)
-    last = bench.events()[-1]
+    last = driven.events()[-1]
     assert last["event"] in {"safe", "watchdog"}
     assert last["current_a"] == 0.0

@@ -38,7 +38,7 @@ def options(**changes):
     return ModbusStreamOptions.model_validate(made)
 
 
-class Bench:
+class DrivenStream:
     """A streaming device that is wired to an emulated LabJack."""
 
     def __init__(self, emulated, log, chosen):
@@ -81,7 +81,7 @@ class Bench:
 
 
 @pytest.fixture
-def bench(tmp_path):
+def driven(tmp_path):
     """Return a function that wires a streaming device to an emulated LabJack."""
     made = []
 
@@ -89,7 +89,7 @@ def bench(tmp_path):
         chosen = options(**changes)
         log = tmp_path / f"log{len(made)}.jsonl"
         emulated = InProcess.of(chosen.profile.name, link=link, log=log, message_s=message_s)
-        made.append(Bench(emulated, log, chosen))
+        made.append(DrivenStream(emulated, log, chosen))
         return made[-1]
 
     yield of
@@ -110,9 +110,9 @@ def alone(commands, rate_hz=RATE_HZ):
     return found
 
 
-def test_says_that_it_streams(bench):
+def test_says_that_it_streams(driven):
     """Its FIFO and the exchanges until an answer are known before it is opened."""
-    info = bench().device.info
+    info = driven().device.info
     assert info.name == "modbus_stream"
     assert info.buffered
     assert (info.fifo_depth, info.latency_blocks) == (8192, FIFO_BLOCKS)
@@ -123,9 +123,9 @@ def test_says_that_it_streams(bench):
 
 
 @pytest.mark.parametrize("profile", ["labjack_t7", "labjack_t4"])
-def test_each_displacement_belongs_to_its_command(bench, profile):
+def test_each_displacement_belongs_to_its_command(driven, profile):
     """What comes back is what the same actuator does sample by sample, as many blocks later."""
-    made = bench(profile=profile)
+    made = driven(profile=profile)
     made.open()
     commands = sine(20 * BLOCK)
     back = [made.exchange(part) for part in np.split(commands, 20)]
@@ -134,9 +134,9 @@ def test_each_displacement_belongs_to_its_command(bench, profile):
     assert found == pytest.approx(alone(commands[: found.size]), abs=0.51 * LSB_UM * 1.03)
 
 
-def test_the_stream_is_set_up_by_the_documented_registers(bench):
+def test_the_stream_is_set_up_by_the_documented_registers(driven):
     """Buffer before values, scan list with the input first, command-response data, then enabled."""
-    made = bench()
+    made = driven()
     made.open()
     made.hold(0.0, FIFO_BLOCKS)
     sent = b"".join(made.link.requests)
@@ -162,9 +162,9 @@ def test_the_stream_is_set_up_by_the_documented_registers(bench):
         at = sent.index(frame, at) + len(frame)
 
 
-def test_nothing_moves_before_the_fifo_is_filled(bench):
+def test_nothing_moves_before_the_fifo_is_filled(driven):
     """Opening and the first blocks leave the output alone; the clock starts with the last."""
-    made = bench()
+    made = driven()
     made.open()
     made.hold(2.0, FIFO_BLOCKS - 1)
     made.stall(1.0)
@@ -174,9 +174,9 @@ def test_nothing_moves_before_the_fifo_is_filled(bench):
     assert made.clock.running
 
 
-def test_the_device_keeps_the_pace(bench):
+def test_the_device_keeps_the_pace(driven):
     """Blocks go out at once until the FIFO is filled, then one for each that was put out."""
-    made = bench()
+    made = driven()
     made.open()
     made.hold(1.0, FIFO_BLOCKS)
     before = made.time()
@@ -186,9 +186,9 @@ def test_the_device_keeps_the_pace(bench):
     assert made.clock.underruns == 0
 
 
-def test_a_block_costs_no_more_messages_than_values_and_readings_need(bench):
+def test_a_block_costs_no_more_messages_than_values_and_readings_need(driven):
     """58 values or 120 readings fill a message; the readings that wait come with the values."""
-    made = bench(message_s=0.001)
+    made = driven(message_s=0.001)
     made.open(20_000.0, 580)
     for _ in range(FIFO_BLOCKS + 3):
         made.exchange(np.zeros(580))
@@ -198,9 +198,9 @@ def test_a_block_costs_no_more_messages_than_values_and_readings_need(bench):
     assert len(made.link.requests) - before <= 10 * (10 + 5)
 
 
-def test_the_highest_rate_needs_all_of_the_messages(bench):
+def test_the_highest_rate_needs_all_of_the_messages(driven):
     """At 1 ms a message and nearly the rate that check allows, nothing runs dry."""
-    made = bench(message_s=0.001, fifo_blocks=6)
+    made = driven(message_s=0.001, fifo_blocks=6)
     rate_hz = 50_000.0
     made.open(rate_hz, 1160)
     commands = sine(40 * 1160, rate_hz=rate_hz)
@@ -211,9 +211,9 @@ def test_the_highest_rate_needs_all_of_the_messages(bench):
     assert made.clock.underruns == 0
 
 
-def test_a_stall_of_this_machine_costs_fifo_and_no_sample(bench):
+def test_a_stall_of_this_machine_costs_fifo_and_no_sample(driven):
     """After a stall shorter than the FIFO holds, blocks go out in a burst and none is missing."""
-    made = bench()
+    made = driven()
     made.open()
     made.hold(1.0, 10)
     made.stall(0.035)
@@ -223,9 +223,9 @@ def test_a_stall_of_this_machine_costs_fifo_and_no_sample(bench):
     assert not made.clock.running
 
 
-def test_an_underrun_is_told_with_its_length(bench):
+def test_an_underrun_is_told_with_its_length(driven):
     """A stall longer than the FIFO holds ends in an error that says by how many samples."""
-    made = bench()
+    made = driven()
     made.open()
     made.hold(1.0, 10)
     made.stall(0.080)
@@ -238,9 +238,9 @@ def test_an_underrun_is_told_with_its_length(bench):
     assert made.events()[-1]["current_a"] == pytest.approx(0.0, abs=1e-9)
 
 
-def test_a_fifo_that_is_nearly_empty_is_an_underrun(bench):
+def test_a_fifo_that_is_nearly_empty_is_an_underrun(driven):
     """With fewer values than pass in one message nobody knows whether each came in time."""
-    made = bench()
+    made = driven()
     made.open()
     made.hold(1.0, 10)
     made.stall(0.0490)
@@ -248,9 +248,9 @@ def test_a_fifo_that_is_nearly_empty_is_an_underrun(bench):
         made.hold(1.0, 1)
 
 
-def test_a_device_that_repeats_values_is_found_out(bench):
+def test_a_device_that_repeats_values_is_found_out(driven):
     """Its own count of waiting values must fit the count of its scans."""
-    made = bench()
+    made = driven()
     made.open()
     made.hold(1.0, 10)
     made.clock.queue(np.zeros(50))
@@ -258,9 +258,9 @@ def test_a_device_that_repeats_values_is_found_out(bench):
         made.hold(1.0, 1)
 
 
-def test_dropped_readings_are_told(bench):
+def test_dropped_readings_are_told(driven):
     """A full buffer of readings is an error with the device's own reason."""
-    made = bench(fifo_blocks=40)
+    made = driven(fifo_blocks=40)
     made.open()
     made.hold(1.0, 45)
     made.emulated.device.overlay.input.start(64)
@@ -309,9 +309,9 @@ class Spoiled(InProcessLink):
         (lambda r: r[:12] + b"\x0b\x7c" + r[14:], "it drops scans"),
     ],
 )
-def test_a_bad_answer_is_an_error_and_the_output_can_still_be_made_safe(bench, change, text):
+def test_a_bad_answer_is_an_error_and_the_output_can_still_be_made_safe(driven, change, text):
     """No wrong reading is taken, and what is queued is dropped for the safe value."""
-    made = bench(link=Spoiled)
+    made = driven(link=Spoiled)
     made.open()
     made.hold(2.0, 8)
     made.link.change = change
@@ -324,9 +324,9 @@ def test_a_bad_answer_is_an_error_and_the_output_can_still_be_made_safe(bench, c
     made.hold(0.0, 8)
 
 
-def test_a_device_that_falls_silent_is_an_error_that_says_what_was_done(bench):
+def test_a_device_that_falls_silent_is_an_error_that_says_what_was_done(driven):
     """Its name, its place and the deed are in the text; it must be opened again."""
-    made = bench(link=Silent)
+    made = driven(link=Silent)
     made.open()
     made.hold(2.0, 8)
     made.link.silent = True
@@ -337,9 +337,9 @@ def test_a_device_that_falls_silent_is_an_error_that_says_what_was_done(bench):
         made.hold(2.0, 1)
 
 
-def test_a_clock_that_stands_is_not_waited_for_for_ever(bench):
+def test_a_clock_that_stands_is_not_waited_for_for_ever(driven):
     """Readings that don't come end the run by the time-out."""
-    made = bench(timeout_s=0.2)
+    made = driven(timeout_s=0.2)
     made.open()
     made.hold(2.0, 8)
     made.clock.advance = lambda now_ns: np.empty(0)
@@ -349,9 +349,9 @@ def test_a_clock_that_stands_is_not_waited_for_for_ever(bench):
     assert made.time() - before < 0.5
 
 
-def test_a_silent_host_is_noticed_by_the_device(bench):
+def test_a_silent_host_is_noticed_by_the_device(driven):
     """The watchdog puts the safe value out; blocks are refused then, and make_safe still works."""
-    made = bench(watchdog={"timeout_s": 2.0, "safe_command": -1.0})
+    made = driven(watchdog={"timeout_s": 2.0, "safe_command": -1.0})
     made.open()
     made.hold(2.0, 10)
     made.stall(3.0)
@@ -364,9 +364,9 @@ def test_a_silent_host_is_noticed_by_the_device(bench):
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, 10.01, -10.01])
-def test_a_block_with_a_bad_value_is_refused_whole(bench, bad):
+def test_a_block_with_a_bad_value_is_refused_whole(driven, bad):
     """Nothing of it is sent, and the run can go on."""
-    made = bench()
+    made = driven()
     made.open()
     made.hold(1.0, 2)
     before = len(made.link.requests)
@@ -378,9 +378,9 @@ def test_a_block_with_a_bad_value_is_refused_whole(bench, bad):
     made.hold(1.0, 2)
 
 
-def test_samples_follow_one_another(bench):
+def test_samples_follow_one_another(driven):
     """A jump is refused: the device puts samples out one after the other, whatever their index."""
-    made = bench()
+    made = driven()
     made.open()
     made.hold(1.0, 2)
     made.sent += BLOCK
@@ -400,21 +400,21 @@ def test_samples_follow_one_another(bench):
         (100.0, 100, {"watchdog": {"timeout_s": 2.0}}, "3 exchanges must come within"),
     ],
 )
-def test_what_the_device_can_not_do_is_refused_at_open(bench, rate_hz, block, changes, text):
+def test_what_the_device_can_not_do_is_refused_at_open(driven, rate_hz, block, changes, text):
     """With what would be possible; nothing was put out."""
-    made = bench(**changes)
+    made = driven(**changes)
     with pytest.raises(DeviceError, match=text):
         made.device.open(rate_hz, block)
     assert made.events() == []
     assert not made.clock.running
 
 
-def test_a_stream_of_an_earlier_run_is_stopped(bench):
+def test_a_stream_of_an_earlier_run_is_stopped(driven):
     """A run that was killed leaves its stream running; the next one starts from its own blocks."""
-    made = bench()
+    made = driven()
     made.open()
     made.hold(2.0, 10)
-    again = Bench(made.emulated, made._log, options())
+    again = DrivenStream(made.emulated, made._log, options())
     again.open()
     assert not again.clock.running
     found = again.hold(2.0, FIFO_BLOCKS + 2)
@@ -422,9 +422,9 @@ def test_a_stream_of_an_earlier_run_is_stopped(bench):
     assert again.clock.underruns == 0
 
 
-def test_opening_again_starts_at_zero_and_keeps_the_output(bench):
+def test_opening_again_starts_at_zero_and_keeps_the_output(driven):
     """After close the output holds; the next run counts from 0 and starts where it is."""
-    made = bench()
+    made = driven()
     made.open()
     held = made.hold(2.0, 20)[-1]
     made.device.close()
@@ -434,9 +434,9 @@ def test_opening_again_starts_at_zero_and_keeps_the_output(bench):
     assert first[0] == pytest.approx(held[-1], abs=0.5)
 
 
-def test_make_safe_needs_no_open_connection(bench):
+def test_make_safe_needs_no_open_connection(driven):
     """It makes its own, and lets go of it."""
-    made = bench()
+    made = driven()
     made.device.make_safe(1.0)
     assert made.events()[-1]["current_a"] == pytest.approx(1.0)
     assert not made.link.is_open
