@@ -32,7 +32,10 @@ class Host(Protocol):
         ...
 
     def claim(self, *, due: bool = True) -> Block:
-        """Return room for the next block: a spare slot where it is not due, or no room is left."""
+        """Return room for the next block: a spare slot where it is not due, or no room is left.
+
+        Its flags are 0, displacements and measured commands NaN: what no device fills is none.
+        """
         ...
 
     def sending(self, block: Block) -> None:

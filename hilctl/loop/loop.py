@@ -55,7 +55,7 @@ class Loop:
         self._device = device
         self._host = host
         self._clock = host.clock
-        self._measures = device.info.measures_command
+        self._is_input = plan.input_um is plan.reference
         self._compensator = plan.compensator
         self._limiter = Limiter(plan.limits, 1.0 / plan.sample_rate_hz)
         self._interlocks = Interlocks(plan.interlocks, plan.interlock_settings, plan.sample_rate_hz)
@@ -194,17 +194,17 @@ class Loop:
         # The memory before the block, so that a replay can begin at any gap.
         self._compensator.state(block.memory)
         block.state[-1] = self._limiter.last
-        block.flags.fill(_SKIPPED if block.skipped else 0)
-        # A slot has been used before: what the device does not fill is not a measurement.
-        block.displacement_um.fill(np.nan)
-        if self._measures:
-            block.measured.fill(np.nan)
+        if block.skipped:
+            block.flags |= _SKIPPED
         block.following = self._phase is _Phase.FOLLOWING
         left = plan.reference.size - self._next_sample
         n = min(left, plan.block) if block.following else 0
         if n == plan.block:
-            whole = (block.reference, block.input_um, block.wanted, block.command, block.flags)
-            return False, self._follow(block, *whole)
+            reference, input_um = block.reference, block.input_um
+            wish = self._follow(
+                block, reference, input_um, block.wanted, block.command, block.flags
+            )
+            return False, wish
         first_invalid = -1
         if n > 0:
             parts = (block.reference[:n], block.input_um[:n], block.wanted[:n])
@@ -228,7 +228,8 @@ class Loop:
         factors = self._tuner.advance(wanted.size)
         if factors is None:
             reference[:] = plan.reference[start:stop]
-            input_um[:] = plan.input_um[start:stop]
+            # The reference itself, as a rule: a copy of what was copied is the quicker one.
+            input_um[:] = reference if self._is_input else plan.input_um[start:stop]
         else:
             tune(factors, plan.reference[start:stop], reference)
             tune(factors, plan.input_um[start:stop], input_um)

@@ -87,8 +87,10 @@ class Job:
         return resolve(document, Path(self.folder), files=TextFiles(self.files))
 
     def arrays(self) -> tuple[F64, F64]:
-        """Return reference and compensator's input: float64[n] each, mapped."""
-        return _mapped(self.reference), _mapped(self.input_um)
+        """Return reference and input, one array where they are the same: float64[n], mapped."""
+        reference = _mapped(self.reference)
+        same = self.input_um == self.reference
+        return reference, reference if same else _mapped(self.input_um)
 
 
 def _mapped(path: str) -> F64:

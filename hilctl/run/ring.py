@@ -76,7 +76,7 @@ class SampleRing:
         self._area = self._views(state_size)
         self._heads = memoryview(self._area.heads.data.cast("B")).cast("q")
         self._sent, self._spares_used = self.page.get(Field.SENT), 0
-        self._tail = self.page.get(Field.TAIL)
+        self._tail = self._released = self.page.get(Field.TAIL)
 
     @classmethod
     def create(
@@ -108,7 +108,7 @@ class SampleRing:
         finally:
             os.close(descriptor)
         made = cls(path)
-        made._area.columns.fill(np.nan)  # what no device fills is not a measurement
+        made._clean(slice(None))
         return made
 
     def _views(self, state_size: int) -> Batch:
@@ -136,6 +136,7 @@ class SampleRing:
         else:
             slot, number = self.slots + self._spares_used % self._spare, -1
             self._spares_used += 1
+            self._clean(slice(slot, slot + 1))
         at, area = slot * _HEAD_NUMBERS, self._area
         head = self._heads[at : at + _HEAD_NUMBERS]
         # Views are made anew: those of all slots, kept, would be out of the processor's cache.
@@ -200,7 +201,17 @@ class SampleRing:
     def release(self) -> None:
         """Give the room of all that was taken back to the producer: it is safe elsewhere."""
         self.page.release_events()
+        # Cleaned here and not in the tick; before the room is given, or the loop would be in it.
+        first, count = self._released % self.slots, self._tail - self._released
+        self._clean(slice(first, min(first + count, self.slots)))
+        self._clean(slice(0, max(0, first + count - self.slots)))
+        self._released = self._tail
         self.page.put(Field.TAIL, self._tail)
+
+    def _clean(self, slots: slice) -> None:
+        """Let slots hold no flag and no answer."""
+        self._area.flags[slots] = 0
+        self._area.columns[slots, ANSWERS] = np.nan
 
     def unanswered(self, next_sample: int) -> Batch | None:
         """Return the blocks that were sent and never answered; for when the producer has died.

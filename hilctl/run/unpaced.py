@@ -13,7 +13,7 @@ import numpy as np
 from hilctl.base.device import Clock
 from hilctl.base.errors import InputError
 from hilctl.base.events import Event
-from hilctl.base.samples import Batch
+from hilctl.base.samples import ANSWERS, Batch
 from hilctl.experiment.check import Checked
 from hilctl.loop.block import Block
 from hilctl.loop.host import Tuning
@@ -93,7 +93,10 @@ class BatchHost:
         """Pass on what has been gathered."""
         if self._answered > self._first:
             size = self._room.heads.shape[0]
-            self._on_batch(self._room.rows(np.arange(self._first, self._answered) % size))
+            taken = np.arange(self._first, self._answered) % size
+            self._on_batch(self._room.rows(taken))
+            self._room.flags[taken] = 0
+            self._room.columns[taken[:, None], ANSWERS] = np.nan
             self._first = self._answered
 
     def heartbeat(self, next_sample: int, late_ticks: int) -> str:
