@@ -10,7 +10,7 @@ from rich.console import Console
 
 from hilctl.base.errors import InputError, RunError
 from hilctl.cli.machine_view import render
-from hilctl.loop.pacer import Pacer
+from hilctl.loop.pacer import LateRules, Pacer
 from hilctl.machine import latency as module
 from hilctl.machine.diagnosis import Diagnosis, lateness_counts
 from hilctl.machine.files import Finding
@@ -91,7 +91,7 @@ def test_lateness_is_the_pacers():
     """Each tick's lateness is kept, and no deadline moves for a late one."""
     wanted = [10, 2_500_000, 10, 10, 10]
     clock, late_ns = TurnedClock(wanted), np.zeros(5, dtype=np.int64)
-    watch(Pacer(clock, 1e6, "catch_up", 1e6), late_ns, clock, lambda: True)
+    watch(Pacer(clock, 1e6, "catch_up", LateRules(1e6)), late_ns, clock, lambda: True)
     assert late_ns.tolist() == [10, 2_500_000, 1_500_010, 500_020, 10]
 
 
@@ -99,7 +99,7 @@ def test_measuring_ends_with_the_parent():
     """Where nobody waits for the result, measuring stops at the next tick."""
     clock, late_ns = TurnedClock([7] * 100), np.zeros(100, dtype=np.int64)
     left = iter([True, True, False])
-    watch(Pacer(clock, 1e6, "catch_up", 1e6), late_ns, clock, lambda: next(left))
+    watch(Pacer(clock, 1e6, "catch_up", LateRules(1e6)), late_ns, clock, lambda: next(left))
     assert np.count_nonzero(late_ns) == 3
 
 
@@ -107,7 +107,7 @@ def test_measuring_ends_far_behind():
     """A rate that can't be kept at all does not hold a CPU for as long as was asked."""
     clock, late_ns = TurnedClock([3_000_000] * 1000), np.zeros(1000, dtype=np.int64)
     clock.sleep_until_ns = lambda _: setattr(clock, "now", clock.now + 3_000_000)
-    ticks = watch(Pacer(clock, 1e6, "catch_up", 1e6), late_ns, clock, lambda: True)
+    ticks = watch(Pacer(clock, 1e6, "catch_up", LateRules(1e6)), late_ns, clock, lambda: True)
     assert ticks < 300
     assert late_ns[ticks - 1] > 500_000_000 >= late_ns[ticks - 2]
 
