@@ -1,5 +1,6 @@
 """Settings and fixtures that all tests share."""
 
+import hashlib
 import os
 import tempfile
 from pathlib import Path
@@ -51,7 +52,31 @@ def memory():
         yield Path(folder)
 
 
+# Autouse fixtures come before the others of their scope: what a wider fixture starts, it starts in
+# the folder of its own scope, and neither a user's command nor another test's can end it.
+@pytest.fixture(scope="session", autouse=True)
+def session_runs(memory):
+    """Keep the runs of session fixtures apart from this user's."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("HILCTL_RUNS", str(memory / "session"))
+        yield
+
+
+@pytest.fixture(scope="module", autouse=True)
+def module_runs(session_runs, memory, request):
+    """Keep the runs of a module's fixtures apart from all others; return their folder."""
+    folder = runs_folder(memory, request.node.nodeid)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("HILCTL_RUNS", str(folder))
+        yield folder
+
+
 @pytest.fixture(autouse=True)
-def own_runs(memory, monkeypatch, request):
+def own_runs(module_runs, memory, monkeypatch, request):
     """Keep each test's runs apart from those of other tests and of this user."""
-    monkeypatch.setenv("HILCTL_RUNS", str(memory / f"{abs(hash(request.node.nodeid)):x}"))
+    monkeypatch.setenv("HILCTL_RUNS", str(runs_folder(memory, request.node.nodeid)))
+
+
+def runs_folder(memory, nodeid):
+    """Return a short path for each test or module: a socket's path may have 107 characters."""
+    return memory / hashlib.sha256(nodeid.encode()).hexdigest()[:16]

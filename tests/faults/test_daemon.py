@@ -69,22 +69,18 @@ def background(tmp_path):
 
 
 @pytest.fixture(scope="module")
-def long_run(memory, tmp_path_factory):
-    """A run in the background for all tests that must leave it undisturbed, and its place."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("HILCTL_RUNS", str(memory / "long_run"))
-        recording = start(tmp_path_factory.mktemp("long_run"))
-        await_state("running")
+def long_run(tmp_path_factory):
+    """A run in the background for all tests that must leave it undisturbed."""
+    recording = start(tmp_path_factory.mktemp("long_run"))
+    await_state("running")
     yield recording
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("HILCTL_RUNS", str(memory / "long_run"))
-        stop_all()
+    stop_all()
 
 
 @pytest.fixture
-def going(long_run, memory, monkeypatch):
+def going(long_run, module_runs, monkeypatch):
     """The recording of the long run, which commands of this test find."""
-    monkeypatch.setenv("HILCTL_RUNS", str(memory / "long_run"))
+    monkeypatch.setenv("HILCTL_RUNS", str(module_runs))
     return long_run
 
 

@@ -7,11 +7,9 @@ from pathlib import Path
 import pytest
 
 from hilctl.base.errors import InputError
-from hilctl.cli.compare_view import headings, notes, render, table_rows
-from hilctl.cli.comparing import _numbers
-from hilctl.cli.comparing import compare as command
+from hilctl.cli.compare_view import notes
 from hilctl.comparison.compare import COMPARED, ComparisonRequest, compare, save_models
-from hilctl.comparison.page import comparison_figure, comparison_page
+from hilctl.comparison.page import comparison_page
 from hilctl.identify.catalogue import CATALOGUE, entry
 from hilctl.models.files import load_model
 from hilctl.recording.reader import read
@@ -68,33 +66,6 @@ def test_everything_goes_into_json(comparison):
     assert "simulated" in mapping["device"]
 
 
-def test_the_table_has_a_column_a_trial(comparison):
-    """Each row has as many texts as there are columns."""
-    rows = list(table_rows(comparison))
-    assert headings(comparison)[-1] == "100 Hz"
-    assert {len(row) for row in rows} == {len(headings(comparison))}
-    assert rows[2][1:3] == ["-", "-"]
-    assert render(comparison) is not None
-    assert any("simulated" in note for note in notes(comparison))
-
-
-def test_the_page_holds_table_and_figure(comparison):
-    """Self-contained, with every model by name."""
-    page = comparison_page(comparison)
-    assert page.count("data:image/png") == 1
-    assert "http://" not in page
-    assert "https://" not in page
-    for row in comparison.rows:
-        assert row.name in page
-
-
-def test_the_figure_draws_each_model_once(comparison):
-    """A line a model in each error panel, a panel a model below."""
-    upper, lower = comparison_figure(comparison).subfigs
-    assert [len(axes.lines) for axes in upper.axes] == [3, 3]
-    assert sum(bool(axes.lines) for axes in lower.axes) == 3
-
-
 @pytest.mark.parametrize("text", ["", "device: {kind: serial_dac, port: /dev/ttyUSB9}"])
 def test_loops_of_a_real_device_are_judged_without_trials(monkeypatch, text):
     """No device is made, and table, figure and page do without compensated errors."""
@@ -146,14 +117,6 @@ def test_a_model_of_another_unit_is_refused():
         compare(ComparisonRequest([GOLDEN], [str(model)]), Clock(), ignore)
 
 
-def test_frequencies_are_numbers():
-    """The command line's list of frequencies."""
-    assert _numbers(None) is None
-    assert _numbers("1, 2.5,1e2") == [1.0, 2.5, 100.0]
-    with pytest.raises(InputError, match="numbers with commas"):
-        _numbers("ten")
-
-
 def test_saved_models_are_model_files(comparison, tmp_path):
     """What was found is written with its provenance; what came from a file is not."""
     paths = save_models(comparison, tmp_path / "models", created="2026-01-01", overwrite=False)
@@ -166,12 +129,3 @@ def test_saved_models_are_model_files(comparison, tmp_path):
         assert saved.provenance.errors_percent["peak"] == row.error.peak_percent
     with pytest.raises(InputError, match="--overwrite"):
         save_models(comparison, tmp_path / "models", created="2026-01-01", overwrite=False)
-
-
-def test_an_existing_page_is_kept(tmp_path):
-    """Unless asked to, the command replaces no file; it says so before anything is read."""
-    page = tmp_path / "models.html"
-    page.write_text("mine")
-    with pytest.raises(InputError, match="--overwrite"):
-        command([Path("nowhere.mcap")], html=page)
-    assert page.read_text() == "mine"

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hilctl.base.errors import ConfigError, InputError
-from hilctl.cli.identify_view import print_identification, print_settings
+from hilctl.cli.identify_view import print_identification
 from hilctl.identify.command import identify_files, settings_from
 from hilctl.identify.page import write_identification
 from hilctl.identify.settings import IdentifySettings
@@ -90,11 +90,3 @@ def test_settings_are_checked_together() -> None:
     assert "is a setting of staged, not of ppi" in problems["lag"]
     with pytest.raises(InputError, match=r"unknown kind of model 'presach' .*'preisach'"):
         settings_from("presach", [])
-
-
-def test_every_setting_is_listed(capsys: pytest.CaptureFixture[str]) -> None:
-    """The list has each setting's name, where --help says that it is."""
-    print_settings()
-    shown = capsys.readouterr().out
-    for name in (*IdentifySettings.model_fields.keys() - {"table"}, "table.rate_hz"):
-        assert f" {name} " in shown, name

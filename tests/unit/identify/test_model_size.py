@@ -1,6 +1,5 @@
 """Model order by loops held out, lag of a table, and the same fits on other workers."""
 
-import importlib.util
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
@@ -8,13 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hilctl.base.errors import DataError, InputError
+from hilctl.base.errors import DataError
 from hilctl.identify.data.records import History, SteadyLoop
 from hilctl.identify.fit_model import fit_model
 from hilctl.identify.job import ignore_progress
 from hilctl.identify.model_size import ORDERS, choose_lag, choose_order
 from hilctl.identify.settings import FitSettings
-from hilctl.identify.workers import one_by_one, workers
+from hilctl.identify.workers import one_by_one
 from hilctl.models.plays import PpiModel
 from hilctl.models.published import exponential_integrated, terfenol_rdpi
 
@@ -91,45 +90,3 @@ def test_creep_and_zero_of_each_history_are_taken_out() -> None:
         settings = FitSettings(kind="ppi", creep=creep, offset=True, **choices)
         found = fit_model(data, settings, lambda: 0.0)
         assert low <= found.peak_percent <= high
-
-
-@pytest.mark.parametrize("scheduler", ["threads", "processes"])
-def test_workers_find_the_same(loops: list[SteadyLoop], scheduler: str) -> None:
-    """Starts followed on other workers end at the same bits."""
-    settings = FitSettings(kind="integrated", weights="free", starts=3)
-    alone = fit_model(loops[:4], settings, lambda: 0.0)
-    with workers(scheduler) as run:
-        found = fit_model(loops[:4], settings, lambda: 0.0, run=run)
-    assert found.model == alone.model
-    assert found.starts == alone.starts
-
-
-@pytest.mark.skipif(
-    importlib.util.find_spec("distributed") is None,
-    reason="Dask is not installed: pip install 'hilctl[scale]'",
-)
-@pytest.mark.filterwarnings("ignore")
-def test_dask_cluster_finds_the_same(loops: list[SteadyLoop]) -> None:
-    """The same on a Dask cluster, by its scheduler's address."""
-    from distributed import LocalCluster
-
-    settings = FitSettings(kind="integrated", weights="free", starts=3)
-    alone = fit_model(loops[:4], settings, lambda: 0.0)
-    with (
-        LocalCluster(
-            n_workers=1, threads_per_worker=1, processes=False, protocol="tcp",
-            dashboard_address=None,
-        ) as cluster,
-        workers(cluster.scheduler_address) as run,
-    ):  # fmt: skip
-        found = fit_model(loops[:4], settings, lambda: 0.0, run=run)
-    assert found.model == alone.model
-
-
-def test_unknown_schedulers_are_refused() -> None:
-    """A scheduler that is neither known nor an address is refused with what there is."""
-    with (
-        pytest.raises(InputError, match=r"none, threads, processes or an address .*: 'four'"),
-        workers("four"),
-    ):
-        pass

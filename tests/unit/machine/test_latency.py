@@ -1,19 +1,15 @@
 """Lateness, the verdict, and the process that measures."""
 
-import io
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-from rich.console import Console
 
 from hilctl.base.errors import InputError, RunError
-from hilctl.cli.machine_view import render
 from hilctl.loop.pacer import LateRules, Pacer
 from hilctl.machine import latency as module
-from hilctl.machine.diagnosis import Diagnosis, lateness_counts
-from hilctl.machine.files import Finding
+from hilctl.machine.diagnosis import lateness_counts
 from hilctl.machine.latency import Latency, measure, watch
 from hilctl.machine.realtime import SetUpStep
 from hilctl.machine.settings import Realtime
@@ -145,38 +141,6 @@ def test_a_process_that_hangs_is_ended(monkeypatch, tmp_path):
     monkeypatch.setattr(module, "_PATIENCE_S", 0.0)
     with pytest.raises(RunError, match="did not end"):
         measure(500.0, 0.05, Realtime())
-
-
-def text_of(diagnosis):
-    console = Console(file=io.StringIO(), width=100)
-    console.print(render(diagnosis))
-    return console.file.getvalue()
-
-
-def test_report_has_all_of_it():
-    """People see findings, remedies, steps, figures and the verdict."""
-    findings = (Finding("kernel", "warn", "PREEMPT_DYNAMIC [none]", "install another"),)
-    shown = text_of(Diagnosis(findings, latency([3000, 5000, 2 * MS])))
-    for part in ("PREEMPT_DYNAMIC [none]", "-> install another", "refused", "-> rtprio",
-                 "from 1024 us", "p99.9", "no, 1000 Hz is not kept"):  # fmt: skip
-        assert part in shown
-
-
-def test_verdict_of_a_rate_that_is_kept():
-    """The verdict names the rate and the longest period."""
-    kept = Diagnosis((), latency([3000, 5000, 3000]))
-    assert kept.verdict == "yes, 1000 Hz is kept: the longest of 3 periods of 1 ms was 1 ms"
-    assert kept.to_mapping()["kept"] is True
-
-
-def test_mapping_is_plain():
-    """Programs get numbers and texts only."""
-    import json
-
-    mapping = Diagnosis((), latency([3000, 5000, 3000])).to_mapping()
-    again = json.loads(json.dumps(mapping, allow_nan=False))
-    assert again["late_us"]["max"] == 5.0
-    assert again["late_histogram_us"] == {"0": 0, "1": 0, "2": 2, "4": 1}
 
 
 def test_command_line(monkeypatch, capsys):

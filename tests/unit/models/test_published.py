@@ -7,16 +7,8 @@ from hilctl.kernels.hysteresis import play_sum_shared, rest_memory
 from hilctl.models.deadband import DeadbandFunction
 from hilctl.models.plays import inverse_plays
 from hilctl.models.published import exponential_integrated, piezo_ppi, terfenol_rdpi
-from hilctl.models.spi import SpiModel
 
 SAMPLE_RATE_HZ = 50_000.0
-SPI_DIRECT = 2.146
-SPI_THRESHOLDS = (
-    0.9108, 1.9418, 3.0797, 4.3122, 5.6285, 7.0194, 8.4762, 9.9915, 11.5587, 13.1716,
-)  # fmt: skip
-SPI_WEIGHTS = (
-    0.4544, 0.3230, 0.2397, 0.1831, 0.1444, 0.1156, 0.0941, 0.0774, 0.0642, 0.0543,
-)  # fmt: skip
 FREQUENCIES_HZ = [1.0, 10.0, 50.0, 100.0, 200.0, 250.0]
 
 
@@ -56,54 +48,6 @@ def widening_of(model, v):
     return model.threshold_growth_s * np.abs(np.diff(v, prepend=v[0])) * SAMPLE_RATE_HZ
 
 
-def spi(ppi):
-    """Return the same PPI, compensated by stops."""
-    return SpiModel(**ppi.model_dump(exclude={"kind"}))
-
-
-def test_spi_direct_weight_from_the_published_ppi():
-    """w_0 from the published PPI is the published one."""
-    assert spi(piezo_ppi()).stop_parameters()[0] == pytest.approx(SPI_DIRECT, abs=0.002)
-
-
-@pytest.mark.parametrize("i", range(10))
-def test_spi_from_the_published_ppi(i):
-    """Each threshold and weight is the published one, within its inputs' rounding."""
-    _, weights, thresholds = spi(piezo_ppi()).stop_parameters()
-    assert thresholds[i] == pytest.approx(SPI_THRESHOLDS[i], abs=0.002)
-    assert weights[i] == pytest.approx(SPI_WEIGHTS[i], abs=0.002)
-
-
-def test_spi_weights_solve_the_published_equations():
-    """sum_j min(s_i, s_j) w_j + s_i w_0 = r_i (3.19), s the initial loading curve at r (3.18)."""
-    ppi = piezo_ppi()
-    direct, weights, thresholds = spi(ppi).stop_parameters()
-    r, p = np.array((0.0, *ppi.thresholds)), np.array((ppi.direct, *ppi.weights))
-    loading = np.maximum(0.0, r[1:, None] - r[None, :]) @ p
-    np.testing.assert_allclose(thresholds, loading, rtol=1e-13)
-    left = np.minimum.outer(thresholds, thresholds) @ weights + thresholds * direct
-    np.testing.assert_allclose(left, ppi.thresholds, rtol=1e-12)
-
-
-@pytest.mark.parametrize("seed", range(8))
-def test_spi_is_the_inverse_ppi(seed):
-    """On any signal, offset or not, both operators put out the same to 1e-12."""
-    rng = np.random.default_rng(seed)
-    y = 12.0 * rng.uniform(-1.0, 1.0, 400).repeat(3) + 0.3 * rng.standard_normal(1_200)
-    ppi = piezo_ppi().model_copy(update={"output_offset_um": 1.5 * (seed % 2)})
-    by_stops = spi(ppi).inverse(SAMPLE_RATE_HZ).process(y)
-    by_plays = ppi.inverse(SAMPLE_RATE_HZ).process(y)
-    assert np.max(np.abs(by_stops - by_plays)) <= 1e-12 * np.max(np.abs(by_plays))
-
-
-def test_spi_of_a_model_without_hysteresis_is_a_gain():
-    """No plays, no stops: the compensator divides by p_0."""
-    ppi = piezo_ppi().model_copy(update={"weights": (), "thresholds": ()})
-    y = sine(3.0, 50.0)
-    command = spi(ppi).inverse(SAMPLE_RATE_HZ).process(y)
-    np.testing.assert_allclose(command, y / 0.2567, rtol=1e-15)
-
-
 @pytest.mark.parametrize(("frequency_hz", "percent"), [(1.0, 18.0), (100.0, 26.6), (200.0, 34.3)])
 def test_rdpi_peak_hysteresis(frequency_hz, percent):
     """The n = 4 model at 2.3 A has 18 % at 1 Hz and grows with the frequency as published."""
@@ -128,21 +72,6 @@ def test_rdpi_and_its_inverse_cancel_with_shared_thresholds(frequency_hz):
         assert np.max(np.abs(again - v)) <= 1e-12 * np.max(np.abs(v))
 
 
-@pytest.mark.parametrize("frequency_hz", FREQUENCIES_HZ)
-def test_integrated_and_its_inverse_cancel_with_shared_thresholds(omega, frequency_hz):
-    """Lambda, Pi, Pi^-1 and Lambda^-1 in a row return the input to 1e-12, both ways."""
-    weights, thresholds = np.array(omega.weights), np.array(omega.thresholds)
-    inverse, unbend = omega.inverse_parameters(), omega.deadband.inverse()
-    v = sine(5.0, frequency_hz) + sine(1.0, 2 * frequency_hz, cycles=6)
-    growth = widening_of(omega, v)
-    y = omega.deadband(shared(v, growth, omega.direct, weights, thresholds))
-    back = shared(unbend(y), omega.direct * growth, *inverse)
-    assert np.max(np.abs(back - v)) <= 1e-12 * np.max(np.abs(v))
-    command = shared(unbend(y), omega.direct * growth, *inverse)
-    again = omega.deadband(shared(command, growth, omega.direct, weights, thresholds))
-    assert np.max(np.abs(again - y)) <= 1e-12 * np.max(np.abs(y))
-
-
 def test_thresholds_that_are_not_shared_do_not_cancel():
     """The test above means something: leaving out the scale a_0 costs far more than rounding."""
     model = terfenol_rdpi()
@@ -151,29 +80,6 @@ def test_thresholds_that_are_not_shared_do_not_cancel():
     y = shared(v, growth, model.direct, np.array(model.weights), np.array(model.thresholds))
     back = shared(y, growth, *model.inverse_parameters())
     assert np.max(np.abs(back - v)) > 1e-3
-
-
-@pytest.mark.parametrize("frequency_hz", FREQUENCIES_HZ)
-def test_without_rate_the_integrated_operators_cancel(omega, frequency_hz):
-    """With gamma 0 the streaming inverse, then the model, return the reference to 1e-12."""
-    still = omega.model_copy(update={"gamma_s": 0.0, "output_offset_um": 4.0})
-    y = sine(40.0, frequency_hz) - 7.0
-    command = still.inverse(SAMPLE_RATE_HZ).process(y)
-    back = still.forward(SAMPLE_RATE_HZ).process(command)
-    assert np.max(np.abs(back - y)) <= 1e-12 * np.max(np.abs(y))
-
-
-def test_with_rate_the_inverse_leaves_little():
-    """With the published n = 4 set what remains grows with the rate: the actuator has its own."""
-    model = terfenol_rdpi()
-    remaining = []
-    for frequency_hz in (1.0, 100.0, 200.0):
-        y = sine(13.0, frequency_hz)
-        command = model.inverse(SAMPLE_RATE_HZ).process(y)
-        back = model.forward(SAMPLE_RATE_HZ).process(command)
-        n = round(SAMPLE_RATE_HZ / frequency_hz)
-        remaining.append(np.max(np.abs(back - y)[-n:]) / np.ptp(y) * 100.0)
-    assert remaining[0] < 0.1 < remaining[1] < remaining[2] < 10.0
 
 
 def test_inverse_plays_follow_the_published_relations():

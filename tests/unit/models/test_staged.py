@@ -131,21 +131,6 @@ def test_corners_of_a_triangle_are_rounded_and_take_no_jolt(rate_hz):
     assert slew < 2.0 * np.pi * 250.0 * np.abs(command).max()
 
 
-def test_weights_add_up_and_follow_slope_and_bend():
-    """Constant, ramp and parabola come out as their derivatives say, whatever the width."""
-    k = np.arange(400.0)
-    for width in (0.0, 0.4, 3.6, 30.0, 1e6):
-        weights, m = smoothing_weights(width, 2.0, 5.0)
-        assert weights.size == 2 * m + 1 <= 255
-        for y, expected in (
-            (np.ones(400), np.ones(400)),
-            (k, k + 2.0),
-            (k**2, k**2 + 2.0 * 2.0 * k + 5.0 * 2.0),
-        ):
-            out = np.convolve(y, weights[::-1], "valid")
-            np.testing.assert_allclose(out, expected[m : 400 - m], rtol=1e-10)
-
-
 def test_structure_s_inverse_asks_for_little_more_than_it_is_given():
     """The largest gain of any reference is near 1 at every rate that can resolve the structure."""
     radian_s = STRUCTURE.radian_s

@@ -7,12 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hilctl.base.errors import DeviceError, InputError
+from hilctl.base.errors import DeviceError
 from hilctl_drivers.labjack import stream
 from hilctl_drivers.labjack.device import ModbusStream
 from hilctl_drivers.labjack.setup import ModbusStreamOptions
-from hilctl_drivers.labjack.timing import stream_time
-from hilctl_drivers.profile import load_profile
 from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
 from hilctl_drivers.wire.links import NoAnswerError
 from tests.fakes import InProcess, InProcessLink
@@ -198,14 +196,6 @@ def test_a_block_costs_no_more_messages_than_values_and_readings_need(bench):
     for _ in range(10):
         made.exchange(np.zeros(580))
     assert len(made.link.requests) - before <= 10 * (10 + 5)
-
-
-def test_check_counts_the_messages_of_a_block():
-    """Ten for 580 values and one that waits for the clock, at 1 ms each."""
-    wire = stream_time(load_profile("labjack_t7"), 580)
-    assert wire.total_s == pytest.approx(0.011)
-    assert wire.highest_rate_hz == pytest.approx(580 / 0.011)
-    assert "580 samples in 11 messages" in str(wire)
 
 
 def test_the_highest_rate_needs_all_of_the_messages(bench):
@@ -417,20 +407,6 @@ def test_what_the_device_can_not_do_is_refused_at_open(bench, rate_hz, block, ch
         made.device.open(rate_hz, block)
     assert made.events() == []
     assert not made.clock.running
-
-
-@pytest.mark.parametrize(
-    ("changes", "text"),
-    [
-        ({"profile": "labjack_t8"}, "LabJack T8 can't stream: take kind: modbus_dac"),
-        ({"output": "TDAC0"}, "output must be one that LabJack T7 can stream, DAC0, DAC1"),
-        ({"reader": {"profile": "labjack_t4", "host": "10.0.0.9"}}, "reader must be left out"),
-    ],
-)
-def test_options_that_do_not_stream_are_refused(changes, text):
-    """Before anything is sent."""
-    with pytest.raises(InputError, match=text):
-        ModbusStream(options(**changes))
 
 
 def test_a_stream_of_an_earlier_run_is_stopped(bench):

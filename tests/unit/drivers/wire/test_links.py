@@ -4,7 +4,6 @@ import os
 import pty
 import select
 import socket
-import struct
 import threading
 import tty
 from collections.abc import Callable, Iterator
@@ -14,7 +13,7 @@ import pytest
 from hilctl.base.errors import DeviceError
 from hilctl_drivers.wire.links import LostError, NoAnswerError
 from hilctl_drivers.wire.serial_port import SerialLink, SerialSettings, held_port
-from hilctl_drivers.wire.tcp import TcpLink, held_address
+from hilctl_drivers.wire.tcp import TcpLink
 
 QUICK_S = 0.05
 PATIENT_S = 5.0
@@ -66,77 +65,6 @@ def tcp(port, timeout_s=PATIENT_S):
     link = TcpLink("127.0.0.1", port, timeout_s)
     link.open()
     return link
-
-
-def test_tcp_reply_in_pieces_is_put_together(serve):
-    """A reply may come in any number of segments."""
-
-    def act(connection):
-        connection.recv(100)
-        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        for k in range(len(REPLY)):
-            connection.sendall(REPLY[k : k + 1])
-
-    link = tcp(serve(act))
-    assert link.transact(b"ask", missing) == REPLY
-    link.close()
-    link.close()
-
-
-def test_tcp_turns_nagle_off(serve):
-    """Small requests leave at once."""
-    link = tcp(serve(lambda connection: None))
-    assert link._socket.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
-    link.close()
-
-
-@pytest.mark.parametrize(
-    ("sent", "words"), [(b"", "no answer within 0.05 s"), (b"0123", "only 4 bytes, 6 short")]
-)
-def test_tcp_silence_ends_at_the_deadline(serve, sent, words):
-    """No reply, or a part of one, is an error in time, and the connection is given up."""
-
-    def act(connection):
-        connection.recv(100)
-        connection.sendall(sent)
-
-    link = tcp(serve(act), QUICK_S)
-    with pytest.raises(NoAnswerError, match=words):
-        link.transact(b"ask", missing)
-    with pytest.raises(LostError, match="not connected"):
-        link.transact(b"ask", missing)
-
-
-def test_tcp_trickle_does_not_move_the_deadline():
-    """A byte now and then does not keep an exchange alive: time is injected and runs out."""
-    ours, theirs = socket.socketpair()
-    theirs.sendall(b"012")
-    times = iter([0.0, 1.1])
-    link = TcpLink("", 0, 1.0, clock=lambda: next(times))
-    link._socket = ours
-    with pytest.raises(NoAnswerError, match="within 1 s"):
-        link.transact(b"ask", lambda received: 1)
-    theirs.close()
-
-
-def test_tcp_reset_closing_and_refusal_are_told_apart(serve):
-    """Each way to lose a peer has words of its own."""
-
-    def reset(connection):
-        connection.recv(100)
-        connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
-        connection.close()
-
-    def hang_up(connection):
-        connection.recv(100)
-        connection.shutdown(socket.SHUT_RDWR)
-
-    with pytest.raises(LostError, match="connection reset by peer"):
-        tcp(serve(reset)).transact(b"ask", missing)
-    with pytest.raises(LostError, match="connection closed by the device"):
-        tcp(serve(hang_up)).transact(b"ask", missing)
-    with pytest.raises(LostError, match="can't connect: connection refused"):
-        tcp(1)
 
 
 def test_no_reply_wanted_is_not_waited_for(serve, line):
@@ -196,29 +124,6 @@ def test_full_serial_line_times_out(line):
     with pytest.raises(NoAnswerError, match="could not send within"):
         link.transact(b"ask", missing)
     link.close()
-
-
-def test_tcp_unknown_host_is_one_line():
-    """A name that can't be looked up is a device error, not a traceback."""
-    with pytest.raises(LostError, match="can't connect"):
-        TcpLink("host.invalid", 502, QUICK_S).open()
-
-
-def test_tcp_frame_error_closes_the_connection(serve):
-    """When the reply can't be one, what else is on its way must not be taken for the next."""
-
-    def act(connection):
-        connection.recv(100)
-        connection.sendall(REPLY)
-
-    def refuse(received):
-        raise DeviceError("not a reply")
-
-    link = tcp(serve(act))
-    with pytest.raises(DeviceError, match="not a reply"):
-        link.transact(b"ask", refuse)
-    with pytest.raises(LostError):
-        link.transact(b"ask", missing)
 
 
 @pytest.fixture
@@ -352,20 +257,6 @@ def test_serial_chatter_does_not_hang(line):
     with pytest.raises(DeviceError, match="does not get quiet"):
         link.transact(b"ask", missing)
     link.close()
-
-
-@pytest.mark.parametrize(
-    ("host", "held"),
-    [
-        ("10.0.0.5", "tcp:10.0.0.5:502"),
-        ("localhost", "tcp:127.0.0.1:502"),
-        ("DAC.lab", "tcp:dac.lab:502"),
-        ("fe80:0:0::0001", "tcp:[fe80::1]:502"),
-    ],
-)
-def test_addresses_have_one_name(host, held):
-    """Numbers in their shortest form; names as they are, for asking takes time."""
-    assert held_address(host, 502) == held
 
 
 def test_ports_have_one_name(tmp_path):

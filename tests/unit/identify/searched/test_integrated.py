@@ -10,7 +10,6 @@ from hilctl.base.arrays import F64
 from hilctl.identify.data.records import SteadyLoop
 from hilctl.identify.fit_data import FitData
 from hilctl.identify.searched.integrated import ExponentialProblem
-from hilctl.identify.searched.plays import PlaysProblem
 from hilctl.identify.settings import FitSettings
 from hilctl.models.published import exponential_integrated
 
@@ -43,19 +42,3 @@ def test_slopes_of_the_exponential_problem(data: FitData, choices: dict[str, Any
     for i in range(x.size):
         missed = np.linalg.norm(found[:, i] - expected[:, i])
         assert missed <= 2e-3 * np.linalg.norm(expected[:, i]), i
-
-
-@pytest.mark.parametrize("kind", ["ppi", "rdpi"])
-@pytest.mark.parametrize("weights", ["free", "exponential"])
-def test_gradient_where_the_weights_follow(data: FitData, kind: Any, weights: Any) -> None:
-    """Slopes lack what the weights make up for, and yet give the gradient of the sum of squares."""
-    problem = PlaysProblem(data, FitSettings(kind=kind, weights=weights, plays=6, offset=True))
-    x, scale = problem.space.guess, 1.0 + (np.arange(data.target_um.size) % 3)
-
-    def square(at: F64) -> F64:
-        return np.array([np.sum((problem.error_um(at, scale) * scale) ** 2)])
-
-    errors = problem.error_um(x, scale) * scale
-    gradient = 2.0 * errors @ (problem.slopes_um(x, scale) * scale[:, None])
-    expected = differences(square, x, 1e-5)[0]
-    np.testing.assert_allclose(gradient, expected, rtol=2e-3, atol=1e-3 * np.abs(expected).max())

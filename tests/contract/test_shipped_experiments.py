@@ -8,7 +8,7 @@ from hilctl.experiment.check import check
 from hilctl.experiment.load import load_experiment
 from hilctl.models.files import load_model
 
-CONFIGS = Path(__file__).parents[3] / "configs"
+CONFIGS = Path(__file__).parents[2] / "configs"
 EXPERIMENTS = sorted(path.name for path in CONFIGS.glob("*.yaml"))
 MODELS = sorted(path.name for path in (CONFIGS / "models").glob("*.yaml"))
 

@@ -1,4 +1,4 @@
-"""What ``hilctl status`` shows of runs."""
+"""What status prints of runs."""
 
 import pytest
 

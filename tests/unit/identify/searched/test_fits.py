@@ -16,7 +16,7 @@ from hilctl.identify.fit_model import FittedModel, fit_model
 from hilctl.identify.judge import judge
 from hilctl.identify.settings import FitSettings
 
-FOLDER = Path(__file__).resolve().parents[4] / "shared" / "data" / "yan9a_DBO"
+FOLDER = Path(__file__).resolve().parents[5] / "shared" / "data" / "yan9a_DBO"
 START_TRANSIENT = 500  # rows of the model file; the test file settles after 600
 RATE_HZ = 200.0
 

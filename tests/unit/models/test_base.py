@@ -108,28 +108,3 @@ def test_offset_moves_the_output_and_comes_off_first(model):
     np.testing.assert_array_equal(block, SIGNAL + 7.0)
     expected = model.inverse(SAMPLE_RATE_HZ).process(block - 7.0)
     np.testing.assert_array_equal(shifted, expected)
-
-
-def test_only_the_rate_dependent_models_know_the_sample_rate():
-    """A PPI does the same at every sample rate; the others don't, the inverse included."""
-    for name, model in MODELS.items():
-        for make in (model.forward, model.inverse):
-            same = np.array_equal(make(1_000.0).process(SIGNAL), make(9_000.0).process(SIGNAL))
-            assert same == (name == "ppi")
-
-
-def test_inverse_rate_is_scaled_to_the_command():
-    """The inverse takes the rate of x / sum a, widened by a_0 gamma: a_0 gamma f / sum a."""
-    assert MODELS["ppi"].inverse_rate_gain(SAMPLE_RATE_HZ) == 0.0
-    gain = 2.0 * 3e-4 * SAMPLE_RATE_HZ / (2.0 + 0.5 + 0.3 + 0.8)
-    for name in ("rdpi", "integrated"):
-        assert MODELS[name].inverse_rate_gain(SAMPLE_RATE_HZ) == pytest.approx(gain, rel=1e-14)
-
-
-def test_deadband_function_and_its_inverse_cancel():
-    """Lambda after its inverse, and the other way round, return what went in."""
-    function = MODELS["integrated"].deadband
-    x = np.linspace(-9.0, 9.0, 2_001)
-    np.testing.assert_allclose(function.inverse()(function(x)), x, rtol=0, atol=1e-13)
-    np.testing.assert_allclose(function(function.inverse()(x)), x, rtol=0, atol=1e-13)
-    np.testing.assert_allclose(function.inverse().inverse()(x), function(x), rtol=0, atol=1e-12)

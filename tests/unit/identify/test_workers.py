@@ -1,0 +1,67 @@
+"""Work shared out over processes or a cluster finds the same."""
+
+import importlib.util
+from collections.abc import Callable
+
+import pytest
+
+from hilctl.base.errors import InputError
+from hilctl.identify.data.records import SteadyLoop
+from hilctl.identify.fit_model import fit_model
+from hilctl.identify.settings import FitSettings
+from hilctl.identify.workers import workers
+from hilctl.models.published import exponential_integrated
+
+Loops = Callable[..., list[SteadyLoop]]
+GRID = [(a, f) for a in (2.0, 3.0, 6.0) for f in (10.0, 100.0, 250.0)]
+
+
+@pytest.fixture
+def loops(loops_of: Loops) -> list[SteadyLoop]:
+    omega = exponential_integrated(
+        alpha=0.9, gamma_s=2e-4, a_0=3.0, alpha_0=1.4, beta_0=0.3, g_0=1.0, alpha_1=0.08,
+        beta_1=0.15, d_p=8.0, alpha_2=0.1, beta_2=0.4, d_n=8.0, plays=6, deadbands_a_side=4,
+    )  # fmt: skip
+    return loops_of(omega, GRID)
+
+
+@pytest.mark.parametrize("scheduler", ["threads", "processes"])
+def test_workers_find_the_same(loops: list[SteadyLoop], scheduler: str) -> None:
+    """Starts followed on other workers end at the same bits."""
+    settings = FitSettings(kind="integrated", weights="free", starts=3)
+    alone = fit_model(loops[:4], settings, lambda: 0.0)
+    with workers(scheduler) as run:
+        found = fit_model(loops[:4], settings, lambda: 0.0, run=run)
+    assert found.model == alone.model
+    assert found.starts == alone.starts
+
+
+@pytest.mark.skipif(
+    importlib.util.find_spec("distributed") is None,
+    reason="Dask is not installed: pip install 'hilctl[scale]'",
+)
+@pytest.mark.filterwarnings("ignore")
+def test_dask_cluster_finds_the_same(loops: list[SteadyLoop]) -> None:
+    """The same on a Dask cluster, by its scheduler's address."""
+    from distributed import LocalCluster
+
+    settings = FitSettings(kind="integrated", weights="free", starts=3)
+    alone = fit_model(loops[:4], settings, lambda: 0.0)
+    with (
+        LocalCluster(
+            n_workers=1, threads_per_worker=1, processes=False, protocol="tcp",
+            dashboard_address=None,
+        ) as cluster,
+        workers(cluster.scheduler_address) as run,
+    ):  # fmt: skip
+        found = fit_model(loops[:4], settings, lambda: 0.0, run=run)
+    assert found.model == alone.model
+
+
+def test_unknown_schedulers_are_refused() -> None:
+    """A scheduler that is neither known nor an address is refused with what there is."""
+    with (
+        pytest.raises(InputError, match=r"none, threads, processes or an address .*: 'four'"),
+        workers("four"),
+    ):
+        pass

@@ -1,0 +1,40 @@
+"""What is written can be read by what it is said to be."""
+
+import pytest
+
+from hilctl.base.events import Event
+from hilctl.recording.reader import read
+
+
+@pytest.fixture
+def recorded(tmp_path, make):
+    """A finished recording of three batches with a gap before the last."""
+    batches = [
+        make.batch(0, 4),
+        make.batch(200, 30, seed=1),
+        make.batch(1900, 3, dropped=200, seed=2),
+    ]
+    path = tmp_path / "run.mcap"
+    with path.open("wb") as stream:
+        make.write(stream, batches)
+    return path, batches
+
+
+def test_event_has_its_numbers_and_its_time(tmp_path, make):
+    """Values come back by name; an event of the loop has the time of its sample."""
+    path = tmp_path / "run.mcap"
+    values = {"gain": 1.5, "offset": -0.1, "samples": 250.0}
+    with path.open("wb") as stream:
+        make.write(stream, [], events=[Event(100, "info", "tuned", "text", values)])
+    due_ns = make.start_ns + 100 * 20_000
+    tuned = Event(100, "info", "tuned", "text", values, time_ns=due_ns)
+    assert read(path).events == (tuned, make.ended)
+
+
+def test_replay_can_start_first_and_after_each_gap(recorded):
+    """The compensator's memory stands with the first block and with the one after a gap."""
+    path, batches = recorded
+    starts = read(path).starts
+    assert [start.sample for start in starts] == [0, 1900]
+    assert starts[1].state.tolist() == batches[2].states[0, :-1].tolist()
+    assert starts[1].previous_command == batches[2].states[0, -1]
