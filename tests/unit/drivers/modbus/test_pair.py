@@ -273,7 +273,7 @@ class TestReader:
         assert served.events()[-1]["current_a"] == pytest.approx(0.0, abs=1e-3)
 
     def test_errors_of_the_one_that_drives_are_not_the_readers(self, serve):
-        """A write that is refused is told of the device itself."""
+        """A write that is refused names the device itself."""
         served = serve("icp_m7024", "icp_m7017", lacking=frozenset({6}))
         device = served.device()
         device.open(5.0, 1)
