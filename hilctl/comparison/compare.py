@@ -163,7 +163,7 @@ def compare(
     Args:
         request: What to compare.
         clock: Time in s, for what is measured.
-        progress: Told of what is being done.
+        progress: Called with how far it is and what is being done.
 
     Raises:
         InputError: Something asked for can't be used.

@@ -78,7 +78,7 @@ class RecordingConfig(Strict):
         scope_rate_hz: Highest rate of the ``/scope`` topic.
         ring_s: Seconds of samples that the ring between loop and recorder holds.
         on_failure: What a run does that can't be recorded any more, for a full or a slow disk:
-            ``stop`` by its way out, or ``go_on`` and count what is lost.
+            ``stop`` by its safe ramp, or ``go_on`` and count what is lost.
     """
 
     folder: str = "recordings"

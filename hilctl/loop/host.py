@@ -10,7 +10,7 @@ from hilctl.loop.block import Block
 
 @dataclass(frozen=True, slots=True)
 class Tuning:
-    """A change of the reference that is wanted while it runs.
+    """A change of the reference that is requested while it runs.
 
     Attributes:
         gain: Factor of the reference.
@@ -47,7 +47,7 @@ class Host(Protocol):
         ...
 
     def heartbeat(self, next_sample: int, late_ticks: int) -> str:
-        """Show that the loop lives, once a tick; return why the run should end, or nothing."""
+        """Write the heartbeat, once a tick; return why the run should end, or an empty text."""
         ...
 
     def closing(self) -> None:

@@ -119,6 +119,7 @@ class Loop:
         """Wait for the tick; return its block with the head filled in."""
         pacer, block_samples = self._pacer, self._plan.block
         skipped = pacer.wait() * block_samples
+        # Before the block is claimed: its number and the state kept with it are those after it.
         if skipped:
             self._pass_over(skipped)
         block = self._host.claim(due=due)
@@ -149,8 +150,9 @@ class Loop:
         self._compensator.process(passed, np.empty_like(passed))
 
     def _supervise(self) -> None:
-        """Show that the loop lives, and follow what is asked of the run."""
+        """Write the heartbeat, and follow what is requested of the run."""
         stop = self._host.heartbeat(self._next_sample, self._pacer.counters.late_ticks)
+        # The end of the waveform first: a stop or a late tick after it changes nothing any more.
         if self._next_sample >= self._plan.reference.size:
             self._leave("completed", "completed", "waveform completed")
         if self._phase is not _Phase.FOLLOWING:
@@ -241,6 +243,7 @@ class Loop:
     def _exchange(self, sent: Block) -> None:
         """Send a block; judge and record the one whose displacements come back."""
         in_flight = self._in_flight
+        # Before the exchange: where it fails, the block is recorded as sent and not answered.
         in_flight.append(sent)
         early = len(in_flight) <= self._plan.latency_blocks
         answered = sent if early else in_flight[0]
@@ -290,6 +293,7 @@ class Loop:
         text = str(error) if self._code == "completed" else f"{self._reason}; then {error}"
         event = Event(self._next_sample, "error", "device_lost", str(error))
         self._host.record_event(event)
+        # Before the device: its time-outs would look like a hanging loop to the supervisor.
         self._host.closing()
         safe = True
         # The coil first: the samples stand in shared memory, and nothing is lost by waiting.

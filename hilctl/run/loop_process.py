@@ -58,16 +58,20 @@ def run_job(job: Job, ring: SampleRing, loaded: LoadedExperiment) -> Outcome:
     config, device, page = loaded.config, loaded.device, ring.page
     host = RingHost(ring, SystemClock(), job.supervisor, job.silence_s)
     loop = assemble(loaded, *job.arrays(), job.memory, host)
+    # After the warm-up, so that all it has mapped gets locked; before the device is opened, so that
+    # a refusal moves nothing.
     steps = prepare(config.realtime)
     if config.realtime.require:
         require(steps)
     device.open(config.sample_rate_hz, config.block)
     try:
         page.write_text(PageText.SET_UP, json.dumps(step_facts(steps)))
+        # After the text, which the supervisor reads then.
         page.put(Field.PHASE, Phase.READY)
         _await_go(page, host)
         page.put(Field.PHASE, Phase.RUNNING)
         outcome = loop.run(page.get(Field.START_NS))
+        # Before the device is closed: that may take its time-outs, and is no hang.
         host.closing()
     except BaseException:
         device.make_safe(config.safe.value)

@@ -98,11 +98,13 @@ class SampleRing:
         size = sum(_padded(each) for each in _sizes(slots + spare, block, state_size))
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
         try:
+            # Claimed now: memory that is not to be had must fail here, and not in mid-run.
             os.posix_fallocate(descriptor, 0, _PAGE_SIZE + size)
             with mmap.mmap(descriptor, _PAGE_SIZE) as memory:
                 numbers = memoryview(memory).cast("q")
                 numbers[Field.SLOTS], numbers[Field.BLOCK] = slots, block
                 numbers[Field.STATE_SIZE], numbers[Field.SPARE] = state_size, spare
+                # Last: a ring whose maker died meanwhile is not taken for one.
                 numbers[Field.MAGIC] = _MAGIC
                 numbers.release()
         finally:
@@ -172,6 +174,7 @@ class SampleRing:
         first = self._tail % self.slots
         count = min(there, self.slots - first)
         batch = self._area.rows(slice(first, first + count))
+        # HEAD may be seen before the block that it counts: the sequence numbers decide.
         expected = np.arange(self._tail + 1, self._tail + count + 1)
         wrong = np.flatnonzero(batch.heads[:, Head.SEQUENCE] != expected)
         if wrong.size:  # not yet visible, or damaged: what stands before it is good

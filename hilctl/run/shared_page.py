@@ -183,6 +183,7 @@ class SharedPage:
         while len(raw := json.dumps({**asdict(event), "text": text})) > _EVENT_BYTES - 8:
             text = text[: len(text) * 3 // 4]
         self._write(_EVENTS_AT + head % _EVENT_SLOTS * _EVENT_BYTES, _EVENT_BYTES, raw)
+        # Last: an event that is counted is whole.
         self.put(Field.EVENT_HEAD, head + 1)
 
     def pop_events(self) -> list[Event]:

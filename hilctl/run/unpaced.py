@@ -104,14 +104,15 @@ class BatchHost:
         return self._stop()
 
     def closing(self) -> None:
-        """Do nothing: nobody watches."""
+        """Do nothing: no supervisor watches."""
 
     def tuning(self) -> Tuning | None:
-        """Return no change: nobody asks for one."""
+        """Return no change: nobody requests one."""
         return None
 
     def record_event(self, event: Event) -> None:
         """Pass an event on, after the blocks before it."""
+        # An event is recorded with the samples that led to it.
         self.flush()
         self._on_event(event)
 

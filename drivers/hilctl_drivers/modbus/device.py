@@ -71,6 +71,7 @@ class ModbusDac(DacDevice):
         already. Only then is it known what rate it can keep.
         """
         del block
+        # Kept before it is opened: after a step that fails, _release must find it.
         self._pair = pair = _Pair(self._setup)
         pair.open()
         # A device that has tripped refuses the steps that follow.
@@ -96,12 +97,14 @@ class ModbusDac(DacDevice):
     def _put_out(self, command: float) -> None:
         self._release()  # many devices take one connection only
         self._pair = pair = _Pair(self._setup)
+        # No self-test, no init steps, no reader: none of them may cost the safe value.
         pair.writer.link.open()
         self._guard.clear_trip(pair.writer)
         pair.put_out(self._encode(self._setup.chain.output(command)))
 
     def _close(self) -> None:
         if self._pair is not None:
+            # First: nothing feeds it any more, and it would trip while the close steps run.
             self._guard.disarm(self._pair.writer)
             self._pair.tear_down()
 

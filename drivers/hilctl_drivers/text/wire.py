@@ -70,6 +70,7 @@ class AsciiWire(SerialWire):
         self._open_links()
         writer, watchdog = self._writer, self._profile.watchdog
         writer.check_selftest()
+        # A device that has tripped refuses the steps that follow.
         self._clear_trip()
         writer.run(self._profile.init)
         if self._setup.reads_elsewhere:
@@ -78,10 +79,11 @@ class AsciiWire(SerialWire):
                 self._reader.run(self._reader_profile.init)
         self._feed_every = 0
         if watchdog != "none" and self._setup.options.watchdog != "none":
+            # The safe value before the time-out: once it counts, it must know where to go.
             self._run("safe")
             self._run("arm")
             self._feed_every = feed_every if watchdog.kick == "strict" else 0
-        writer.check_errors()
+        writer.check_errors()  # after all steps: commands without a reply leave theirs there
         self._ticks = 0
 
     def exchange(self, first_sample: int, output: F64, reading: F64, measured: F64) -> None:
@@ -115,6 +117,7 @@ class AsciiWire(SerialWire):
     def close(self) -> None:
         """See :meth:`~hilctl_drivers.serial.wire.SerialWire.close`."""
         if self._profile.watchdog != "none" and self._setup.options.watchdog != "none":
+            # First: nothing feeds it any more, and it would trip while the close steps run.
             self._run("disarm")
         self._writer.run(self._profile.close)
         self._writer.check_errors()
