@@ -5,21 +5,17 @@ import logging
 import subprocess
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from hilctl.analysis.replay import replay
 from hilctl.base.errors import DataError, InputError
 from hilctl.base.events import Event
 from hilctl.base.samples import COLUMNS, Head
 from hilctl.recording.reader import read
 from hilctl.recording.recover import recover_recording
 from hilctl.recording.writer import OutputFile
-
-GOLDEN = Path(__file__).parents[3] / "recordings" / "golden"
 
 
 @pytest.fixture
@@ -242,19 +238,6 @@ def test_a_sound_file_with_all_of_the_ring_is_left_alone(torn, batches):
     before = state(torn.parent)
     assert recover_recording(torn, batches[:3]).sound
     assert state(torn.parent) == before
-
-
-def test_replay_leaves_out_what_stands_behind_lost_samples(tmp_path):
-    """After a damaged chunk the compensator's memory is not known; what is before it replays."""
-    data = bytearray((GOLDEN / "piezo_compensated.mcap").read_bytes())
-    data[len(data) // 2] ^= 4
-    path = tmp_path / "run.mcap"
-    path.write_bytes(data)
-    for recording in (read(path), read(recover_recording(path).path)):
-        result = replay(recording)
-        assert result.identical
-        assert result.left_out_samples > 0
-        assert result.samples + result.left_out_samples == recording.samples.index.size
 
 
 def test_the_command(torn):

@@ -1,0 +1,62 @@
+"""Replay: commands recomputed from a recording, bit for bit, and what can not be."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hilctl.analysis.replay import replay
+from hilctl.base.errors import DataError
+from hilctl.models.files import load_model
+from hilctl.recording.reader import read
+from hilctl.recording.recover import recover_recording
+
+ROOT = Path(__file__).parents[3]
+GOLDEN, CONFIGS = ROOT / "recordings" / "golden", ROOT / "configs"
+
+
+def test_replay_leaves_out_what_stands_behind_lost_samples(tmp_path):
+    """After a damaged chunk the compensator's memory is not known; what is before it replays."""
+    data = bytearray((GOLDEN / "piezo_compensated.mcap").read_bytes())
+    data[len(data) // 2] ^= 4
+    path = tmp_path / "run.mcap"
+    path.write_bytes(data)
+    for recording in (read(path), read(recover_recording(path).path)):
+        result = replay(recording)
+        assert result.identical
+        assert result.left_out_samples > 0
+        assert result.samples + result.left_out_samples == recording.samples.index.size
+
+
+def test_the_sound_recording_is_identical_and_another_model_is_not():
+    """The recorded model gives the recorded bits; another one is told by how much it differs."""
+    recording = read(GOLDEN / "terfenol_compensated.mcap")
+    same = replay(recording)
+    assert (same.identical, same.first_difference, same.differing_samples) == (True, None, 0)
+    assert same.samples == recording.samples.index.size
+    other = replay(recording, load_model(CONFIGS / "models" / "terfenol_rdpi.yaml"))
+    assert not other.identical
+    assert other.rms_difference > 0.0
+    assert other.largest_difference >= other.rms_difference
+
+
+def test_one_flipped_bit_is_found_at_its_sample():
+    """The last bit of one recorded command is a difference."""
+    recording = read(GOLDEN / "terfenol_uncompensated.mcap")
+    samples = recording.samples
+    command = samples.command.copy()
+    command[1234] = np.nextafter(command[1234], np.inf)
+    changed = replace(recording, samples=replace(samples, command=command))
+    found = replay(changed)
+    assert (found.first_difference, found.differing_samples) == (int(samples.index[1234]), 1)
+
+
+def test_what_can_not_be_replayed_is_refused():
+    """Another model needs a reference; a recording without a start has no memory to begin with."""
+    recording = read(GOLDEN / "terfenol_uncompensated.mcap")
+    model = load_model(CONFIGS / "models" / "terfenol_rdpi.yaml")
+    with pytest.raises(DataError, match="had no compensator: there is no reference"):
+        replay(recording, model)
+    with pytest.raises(DataError, match="holds no samples to replay"):
+        replay(replace(recording, starts=()))

@@ -1,0 +1,33 @@
+"""The one base of all pydantic models: nothing is guessed, ignored or changed."""
+
+import pytest
+from pydantic import ValidationError
+
+from hilctl.base.strict import Strict
+
+
+class Gain(Strict):
+    gain: float
+    plays: int = 1
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        {"gain": "1.0"},
+        {"gain": True},
+        {"gain": float("nan")},
+        {"gain": float("inf")},
+        {"gain": 1.0, "plays": 2.0},
+        {"gain": 1.0, "gian": 1.0},
+        {},
+    ],
+)
+def test_what_is_not_exactly_right_is_refused(given):
+    with pytest.raises(ValidationError):
+        Gain.model_validate(given)
+
+
+def test_models_do_not_change():
+    with pytest.raises(ValidationError, match="frozen"):
+        Gain(gain=1.0).gain = 2.0

@@ -1,0 +1,93 @@
+"""Commands about runs: exit codes, and what programs read of them."""
+
+import json
+import signal
+from pathlib import Path
+
+import pytest
+import typer
+
+from hilctl.cli.running import check, run, set_, status, stop
+from hilctl.run.result import RunResult
+
+DEMO = Path(__file__).parents[3] / "configs" / "demo.yaml"
+
+
+@pytest.fixture
+def ended(monkeypatch):
+    """Let a run end at once, as told; collect what it was started with."""
+    started = []
+
+    def so(code, stop_signal=0):
+        def start_run(experiment, settings, output, overwrite, on_progress):
+            started.append((experiment, settings, output, overwrite))
+            return RunResult(Path("no.mcap"), code, "because", True, stop_signal, 0, 0, 0)
+
+        monkeypatch.setattr("hilctl.run.start.start_run", start_run)
+        monkeypatch.setattr("hilctl.cli.run_view.report_of", lambda result, *, whole: None)
+        return started
+
+    return so
+
+
+@pytest.mark.parametrize(
+    ("code", "stop_signal", "exit_code"), [("fault", 0, 3), ("stopped", signal.SIGTERM, 143)]
+)
+def test_a_run_that_did_not_complete_says_so_by_its_exit_code(ended, code, stop_signal, exit_code):
+    before = signal.getsignal(signal.SIGTERM)
+    ended(code, stop_signal)
+    try:
+        with pytest.raises(typer.Exit) as left:
+            run(DEMO, as_json=True)
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert left.value.exit_code == exit_code
+
+
+def test_require_rt_is_one_more_setting(ended, capsys):
+    """Behind those that were given, which it goes before."""
+    started = ended("completed")
+    run(DEMO, settings=["block=25"], require_rt=True, as_json=True)
+    assert started == [(DEMO, ["block=25", "realtime.require=true"], None, False)]
+    assert json.loads(capsys.readouterr().out)["code"] == "completed"
+
+
+def test_check_moves_nothing_and_says_what_would(capsys):
+    check(DEMO, ["waveform.duration_s=1.0"], as_json=True)
+    printed = json.loads(capsys.readouterr().out)
+    assert printed["experiment"] == str(DEMO)
+    assert printed["samples"] == 50_000
+
+
+def test_no_run_is_an_empty_list(capsys):
+    status(as_json=True)
+    assert json.loads(capsys.readouterr().out) == {"runs": []}
+
+
+@pytest.fixture
+def going(monkeypatch):
+    """A run that answers as told."""
+
+    class Card:
+        name, recording = "sine-7", "a.mcap"
+
+    class Going:
+        card = Card
+
+    monkeypatch.setattr("hilctl.run.client.find_run", lambda name: Going)
+    return monkeypatch
+
+
+def test_a_run_that_does_not_end_in_time_is_a_failure(going, capsys):
+    going.setattr("hilctl.run.client.stop_run", lambda run, wait_s: {"ended": False})
+    with pytest.raises(typer.Exit) as left:
+        stop(wait_s=2.0)
+    assert left.value.exit_code == 3
+    assert "sine-7 was told to stop, and is still going after 2 s" in capsys.readouterr().out
+
+
+def test_set_says_what_was_taken(going, capsys):
+    answer = {"gain": 0.5, "offset": -2.0, "over_s": 1.5}
+    going.setattr("hilctl.run.client.set_run", lambda run, assignments, over_s: answer)
+    set_(["gain=0.5"], over_s=1.5)
+    assert capsys.readouterr().out == "sine-7: gain 0.5, offset -2, over 1.5 s\n"

@@ -1,0 +1,36 @@
+"""What can be named in a device section, and whether a device answers."""
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from hilctl.base.errors import InputError
+from hilctl.experiment import inventory as module
+from hilctl.experiment.inventory import inventory, probe
+
+CONFIGS = Path(__file__).parents[3] / "configs"
+
+
+def test_devices_profiles_and_ports_are_listed(monkeypatch):
+    """Shipped profiles by path; ports in order, with what the system calls them."""
+    ports = [SimpleNamespace(device="/dev/ttyX1", description="b")]
+    monkeypatch.setattr("serial.tools.list_ports.comports", lambda: ports)
+    found = inventory().to_mapping()
+    assert "modbus_dac" in found["devices"]
+    assert Path(found["profiles"]["labjack_t7"]).is_file()
+    assert list(found["profiles"]) == sorted(found["profiles"])
+    assert found["serial_ports"] == ({"path": "/dev/ttyX1", "description": "b"},)
+
+
+@pytest.mark.parametrize("place", ["no_such_package:shipped", "hilctl_drivers.profile:no_such"])
+def test_drivers_that_are_not_there_are_said(monkeypatch, place):
+    monkeypatch.setattr(module, "SHIPPED_PROFILES", place)
+    with pytest.raises(InputError, match="the shipped profiles can't be listed"):
+        inventory()
+
+
+def test_a_device_is_opened_and_closed_and_told_of():
+    found = probe(CONFIGS / "demo.yaml", [])
+    assert found.name == "simulated_terfenol"
+    assert found.to_mapping()["max_rate_hz"] == found.max_rate_hz > 0.0

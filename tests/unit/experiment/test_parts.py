@@ -1,0 +1,34 @@
+"""Common types of the experiment file: names, intervals, and the ring that bridges flushes."""
+
+import pytest
+from pydantic import TypeAdapter, ValidationError
+
+from hilctl.experiment.parts import Interval, Name, RecordingConfig
+
+NAME, INTERVAL = TypeAdapter(Name), TypeAdapter(Interval)
+
+
+@pytest.mark.parametrize("text", ["a", "9.x_y-z", "a" * 80])
+def test_names_that_can_be_file_names(text):
+    assert NAME.validate_python(text) == text
+
+
+@pytest.mark.parametrize("text", ["", ".hidden", "a b", "a/b", "../a", "a" * 81, "ä", "a\n"])
+def test_other_names_are_refused(text):
+    """A recording is named after its experiment."""
+    with pytest.raises(ValidationError, match="at most 80 letters"):
+        NAME.validate_python(text)
+
+
+@pytest.mark.parametrize("given", [(1.0,), (1.0, 2.0, 3.0), (2.0, 1.0), (1.0, 1.0)])
+def test_an_interval_is_two_rising_numbers(given):
+    assert INTERVAL.validate_python((1.0, 2.0)) == (1.0, 2.0)
+    with pytest.raises(ValidationError, match=r"must be \[lowest, highest\]"):
+        INTERVAL.validate_python(given)
+
+
+def test_the_ring_bridges_three_flushes():
+    """One that is being written, one that waits, and one that fills."""
+    assert RecordingConfig(flush_s=2.0, ring_s=6.0).ring_s == 6.0
+    with pytest.raises(ValidationError, match="at least three times flush_s"):
+        RecordingConfig(flush_s=2.0, ring_s=5.9)

@@ -1,0 +1,74 @@
+"""Every whole record of a damaged file, and one line on what is wrong with it."""
+
+import io
+
+import pytest
+from mcap.records import Message, Metadata
+
+from hilctl.recording.salvage import Damage, Salvage
+
+
+@pytest.fixture
+def data(make):
+    stream = io.BytesIO()
+    make.write(stream, [make.batch(200 * i, 4, seed=i) for i in range(4)])
+    return stream.getvalue()
+
+
+def salvaged(data):
+    salvage = Salvage(io.BytesIO(data))
+    return salvage, list(salvage.records())
+
+
+def count(records):
+    return sum(isinstance(record, Message) for record in records)
+
+
+def test_a_sound_file_has_no_damage(data):
+    salvage, records = salvaged(data)
+    assert salvage.sound
+    assert salvage.is_mcap
+    assert count(records) > 4
+    assert [r.name for r in records if isinstance(r, Metadata)] == ["hilctl.run", "hilctl.end"]
+
+
+def test_a_file_that_ends_early_lacks_end_and_index(data):
+    salvage, records = salvaged(data[: len(data) // 2])
+    assert not salvage.sound
+    assert 0 < count(records) < count(salvaged(data)[1])
+
+
+def test_a_damaged_stretch_costs_no_record_behind_it(data):
+    """One flipped byte inside the file: facts of the end are still found."""
+    broken = bytearray(data)
+    broken[len(data) // 3] ^= 0x10
+    salvage, records = salvaged(bytes(broken))
+    assert not salvage.sound
+    assert len(salvage.damages) >= 1
+    assert "hilctl.end" in [r.name for r in records if isinstance(r, Metadata)]
+
+
+def test_what_is_no_mcap_file_holds_nothing():
+    salvage, records = salvaged(b"time,current\n" * 100)
+    assert not salvage.is_mcap
+    assert records == []
+
+
+@pytest.mark.parametrize(
+    ("damages", "text"),
+    [
+        ([], "its end and index are missing"),
+        ([Damage(9, 5, "index")], "its index is damaged or cut"),
+        ([Damage(9, 5, "damaged record")], "damaged record at byte 9 (5 bytes)"),
+        (
+            [Damage(9, 5, "damaged chunk", 3)] * 4,
+            "damaged chunk at byte 9 (5 bytes, 3 messages of it saved without a checksum), "
+            "damaged chunk at byte 9 (5 bytes, 3 messages of it saved without a checksum) "
+            "and 2 more",
+        ),
+    ],
+)
+def test_damages_are_described_in_one_line(damages, text):
+    salvage = Salvage(io.BytesIO(b""))
+    salvage.damages = damages
+    assert salvage.describe() == text

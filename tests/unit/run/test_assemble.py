@@ -1,0 +1,53 @@
+"""From a checked experiment to a plan: late policy, late rules and a warm compensator."""
+
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from hilctl.run.assemble import plan_of
+from hilctl.run.start import checked_experiment
+
+CONFIGS = Path(__file__).parents[3] / "configs"
+
+
+def planned(loaded, state=None, *, paced=True):
+    values = np.zeros(100)
+    return plan_of(loaded, values, values, state, paced=paced)
+
+
+def loaded_of(*settings, name="demo.yaml", **info):
+    loaded = checked_experiment(CONFIGS / name, list(settings)).loaded
+    return replace(loaded, device=SimpleNamespace(info=replace(loaded.device.info, **info)))
+
+
+@pytest.mark.parametrize(
+    ("info", "policy"),
+    [({}, "slip"), ({"buffered": True}, "catch_up"), ({"latency_blocks": 3}, "follow")],
+)
+def test_the_device_goes_before_the_file_in_what_late_ticks_do(info, policy):
+    """A FIFO sets the pace itself; a buffer has to be filled again."""
+    settings = "timing.late_policy=slip"
+    loaded = loaded_of(settings, **{"buffered": False, "latency_blocks": 0, **info})
+    assert planned(loaded).late_policy == policy
+
+
+def test_late_rules_are_in_the_file_s_own_ticks():
+    """Half a tick of 50 samples at 50 kHz is half a millisecond; no run of late ticks lasts 2 s."""
+    rules = planned(loaded_of("timing.late_after=0.5", "timing.max_late_s=0.25")).late_rules
+    assert (rules.late_after_ns, rules.max_late_ns) == (pytest.approx(5e5), pytest.approx(2.5e8))
+    assert rules.max_consecutive_late == 2000
+    asked = planned(loaded_of("timing.max_consecutive_late=7")).late_rules
+    assert asked.max_consecutive_late == 7
+
+
+def test_the_compensator_starts_from_the_memory_that_was_given():
+    """Warming up leaves no trace in it."""
+    loaded = loaded_of(name="terfenol_sine_6a.yaml")
+    rest = planned(loaded).compensator
+    state = rest.state()
+    state[0] += 0.25
+    np.testing.assert_array_equal(planned(loaded, state).compensator.state(), state)
+    np.testing.assert_array_equal(planned(loaded).compensator.state(), rest.state())

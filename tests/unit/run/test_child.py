@@ -1,0 +1,90 @@
+"""How the loop's process ended, or why it never started."""
+
+import signal
+from types import SimpleNamespace
+
+import pytest
+
+from hilctl.base.errors import InputError, RunError
+from hilctl.loop.plan import Outcome
+from hilctl.run import child as module
+from hilctl.run.child import LoopChild
+from hilctl.run.ring import SampleRing
+from hilctl.run.shared_page import Field, PageText, Phase
+
+
+class FakeProcess:
+    """A process that has ended with a code, or lives where that is None."""
+
+    def __init__(self, command, **options):
+        self.command, self.options, self.code = command, options, None
+        self.stdin = SimpleNamespace(write=self.take, close=lambda: None)
+        self.job = b""
+
+    def take(self, data):
+        self.job += data
+
+    def poll(self):
+        return self.code
+
+    wait = poll
+
+
+@pytest.fixture
+def started(tmp_path, monkeypatch):
+    """A child that was started, and its page."""
+    monkeypatch.setattr(module.subprocess, "Popen", FakeProcess)
+    monkeypatch.setattr(
+        module.Job, "of", lambda *a, **k: SimpleNamespace(to_json=lambda: '{"job": 1}')
+    )
+    ring = SampleRing.create(tmp_path / "ring", slots=4, block=1, state_size=1)
+    return LoopChild(None, None, ring, (5, 6), 1.0), ring.page
+
+
+def never():
+    return False
+
+
+def test_the_job_goes_in_by_standard_input_and_locks_are_inherited(started):
+    """A stop from the terminal reaches the supervisor only: the loop has a session of its own."""
+    process = started[0]._process
+    assert process.job == b'{"job": 1}'
+    assert process.options["pass_fds"] == (5, 6)
+    assert process.options["start_new_session"] is True
+
+
+@pytest.mark.parametrize(
+    ("phase", "error"), [(Phase.REFUSED, InputError), (Phase.FAILED, RunError)]
+)
+def test_a_loop_that_can_not_start_says_why(started, phase, error):
+    """What the user gave is told from what a device did."""
+    child, page = started
+    page.write_text(PageText.ERROR, "no port")
+    page.put(Field.PHASE, phase)
+    with pytest.raises(error, match="no port"):
+        child.await_ready(never)
+
+
+def test_a_loop_that_died_before_the_start_is_told_by_its_signal(started):
+    child, _ = started
+    child._process.code = -signal.SIGKILL
+    with pytest.raises(RunError, match="died before the start: killed by SIGKILL"):
+        child.await_ready(never)
+
+
+def test_a_stop_comes_before_the_start(started):
+    child, page = started
+    with pytest.raises(RunError, match="stopped before the start; nothing has moved"):
+        child.await_ready(lambda: True)
+    page.put(Field.PHASE, Phase.READY)
+    child.await_ready(lambda: True)
+
+
+def test_the_outcome_is_the_loop_s_own_where_it_left_one(started):
+    child, page = started
+    child._process.code = 7
+    assert child.outcome() == "the loop process died: exit code 7"
+    outcome = Outcome("stopped", "by a test", 7, True, 2)
+    page.leave_outcome(outcome)
+    page.put(Field.PHASE, Phase.ENDED)
+    assert child.outcome() == outcome

@@ -1,0 +1,71 @@
+"""Runs whose processes died: what the ring holds goes into the recording, and the folder goes."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from hilctl.loop.plan import Outcome
+from hilctl.recording.reader import read
+from hilctl.run.orphans import recover_orphans
+from hilctl.run.ring import SampleRing
+from hilctl.run.run_folder import run_folder, runs
+from hilctl.run.shared_page import Field, Phase
+
+GOLDEN = Path(__file__).parents[3] / "recordings" / "golden" / "terfenol_uncompensated.mcap"
+
+
+@pytest.fixture
+def dead(tmp_path):
+    """Leave the folder of a dead run behind; yield a function that does, given its ring."""
+
+    def leave(fill=lambda folder: None):
+        recording = tmp_path / "a.mcap"
+        recording.write_bytes(GOLDEN.read_bytes()[:-100])
+        kept = tmp_path / "kept"
+        with run_folder("sine", recording, 12.0) as (folder, _):
+            fill(folder)
+            shutil.copytree(folder.path, kept)
+        shutil.move(kept, folder.path)
+        return recording
+
+    return leave
+
+
+def test_a_run_that_left_no_ring_is_not_known_to_be_safe(dead):
+    """Its recording is made whole all the same, and the next look finds nothing."""
+    recording = dead()
+    (orphan,) = recover_orphans()
+    assert orphan.recording == recording
+    assert not orphan.safe
+    assert "NOT known to be safe: look at it" in orphan.text
+    assert read(recording).samples.index.size > 0
+    assert runs() == []
+    assert recover_orphans() == []
+
+
+def test_a_loop_that_ended_by_its_ramp_is_believed(dead):
+    """The page says so, although nobody was left to read it."""
+
+    def fill(folder):
+        page = SampleRing.create(folder.ring, slots=4, block=1, state_size=1).page
+        page.leave_outcome(Outcome("stopped", "stopped because the supervisor died", 0, True, 0))
+        page.put(Field.PHASE, Phase.ENDED)
+
+    dead(fill)
+    (orphan,) = recover_orphans()
+    assert orphan.safe
+    assert orphan.text.startswith("stopped because the supervisor died; output at its safe value")
+
+
+def test_a_recording_that_has_gone_is_said_and_not_asked_for_again(dead):
+    dead().unlink()
+    (orphan,) = recover_orphans()
+    assert "could not be recovered" in orphan.text
+    assert recover_orphans() == []
+
+
+def test_a_living_run_is_left_alone(tmp_path):
+    with run_folder("sine", tmp_path / "a.mcap", 12.0) as (folder, _):
+        assert recover_orphans() == []
+        assert folder.path.is_dir()

@@ -1,0 +1,79 @@
+"""A run as fast as it goes: blocks in whole batches, virtual time, and only on simulations."""
+
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from hilctl.base.errors import InputError
+from hilctl.base.events import Event
+from hilctl.base.samples import Head
+from hilctl.recording.reader import read
+from hilctl.run.start import checked_experiment
+from hilctl.run.unpaced import BatchHost, SampleClock, run_unpaced
+
+UNCOMPENSATED = Path(__file__).parents[3] / "configs" / "terfenol_sine_6a_uncompensated.yaml"
+SHORT = ["waveform.duration_s=0.25", "waveform.frequency_hz=100"]
+
+
+def test_time_passes_in_sleeps_only():
+    clock = SampleClock()
+    clock.sleep_until_ns(500)
+    clock.sleep_until_ns(200)
+    assert clock.now_ns() == 500
+
+
+@pytest.mark.parametrize("latency", [0, 3])
+def test_every_block_comes_once_and_in_order(latency):
+    """Also those that a FIFO answers later, whose slots are not used again before."""
+    firsts, seen = [], []
+
+    def take(batch):
+        firsts.extend(batch.heads[:, Head.FIRST_SAMPLE].tolist())
+        seen.extend(batch.columns[:, 0, 0].tolist())
+
+    host = BatchHost(2, 1, latency, on_batch=take)
+    waiting = []
+    for number in range(1000):
+        block = host.claim()
+        block.head[Head.FIRST_SAMPLE] = 2 * number
+        block.reference[:] = number
+        waiting.append(block)
+        if len(waiting) > latency:
+            assert host.answered(waiting.pop(0))
+    for block in waiting:
+        host.answered(block)
+    host.flush()
+    assert firsts == [2 * number for number in range(1000)]
+    assert seen == list(range(1000))
+
+
+def test_an_event_comes_after_the_blocks_before_it():
+    order = []
+    host = BatchHost(
+        1, 1, 0, on_batch=lambda batch: order.append(len(batch.heads)),
+        on_event=lambda event: order.append(event.code),
+    )  # fmt: skip
+    host.answered(host.claim())
+    host.record_event(Event(1, "info", "tuned", "x"))
+    assert order == [1, "tuned"]
+
+
+def test_a_whole_run_is_recorded_and_says_that_it_was_not_paced(tmp_path):
+    checked = checked_experiment(UNCOMPENSATED, SHORT)
+    result = run_unpaced(checked, tmp_path / "run.mcap")
+    recording = read(result.path)
+    assert (result.code, result.safe, result.missing) == ("completed", True, 0)
+    assert np.array_equal(recording.samples.index, np.arange(result.samples))
+    assert '"paced": "false"' in str(recording.run) or recording.run.get("paced") == "false"
+
+
+def test_real_devices_are_refused_before_a_file_is_made(tmp_path):
+    checked = checked_experiment(UNCOMPENSATED, SHORT)
+    info = replace(checked.loaded.device.info, simulated=False)
+    loaded = replace(checked.loaded, device=SimpleNamespace(info=info))
+    with pytest.raises(InputError, match="only a simulated device can run without real time"):
+        run_unpaced(replace(checked, loaded=loaded), tmp_path / "run.mcap")
+    assert list(tmp_path.iterdir()) == []
