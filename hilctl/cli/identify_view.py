@@ -1,4 +1,4 @@
-"""What was found, for people."""
+"""An identified model, for people."""
 
 from collections.abc import Sequence
 from pathlib import Path
