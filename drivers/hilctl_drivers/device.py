@@ -95,7 +95,7 @@ class DacDevice(ABC):
         """
         if not self._low <= command <= self._high:
             raise self._out_of_range(np.array([command]))
-        # Closed first: whatever comes of it, nobody may go on as if the output were his.
+        # Closed first: whatever comes of it, no exchange may follow as if nothing had happened.
         self._block = 0
         try:
             self._put_out(command)

@@ -156,6 +156,7 @@ def _run(job: dict[str, Any]) -> tuple[SetUpStep, ...]:
     period_ns = 1e9 / job["rate_hz"]
     pacer = Pacer(clock, period_ns, "catch_up", LateRules(period_ns))
     late_ns = np.zeros(job["ticks"], dtype=np.int64)
+    # After the array: memory that is claimed later would be faulted in while lateness is measured.
     steps = prepare(Realtime(**job["settings"]))
     ticks = watch(pacer, late_ns, clock, lambda: os.getppid() == job["parent"])
     np.save(job["output"], late_ns[:ticks])

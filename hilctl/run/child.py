@@ -56,7 +56,7 @@ class LoopChild:
         """Wait until it needs only the start signal.
 
         Args:
-            stopped: Whether somebody has asked for a stop.
+            stopped: Whether a stop has been requested.
 
         Raises:
             InputError: It refuses what it is asked for; nothing has moved.

@@ -94,7 +94,7 @@ class SimulatedDevice(DacDevice):
         self._last_command = command
 
     def _close(self) -> None:
-        """Nobody is there to take leave of."""
+        """There is nothing to disarm."""
 
     def _release(self) -> None:
         self._plant = None

@@ -20,7 +20,7 @@ Factor: TypeAlias = Annotated[float, Field(ge=0.5, le=2.0)]
 
 
 class Variation(DeviceOptions):
-    """Factors on the rated actuator, to try what a model found on another one is still good for."""
+    """Factors on the rated actuator, to try what a model of another one is still good for."""
 
     lag: Factor = Field(default=1.0, description="time constant of the field")
     pinning: Factor = Field(default=1.0, description="pinning fields, the width of the loops")

@@ -172,6 +172,7 @@ class AsciiWire(SerialWire):
         except WatchdogTripped:
             self._clear_trip()
             self._write(value)
+        # A command without a reply may have been ignored: the safe value must be seen to stand.
         readback = self._output.readback
         if readback == "none":
             self._writer.check_errors()
