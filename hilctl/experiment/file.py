@@ -5,9 +5,8 @@ from typing import Annotated, Any, Literal, TypeVar
 from pydantic import BeforeValidator, Field
 
 from hilctl.base.strict import Strict
-from hilctl.experiment.feedback_keys import FeedbackConfig
 from hilctl.experiment.limits import Limits
-from hilctl.experiment.parts import Name, RecordingConfig, Timing
+from hilctl.experiment.parts import FeedbackConfig, Name, RecordingConfig, Timing
 from hilctl.loop.limiter import CommandLimits
 from hilctl.machine.settings import Realtime
 from hilctl.waveforms.spec import AnyWaveform

@@ -163,7 +163,7 @@ def _run(checked: Checked, recorder: Recorder) -> tuple[Outcome, Lateness]:
         on_event=recorder.event,
         stop=lambda: recorder.error,
     )
-    samples = (checked.reference.values, checked.input_um, checked.state)
+    samples = (checked.reference.values, checked.begun.input_um, checked.begun.state)
     loop = assemble(loaded, *samples, host, paced=False)
     device.open(config.sample_rate_hz, config.block)
     try:

@@ -55,11 +55,6 @@ class SimulatedDevice(DacDevice):
         self._last_command = 0.0
         self._last_reading_um = 0.0
 
-    @property
-    def last_command(self) -> float:
-        """What the output is at, in ``info.command_unit``."""
-        return self._last_command
-
     def _longest_block(self) -> tuple[int, str]:
         return FIFO_DEPTH, ""
 

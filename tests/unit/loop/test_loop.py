@@ -14,8 +14,8 @@ from hilctl.loop.loop import Loop
 from hilctl.loop.pacer import LateRules
 from hilctl.loop.plan import Plan
 from hilctl.models.files import load_model
-from hilctl.models.published import terfenol_rdpi
 from tests.fakes import FakeClock, FakeDevice, FakeFifoDevice, FakeHost
+from tests.published import terfenol_rdpi
 
 RATE_HZ = 1000.0
 LIMITS = CommandLimits(low=-5.0, high=5.0, slew_per_s=2000.0, safe=0.0, ramp_per_s=100.0)
