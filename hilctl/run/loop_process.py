@@ -8,7 +8,6 @@ import json
 import signal
 import sys
 import time
-from dataclasses import asdict
 
 from hilctl.base.errors import DeviceError, HilctlError, InputError
 from hilctl.experiment.load import LoadedExperiment
@@ -37,8 +36,7 @@ def main() -> int:
         return _failed(page, str(error))
     except Exception as error:  # noqa: BLE001  the supervisor must know it and make the rig safe
         return _failed(page, f"the loop broke: {type(error).__name__}: {error}")
-    page.write_text(PageText.OUTCOME, json.dumps(asdict(outcome)))
-    page.put(Field.PHASE, Phase.ENDED)
+    page.leave_outcome(outcome)
     return 0
 
 

@@ -166,6 +166,12 @@ class SharedPage:
         for field, count in zip(_LATENESS, astuple(lateness), strict=True):
             self.put(field, count)
 
+    def leave_outcome(self, outcome: Outcome) -> None:
+        """Leave how the run ended for the supervisor."""
+        self.write_text(PageText.OUTCOME, json.dumps(asdict(outcome)))
+        # The text first: the phase says that it is there.
+        self.put(Field.PHASE, Phase.ENDED)
+
     def outcome(self) -> Outcome | None:
         """Return how the loop said that the run ended; None where it said nothing."""
         if self.get(Field.PHASE) != Phase.ENDED:

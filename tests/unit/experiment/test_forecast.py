@@ -171,7 +171,7 @@ class TestForecast:
         assert result.forecast.command_max == command.max()
         plain = checked(DISPLACEMENT, model=terfenol_rdpi())
         assert not plain.records_input
-        assert plain.state is None
+        assert plain.begun.state is None
         assert plain.begun.input_um is plain.reference.values
         assert result.forecast.recording_mb > plain.forecast.recording_mb
 

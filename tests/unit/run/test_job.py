@@ -43,4 +43,4 @@ def test_an_input_that_is_the_reference_is_kept_once(folder):
     plain = checked_experiment(CONFIGS / "terfenol_sine_6a_uncompensated.yaml", [])
     job = Job.of(plain, folder, supervisor=1, silence_s=1.0)
     assert (job.reference == job.input_um) == (plain.begun.input_um is plain.reference.values)
-    assert job.memory is None if plain.state is None else job.memory is not None
+    assert job.memory is None if plain.begun.state is None else job.memory is not None

@@ -198,7 +198,7 @@ class TestMakeSafe:
         device.make_safe(1.0)
         with pytest.raises(DeviceError, match="not open"):
             send(device, BLOCK, np.zeros(BLOCK))
-        assert device.last_command == 1.0
+        assert device._last_command == 1.0
         send(opened(device), 0, np.zeros(BLOCK))
 
     @pytest.mark.parametrize("value", [11.0, np.nan])
@@ -207,7 +207,7 @@ class TestMakeSafe:
         device = terfenol()
         with pytest.raises(DeviceError, match="simulated_terfenol"):
             device.make_safe(value)
-        assert device.last_command == 0.0
+        assert device._last_command == 0.0
 
 
 class TestFaults:
