@@ -43,6 +43,41 @@ class FakeClock:
         self.sleeps += 1
 
 
+@dataclass
+class ManualClock:
+    """Time in ns that passes only when a test lets it."""
+
+    now_ns: int = 1_000_000_000
+
+    def __call__(self):
+        return self.now_ns
+
+    def pass_s(self, seconds):
+        self.now_ns += round(seconds * 1e9)
+
+
+@dataclass
+class ShiftedClock:
+    """The machine's time in ns, and what a test lets pass on top."""
+
+    extra_ns: int = 0
+
+    def __call__(self):
+        return time.monotonic_ns() + self.extra_ns
+
+
+@dataclass
+class SteppingClock:
+    """Time in s that goes on by a step whenever it is looked at."""
+
+    step_s: float = 0.0
+    now: float = 0.0
+
+    def __call__(self):
+        self.now += self.step_s
+        return self.now
+
+
 @dataclass(frozen=True)
 class FakeInfo:
     """What the loop asks of a device's info."""

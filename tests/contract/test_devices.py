@@ -20,6 +20,7 @@ from hilctl_drivers.emulator.options import EmulatorOptions
 from hilctl_drivers.emulator.setup import build
 from hilctl_drivers.modbus.profile import ModbusProfile
 from hilctl_drivers.profile import load_profile, shipped_profiles
+from tests.fakes import ManualClock
 
 RATE_HZ = 10_000.0
 SAMPLES = 20
@@ -38,16 +39,6 @@ MODBUS = (
     "waveshare_ao_8ch_b waveshare_ai_8ch_b same", "adam_4024 adam_6217 own",
 )  # fmt: skip
 """What modbus_dac is tried with; every shipped Modbus profile is among them."""
-
-
-class Clock:
-    """Time that passes when told to."""
-
-    def __init__(self) -> None:
-        self.now_ns = 1_000_000_000
-
-    def __call__(self) -> int:
-        return self.now_ns
 
 
 @dataclass
@@ -114,7 +105,7 @@ watchdog: none
 
 def modbus(words: list[str], stack: list[Callable[[], None]]) -> Bench:
     """Return a modbus_dac that is wired to an emulator of the profile, or of two."""
-    clock = Clock()
+    clock = ManualClock()
     name, reader, line = [*words, None, None][:3]
     emulator = build(EmulatorOptions(name, reader=reader, reader_line=line), clock)
     thread = threading.Thread(target=emulator.server.run)

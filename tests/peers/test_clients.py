@@ -15,6 +15,7 @@ import pytest
 
 from hilctl_drivers.emulator.options import EmulatorOptions
 from hilctl_drivers.emulator.setup import Emulator, build
+from tests.fakes import ManualClock
 
 BAUD = 115_200
 RTU_PROFILE = """\
@@ -268,20 +269,10 @@ class ModbusTk:
         self._master.close()
 
 
-class Clock:
-    """Time that passes when told to."""
-
-    def __init__(self) -> None:
-        self.now_ns = 1_000_000_000
-
-    def __call__(self) -> int:
-        return self.now_ns
-
-
 class Emulated:
     """An emulated device with its time and its physics in sight."""
 
-    def __init__(self, emulator: Emulator, clock: Clock) -> None:
+    def __init__(self, emulator: Emulator, clock: ManualClock) -> None:
         self.emulator = emulator
         self._clock = clock
         self.rig = emulator.device._rig
@@ -299,7 +290,7 @@ def emulate() -> Iterator[Callable[[str], Emulated]]:
     stops: list[Callable[[], None]] = []
 
     def start(profile: str) -> Emulated:
-        clock = Clock()
+        clock = ManualClock()
         emulator = build(EmulatorOptions(profile, noise=False), clock)
         thread = threading.Thread(target=emulator.server.run)
         thread.start()

@@ -6,21 +6,11 @@ import pytest
 
 from hilctl.cli.compare_view import headings, notes, render, table_rows
 from hilctl.comparison.compare import ComparisonRequest, compare
+from tests.fakes import SteppingClock
 
 ROOT = Path(__file__).parents[3]
 GOLDEN = ROOT / "recordings" / "golden" / "terfenol_uncompensated.mcap"
 OMEGA = ROOT / "configs" / "models" / "terfenol_omega.yaml"
-
-
-class Clock:
-    """Time that goes on by 1 ms whenever it is looked at."""
-
-    def __init__(self):
-        self.now = 0.0
-
-    def __call__(self):
-        self.now += 1e-3
-        return self.now
 
 
 def ignore(done, text):
@@ -31,7 +21,7 @@ def ignore(done, text):
 def comparison():
     """Two models of the catalogue and one of a file, tried at 100 Hz."""
     request = ComparisonRequest([GOLDEN], ["duhem", "straight", str(OMEGA)], frequencies_hz=[100.0])
-    return compare(request, Clock(), ignore)
+    return compare(request, SteppingClock(1e-3), ignore)
 
 
 def test_the_table_has_a_column_a_trial(comparison):

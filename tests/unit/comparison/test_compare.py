@@ -13,21 +13,11 @@ from hilctl.comparison.page import comparison_page
 from hilctl.identify.catalogue import CATALOGUE, entry
 from hilctl.models.files import load_model
 from hilctl.recording.reader import read
+from tests.fakes import SteppingClock
 
 ROOT = Path(__file__).parents[3]
 GOLDEN = ROOT / "recordings" / "golden" / "terfenol_uncompensated.mcap"
 OMEGA = ROOT / "configs" / "models" / "terfenol_omega.yaml"
-
-
-class Clock:
-    """Time that goes on by 1 ms whenever it is looked at."""
-
-    def __init__(self):
-        self.now = 0.0
-
-    def __call__(self):
-        self.now += 1e-3
-        return self.now
 
 
 def ignore(done, text):
@@ -38,7 +28,7 @@ def ignore(done, text):
 def comparison():
     """Two models of the catalogue and one of a file, tried at 100 Hz."""
     request = ComparisonRequest([GOLDEN], ["duhem", "straight", str(OMEGA)], frequencies_hz=[100.0])
-    return compare(request, Clock(), ignore)
+    return compare(request, SteppingClock(1e-3), ignore)
 
 
 def test_rows_come_as_asked_for(comparison):
@@ -73,7 +63,7 @@ def test_loops_of_a_real_device_are_judged_without_trials(monkeypatch, text):
     run = {**recording.run, "simulated": "false"}
     recording = replace(recording, experiment_yaml=text, run=run)
     monkeypatch.setattr("hilctl.comparison.compare.read", lambda path: recording)
-    judged = compare(ComparisonRequest([GOLDEN], ["straight"]), Clock(), ignore)
+    judged = compare(ComparisonRequest([GOLDEN], ["straight"]), SteppingClock(1e-3), ignore)
     assert judged.rows[0].trials == ()
     assert judged.rows[0].compensated_percent is None
     assert judged.to_mapping()["device"] is None
@@ -85,7 +75,7 @@ def test_a_compensated_recording_gives_device_and_limits():
     """Its own waveform and compensator, whose file may be elsewhere, are not needed."""
     path = GOLDEN.with_name("terfenol_compensated.mcap")
     judged = compare(
-        ComparisonRequest([path], ["straight"], frequencies_hz=[200.0]), Clock(), ignore
+        ComparisonRequest([path], ["straight"], frequencies_hz=[200.0]), SteppingClock(1e-3), ignore
     )
     assert judged.rows[0].trials[0].frequency_hz == pytest.approx(200.0)
 
@@ -94,7 +84,7 @@ def test_progress_rises_to_the_end():
     """Whoever waits is told what is being done, and how far it is."""
     told = []
     request = ComparisonRequest([GOLDEN], ["straight"], frequencies_hz=[100.0])
-    compare(request, Clock(), lambda done, text: told.append((done, text)))
+    compare(request, SteppingClock(1e-3), lambda done, text: told.append((done, text)))
     parts = [done for done, _ in told]
     assert parts == sorted(parts)
     assert parts[-1] == 1.0
@@ -104,7 +94,7 @@ def test_progress_rises_to_the_end():
 def test_unknown_models_are_refused_at_once():
     """A misspelt name is refused before any file is read, with the nearest one."""
     with pytest.raises(InputError, match="did you mean 'preisach'"):
-        compare(ComparisonRequest([Path("nowhere.mcap")], ["presach"]), Clock(), ignore)
+        compare(ComparisonRequest([Path("nowhere.mcap")], ["presach"]), SteppingClock(1e-3), ignore)
     assert set(COMPARED) <= set(CATALOGUE)
     for name in CATALOGUE:
         assert entry(name)[1].title
@@ -114,7 +104,7 @@ def test_a_model_of_another_unit_is_refused():
     """A stage's model in V can't stand beside loops in A."""
     model = ROOT / "configs" / "models" / "piezo_ppi.yaml"
     with pytest.raises(InputError, match="commands in A"):
-        compare(ComparisonRequest([GOLDEN], [str(model)]), Clock(), ignore)
+        compare(ComparisonRequest([GOLDEN], [str(model)]), SteppingClock(1e-3), ignore)
 
 
 def test_saved_models_are_model_files(comparison, tmp_path):

@@ -1,31 +1,14 @@
 """Pacing on absolute deadlines, with a clock that the test turns."""
 
-from dataclasses import dataclass, field
-
 import pytest
 
 from hilctl.loop.pacer import LateRules, Pacer, SystemClock
+from tests.fakes import FakeClock
 
 PERIOD_NS = 1_000_000
 
 
-@dataclass
-class TurnedClock:
-    """Time stands still but for sleeps and for what each tick is given to do."""
-
-    now: int = 5_000
-    wake_late_ns: dict[int, int] = field(default_factory=dict)
-    sleeps: int = 0
-
-    def now_ns(self) -> int:
-        return self.now
-
-    def sleep_until_ns(self, deadline_ns: int) -> None:
-        self.now = max(self.now, deadline_ns) + self.wake_late_ns.get(self.sleeps, 0)
-        self.sleeps += 1
-
-
-def pacer(clock: TurnedClock, policy: str = "skip") -> Pacer:
+def pacer(clock: FakeClock, policy: str = "skip") -> Pacer:
     made = Pacer(clock, PERIOD_NS, policy, LateRules(0.5 * PERIOD_NS))  # type: ignore[arg-type]
     made.begin(10_000)
     return made
@@ -33,7 +16,7 @@ def pacer(clock: TurnedClock, policy: str = "skip") -> Pacer:
 
 def test_deadlines_do_not_drift():
     """Each deadline is a whole number of periods after the start, whatever wake-ups cost."""
-    clock = TurnedClock(wake_late_ns=dict.fromkeys(range(1000), 40_000))
+    clock = FakeClock(5_000, dict.fromkeys(range(1000), 40_000))
     paced = pacer(clock)
     for tick in range(1000):
         assert paced.wait() == 0
@@ -43,7 +26,7 @@ def test_deadlines_do_not_drift():
 
 def test_period_need_not_be_whole():
     """A period of a third of a microsecond is kept on average, to the nanosecond."""
-    clock = TurnedClock(now=0)
+    clock = FakeClock(0)
     paced = Pacer(clock, 1000.0 / 3.0, "skip", LateRules(1e9))
     paced.begin(0)
     for _ in range(3001):
@@ -54,7 +37,7 @@ def test_period_need_not_be_whole():
 @pytest.mark.parametrize(("late_ns", "counted"), [(499_999, 0), (500_000, 0), (500_001, 1)])
 def test_late_is_later_than_the_limit(late_ns, counted):
     """A tick counts as late only beyond the limit."""
-    paced = pacer(TurnedClock(wake_late_ns={3: late_ns}))
+    paced = pacer(FakeClock(5_000, {3: late_ns}))
     for _ in range(6):
         paced.wait()
     assert paced.counters.late_ticks == counted
@@ -64,7 +47,7 @@ def test_late_is_later_than_the_limit(late_ns, counted):
 
 def test_skip_leaves_out_ticks_and_keeps_the_phase():
     """After 3.2 periods of stall, three ticks are left out and the next is on the old grid."""
-    clock = TurnedClock(wake_late_ns={2: 3_200_000})
+    clock = FakeClock(5_000, {2: 3_200_000})
     paced = pacer(clock)
     assert [paced.wait() for _ in range(4)] == [0, 0, 3, 0]
     assert paced.tick == 6
@@ -74,7 +57,7 @@ def test_skip_leaves_out_ticks_and_keeps_the_phase():
 
 def test_catch_up_runs_every_tick():
     """Nothing is left out: ticks follow at once until the old grid is reached."""
-    clock = TurnedClock(wake_late_ns={2: 3_200_000})
+    clock = FakeClock(5_000, {2: 3_200_000})
     paced = pacer(clock, "catch_up")
     late = []
     for _ in range(8):
@@ -87,7 +70,7 @@ def test_catch_up_runs_every_tick():
 
 def test_slip_moves_the_grid():
     """The stall becomes part of the grid: the next tick is a full period later."""
-    clock = TurnedClock(wake_late_ns={2: 3_200_000})
+    clock = FakeClock(5_000, {2: 3_200_000})
     paced = pacer(clock, "slip")
     for _ in range(4):
         assert paced.wait() == 0
@@ -119,7 +102,7 @@ class TestFollow:
 
     def test_waits_only_for_the_start(self):
         """The first tick waits for its time; after it, the exchange is the only wait."""
-        clock = TurnedClock()
+        clock = FakeClock(5_000)
         self.run(clock, lambda _: PERIOD_NS, 100)
         assert clock.sleeps == 1
         assert clock.now == 10_000 + 100 * PERIOD_NS
@@ -128,14 +111,14 @@ class TestFollow:
     def test_a_clock_that_drifts_is_never_late(self, ppm):
         """After an hour of a clock that is off by far more than a quartz is, no tick is late."""
         period = PERIOD_NS + PERIOD_NS * ppm // 1_000_000
-        paced, late_ns = self.run(TurnedClock(), lambda _: period, 100_000)
+        paced, late_ns = self.run(FakeClock(5_000), lambda _: period, 100_000)
         assert paced.counters.late_ticks == 0
         assert max(late_ns) < 0.1 * PERIOD_NS
 
     def test_a_burst_that_fills_the_fifo_is_not_lateness(self):
         """Exchanges that return at once move the deadlines; the ticks after them are on time."""
         burst = 8
-        paced, late_ns = self.run(TurnedClock(), lambda k: PERIOD_NS if k >= burst else 0, 100)
+        paced, late_ns = self.run(FakeClock(5_000), lambda k: PERIOD_NS if k >= burst else 0, 100)
         assert max(late_ns) == 0
         assert paced.counters.late_ticks == 0
 
@@ -145,7 +128,7 @@ class TestFollow:
         def exchange_ns(tick):
             return {50: 6 * PERIOD_NS}.get(tick, 0 if 51 <= tick < 56 else PERIOD_NS)
 
-        paced, late_ns = self.run(TurnedClock(), exchange_ns, 200)
+        paced, late_ns = self.run(FakeClock(5_000), exchange_ns, 200)
         assert late_ns[51] == 5 * PERIOD_NS
         assert late_ns[51:57] == sorted(late_ns[51:57], reverse=True)
         assert max(late_ns[57:]) < 0.5 * PERIOD_NS

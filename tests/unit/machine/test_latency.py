@@ -13,6 +13,7 @@ from hilctl.machine.diagnosis import lateness_counts
 from hilctl.machine.latency import Latency, measure, watch
 from hilctl.machine.realtime import SetUpStep
 from hilctl.machine.settings import Realtime
+from tests.fakes import FakeClock
 
 MS = 1_000_000
 STEPS = (SetUpStep("fifo", "refused", "SCHED_FIFO 80: Operation not permitted", "rtprio"),)
@@ -69,31 +70,17 @@ def test_lateness_of_nothing_is_empty():
     assert lateness_counts(np.array([], dtype=np.int64)) == {}
 
 
-class TurnedClock:
-    """Each sleep ends a given time after its deadline."""
-
-    def __init__(self, late_ns):
-        self.now = 0
-        self.late_ns = list(late_ns)
-
-    def now_ns(self):
-        return self.now
-
-    def sleep_until_ns(self, deadline_ns):
-        self.now = max(self.now, deadline_ns) + self.late_ns.pop(0)
-
-
 def test_lateness_is_the_pacers():
     """Each tick's lateness is kept, and no deadline moves for a late one."""
     wanted = [10, 2_500_000, 10, 10, 10]
-    clock, late_ns = TurnedClock(wanted), np.zeros(5, dtype=np.int64)
+    clock, late_ns = FakeClock(stall_ns=dict(enumerate(wanted))), np.zeros(5, dtype=np.int64)
     watch(Pacer(clock, 1e6, "catch_up", LateRules(1e6)), late_ns, clock, lambda: True)
     assert late_ns.tolist() == [10, 2_500_000, 1_500_010, 500_020, 10]
 
 
 def test_measuring_ends_with_the_parent():
     """Where nobody waits for the result, measuring stops at the next tick."""
-    clock, late_ns = TurnedClock([7] * 100), np.zeros(100, dtype=np.int64)
+    clock, late_ns = FakeClock(stall_ns=dict(enumerate([7] * 100))), np.zeros(100, dtype=np.int64)
     left = iter([True, True, False])
     watch(Pacer(clock, 1e6, "catch_up", LateRules(1e6)), late_ns, clock, lambda: next(left))
     assert np.count_nonzero(late_ns) == 3
@@ -101,7 +88,10 @@ def test_measuring_ends_with_the_parent():
 
 def test_measuring_ends_far_behind():
     """A rate that can't be kept at all does not hold a CPU for as long as was asked."""
-    clock, late_ns = TurnedClock([3_000_000] * 1000), np.zeros(1000, dtype=np.int64)
+    clock, late_ns = (
+        FakeClock(stall_ns=dict(enumerate([3_000_000] * 1000))),
+        np.zeros(1000, dtype=np.int64),
+    )
     clock.sleep_until_ns = lambda _: setattr(clock, "now", clock.now + 3_000_000)
     ticks = watch(Pacer(clock, 1e6, "catch_up", LateRules(1e6)), late_ns, clock, lambda: True)
     assert ticks < 300

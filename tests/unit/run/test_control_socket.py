@@ -11,17 +11,7 @@ from hypothesis import strategies as st
 
 from hilctl.base.errors import InputError, RunError
 from hilctl.run.control_socket import MAX_BYTES, ControlServer, ask
-
-
-class Clock:
-    """Time that passes by a step whenever it is looked at."""
-
-    def __init__(self, step_s=0.0):
-        self.now, self.step_s = 0.0, step_s
-
-    def __call__(self):
-        self.now += self.step_s
-        return self.now
+from tests.fakes import SteppingClock
 
 
 def echo(line):
@@ -32,7 +22,7 @@ def echo(line):
 
 @pytest.fixture
 def server(tmp_path):
-    with ControlServer(tmp_path / "socket", echo, Clock()) as made:
+    with ControlServer(tmp_path / "socket", echo, SteppingClock()) as made:
         yield made
 
 
@@ -88,7 +78,7 @@ def test_endless_question_is_cut_off(server, tmp_path):
 
 def test_silent_client_is_dropped(tmp_path):
     """Who connects and says nothing holds nobody up, and is sent away after a second."""
-    clock = Clock()
+    clock = SteppingClock()
     with ControlServer(tmp_path / "socket", echo, clock) as server, connect(tmp_path) as client:
         server.serve(0.0)
         clock.now = 0.9
@@ -119,7 +109,7 @@ def test_crowd_is_sent_away(server, tmp_path):
 def test_any_bytes_are_answered_or_dropped(tmp_path_factory, raw):
     """Nothing that a client sends makes the server raise or hang."""
     folder = tmp_path_factory.mktemp("control")
-    with ControlServer(folder / "socket", echo, Clock()) as server:
+    with ControlServer(folder / "socket", echo, SteppingClock()) as server:
         answer = exchange(server, folder, raw)
         assert answer == b"" or "ok" in json.loads(answer)
         assert json.loads(exchange(server, folder, b"still there\n"))["ok"]

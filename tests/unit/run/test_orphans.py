@@ -1,6 +1,8 @@
 """Runs whose processes died: what the ring holds goes into the recording, and the folder goes."""
 
+import json
 import shutil
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
@@ -10,7 +12,7 @@ from hilctl.recording.reader import read
 from hilctl.run.orphans import recover_orphans
 from hilctl.run.ring import SampleRing
 from hilctl.run.run_folder import run_folder, runs
-from hilctl.run.shared_page import Field, Phase
+from hilctl.run.shared_page import Field, PageText, Phase
 
 GOLDEN = Path(__file__).parents[3] / "recordings" / "golden" / "terfenol_uncompensated.mcap"
 
@@ -49,7 +51,8 @@ def test_a_loop_that_ended_by_its_ramp_is_believed(dead):
 
     def fill(folder):
         page = SampleRing.create(folder.ring, slots=4, block=1, state_size=1).page
-        page.leave_outcome(Outcome("stopped", "stopped because the supervisor died", 0, True, 0))
+        ended = Outcome("stopped", "stopped because the supervisor died", 0, True, 0)
+        page.write_text(PageText.OUTCOME, json.dumps(asdict(ended)))
         page.put(Field.PHASE, Phase.ENDED)
 
     dead(fill)

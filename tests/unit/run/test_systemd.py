@@ -3,13 +3,7 @@
 import socket
 
 from hilctl.run.systemd import Notifier
-
-
-class Clock:
-    now = 0.0
-
-    def __call__(self):
-        return self.now
+from tests.fakes import SteppingClock
 
 
 def test_lines_reach_the_service_manager(tmp_path):
@@ -22,7 +16,7 @@ def test_lines_reach_the_service_manager(tmp_path):
 
 def test_watchdog_is_fed_three_times_in_its_interval(tmp_path):
     """However often it is called, it says so at a third of the interval."""
-    clock = Clock()
+    clock = SteppingClock()
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.bind(str(tmp_path / "notify"))
         manager.setblocking(False)

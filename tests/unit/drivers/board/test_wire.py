@@ -21,22 +21,12 @@ from hilctl_drivers.profile import shipped_profiles
 from hilctl_drivers.serial.device import SerialDac
 from hilctl_drivers.serial.setup import SerialOptions
 from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
-from tests.fakes import FakeHost, emulated
+from tests.fakes import FakeHost, ShiftedClock, emulated
 
 RATE_HZ = 10_000.0
 BLOCK = 100
 FIFO_BLOCKS = 5
 MS = 1_000_000
-
-
-class Clock:
-    """The board's time: the machine's, and what a test lets pass on top."""
-
-    def __init__(self):
-        self.extra_ns = 0
-
-    def __call__(self):
-        return time.monotonic_ns() + self.extra_ns
 
 
 class Board:
@@ -79,7 +69,7 @@ def board(tmp_path):
     def of(faults=(), noise=False, **options):
         log = tmp_path / f"log{len(stack)}.jsonl"
         made = tuple(parse_fault(fault) for fault in faults)
-        clock = Clock()
+        clock = ShiftedClock()
         wanted = EmulatorOptions(str(profile), log=log, faults=made, noise=noise)
         served = emulated(wanted, clock)
         stack.append((Board(served.__enter__(), log, clock, **options), served))

@@ -17,6 +17,7 @@ from hilctl_drivers.emulator.setup import Emulator, build
 from hilctl_drivers.modbus.device import ModbusDac
 from hilctl_drivers.modbus.setup import ModbusOptions
 from hilctl_drivers.profile import load_profile, shipped_profiles
+from tests.fakes import ManualClock
 
 T7 = {
     "profile": "labjack_t7",
@@ -61,19 +62,6 @@ RTU = {
 }
 
 
-class Clock:
-    """Time that passes when told to."""
-
-    def __init__(self) -> None:
-        self.now_ns = 0
-
-    def __call__(self) -> int:
-        return self.now_ns
-
-    def pass_s(self, seconds: float) -> None:
-        self.now_ns += round(seconds * 1e9)
-
-
 @dataclass
 class Served:
     """An emulator in a thread, with what it logs.
@@ -85,7 +73,7 @@ class Served:
     """
 
     emulator: Emulator
-    clock: Clock
+    clock: ManualClock
     log: Path
 
     def device(self, options: dict, **changes) -> ModbusDac:
@@ -104,7 +92,7 @@ def serve(tmp_path) -> Iterator[Callable[..., Served]]:
     started: list[tuple[Served, threading.Thread]] = []
 
     def start(profile: str, **options) -> Served:
-        clock, log = Clock(), tmp_path / f"writes{len(started)}.jsonl"
+        clock, log = ManualClock(0), tmp_path / f"writes{len(started)}.jsonl"
         emulator = build(EmulatorOptions(profile, log=log, **options), clock)
         thread = threading.Thread(target=emulator.server.run)
         thread.start()

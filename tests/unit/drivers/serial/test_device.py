@@ -14,7 +14,7 @@ from hilctl_drivers.emulator.options import EmulatorOptions
 from hilctl_drivers.profile import shipped_profiles
 from hilctl_drivers.serial.device import SerialDac
 from hilctl_drivers.serial.setup import SerialOptions
-from tests.fakes import emulated
+from tests.fakes import ShiftedClock, emulated
 
 DCON = (Path(__file__).parents[3] / "data" / "dcon_module.yaml").read_text()
 KINDS = ["dcon", "scpi", "cobs", "length"]
@@ -34,16 +34,6 @@ def profiles(tmp_path):
         (tmp_path / f"{name}.yaml").write_text(text)
     made = {name: str(tmp_path / f"{name}.yaml") for name in texts}
     return {**made, "scpi": "agilent_34970a"}
-
-
-class Clock:
-    """The emulator's time: the machine's, and what a test lets pass on top."""
-
-    def __init__(self):
-        self.extra_ns = 0
-
-    def __call__(self):
-        return time.monotonic_ns() + self.extra_ns
 
 
 class Rig:
@@ -98,7 +88,7 @@ def rig(profiles, tmp_path):
             reader=reader,
             reader_line="own" if own_line else "same",
         )
-        clock = Clock()
+        clock = ShiftedClock()
         served = emulated(wanted, clock)
         made = Rig(served.__enter__(), log, clock, **options)
         stack.append((made, served))

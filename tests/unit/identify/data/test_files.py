@@ -1,0 +1,64 @@
+"""Recordings and tables to records: loops or whole histories, one unit, and no gaps."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hilctl.base.errors import DataError, InputError
+from hilctl.base.samples import Flag
+from hilctl.identify.command import settings_from
+from hilctl.identify.data.files import history_from_recording, load_records
+from hilctl.identify.data.records import History, SteadyLoop
+
+GOLDEN = Path(__file__).parents[4] / "recordings" / "golden"
+CURRENT, VOLTAGE = GOLDEN / "terfenol_uncompensated.mcap", GOLDEN / "piezo_compensated.mcap"
+
+
+def test_a_recording_gives_loops_or_its_history():
+    loops, unit = load_records([CURRENT], settings_from("ppi", []), 0)
+    assert unit == "A"
+    assert all(isinstance(each, SteadyLoop) for each in loops)
+    (history,), _ = load_records([CURRENT], settings_from("ppi", ["whole=true"]), 0)
+    assert isinstance(history, History)
+
+
+def test_currents_and_voltages_are_not_fitted_together():
+    with pytest.raises(InputError, match="driven in A and in V can't be fitted together"):
+        load_records([CURRENT, VOLTAGE], settings_from("ppi", ["whole=true"]), 0)
+
+
+def test_a_history_ends_where_the_ramp_begins(recording_of):
+    command = np.linspace(0.0, 1.0, 100)
+    recording = recording_of(command, 2.0 * command, [])
+    recording.samples.flags[80:] |= Flag.RAMP.value
+    history = history_from_recording(recording)
+    assert history.command.size == 80
+    np.testing.assert_array_equal(history.displacement_um, 2.0 * command[:80])
+
+
+@pytest.mark.parametrize("what", ["begins late", "has a gap", "has no reading"])
+def test_a_history_with_missing_samples_is_refused(recording_of, what):
+    """A model's memory would be another behind the gap."""
+    index, displacement_um = np.arange(100), np.zeros(100)
+    if what == "begins late":
+        index += 1
+    elif what == "has a gap":
+        index[50:] += 1
+    else:
+        displacement_um[50] = np.nan
+    with pytest.raises(DataError, match="samples are missing, so it can't be judged as a whole"):
+        history_from_recording(recording_of(np.zeros(100), displacement_um, [], index=index))
+
+
+def test_tables_have_no_unit_of_their_own(tmp_path):
+    path = tmp_path / "t.csv"
+    rows = "\n".join(f"{v!r},{2.0 * v!r}" for v in np.sin(np.arange(60) / 5.0).tolist())
+    path.write_text(f"drive,um\n{rows}\n")
+    texts = ["table.command_column=drive", "table.displacement_column=um", "table.rate_hz=200",
+             "table.unit=V", "whole=true"]  # fmt: skip
+    (history,), unit = load_records([path], settings_from("ppi", texts), 0)
+    assert unit is None
+    assert history.sample_rate_hz == 200.0
+    (late,), _ = load_records([path], settings_from("ppi", texts), 3)
+    assert late.command.size == history.command.size - 3

@@ -1,0 +1,73 @@
+"""From fitted parameters to a model and back to its response."""
+
+import math
+
+import numpy as np
+import pytest
+
+from hilctl.identify.fit_data import FitData
+from hilctl.identify.staged.fit_data import Linear, StagedFitData
+from hilctl.identify.staged.layered import Layers, Point
+from hilctl.identify.staged.model import (
+    loop_delay_s,
+    parameters,
+    response_um,
+    staged_model,
+    stages_of,
+    structure_of,
+)
+from hilctl.models.published import exponential_integrated
+
+HALF_S = 1e-5
+LAYERS = Layers(plays=2, deadbands=1, least_delay_s=HALF_S)
+RADIAN_S = 1.0 / (2.0 * math.pi * 2000.0)
+POINT = Point(
+    before=np.array([1e-4, 0.3, 0.5, 0.0]), linear=Linear(5e-5, 0.3 * RADIAN_S, RADIAN_S**2),
+    direct=3.0, weights=np.array([1.0, 0.5]), spacings_um=(6.0, 5.0), up=np.array([0.8]),
+    down=np.array([1.2]), offset_um=-2.0,
+)  # fmt: skip
+
+
+@pytest.fixture
+def data(loops_of):
+    omega = exponential_integrated(
+        alpha=0.33, gamma_s=0.0, a_0=3.0, alpha_0=1.4, beta_0=0.23, g_0=1.0, alpha_1=0.08,
+        beta_1=0.15, d_p=4.0, alpha_2=0.1, beta_2=0.4, d_n=3.0,
+    )  # fmt: skip
+    loops = loops_of(omega, [(6.0, 100.0)])
+    return StagedFitData(loops, FitData(loops).speeds)
+
+
+def test_a_sampled_loop_has_a_delay_that_is_not_the_model_s():
+    """Half a period behind a lag, which holds its command; a whole one without."""
+    assert loop_delay_s(HALF_S, lag=True) == HALF_S
+    assert loop_delay_s(HALF_S, lag=False) == 2.0 * HALF_S
+
+
+def test_structure_is_told_in_hertz_and_damping():
+    assert structure_of(POINT.linear) == pytest.approx((2000.0, 0.15))
+
+
+def test_parameters_are_under_their_published_names():
+    found = parameters(LAYERS, POINT, staged=True)
+    assert found["delay_s"] == pytest.approx(5e-5 - HALF_S)
+    assert (found["a_1"], found["a_2"], found["g_0"]) == (1.0, 0.5, 1.0)
+    assert found["g_1"] == pytest.approx(-0.2)
+    assert found["g_-1"] == pytest.approx(0.2)
+    assert "delay_s" not in parameters(LAYERS, POINT, staged=False)
+
+
+def test_a_model_has_the_stages_of_its_point_and_gives_them_back(data):
+    model = staged_model(data, LAYERS, POINT, "A")
+    assert (model.lag.tau_s, model.lag.growth_per_unit) == (1e-4, 0.3)
+    assert model.structure.natural_hz == pytest.approx(2000.0)
+    assert model.hysteresis.thresholds == pytest.approx((0.5, 1.0))
+    back = stages_of(model, HALF_S)
+    assert back.delay_s == pytest.approx(POINT.linear.delay_s)
+    assert (back.c_s, back.q_s2) == pytest.approx((POINT.linear.c_s, POINT.linear.q_s2))
+
+
+def test_the_response_is_moved_by_the_offset(data):
+    model = staged_model(data, LAYERS, POINT, "A")
+    moved = model.model_copy(update={"output_offset_um": model.output_offset_um + 3.0})
+    np.testing.assert_allclose(response_um(moved, data), response_um(model, data) + 3.0)

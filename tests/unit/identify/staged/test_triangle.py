@@ -1,0 +1,85 @@
+"""A Preisach triangle in the place of the plays, between known stages."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hilctl.identify.data.records import SteadyLoop
+from hilctl.identify.fit_data import FitData
+from hilctl.identify.fit_model import FittedModel, fit_model
+from hilctl.identify.settings import FitSettings
+from hilctl.identify.staged.fit_data import StagedFitData
+from hilctl.models.files import dump_model, parse_model
+from hilctl.models.preisach import PreisachModel
+from hilctl.models.published import exponential_integrated
+from hilctl.models.staged import FieldLag, StagedModel, Structure
+
+Loops = Callable[..., list[SteadyLoop]]
+GRID = [(a, f) for a in (3.0, 6.0) for f in (2.0, 50.0, 150.0, 250.0, 400.0)]
+
+
+def truth(**stages: Any) -> StagedModel:
+    """Return a known model; its deadbands lie where identification puts them."""
+    omega = exponential_integrated(
+        alpha=0.5,
+        gamma_s=0.0,
+        a_0=3.0,
+        alpha_0=1.4,
+        beta_0=0.3,
+        g_0=1.0,
+        alpha_1=0.08,
+        beta_1=0.15,
+        d_p=6.0,
+        alpha_2=0.1,
+        beta_2=0.4,
+        d_n=6.0,
+        plays=8,
+        deadbands_a_side=5,
+    )
+    return StagedModel.around(omega, **stages)
+
+
+def fit(data: list[SteadyLoop], **choices: Any) -> FittedModel:
+    settings = FitSettings(kind="staged", plays=8, deadbands=5, starts=2, **choices)
+    return fit_model(data, settings, lambda: 0.0)
+
+
+@pytest.fixture
+def data(loops_of: Loops) -> StagedFitData:
+    loops = loops_of(truth(lag=FieldLag(tau_s=1e-4, growth_per_unit=0.3)), GRID[::3])
+    return StagedFitData(loops, FitData(loops).speeds)
+
+
+def test_preisach_triangle_is_nearer_between_known_stages(loops_of: Loops) -> None:
+    """A triangle in place of plays and deadbands meets loops whose plays bend one by one."""
+    stages: dict[str, Any] = {
+        "lag": FieldLag(tau_s=1e-4, growth_per_unit=0.3),
+        "structure": Structure(natural_hz=2300.0, damping_ratio=0.15),
+        "delay_s": 3e-5,
+    }
+    lines = 12
+    edges = np.linspace(-7.0, 7.0, lines + 1)
+    bend = 1.5 - np.tanh(edges[:-1] / 3.0)
+    made = PreisachModel(
+        command_span=(-7.5, 7.5),
+        thresholds=tuple((0.5 * np.arange(lines)).tolist()),
+        lowest=-7.0,
+        cell=float(edges[1] - edges[0]),
+        slopes=tuple(tuple((bend * np.exp(-0.3 * i)).tolist()) for i in range(lines)),
+    )
+    loops = loops_of(StagedModel.around(made, **stages), GRID)
+    plays = fit(loops)
+    triangle = fit(loops, hysteresis="preisach", lines=16)
+    assert triangle.rms_percent < 0.5 * plays.rms_percent
+    assert isinstance(triangle.model, StagedModel)
+    assert triangle.model.hysteresis.kind == "preisach"
+    assert triangle.standard_errors.keys() <= triangle.parameters.keys() - {"output_offset_um"}
+    assert parse_model("x.yaml", dump_model(triangle.model)) == triangle.model
+    inverse, rate_hz = triangle.model.inverse(75_000.0), 75_000.0
+    reference_um = 8.0 * np.sin(2.0 * np.pi * 50.0 * np.arange(6000) / rate_hz)
+    command = inverse.process(np.append(reference_um, np.zeros(inverse.preview))[inverse.preview :])
+    back = triangle.model.forward(rate_hz).process(command)
+    error = (back - reference_um)[3000 : -2 * inverse.preview]
+    assert np.max(np.abs(error)) < 0.02 * 16.0

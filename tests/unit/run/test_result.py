@@ -1,0 +1,27 @@
+"""What a run hands to those who show it: complete, and fixed."""
+
+from dataclasses import FrozenInstanceError, fields
+from pathlib import Path
+
+import pytest
+
+from hilctl.cli.run_view import run_mapping
+from hilctl.run.result import RunResult
+
+RESULT = RunResult(
+    path=Path("a.mcap"), code="stopped", reason="by a test", safe=False, stop_signal=15,
+    samples=90, missing=10, late_ticks=3,
+)  # fmt: skip
+
+
+def test_programs_get_every_figure_of_a_run_too_long_to_report():
+    """All but the two that the exit code and the recording's own report tell."""
+    mapping = run_mapping(RESULT, None)
+    told = {"a.mcap", "stopped", "by a test", False, 90, 10}
+    assert set(mapping.values()) == told
+    assert len(mapping) == len(fields(RunResult)) - 2
+
+
+def test_a_result_does_not_change():
+    with pytest.raises(FrozenInstanceError):
+        RESULT.code = "completed"
