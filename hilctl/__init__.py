@@ -2,7 +2,7 @@
 
 The rooms, top to bottom; each sees those below it:
 
-cli          words to and from people; the only room that prints
+cli          commands, messages and tables; the only room that prints
 learning     corrections from run to run
 comparison   models of the literature on the same loops
 identify     measured data in, model parameters out
@@ -11,11 +11,11 @@ run          two processes round one loop: recording, requests, recovery
 experiment   the file, what it refers to, and whether it may start; moves nothing
 machine      what this computer can do
 loop         everything that a tick executes
-waveforms    reference samples from a few words
+waveforms    reference samples from a few keys
 recording    MCAP in, out, recovered
 models       parameters, forward and inverse operators
 kernels      compiled arithmetic on plain arrays
-base         words that all share: arrays, errors, the device contract, samples, strict YAML
+base         what all share: arrays, errors, the device contract, samples, strict YAML
 
 Devices stand in ``hilctl_drivers``, which sees ``base`` and ``kernels`` only.
 """

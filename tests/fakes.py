@@ -1,8 +1,10 @@
 """Doubles that tests of several rooms share: clocks, devices, hosts and links."""
 
 import math
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
@@ -17,7 +19,9 @@ from hilctl.loop.interlocks import InterlockContext, Interlocks, InterlockSettin
 from hilctl_drivers.emulator.labjack_stream import attach_stream
 from hilctl_drivers.emulator.modbus_device import EmulatedModbus
 from hilctl_drivers.emulator.modbus_wire import ModbusWire
+from hilctl_drivers.emulator.options import EmulatorOptions
 from hilctl_drivers.emulator.rig import Rig, WriteLog
+from hilctl_drivers.emulator.setup import Emulator, build
 from hilctl_drivers.modbus.profile import ModbusProfile
 from hilctl_drivers.profile import load_profile
 from hilctl_drivers.wire.links import LostError, Missing, NoAnswerError
@@ -371,3 +375,19 @@ class InProcess:
         device = EmulatedModbus(loaded, rig, writes, output, sensor)
         attach_stream(device, rig, writes, output, sensor, noise=noise)
         return cls(device, rig, link(ModbusWire("tcp", device), time, message_s), time, writes)
+
+
+@contextmanager
+def emulated(
+    options: EmulatorOptions, clock_ns: Callable[[], int] = time.monotonic_ns
+) -> Iterator[Emulator]:
+    """Serve an emulator in a thread; its ``options`` say how to reach it."""
+    emulator = build(options, clock_ns)
+    thread = threading.Thread(target=emulator.server.run)
+    thread.start()
+    try:
+        yield emulator
+    finally:
+        emulator.server.stop()
+        thread.join()
+        emulator.log.close()

@@ -18,5 +18,5 @@ emulator/         the simulated rig behind the same wires
 A protocol folder has ``profile`` (what a profile says), ``timing`` (how long an exchange takes),
 its messages (``pdu``, ``frames``, ``lines``), ``session`` (one conversation), and either ``setup``
 and ``device``, or ``wire`` where it stands behind ``serial_dac``. A new protocol is such a folder
-and one line in ``profile.LINK_KINDS``.
+whose ``LINK_KINDS`` say what profiles of it are.
 """

@@ -1,7 +1,7 @@
 """The base of every device here: what a DAC must do whatever it speaks.
 
 It checks block, rate, sizes and range before anything is sent, never clips, names the device and
-the deed in each error, and lets go of the connection after a failure: nobody knows then what the
+the action in each error, and lets go of the connection after a failure: nobody knows then what the
 device holds, so it must be opened again. A back end connects, exchanges and disconnects.
 """
 
@@ -95,6 +95,7 @@ class DacDevice(ABC):
         """
         if not self._low <= command <= self._high:
             raise self._out_of_range(np.array([command]))
+        # Closed first: whatever comes of it, no exchange may follow as if nothing had happened.
         self._block = 0
         try:
             self._put_out(command)
@@ -104,7 +105,7 @@ class DacDevice(ABC):
             self._release()
 
     def close(self) -> None:
-        """Take leave of the device and let go of it; the output stays. Closing twice is fine.
+        """Disarm and let go of the device; the output stays. Closing twice is fine.
 
         After an error in an exchange there is no connection any more, and a watchdog stays armed.
 
@@ -149,11 +150,11 @@ class DacDevice(ABC):
 
     @abstractmethod
     def _close(self) -> None:
-        """Disarm and say good-bye to a device that is open; :meth:`_release` follows."""
+        """Disarm and run the close steps of a device that is open; :meth:`_release` follows."""
 
     @abstractmethod
     def _release(self) -> None:
-        """Let go of what is held, without a word to the device; it may be held no more."""
+        """Let go of what is held, without a message to the device; it may be held no more."""
 
     def _check_block(self, block: int) -> None:
         """Refuse a block that is too long."""

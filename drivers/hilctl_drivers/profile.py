@@ -6,8 +6,10 @@ Shipped profiles are in ``profiles/``; a user's own is given by its path.
 
 import json
 from dataclasses import dataclass
+from functools import cache
 from importlib import import_module
 from pathlib import Path
+from pkgutil import iter_modules
 from typing import Annotated, Any, TypeAlias, TypeVar, cast
 
 from pydantic import PlainSerializer, PlainValidator, ValidationError, ValidationInfo
@@ -19,15 +21,6 @@ from hilctl.base.files import TextFiles
 from hilctl.base.yaml.document import Document
 from hilctl.base.yaml.messages import broken_rules, loc_of
 from hilctl_drivers.profile_parts import BaseProfile
-
-LINK_KINDS: dict[str, str] = {
-    "tcp": "hilctl_drivers.modbus.profile:ModbusProfile",
-    "rtu": "hilctl_drivers.modbus.profile:ModbusProfile",
-    "ascii": "hilctl_drivers.text.profile:AsciiProfile",
-    "frames": "hilctl_drivers.board.profile:FrameProfile",
-}
-"""What a profile's ``link.kind`` says of it: the class of such profiles, which knows the rest of
-its protocol. A new protocol is one line here."""
 
 FOLDER = Path(__file__).parent / "profiles"
 _Profile = TypeVar("_Profile", bound=BaseProfile)
@@ -79,6 +72,20 @@ ProfileName: TypeAlias = Annotated[
 """An option that names a profile; it holds the profile too once it is validated."""
 
 
+@cache
+def link_kinds() -> dict[str, str]:
+    """Return every ``link.kind`` of a profile, and where the class of such profiles stands.
+
+    Each protocol's folder says its own, so that a new one edits nothing outside of it.
+    """
+    here = __name__.rpartition(".")[0]
+    folders = [each.name for each in iter_modules([str(Path(__file__).parent)]) if each.ispkg]
+    kinds: dict[str, str] = {}
+    for name in folders:
+        kinds |= getattr(import_module(f"{here}.{name}"), "LINK_KINDS", {})
+    return dict(sorted(kinds.items()))
+
+
 def named_class(place: str) -> Any:
     """Return what stands at ``module:name``."""
     module, _, name = place.partition(":")
@@ -91,7 +98,7 @@ def profile_class(kind: str) -> type[BaseProfile]:
     Raises:
         KeyError: There is none.
     """
-    return cast("type[BaseProfile]", named_class(LINK_KINDS[kind]))
+    return cast("type[BaseProfile]", named_class(link_kinds()[kind]))
 
 
 def shipped_profiles() -> dict[str, Path]:
@@ -141,8 +148,8 @@ def parse_profile(text: str, where: str) -> BaseProfile:
     document = Document(where, text)
     link = document.data.get("link")
     kind = link.get("kind") if isinstance(link, dict) else None
-    if not isinstance(kind, str) or kind not in LINK_KINDS:
-        rule = f"must be one of {', '.join(LINK_KINDS)}"
+    if not isinstance(kind, str) or kind not in link_kinds():
+        rule = f"must be one of {', '.join(link_kinds())}"
         value = "nothing" if kind is None else repr(kind)
         place = document.where(("link", "kind"))
         raise ConfigError([Problem(place, "link.kind", rule, value)])
@@ -202,7 +209,7 @@ def check_baud(profile: BaseProfile, baud: int) -> None:
 
 def profile_schema_text() -> str:
     """Return the JSON schema of profiles, as the text of ``profiles/schema.json``."""
-    models = list(dict.fromkeys(map(profile_class, LINK_KINDS)))
+    models = list(dict.fromkeys(map(profile_class, link_kinds())))
     refs, schema = models_json_schema([(model, "validation") for model in models])
     whole = {
         "$schema": "https://json-schema.org/draft/2020-12/schema",

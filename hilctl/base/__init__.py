@@ -1,4 +1,4 @@
-"""Words that all rooms share; it knows none of them.
+"""What all rooms share; it knows none of them.
 
 arrays.py    array types
 device.py    the contract of a device and of a clock
@@ -6,7 +6,7 @@ errors.py    every exception that is raised on purpose
 strict.py    base of every pydantic model
 files.py     texts, each read once; files written whole or not at all
 samples.py   a sample's columns and flags, and blocks of samples
-events.py    what a run tells beside its samples
+events.py    what a run records beside its samples
 segments.py  which samples of a run are judged
 text_table.py  columns of CSV and its relatives, mistakes with their line
 yaml/        plain YAML in, with the line of every value and all problems at once

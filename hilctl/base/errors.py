@@ -6,8 +6,7 @@ HilctlError
 |   |-- ModelError        model parameters that can't describe or invert an actuator
 |   `-- DataError         a recording or a data file can't be read or doesn't hold what is asked
 `-- RunError              something went wrong while current was flowing (exit code 3)
-    |-- DeviceError       the device refused, answered wrongly or went away
-    `-- SensorError        the displacement reading is not a number or out of range
+    `-- DeviceError       the device refused, answered wrongly or went away
 """
 
 from collections.abc import Iterable
@@ -92,11 +91,4 @@ class DeviceError(RunError):
 
     Example scenarios: a command outside the device's range, a time-out, an unplugged cable. The
     text names the device and what it was doing.
-    """
-
-
-class SensorError(RunError):
-    """The displacement reading can't be trusted.
-
-    Example scenarios: not a number, outside the sensor's range, outside the stroke limits.
     """

@@ -61,11 +61,11 @@ COMMANDS: dict[str, CommandEntry] = {
     ),
     "identify": CommandEntry(
         "hilctl.cli.recordings:identify",
-        "Find a model's parameters from recordings or measured tables.",
+        "Identify a model's parameters from recordings or measured tables.",
     ),
     "compare": CommandEntry(
         "hilctl.cli.comparing:compare",
-        "Find models of the literature on the same loops, and hold them against one another.",
+        "Identify models of the literature on the same loops, and compare them.",
     ),
     "learn": CommandEntry(
         "hilctl.cli.learning:learn",

@@ -1,4 +1,4 @@
-"""The command that holds models against one another."""
+"""The command that compares models."""
 
 import time
 from datetime import UTC, datetime
@@ -39,7 +39,7 @@ def compare(
     overwrite: Overwrite = False,
     as_json: AsJson = False,
 ) -> None:
-    """Find models of the literature on the same loops, and hold them against one another."""
+    """Identify models of the literature on the same loops, and compare them."""
     from hilctl.cli.compare_view import render
     from hilctl.cli.console import print_rich
     from hilctl.cli.progress import shown_progress

@@ -1,4 +1,4 @@
-"""What was found, for people."""
+"""An identified model, for people."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -53,7 +53,7 @@ def _orders_table(orders: Sequence[OrderError]) -> Table:
 
 def print_settings() -> None:
     """Print every kind of model, and every setting of a fit."""
-    kinds = Table("--model", "what it is", "found by", "from", box=None)
+    kinds = Table("--model", "what it is", "identified by", "from", box=None)
     kinds.columns[0].no_wrap = True
     for kind, known in CATALOGUE.items():
         kinds.add_row(kind, known.title, known.found_by, known.data)

@@ -136,7 +136,7 @@ def identify(
     overwrite: Overwrite = False,
     as_json: AsJson = False,
 ) -> None:
-    """Find a model's parameters from recordings or measured tables."""
+    """Identify a model's parameters from recordings or measured tables."""
     from hilctl.cli.identify_view import print_identification
     from hilctl.cli.progress import shown_progress
     from hilctl.identify.command import identify_files, settings_from

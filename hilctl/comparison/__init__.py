@@ -1,6 +1,6 @@
-"""Models of the literature on the same loops, found, judged and tried alike.
+"""Models of the literature on the same loops, identified, judged and tried alike.
 
-compare.py  all of it together; what was found as model files
+compare.py  all of it together; identified models as files
 trials.py   each inverse before a simulated device, in this process; time a sample
 summary.py  the table's texts
 page.py     table and figure as one page

@@ -1,4 +1,4 @@
-"""Models found on the same loops, judged on them, and tried before the same device."""
+"""Models identified on the same loops, judged on them, and tried before the same device."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -88,7 +88,7 @@ class ComparedModel:
         name: Name in the catalogue, or of the model file.
         title: What it is, for people.
         model: The model.
-        numbers: How many numbers were found for it; None for a model file.
+        numbers: How many numbers were identified for it; None for a model file.
         identify_s: Time that took; None for a model file.
         error: How far it is from the loops.
         inverse_ns: Time that one sample of its inverse takes.
@@ -158,12 +158,12 @@ def _row_mapping(loops: Sequence[SteadyLoop], row: ComparedModel) -> dict[str, A
 def compare(
     request: ComparisonRequest, clock: Callable[[], float], progress: OnProgress
 ) -> Comparison:
-    """Find each model on the loops, judge it on them, and try its inverse before the device.
+    """Identify each model on the loops, judge it on them, and try its inverse before the device.
 
     Args:
         request: What to compare.
         clock: Time in s, for what is measured.
-        progress: Told of what is being done.
+        progress: Called with how far it is and what is being done.
 
     Raises:
         InputError: Something asked for can't be used.
@@ -281,7 +281,7 @@ def check_free(names: Sequence[str], folder: Path, *, overwrite: bool) -> None:
 def save_models(
     comparison: Comparison, folder: Path, *, created: str, overwrite: bool
 ) -> tuple[Path, ...]:
-    """Write each model that was found here to ``folder/NAME.yaml``, ready to run.
+    """Write each model that was identified here to ``folder/NAME.yaml``, ready to run.
 
     Args:
         comparison: The models; those that came from files are left out.

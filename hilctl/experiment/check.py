@@ -37,16 +37,6 @@ class Checked:
     begun: Begun
 
     @property
-    def input_um(self) -> F64:
-        """The compensator's input: float64[n]; the reference's own array where that is it."""
-        return self.begun.input_um
-
-    @property
-    def state(self) -> F64 | None:
-        """The compensator's memory before the first sample; None where it is at rest."""
-        return self.begun.state
-
-    @property
     def state_size(self) -> int:
         """Numbers of state that are kept with each block: the memory, and the command before."""
         model, rate_hz = self.loaded.model, self.loaded.config.sample_rate_hz
@@ -55,7 +45,7 @@ class Checked:
     @property
     def records_input(self) -> bool:
         """Whether the compensator's input is recorded: not where it is the reference itself."""
-        own = self.input_um is not self.reference.values
+        own = self.begun.input_um is not self.reference.values
         return own or self.loaded.config.feedback is not None
 
 
@@ -128,7 +118,7 @@ def check_tuned(
     loaded, plain = checked.loaded, checked.reference
     change = abs(wanted[0] - now[0]) * np.abs(plain.values).max() + abs(wanted[1] - now[1])
     values = _led_in(plain.values * wanted[0] + wanted[1], samples)
-    input_um = _led_in(checked.input_um * wanted[0] + wanted[1], samples)
+    input_um = _led_in(checked.begun.input_um * wanted[0] + wanted[1], samples)
     tuned = Reference(values, plain.unit, plain.sample_rate_hz, plain.segments)
     problems = _reference_problems(loaded, tuned)
     problems += _command_problems(loaded, forecast_of(loaded, tuned, input_um))

@@ -10,9 +10,9 @@ import math
 import numpy as np
 
 from hilctl.base.errors import Problem
-from hilctl.experiment.feedback_keys import FeedbackConfig
 from hilctl.experiment.file import Experiment
 from hilctl.experiment.load import LoadedExperiment
+from hilctl.experiment.parts import FeedbackConfig
 from hilctl.loop.compensator import Compensator
 from hilctl.loop.feedback import Feedback, Gains
 

@@ -5,9 +5,8 @@ from typing import Annotated, Any, Literal, TypeVar
 from pydantic import BeforeValidator, Field
 
 from hilctl.base.strict import Strict
-from hilctl.experiment.feedback_keys import FeedbackConfig
 from hilctl.experiment.limits import Limits
-from hilctl.experiment.parts import Name, RecordingConfig, Timing
+from hilctl.experiment.parts import FeedbackConfig, Name, RecordingConfig, Timing
 from hilctl.loop.limiter import CommandLimits
 from hilctl.machine.settings import Realtime
 from hilctl.waveforms.spec import AnyWaveform
@@ -25,7 +24,7 @@ def _none_or_mapping(value: Any) -> Any:
 
 
 class Safe(Strict):
-    """Where the output goes on every way out of a run.
+    """The safe value, and the safe ramp to it with which every run ends.
 
     Attributes:
         value: Command of the safe state, in the device's unit.
@@ -41,7 +40,7 @@ class CompensatorConfig(Strict):
 
     Attributes:
         model: Model file, relative to the experiment file's folder.
-        correction: File of what ``hilctl learn`` has found for this waveform, relative to the same
+        correction: File that ``hilctl learn`` has written for this waveform, relative to the same
             folder; None where nothing is added to the reference.
         initial_state: Recording of the run before this one, relative to the same folder, so that
             the compensator begins with what that run left in the actuator, and reaches the
@@ -66,7 +65,7 @@ class Experiment(Strict):
         compensator: ``none``, read as None, or the model to invert.
         feedback: A controller around the compensator; None where there is none.
         limits: What the run is held to.
-        safe: Where the output goes on the way out.
+        safe: The safe value, and the safe ramp to it.
         timing: What happens to late ticks.
         recording: Where and how the run is recorded.
         realtime: How the loop's process asks for real time.

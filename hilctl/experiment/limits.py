@@ -17,7 +17,7 @@ class Limits(InterlockSettings):
         slew_a_per_s: Fastest change of the coil current.
         drive_v: Lowest and highest drive voltage, for devices driven in V.
         slew_v_per_s: Fastest change of the drive voltage.
-        stroke_um: Displacements that the sensor may show; outside, the run ends by its way out.
+        stroke_um: Displacements that the sensor may show; outside, the run ends by its safe ramp.
     """
 
     peak_current_a: Annotated[float, Field(gt=0.0)] | None = None

@@ -2,9 +2,9 @@
 
 command.py     identify from files; summary.py and page.py show what was found
 settings.py    every choice of a fit, once; the published ones
-catalogue.py   every kind of model: its name, how it is found, what data that takes
+catalogue.py   every kind of model: its name, how it is identified, what data that takes
 fit_model.py   fit a model of any kind, with its provenance
-job.py         what a fit is asked, and what it answers
+job.py         what a fit takes, and what it returns
 judge.py       how far a model is from data
 model_size.py  number of plays by loops held out; lag of a table
 workers.py     independent fits over threads, processes or a Dask cluster

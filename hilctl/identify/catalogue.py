@@ -1,4 +1,4 @@
-"""Every kind of model that can be found: its name, how it is found, and what data that takes."""
+"""Every kind of model that can be identified: its name, how, and what data that takes."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -26,9 +26,9 @@ class CatalogueEntry:
 
     Attributes:
         title: What it is, for people.
-        found_by: How it is found, for people.
+        found_by: How it is identified, for people.
         data: What that takes, for people.
-        fit: Finds it.
+        fit: Identifies it.
     """
 
     title: str
@@ -50,7 +50,7 @@ CATALOGUE: Mapping[FitKind, CatalogueEntry] = {
         "integrated, Omega: rate, asymmetry (6.18-6.24)", _SEARCH, ANY, _fit_integrated
     ),
     "staged": CatalogueEntry(
-        "Omega between field lag, structure and delay", "all found together", STAGES, fit_staged
+        "Omega between field lag, structure and delay", "identified together", STAGES, fit_staged
     ),
     "rdpi": CatalogueEntry("rate-dependent PI: no deadbands (5.11, 5.14)", _SEARCH, ANY, fit_plays),
     "asymmetric": CatalogueEntry(

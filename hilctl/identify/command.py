@@ -24,7 +24,7 @@ from hilctl.models.files import dump_model
 
 @dataclass(frozen=True, slots=True)
 class Identification:
-    """What was found, and how it does on data that it was not fitted to.
+    """An identified model, and how it does on data that it was not fitted to.
 
     Attributes:
         fit: The fit.

@@ -1,4 +1,4 @@
-"""What a fit is asked, and what it answers: the contract of every way to find a model."""
+"""What a fit takes, and what it returns: the contract of every way to identify a model."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -60,7 +60,7 @@ class StartOutcome:
 
 @dataclass(frozen=True, slots=True)
 class FoundModel:
-    """A model without provenance, and how it was found.
+    """A model without provenance, and how it was identified.
 
     Attributes:
         model: The model.

@@ -124,7 +124,8 @@ def _loop_error(record: Record, response_um: F64, target_um: F64) -> LoopError:
     area_error: float | None = None
     if isinstance(record, SteadyLoop):
         measured = loop_area(record.command, target_um)
-        area_error = 100.0 * (loop_area(record.command, response_um) / measured - 1.0)
+        if measured > 0.0:  # a line has no area to be wrong by a part of
+            area_error = 100.0 * (loop_area(record.command, response_um) / measured - 1.0)
     return LoopError(
         label=record.label,
         peak_percent=100.0 * float(np.max(np.abs(error_um))) / peak_to_peak,

@@ -1,4 +1,4 @@
-"""What was found as one self-contained page: model against data."""
+"""An identified model as one self-contained page: model against data."""
 
 import html
 from collections.abc import Sequence

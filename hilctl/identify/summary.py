@@ -1,4 +1,4 @@
-"""What was found, as rows and lines of text."""
+"""An identified model, as rows and lines of text."""
 
 from collections.abc import Sequence
 

@@ -19,21 +19,6 @@ from hilctl.base.arrays import F64
 from hilctl.kernels.jit import kernel
 
 
-@kernel("float64(float64, float64, float64)")
-def play_step(v: float, threshold: float, held: float) -> float:
-    """Advance one play operator by one sample (4.5).
-
-    Args:
-        v: Input.
-        threshold: Half the operator's width, >= 0, in the unit of ``v``.
-        held: The operator's previous output.
-
-    Returns:
-        The operator's output, within ``threshold`` of ``v``.
-    """
-    return max(v - threshold, min(v + threshold, held))
-
-
 @kernel("float64(float64, float64, float64, float64)")
 def stop_step(v: float, v_previous: float, threshold: float, held: float) -> float:
     """Advance one stop operator by one sample (section 3.3).

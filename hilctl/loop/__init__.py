@@ -1,12 +1,13 @@
 """Everything that a tick executes; no file, no log, no other thread.
 
 loop.py         block after block until the waveform ends, or something goes wrong
-plan.py         what a run does, whom the loop answers to, how a run ended
+plan.py         what a run does, and how it ended
+host.py         what the loop needs of its host: time, room for blocks, supervision
+block.py        one block of samples, in its slot from birth to answer
 pacer.py        absolute deadlines and the policy for late ticks
 tuning.py       gain and offset of a running reference
 compensator.py  the inverse of a model, in the loop's terms
 feedback.py     a controller around the compensator
 limiter.py      range and slew of every command: last before the device
-in_flight.py    blocks that were sent and have no answer yet
-interlocks.py   what ends a run, looked at in every answer
+interlocks.py   what ends a run, checked in every answer
 """

@@ -23,6 +23,7 @@ class Block:
         command: float64[B], command that is put out.
         displacement_um: float64[B], filled by the device.
         measured: float64[B], filled by the device where it measures its command.
+        columns: float64[k, B], all that :data:`hilctl.base.samples.COLUMNS` name, these six too.
         number: The slot's number since the start of the run; -1 where it is a spare one, which is
             not recorded.
         due: Whether the block is to be recorded: not while the loop only waits for answers.
@@ -31,6 +32,7 @@ class Block:
     """
 
     __slots__ = (
+        "columns",
         "command",
         "displacement_um",
         "due",
@@ -48,7 +50,7 @@ class Block:
     )
 
     def __init__(self, head: "memoryview[int]", state: F64, columns: F64, flags: U32) -> None:
-        self.head, self.state, self.flags = head, state, flags
+        self.head, self.state, self.columns, self.flags = head, state, columns, flags
         self.memory = state[:-1]
         # One by one: to take the rows of an array apart in one go takes three times as long.
         self.reference, self.input_um = columns[REFERENCE], columns[INPUT_UM]

@@ -10,7 +10,7 @@ from hilctl.loop.block import Block
 
 @dataclass(frozen=True, slots=True)
 class Tuning:
-    """A change of the reference that is wanted while it runs.
+    """A change of the reference that is requested while it runs.
 
     Attributes:
         gain: Factor of the reference.
@@ -32,7 +32,10 @@ class Host(Protocol):
         ...
 
     def claim(self, *, due: bool = True) -> Block:
-        """Return room for the next block: a spare slot where it is not due, or no room is left."""
+        """Return room for the next block: a spare slot where it is not due, or no room is left.
+
+        Its flags are 0, displacements and measured commands NaN: what no device fills is none.
+        """
         ...
 
     def sending(self, block: Block) -> None:
@@ -44,7 +47,7 @@ class Host(Protocol):
         ...
 
     def heartbeat(self, next_sample: int, late_ticks: int) -> str:
-        """Show that the loop lives, once a tick; return why the run should end, or nothing."""
+        """Write the heartbeat, once a tick; return why the run should end, or an empty text."""
         ...
 
     def closing(self) -> None:

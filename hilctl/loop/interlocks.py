@@ -1,4 +1,4 @@
-"""Interlocks: what ends a run by its way out, looked at in every sample that has come back.
+"""Interlocks: what ends a run by its safe ramp, checked in every sample that has come back.
 
 All of them are one compiled call a block. Each says at which sample it tripped, by a code for
 programs and a reason for people, and marks the samples by its flag.

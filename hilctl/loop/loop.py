@@ -55,7 +55,7 @@ class Loop:
         self._device = device
         self._host = host
         self._clock = host.clock
-        self._measures = device.info.measures_command
+        self._is_input = plan.input_um is plan.reference
         self._compensator = plan.compensator
         self._limiter = Limiter(plan.limits, 1.0 / plan.sample_rate_hz)
         self._interlocks = Interlocks(plan.interlocks, plan.interlock_settings, plan.sample_rate_hz)
@@ -119,6 +119,7 @@ class Loop:
         """Wait for the tick; return its block with the head filled in."""
         pacer, block_samples = self._pacer, self._plan.block
         skipped = pacer.wait() * block_samples
+        # Before the block is claimed: its number and the state kept with it are those after it.
         if skipped:
             self._pass_over(skipped)
         block = self._host.claim(due=due)
@@ -149,8 +150,9 @@ class Loop:
         self._compensator.process(passed, np.empty_like(passed))
 
     def _supervise(self) -> None:
-        """Show that the loop lives, and follow what is asked of the run."""
+        """Write the heartbeat, and follow what is requested of the run."""
         stop = self._host.heartbeat(self._next_sample, self._pacer.counters.late_ticks)
+        # The end of the waveform first: a stop or a late tick after it changes nothing any more.
         if self._next_sample >= self._plan.reference.size:
             self._leave("completed", "completed", "waveform completed")
         if self._phase is not _Phase.FOLLOWING:
@@ -194,17 +196,17 @@ class Loop:
         # The memory before the block, so that a replay can begin at any gap.
         self._compensator.state(block.memory)
         block.state[-1] = self._limiter.last
-        block.flags.fill(_SKIPPED if block.skipped else 0)
-        # A slot has been used before: what the device does not fill is not a measurement.
-        block.displacement_um.fill(np.nan)
-        if self._measures:
-            block.measured.fill(np.nan)
+        if block.skipped:
+            block.flags |= _SKIPPED
         block.following = self._phase is _Phase.FOLLOWING
         left = plan.reference.size - self._next_sample
         n = min(left, plan.block) if block.following else 0
         if n == plan.block:
-            whole = (block.reference, block.input_um, block.wanted, block.command, block.flags)
-            return False, self._follow(block, *whole)
+            reference, input_um = block.reference, block.input_um
+            wish = self._follow(
+                block, reference, input_um, block.wanted, block.command, block.flags
+            )
+            return False, wish
         first_invalid = -1
         if n > 0:
             parts = (block.reference[:n], block.input_um[:n], block.wanted[:n])
@@ -228,7 +230,8 @@ class Loop:
         factors = self._tuner.advance(wanted.size)
         if factors is None:
             reference[:] = plan.reference[start:stop]
-            input_um[:] = plan.input_um[start:stop]
+            # The reference itself, as a rule: a copy of what was copied is the quicker one.
+            input_um[:] = reference if self._is_input else plan.input_um[start:stop]
         else:
             tune(factors, plan.reference[start:stop], reference)
             tune(factors, plan.input_um[start:stop], input_um)
@@ -240,6 +243,7 @@ class Loop:
     def _exchange(self, sent: Block) -> None:
         """Send a block; judge and record the one whose displacements come back."""
         in_flight = self._in_flight
+        # Before the exchange: where it fails, the block is recorded as sent and not answered.
         in_flight.append(sent)
         early = len(in_flight) <= self._plan.latency_blocks
         answered = sent if early else in_flight[0]
@@ -289,6 +293,7 @@ class Loop:
         text = str(error) if self._code == "completed" else f"{self._reason}; then {error}"
         event = Event(self._next_sample, "error", "device_lost", str(error))
         self._host.record_event(event)
+        # Before the device: its time-outs would look like a hanging loop to the supervisor.
         self._host.closing()
         safe = True
         # The coil first: the samples stand in shared memory, and nothing is lost by waiting.

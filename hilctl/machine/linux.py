@@ -121,6 +121,7 @@ class LinuxProcess:
 
     def undo(self) -> None:
         """Go back to an ordinary process, as far as each step was taken."""
+        # First: the rest takes as long as it takes, and must not keep others from a CPU.
         self.set_ordinary()
         if self._cpus_before is not None:
             os.sched_setaffinity(0, self._cpus_before)

@@ -166,6 +166,8 @@ def prepare(settings: Realtime, system: System = _THIS_PROCESS) -> tuple[SetUpSt
     Returns:
         The steps in the order in which they were tried.
     """
+    # The heap before the lock, which keeps it in RAM; the CPU before the policy, so that none is
+    # taken from everybody else; SCHED_FIFO last, as the steps before it take milliseconds.
     return (
         _step("gc", "collected once, then off", system.freeze_gc),
         _step(

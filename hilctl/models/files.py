@@ -35,19 +35,6 @@ AnyModel: TypeAlias = Annotated[
     | DuhemModel,
     Field(discriminator="kind"),
 ]
-KINDS: tuple[str, ...] = (
-    "ppi",
-    "spi",
-    "rdpi",
-    "integrated",
-    "staged",
-    "butterfly",
-    "generalised",
-    "preisach",
-    "krasnoselskii_pokrovskii",
-    "bouc_wen",
-    "duhem",
-)
 
 
 class ModelFile(Strict):

@@ -120,6 +120,7 @@ class Resaved:
                 )
             case Channel():
                 self._channel(record)
+            # The end is written anew: what is added comes before it, and its counters change.
             case Metadata() if record.name != "hilctl.end":
                 writer.add_metadata(record.name, record.metadata)
             case Attachment():

@@ -71,7 +71,7 @@ _MESSAGES: dict[str, _Fields] = {
         "level": (2, _STRING, False),
         "code": (3, _STRING, False),
         "text": (4, _STRING, False),
-        # The last samples up to it, so that one message tells what led there.
+        # The last samples up to it, so that one message has what led there.
         "before_sample": (5, _UINT64, True),
         "before_flags": (10, _UINT32, True),
         **_columns("before", "before_"),

@@ -72,6 +72,7 @@ class RecordingWriter:
         if run.correction_yaml:
             self._attach("correction.yaml", run.correction_yaml, start_unix_ns)
         self._topics.register()
+        # Before the first sample: a file that is cut short must say what it is.
         self._writer.flush()
 
     def _attach(self, name: str, text: str, time_ns: int) -> None:
@@ -131,6 +132,7 @@ class OutputFile:
     def __init__(self, path: Path, *, overwrite: bool) -> None:
         self._path = path
         self._ours = not path.exists()
+        # Not "wb": what stands there is emptied only once the run starts, and under the lock.
         self.stream: BinaryIO = path.open("r+b" if overwrite and not self._ours else "xb")
         lock(self.stream, fcntl.LOCK_EX)
 

@@ -1,13 +1,15 @@
 """Two processes round one loop: shared memory, recording, requests, recovery.
 
 start.py           from an experiment file to a finished run
+job.py             the experiment as it goes to the loop's process
+assemble.py        from a checked experiment to its loop
 supervisor.py      starts the loop's process, records, makes the rig safe
-child.py           its hold on that process; hang_watch.py  whether it hangs
-loop_process.py    the loop's process
+child.py           the supervisor's hold on that process; hang_watch.py  whether it hangs
+loop_process.py    the loop's process; host.py  its side of the shared memory
 ring.py            sample blocks in shared memory, behind shared_page.py
 recorder.py        into the recording; metadata.py what it says of the run
 run_folder.py      runs that are going on, and who holds a device
-requests.py        what a run may be asked, over control_socket.py; client.py asks
+requests.py        requests to a run, over control_socket.py; client.py sends them
 systemd.py         readiness and watchdog of a service
 orphans.py         what dead runs left behind
 unpaced.py         a run of a simulated device that needs no real time

@@ -48,15 +48,15 @@ class LoopChild:
             pass_fds=inherits,
         )
         assert self._process.stdin is not None
-        with suppress(BrokenPipeError):  # it died at once, which is told where it is waited for
+        with suppress(BrokenPipeError):  # it died at once, which await_ready reports
             self._process.stdin.write(job.to_json().encode())
             self._process.stdin.close()
 
     def await_ready(self, stopped: Callable[[], bool]) -> None:
-        """Wait until it only needs the word to start.
+        """Wait until it needs only the start signal.
 
         Args:
-            stopped: Whether somebody has asked for a stop.
+            stopped: Whether a stop has been requested.
 
         Raises:
             InputError: It refuses what it is asked for; nothing has moved.
@@ -89,6 +89,7 @@ class LoopChild:
 
     def outcome(self) -> Outcome | str:
         """Return how it ended, or why it could not say so."""
+        # Before the exit code: the loop writes it last, with the device closed.
         if (outcome := self._page.outcome()) is not None:
             return outcome
         if self._page.get(Field.PHASE) == Phase.FAILED:

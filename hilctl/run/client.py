@@ -1,4 +1,4 @@
-"""Runs in the background: start one, find it, ask it, stop it."""
+"""Runs in the background: start one, find it, send it a request, stop it."""
 
 import subprocess
 import sys
@@ -39,7 +39,7 @@ def start_detached(
         experiment: Experiment file.
         settings: ``key=value`` texts over it.
         output: Recording to write; a name in the experiment's folder where None.
-        flags: Further words for ``hilctl run``.
+        flags: Further arguments of ``hilctl run``.
 
     Raises:
         InputError: It can't be used; nothing has moved.
@@ -115,7 +115,7 @@ def status_of(run: RunFolder) -> dict[str, Any]:
 
 
 def stop_run(run: RunFolder, wait_s: float) -> dict[str, Any]:
-    """Tell a run to end by its way out.
+    """Request a run to end by its safe ramp.
 
     Args:
         run: The run.

@@ -53,6 +53,7 @@ class ControlServer:
         self._clients: dict[int, _Client] = {}
         self._selector = selectors.DefaultSelector()
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        # Not chmod after bind: for that moment others could connect.
         before = os.umask(0o177)
         try:
             self._listener.bind(str(path))

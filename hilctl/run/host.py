@@ -34,7 +34,7 @@ class RingHost:
         self._silence_ns = silence_s * 1e9
 
     def heartbeat(self, next_sample: int, late_ticks: int) -> str:
-        """Show that the loop lives; return why the run should end, or an empty text."""
+        """Write the loop's heartbeat; return why the run should end, or an empty text."""
         numbers = self._numbers
         now_ns = self.clock.now_ns()
         numbers[_HEARTBEAT_NS] = now_ns

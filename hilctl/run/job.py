@@ -45,11 +45,12 @@ class Job:
     @classmethod
     def of(cls, checked: Checked, folder: RunFolder, *, supervisor: int, silence_s: float) -> Self:
         """Return the job of a checked experiment; its arrays are left in the run's folder."""
+        begun = checked.begun
         reference = input_um = folder.reference
         np.save(reference, checked.reference.values)
-        if checked.input_um is not checked.reference.values:
+        if begun.input_um is not checked.reference.values:
             input_um = folder.input_um
-            np.save(input_um, checked.input_um)
+            np.save(input_um, begun.input_um)
         return cls(
             experiment=checked.loaded.yaml_text,
             files=checked.loaded.files.texts,
@@ -57,7 +58,7 @@ class Job:
             ring=str(folder.ring),
             reference=str(reference),
             input_um=str(input_um),
-            state=None if checked.state is None else checked.state.tolist(),
+            state=None if begun.state is None else begun.state.tolist(),
             supervisor=supervisor,
             silence_s=silence_s,
         )
@@ -87,8 +88,10 @@ class Job:
         return resolve(document, Path(self.folder), files=TextFiles(self.files))
 
     def arrays(self) -> tuple[F64, F64]:
-        """Return reference and compensator's input: float64[n] each, mapped."""
-        return _mapped(self.reference), _mapped(self.input_um)
+        """Return reference and input, one array where they are the same: float64[n], mapped."""
+        reference = _mapped(self.reference)
+        same = self.input_um == self.reference
+        return reference, reference if same else _mapped(self.input_um)
 
 
 def _mapped(path: str) -> F64:

@@ -8,7 +8,6 @@ import json
 import signal
 import sys
 import time
-from dataclasses import asdict
 
 from hilctl.base.errors import DeviceError, HilctlError, InputError
 from hilctl.experiment.load import LoadedExperiment
@@ -37,8 +36,7 @@ def main() -> int:
         return _failed(page, str(error))
     except Exception as error:  # noqa: BLE001  the supervisor must know it and make the rig safe
         return _failed(page, f"the loop broke: {type(error).__name__}: {error}")
-    page.write_text(PageText.OUTCOME, json.dumps(asdict(outcome)))
-    page.put(Field.PHASE, Phase.ENDED)
+    page.leave_outcome(outcome)
     return 0
 
 
@@ -58,16 +56,20 @@ def run_job(job: Job, ring: SampleRing, loaded: LoadedExperiment) -> Outcome:
     config, device, page = loaded.config, loaded.device, ring.page
     host = RingHost(ring, SystemClock(), job.supervisor, job.silence_s)
     loop = assemble(loaded, *job.arrays(), job.memory, host)
+    # After the warm-up, so that all it has mapped gets locked; before the device is opened, so that
+    # a refusal moves nothing.
     steps = prepare(config.realtime)
     if config.realtime.require:
         require(steps)
     device.open(config.sample_rate_hz, config.block)
     try:
         page.write_text(PageText.SET_UP, json.dumps(step_facts(steps)))
+        # After the text, which the supervisor reads then.
         page.put(Field.PHASE, Phase.READY)
         _await_go(page, host)
         page.put(Field.PHASE, Phase.RUNNING)
         outcome = loop.run(page.get(Field.START_NS))
+        # Before the device is closed: that may take its time-outs, and is no hang.
         host.closing()
     except BaseException:
         device.make_safe(config.safe.value)

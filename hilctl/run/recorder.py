@@ -72,6 +72,7 @@ class Recorder:
         """
         self._unix_ns = steady_unix_ns()
         try:
+            # Before the file is opened for writing: that empties one which stood there.
             facts = self._facts(start_unix_ns, set_up)
             self._writer = RecordingWriter(self._file.begin(), facts)
         except OSError as error:
@@ -83,6 +84,7 @@ class Recorder:
 
     def batch(self, batch: Batch) -> None:
         """Write a batch, or count it as lost where the file can't be written any more."""
+        # Before it is written: what a failing write loses is counted all the same.
         self._next_sample = int(batch.heads[-1, Head.FIRST_SAMPLE]) + batch.flags.shape[1]
         self._tail.add(batch)
         self._write(partial(self._begun.batch, batch))
@@ -95,6 +97,7 @@ class Recorder:
     def flush(self) -> None:
         """Hand all that was written to the kernel."""
         self._write(self._begun.flush)
+        # After the flush: should a later write fail, no more than this is sure to be in the file.
         if not self.error:
             self._flushed = self._begun.samples
 
@@ -115,6 +118,7 @@ class Recorder:
         if self.error:
             with suppress(OSError):  # the disk's refusal is known already
                 self._file.stream.close()
+        # Closing writes what is still buffered: a full disk may show only here.
         self._write(self._file.stream.close)
 
     @property

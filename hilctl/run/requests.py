@@ -1,4 +1,4 @@
-"""What a running supervisor may be asked: where it stands, to stop, to move the reference."""
+"""Requests to a running supervisor: its status, to stop, to move the reference."""
 
 import time
 from typing import Annotated, Any, Literal
@@ -47,7 +47,7 @@ _REQUESTS: TypeAdapter[StatusRequest | StopRequest | SetRequest] = TypeAdapter(
 
 
 class Requests:
-    """Answers what a run is asked.
+    """Answers the requests to a run.
 
     Args:
         checked: The experiment.
@@ -65,7 +65,7 @@ class Requests:
         self._recorder = recorder
         self._tuning = (1.0, 0.0)
         self.stop = False
-        """Whether the run was told to stop."""
+        """Whether a stop was requested."""
 
     def answer(self, line: bytes) -> dict[str, Any]:
         """Return the answer to one line of JSON.
@@ -111,6 +111,7 @@ class Requests:
             raise InputError("set: the run is on its way to the safe value")
         if page.get(Number.NEXT_SAMPLE) >= self._checked.forecast.samples:
             raise InputError("set: the waveform is over; the run is on its way to the safe value")
+        # Only after the loop has taken it may the change before be written over.
         if page.get(Number.TUNE_WANTED) != page.get(Number.TUNE_TAKEN):
             raise InputError("set: the change before has not been taken yet: try again")
         gain = self._tuning[0] if request.gain is None else request.gain
@@ -124,6 +125,7 @@ class Requests:
         page.put_float(Number.TUNE_GAIN, gain)
         page.put_float(Number.TUNE_OFFSET, offset)
         page.put(Number.TUNE_SAMPLES, samples)
+        # Last: the loop reads the three numbers above as soon as it sees a new count.
         page.put(Number.TUNE_WANTED, page.get(Number.TUNE_WANTED) + 1)
         self._tuning = (gain, offset)
         return {"gain": gain, "offset": offset, "over_s": request.over_s}

@@ -15,7 +15,7 @@ class RunResult:
         code: ``completed``, ``stopped`` or ``fault``.
         reason: One line for people.
         safe: Whether the output is known to be at its safe value.
-        stop_signal: Number of the signal that stopped it, SIGTERM for a stop order, or 0.
+        stop_signal: Number of the signal that stopped it, SIGTERM for a requested stop, or 0.
         samples: Samples recorded.
         missing: Samples counted as dropped, skipped or lost.
         late_ticks: Ticks that woke late.

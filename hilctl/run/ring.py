@@ -76,7 +76,7 @@ class SampleRing:
         self._area = self._views(state_size)
         self._heads = memoryview(self._area.heads.data.cast("B")).cast("q")
         self._sent, self._spares_used = self.page.get(Field.SENT), 0
-        self._tail = self.page.get(Field.TAIL)
+        self._tail = self._released = self.page.get(Field.TAIL)
 
     @classmethod
     def create(
@@ -98,17 +98,19 @@ class SampleRing:
         size = sum(_padded(each) for each in _sizes(slots + spare, block, state_size))
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
         try:
+            # Claimed now: memory that is not to be had must fail here, and not in mid-run.
             os.posix_fallocate(descriptor, 0, _PAGE_SIZE + size)
             with mmap.mmap(descriptor, _PAGE_SIZE) as memory:
                 numbers = memoryview(memory).cast("q")
                 numbers[Field.SLOTS], numbers[Field.BLOCK] = slots, block
                 numbers[Field.STATE_SIZE], numbers[Field.SPARE] = state_size, spare
+                # Last: a ring whose maker died meanwhile is not taken for one.
                 numbers[Field.MAGIC] = _MAGIC
                 numbers.release()
         finally:
             os.close(descriptor)
         made = cls(path)
-        made._area.columns.fill(np.nan)  # what no device fills is not a measurement
+        made._clean(slice(None))
         return made
 
     def _views(self, state_size: int) -> Batch:
@@ -136,6 +138,7 @@ class SampleRing:
         else:
             slot, number = self.slots + self._spares_used % self._spare, -1
             self._spares_used += 1
+            self._clean(slice(slot, slot + 1))
         at, area = slot * _HEAD_NUMBERS, self._area
         head = self._heads[at : at + _HEAD_NUMBERS]
         # Views are made anew: those of all slots, kept, would be out of the processor's cache.
@@ -171,6 +174,7 @@ class SampleRing:
         first = self._tail % self.slots
         count = min(there, self.slots - first)
         batch = self._area.rows(slice(first, first + count))
+        # HEAD may be seen before the block that it counts: the sequence numbers decide.
         expected = np.arange(self._tail + 1, self._tail + count + 1)
         wrong = np.flatnonzero(batch.heads[:, Head.SEQUENCE] != expected)
         if wrong.size:  # not yet visible, or damaged: what stands before it is good
@@ -200,7 +204,17 @@ class SampleRing:
     def release(self) -> None:
         """Give the room of all that was taken back to the producer: it is safe elsewhere."""
         self.page.release_events()
+        # Cleaned here and not in the tick; before the room is given, or the loop would be in it.
+        first, count = self._released % self.slots, self._tail - self._released
+        self._clean(slice(first, min(first + count, self.slots)))
+        self._clean(slice(0, max(0, first + count - self.slots)))
+        self._released = self._tail
         self.page.put(Field.TAIL, self._tail)
+
+    def _clean(self, slots: slice) -> None:
+        """Let slots hold no flag and no answer."""
+        self._area.flags[slots] = 0
+        self._area.columns[slots, ANSWERS] = np.nan
 
     def unanswered(self, next_sample: int) -> Batch | None:
         """Return the blocks that were sent and never answered; for when the producer has died.

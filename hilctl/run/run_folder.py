@@ -100,7 +100,7 @@ def base_folder() -> Path:
     folder = Path(given) if given else memory_folder() / f"hilctl-{os.getuid()}"
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        found = folder.lstat()
+        found = folder.lstat()  # a link that somebody else has put there is not ours to follow
     except OSError as error:
         raise RunError(f"{folder}: can't be made: {error.strerror}") from None
     if found.st_uid != os.getuid() or found.st_mode & 0o022:
@@ -139,6 +139,7 @@ def run_folder(
         stack.callback(shutil.rmtree, path, ignore_errors=True)
         shared = stack.enter_context(_locked(path / "run.lock"))
         stack.enter_context(_locked(path / "supervisor.lock"))
+        # After the locks: others know a run by its card, and take one without locks for dead.
         (path / _CARD).write_text(json.dumps(asdict(card)), encoding="utf-8")
         yield RunFolder(path, card), [shared]
 
@@ -160,9 +161,10 @@ def held_devices(holds: Sequence[str], user: str) -> Iterator[list[int]]:
     folder = memory_folder() / "hilctl-devices"
     with suppress(FileExistsError):
         folder.mkdir()
-        folder.chmod(0o1777)
+        folder.chmod(0o1777)  # the umask cuts the mode that mkdir is given
     with ExitStack() as stack:
         descriptors = []
+        # In one order for all: else two runs might each get one of two, and both be refused.
         for name in sorted(set(holds)):
             path = folder / (re.sub(r"[^A-Za-z0-9.:_-]+", "_", name) + ".lock")
             descriptors.append(stack.enter_context(_held(path, name, user)))
@@ -191,6 +193,7 @@ def _held(path: Path, name: str, user: str) -> Iterator[int]:
 def _open_shared(path: Path) -> int:
     """Open a lock file that every user of the machine may lock."""
     try:
+        # Without O_CREAT first: in a sticky folder Linux may refuse it on another user's file.
         return os.open(path, os.O_RDWR)
     except PermissionError:
         return os.open(path, os.O_RDONLY)
@@ -222,7 +225,7 @@ def taken_over(run: RunFolder) -> Iterator[bool]:
         return
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        held = run.path.exists()
+        held = run.path.exists()  # under the lock: who had it before may have removed the folder
     except BlockingIOError:
         held = False
     try:
@@ -237,6 +240,7 @@ def _is_locked(path: Path) -> bool:
     except OSError:
         return False
     try:
+        # Shared: two that look at once must not take each other for the holder.
         fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
     except BlockingIOError:
         return True

@@ -5,7 +5,7 @@ Each number has one writer, and is written whole. Nobody ever waits for the othe
 
 import json
 from contextlib import suppress
-from dataclasses import asdict
+from dataclasses import asdict, astuple
 from enum import IntEnum
 from mmap import mmap
 
@@ -108,6 +108,16 @@ _REASONS = {
 }
 
 
+_LATENESS = (
+    Field.LATE_TICKS,
+    Field.SKIPPED_TICKS,
+    Field.WORST_LATE_NS,
+    Field.WORST_LATE_TICK,
+    Field.LONGEST_LATE_RUN,
+)
+"""Where each field of :class:`~hilctl.loop.pacer.Lateness` stands, in its order."""
+
+
 class SharedPage:
     """The page, seen from either side.
 
@@ -149,21 +159,18 @@ class SharedPage:
 
     def lateness(self) -> Lateness:
         """Return the counters of late ticks that the loop left."""
-        return Lateness(
-            late_ticks=self.get(Field.LATE_TICKS),
-            skipped_ticks=self.get(Field.SKIPPED_TICKS),
-            worst_ns=self.get(Field.WORST_LATE_NS),
-            worst_tick=self.get(Field.WORST_LATE_TICK),
-            longest_run=self.get(Field.LONGEST_LATE_RUN),
-        )
+        return Lateness(*map(self.get, _LATENESS))
 
     def leave_lateness(self, lateness: Lateness) -> None:
         """Leave the counters of late ticks for the supervisor."""
-        self.put(Field.LATE_TICKS, lateness.late_ticks)
-        self.put(Field.SKIPPED_TICKS, lateness.skipped_ticks)
-        self.put(Field.WORST_LATE_NS, lateness.worst_ns)
-        self.put(Field.WORST_LATE_TICK, lateness.worst_tick)
-        self.put(Field.LONGEST_LATE_RUN, lateness.longest_run)
+        for field, count in zip(_LATENESS, astuple(lateness), strict=True):
+            self.put(field, count)
+
+    def leave_outcome(self, outcome: Outcome) -> None:
+        """Leave how the run ended for the supervisor."""
+        self.write_text(PageText.OUTCOME, json.dumps(asdict(outcome)))
+        # The text first: the phase says that it is there.
+        self.put(Field.PHASE, Phase.ENDED)
 
     def outcome(self) -> Outcome | None:
         """Return how the loop said that the run ended; None where it said nothing."""
@@ -183,6 +190,7 @@ class SharedPage:
         while len(raw := json.dumps({**asdict(event), "text": text})) > _EVENT_BYTES - 8:
             text = text[: len(text) * 3 // 4]
         self._write(_EVENTS_AT + head % _EVENT_SLOTS * _EVENT_BYTES, _EVENT_BYTES, raw)
+        # Last: an event that is counted is whole.
         self.put(Field.EVENT_HEAD, head + 1)
 
     def pop_events(self) -> list[Event]:

@@ -79,12 +79,14 @@ class Supervisor:
         config = self._config
         with ExitStack() as stack:
             user = f"run {config.name} (process {os.getpid()}, recording {self._output})"
+            # The device before the recording: a run that is refused must not touch a file.
             locks = stack.enter_context(held_devices(self._checked.loaded.device.info.holds, user))
             recorder = Recorder(self._checked, self._output, overwrite=self._overwrite)
             try:
                 folder, own = stack.enter_context(
                     run_folder(config.name, self._output, time.time())
                 )
+                # Before there is a loop: a signal must stop it, not just end this process.
                 stack.enter_context(self._signals())
                 ring = self._make_ring(folder)
                 child = LoopChild(self._checked, folder, ring, locks + own, self._silence_s)
@@ -103,7 +105,7 @@ class Supervisor:
             return self._result(started.end(self._on_progress), started)
 
     def _start(self, ring: SampleRing, child: LoopChild, recorder: Recorder) -> None:
-        """Wait for the loop to be ready, and give it the word to start."""
+        """Wait for the loop to be ready, and give it the start signal."""
         page = ring.page
         try:
             child.await_ready(lambda: self._stop_signal != 0)
@@ -111,10 +113,10 @@ class Supervisor:
             unix_ns = time.time_ns() + start_ns - time.monotonic_ns()
             recorder.begin(unix_ns, json.loads(page.read_text(PageText.SET_UP)))
         except (RunError, InputError):
-            child.kill()  # it waits for the word to start, so nothing has moved
+            child.kill()  # it waits for the start signal, so nothing has moved
             recorder.give_back()
             raise
-        # The heartbeat before the word: the loop would take an old one for silence.
+        # GO last: the loop then reads its start time, and would take an old heartbeat for silence.
         page.put(Field.SUPERVISOR_HEARTBEAT_NS, time.monotonic_ns())
         page.put(Field.START_NS, start_ns)
         page.put(Field.GO, 1)
@@ -189,7 +191,7 @@ class _StartedRun:
         self._hung = False
 
     def attend(self, stop_signal: int, on_progress: Callable[[Progress], None]) -> bool:
-        """Show that this side lives, pass a stop on, and record; return whether the loop lives."""
+        """Write the heartbeat, pass a stop on, and record; return whether the loop lives."""
         page = self.ring.page
         # Asked before the ring is drained: of a loop that has ended, nothing can come after that.
         ended = self.child.ended
@@ -204,6 +206,7 @@ class _StartedRun:
             self._flushed = now
         if not ended and self._watch.hangs(time.monotonic_ns()):
             self._hung = True
+            # Before the output is made safe: many devices take one connection only.
             self.child.kill()
         return not ended
 
@@ -251,5 +254,6 @@ class _StartedRun:
             total, late = self._checked.forecast.samples, page.get(Field.LATE_TICKS)
             compensated = self._config.compensator is not None
             on_progress(Progress(recorder.samples, total, late, compensated, batch))
+        # After the samples: an event is recorded with those that led to it.
         for event in page.pop_events():
             recorder.event(event)

@@ -1,4 +1,4 @@
-"""Word to systemd: ready, alive, stopping. Nothing where no service manager listens."""
+"""Notifications to systemd: ready, watchdog, stopping; none without a service manager."""
 
 import os
 import socket

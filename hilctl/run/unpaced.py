@@ -13,7 +13,7 @@ import numpy as np
 from hilctl.base.device import Clock
 from hilctl.base.errors import InputError
 from hilctl.base.events import Event
-from hilctl.base.samples import Batch
+from hilctl.base.samples import ANSWERS, Batch
 from hilctl.experiment.check import Checked
 from hilctl.loop.block import Block
 from hilctl.loop.host import Tuning
@@ -93,7 +93,10 @@ class BatchHost:
         """Pass on what has been gathered."""
         if self._answered > self._first:
             size = self._room.heads.shape[0]
-            self._on_batch(self._room.rows(np.arange(self._first, self._answered) % size))
+            taken = np.arange(self._first, self._answered) % size
+            self._on_batch(self._room.rows(taken))
+            self._room.flags[taken] = 0
+            self._room.columns[taken[:, None], ANSWERS] = np.nan
             self._first = self._answered
 
     def heartbeat(self, next_sample: int, late_ticks: int) -> str:
@@ -101,14 +104,15 @@ class BatchHost:
         return self._stop()
 
     def closing(self) -> None:
-        """Do nothing: nobody watches."""
+        """Do nothing: no supervisor watches."""
 
     def tuning(self) -> Tuning | None:
-        """Return no change: nobody asks for one."""
+        """Return no change: nobody requests one."""
         return None
 
     def record_event(self, event: Event) -> None:
         """Pass an event on, after the blocks before it."""
+        # An event is recorded with the samples that led to it.
         self.flush()
         self._on_event(event)
 
@@ -159,7 +163,7 @@ def _run(checked: Checked, recorder: Recorder) -> tuple[Outcome, Lateness]:
         on_event=recorder.event,
         stop=lambda: recorder.error,
     )
-    samples = (checked.reference.values, checked.input_um, checked.state)
+    samples = (checked.reference.values, checked.begun.input_um, checked.begun.state)
     loop = assemble(loaded, *samples, host, paced=False)
     device.open(config.sample_rate_hz, config.block)
     try:

@@ -198,7 +198,7 @@ class FileWaveform(_Shape):
         return last_row
 
 
-SinglePart: TypeAlias = Annotated[
+_Single: TypeAlias = (
     Sine
     | Triangle
     | ComplexHarmonic
@@ -207,9 +207,9 @@ SinglePart: TypeAlias = Annotated[
     | Step
     | Hold
     | Multisine
-    | FileWaveform,
-    Field(discriminator="kind"),
-]
+    | FileWaveform
+)
+SinglePart: TypeAlias = Annotated[_Single, Field(discriminator="kind")]
 
 
 class Sequence(Strict):
@@ -230,16 +230,4 @@ class Sequence(Strict):
         return parts
 
 
-AnyWaveform: TypeAlias = Annotated[
-    Sine
-    | Triangle
-    | ComplexHarmonic
-    | GrowingOrDecaying
-    | Chirp
-    | Step
-    | Hold
-    | Multisine
-    | FileWaveform
-    | Sequence,
-    Field(discriminator="kind"),
-]
+AnyWaveform: TypeAlias = Annotated[_Single | Sequence, Field(discriminator="kind")]

@@ -15,8 +15,8 @@ import pytest
 from hilctl.base.errors import DeviceError
 from hilctl.experiment.registry import device_class
 from hilctl_drivers.emulator.options import EmulatorOptions
-from hilctl_drivers.emulator.setup import emulated
 from hilctl_drivers.profile import load_profile, shipped_profiles
+from tests.fakes import emulated
 
 SERIAL = (
     "adam_4024_ascii agilent_34970a own", "adam_4024_ascii only_reads same", "agilent_34970a",

@@ -231,7 +231,7 @@ def test_short_stop_of_the_supervisor_loses_nothing(going, stopped_s):
 
 
 def test_run_that_was_left_in_peace_is_whole(going):
-    """After all that, it ends by its way out, and every sample is there and replays."""
+    """After all that, it ends by its safe ramp, and every sample is there and replays."""
     await_state("running")
     assert hilctl("stop")["ended"]
     recording = read(going)

@@ -1,4 +1,4 @@
-"""Whole runs that stream over Modbus with things going wrong: one way out, judged by the device."""
+"""Whole runs that stream over Modbus with things going wrong: one ramp, judged by the device."""
 
 import os
 import signal

@@ -116,7 +116,7 @@ def test_short_stop_of_the_loop_costs_no_sample(tmp_path, stopped_s):
 
 
 def test_stop_beyond_the_limit_ends_the_run(tmp_path):
-    """A loop that wakes too late takes the way out, if it was not killed before."""
+    """A loop that wakes too late takes the safe ramp, if it was not killed before."""
     run = Run(tmp_path, timing={"max_late_s": 0.3})
     os.kill(run.loop, signal.SIGSTOP)
     time.sleep(0.5)

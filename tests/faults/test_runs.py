@@ -1,4 +1,4 @@
-"""Whole runs as a user starts them, with things going wrong: one way out, nothing lost."""
+"""Whole runs as a user starts them, with things going wrong: one safe ramp, nothing lost."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""Whole runs over text lines and board frames with things going wrong: one way out, every time."""
+"""Whole runs over text lines and board frames with things going wrong: one ramp, every time."""
 
 import re
 import signal

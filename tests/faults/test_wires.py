@@ -1,4 +1,4 @@
-"""Whole runs over Modbus with things going wrong: one way out, judged by what was put out."""
+"""Whole runs over Modbus with things going wrong: one safe ramp, judged by what was put out."""
 
 import os
 import signal

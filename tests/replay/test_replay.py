@@ -13,11 +13,11 @@ from hilctl.experiment.initial_state import initial_state_after
 from hilctl.loop.compensator import Compensator
 from hilctl.models.base import HysteresisModel
 from hilctl.models.files import dump_model
-from hilctl.models.published import terfenol_rdpi
 from hilctl.models.staged import FieldLag, StagedModel, Structure
 from hilctl.recording.data import Recording
 from hilctl.recording.reader import read
 from hilctl.run.start import start_run
+from tests.published import terfenol_rdpi
 
 GOLDEN = sorted((Path(__file__).parents[2] / "recordings" / "golden").glob("*.mcap"))
 

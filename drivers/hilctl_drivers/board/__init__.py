@@ -6,3 +6,6 @@ session.py  one conversation
 timing.py   how long a block takes
 wire.py     sample by sample, and through a FIFO
 """
+
+LINK_KINDS = {"frames": f"{__name__}.profile:FrameProfile"}
+"""What a profile's ``link.kind`` says of it: where the class of such profiles stands."""

@@ -161,6 +161,7 @@ class BoardSession:
                 f"reply {found_kind:02x} to message {found_seq}, "
                 f"asked was {kind:02x} in message {seq}"
             )
+        # Before the size is looked at: a refusal ends at its status.
         _raise_refusal(status)
         if len(payload) < reply.size:
             raise Mismatch(f"reply {found_kind:02x} of {len(payload)} bytes, wanted {reply.size}")

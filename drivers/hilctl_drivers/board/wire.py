@@ -67,7 +67,7 @@ class BoardWire(SerialWire):
     def put_out(self, value: float) -> None:
         """See :meth:`~hilctl_drivers.serial.wire.SerialWire.put_out`.
 
-        A board whose watchdog has tripped is armed and told again.
+        A board whose watchdog has tripped is armed, and the value sent again.
         """
         try:
             self._put_out(value)
@@ -159,7 +159,7 @@ class BoardStream(BoardWire):
         self._block = 0
         self._next_sample = 0
         self.fifo_level_min = 0
-        """Lowest level that an answer has told of since the output began to move."""
+        """Lowest level that an answer has reported since the output began to move."""
 
     def open(self, sample_rate_hz: float, block: int) -> None:
         """See :meth:`~hilctl_drivers.serial.wire.SerialWire.open`; starts no clock yet."""
@@ -167,6 +167,7 @@ class BoardStream(BoardWire):
         check_feeds(self._setup.options.watchdog_timeout_s, sample_rate_hz / block)
         facts = self._connect(self._setup.link(extra_s=block / sample_rate_hz))
         self._check_board(facts, sample_rate_hz, block)
+        # Before the clock: from the first sample on, the board must know where to go without us.
         self._arm()
         prefill = self._latency_blocks * block
         self._session.set_clock(sample_rate_hz, prefill)
@@ -194,6 +195,7 @@ class BoardStream(BoardWire):
 
     def close(self) -> None:
         """Stop the clock and disarm; the output holds its last value."""
+        # The clock first: an output that moves must not be without its watchdog.
         self._session.set_clock(0.0, 0)
         self._disarm()
 

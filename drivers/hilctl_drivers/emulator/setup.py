@@ -4,11 +4,9 @@ Two Modbus devices share a line, or a gateway, by unit id, and two text devices 
 or each has a port of its own.
 """
 
-import threading
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeAlias
 
@@ -108,30 +106,6 @@ def build(options: EmulatorOptions, clock_ns: Callable[[], int] = time.monotonic
         reader_unit_id=plan.reader_unit_id,
         options={**plan.channels(), **plan.places(addresses)},
     )
-
-
-@contextmanager
-def emulated(
-    options: EmulatorOptions, clock_ns: Callable[[], int] = time.monotonic_ns
-) -> Iterator[Emulator]:
-    """Serve an emulator in a thread; its ``options`` say how to reach it.
-
-    Args:
-        options: What to emulate.
-        clock_ns: See :func:`build`.
-
-    Raises:
-        InputError: See :func:`build`.
-    """
-    emulator = build(options, clock_ns)
-    thread = threading.Thread(target=emulator.server.run)
-    thread.start()
-    try:
-        yield emulator
-    finally:
-        emulator.server.stop()
-        thread.join()
-        emulator.log.close()
 
 
 def _opened(server: EmulatorServer, port: Port, host: str) -> str:

@@ -97,6 +97,7 @@ class ModbusStream(DacDevice):
         addresses = base.writer.address(base.output), base.writer.address(base.input)
         stream.prepare(sample_rate_hz, *addresses)
         setup.check_capacity(block, stream.capacity)
+        # Armed last: the steps above may take longer than its time-out.
         self._guard.arm(session, sample_rate_hz / block)
         self._stream = stream
         self._next_sample = 0
@@ -124,6 +125,7 @@ class ModbusStream(DacDevice):
             rule = f"samples must follow one another, {self._next_sample} is next"
             raise DeviceError(f"{rule}, got {first_sample}: open again to start at 0")
         gain, offset, um_per_unit, offset_um = self._factors
+        # Queued before the readings are waited for: meanwhile the device must not run dry.
         stream.feed((command - offset) / gain)
         self._next_sample += command.size
         readings = self._readings(stream, command.size)
@@ -151,12 +153,14 @@ class ModbusStream(DacDevice):
         self._session = session = self._connect(base.writer)
         session.link.open()
         self._guard.clear_trip(session)
+        # A stream that runs would write over the safe value with its next scan.
         self._stream_on(session).stop()
         session.write_bytes(base.output, base.output.format.encode(base.chain.output(command)))
 
     def _close(self) -> None:
         session, stream = self._session, self._stream
         if session is not None and stream is not None:
+            # The stream first: an output that moves must not be without its watchdog.
             stream.stop()
             self._guard.disarm(session)
             session.run(self._setup.base.writer.profile.close)

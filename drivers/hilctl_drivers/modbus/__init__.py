@@ -8,3 +8,6 @@ setup.py         an experiment's options, held against the profile
 watchdog.py      the module's host watchdog
 device.py        the device, and the one that reads the sensor where it is another
 """
+
+LINK_KINDS = dict.fromkeys(("tcp", "rtu"), f"{__name__}.profile:ModbusProfile")
+"""What a profile's ``link.kind`` says of it: where the class of such profiles stands."""

@@ -1,4 +1,4 @@
-"""Registers in a profile: channels, the steps that set a device up, and what tells of a trip."""
+"""Registers in a profile: channels, the steps that set a device up, and the flag of a trip."""
 
 from typing import Annotated, Literal, Self, TypeAlias
 

@@ -6,8 +6,7 @@ read and then a write; the read may go to another device. Nothing is sent twice,
 the last reply has come.
 """
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import replace
 from typing import ClassVar, TypeAlias
 
@@ -25,7 +24,7 @@ from hilctl_drivers.modbus.pdu import (
 from hilctl_drivers.modbus.setup import ModbusOptions, ModbusSetup
 from hilctl_drivers.modbus.watchdog import ModbusGuard
 from hilctl_drivers.wire.errors import Refused
-from hilctl_drivers.wire.links import NoAnswerError
+from hilctl_drivers.wire.links import NoAnswerError, naming
 
 Swap: TypeAlias = Callable[[bytes], bytes]
 """Write these register bytes to the output, return those of the input.
@@ -71,6 +70,7 @@ class ModbusDac(DacDevice):
         already. Only then is it known what rate it can keep.
         """
         del block
+        # Kept before it is opened: after a step that fails, _release must find it.
         self._pair = pair = _Pair(self._setup)
         pair.open()
         # A device that has tripped refuses the steps that follow.
@@ -96,12 +96,14 @@ class ModbusDac(DacDevice):
     def _put_out(self, command: float) -> None:
         self._release()  # many devices take one connection only
         self._pair = pair = _Pair(self._setup)
+        # No self-test, no init steps, no reader: none of them may cost the safe value.
         pair.writer.link.open()
         self._guard.clear_trip(pair.writer)
         pair.put_out(self._encode(self._setup.chain.output(command)))
 
     def _close(self) -> None:
         if self._pair is not None:
+            # First: nothing feeds it any more, and it would trip while the close steps run.
             self._guard.disarm(self._pair.writer)
             self._pair.tear_down()
 
@@ -127,7 +129,10 @@ class _Pair:
         self.writer = setup.writer.session()
         self.reader = self.writer
         self._one = not setup.reads_elsewhere
+        self._reader = ""
         if not self._one:
+            other = setup.reader
+            self._reader = f"reader {other.name}, unit {other.unit} at {other.place}"
             self.reader = setup.reader.session(self.writer.link if setup.shares_link else None)
 
     def open(self) -> None:
@@ -140,7 +145,7 @@ class _Pair:
         self.writer.check_selftest()
         if self._one:
             return
-        with self._reader_named():
+        with naming(self._reader):
             if self.reader.link is not self.writer.link:
                 self.reader.link.open()
             self.reader.check_selftest()
@@ -153,7 +158,7 @@ class _Pair:
         """
         self.writer.run(self.writer.profile.init)
         if not self._one:
-            with self._reader_named():
+            with naming(self._reader):
                 self.reader.run(self.reader.profile.init)
 
     def tear_down(self) -> None:
@@ -164,7 +169,7 @@ class _Pair:
         """
         self.writer.run(self.writer.profile.close)
         if not self._one:
-            with self._reader_named():
+            with naming(self._reader):
                 self.reader.run(self.reader.profile.close)
 
     def release(self) -> None:
@@ -182,7 +187,7 @@ class _Pair:
         Raises:
             DeviceError: The input or the output can't be read.
         """
-        with self._reader_named():
+        with naming(self._reader):
             self.reader.read_bytes(self._setup.input)
         swap = self._combined()
         readback = self._setup.output.readback_register
@@ -224,10 +229,8 @@ class _Pair:
             return found
 
         def named_pair(data: bytes) -> bytes:
-            try:
+            with naming(self._reader):
                 found = reader.call(read)
-            except DeviceError as error:
-                raise self._named(error) from None
             writer.call(write, data)
             return found
 
@@ -248,17 +251,3 @@ class _Pair:
         transact, usual = self.writer.link.transact, transaction.reply_size
         request, missing, reply = transaction.request, transaction.missing, transaction.reply
         return lambda data: reply(transact(request(data), missing, usual))
-
-    @contextmanager
-    def _reader_named(self) -> Iterator[None]:
-        try:
-            yield
-        except DeviceError as error:
-            raise self._named(error) from None
-
-    def _named(self, error: DeviceError) -> DeviceError:
-        """Return an error that says that the reader made it, where it is another device."""
-        if self._one:
-            return error
-        reader = self._setup.reader
-        return DeviceError(f"reader {reader.name}, unit {reader.unit} at {reader.place}: {error}")

@@ -109,7 +109,7 @@ class ModbusWatchdog(Watchdog):
     safe: dict[Name, tuple[ModbusStep, ...]] = Field(
         default={}, description="steps that set an output's safe value, by output"
     )
-    tripped: TripFlag | Literal["none"] = Field(default="none", description="what tells of a trip")
+    tripped: TripFlag | Literal["none"] = Field(default="none", description="where a trip shows")
 
     @model_validator(mode="after")
     def _can_be_fed(self) -> Self:

@@ -92,7 +92,7 @@ class ModbusPeer:
     def of(
         cls, options: ModbusOptions | ModbusReaderOptions, profile: ModbusProfile, timeout_s: float
     ) -> "ModbusPeer":
-        """Return the device that options tell the place of."""
+        """Return the device whose place options give."""
         usual = getattr(profile.link, "port", _TCP_PORT)
         unit = profile.unit_id if options.unit_id is None else options.unit_id
         port = options.serial_port or options.tcp_port or usual

@@ -45,6 +45,7 @@ class ModbusGuard:
         if self._wanted == "none" or has == "none":
             return
         ticks = check_feeds(self._wanted.timeout_s, ticks_per_s)
+        # The safe value before the time-out: once it counts, it must know where to go.
         steps = self._bound(has, (*has.safe.get(self._setup.options.output, ()), *has.arm))
         if session.would_change(steps):
             session.run(self._bound(has, has.unlock))

@@ -55,11 +55,6 @@ class SimulatedDevice(DacDevice):
         self._last_command = 0.0
         self._last_reading_um = 0.0
 
-    @property
-    def last_command(self) -> float:
-        """What the output is at, in ``info.command_unit``."""
-        return self._last_command
-
     def _longest_block(self) -> tuple[int, str]:
         return FIFO_DEPTH, ""
 
@@ -94,7 +89,7 @@ class SimulatedDevice(DacDevice):
         self._last_command = command
 
     def _close(self) -> None:
-        """Nobody is there to take leave of."""
+        """There is nothing to disarm."""
 
     def _release(self) -> None:
         self._plant = None

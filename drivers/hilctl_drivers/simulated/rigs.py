@@ -20,7 +20,7 @@ Factor: TypeAlias = Annotated[float, Field(ge=0.5, le=2.0)]
 
 
 class Variation(DeviceOptions):
-    """Factors on the rated actuator, to try what a model found on another one is still good for."""
+    """Factors on the rated actuator, to try what a model of another one is still good for."""
 
     lag: Factor = Field(default=1.0, description="time constant of the field")
     pinning: Factor = Field(default=1.0, description="pinning fields, the width of the loops")
@@ -138,6 +138,15 @@ def _details(parameters: dict[str, Any], options: SimulatedOptions) -> dict[str,
     return {name: str(value) for name, value in everything.items()}
 
 
+_COMMON: dict[str, Any] = {
+    "max_rate_hz": MAX_RATE_HZ,
+    "buffered": True,
+    "fifo_depth": FIFO_DEPTH,
+    "measures_command": True,
+    "simulated": True,
+}
+
+
 class SimulatedTerfenol(SimulatedDevice):
     """The Terfenol-D actuator of :mod:`hilctl_drivers.simulated.terfenol`; commands in A."""
 
@@ -157,12 +166,8 @@ class SimulatedTerfenol(SimulatedDevice):
             command_max=command_max,
             sensor_min_um=-range_um,
             sensor_max_um=range_um,
-            max_rate_hz=MAX_RATE_HZ,
-            buffered=True,
-            fifo_depth=FIFO_DEPTH,
-            measures_command=True,
-            simulated=True,
             details=_details(asdict(self._parameters), options),
+            **_COMMON,
         )
         super().__init__(info, options.fault)
 
@@ -193,12 +198,8 @@ class SimulatedPiezo(SimulatedDevice):
             command_max=self._parameters.drive_max_v,
             sensor_min_um=-self._parameters.sensor_range_um,
             sensor_max_um=self._parameters.sensor_range_um,
-            max_rate_hz=MAX_RATE_HZ,
-            buffered=True,
-            fifo_depth=FIFO_DEPTH,
-            measures_command=True,
-            simulated=True,
             details=_details(asdict(self._parameters), options),
+            **_COMMON,
         )
         super().__init__(info, options.fault)
 

@@ -6,3 +6,6 @@ timing.py   how long they take
 session.py  one conversation
 wire.py     sample by sample
 """
+
+LINK_KINDS = {"ascii": f"{__name__}.profile:AsciiProfile"}
+"""What a profile's ``link.kind`` says of it: where the class of such profiles stands."""

@@ -171,7 +171,7 @@ class ErrorReply(Reply):
 
 
 class ErrorQuery(Reply):
-    """A question that tells of errors that commands left behind; the pattern means none."""
+    """A query for errors that commands left behind; the pattern means none."""
 
     ask: LineTemplate
 

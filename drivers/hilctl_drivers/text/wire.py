@@ -1,8 +1,5 @@
 """A device that speaks lines of text, sample by sample; its sensor may stand behind another one."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-
 from hilctl.base.arrays import F64
 from hilctl.base.errors import DeviceError, InputError
 from hilctl_drivers.profile_parts import Range
@@ -13,7 +10,7 @@ from hilctl_drivers.text.profile import AsciiInput, AsciiOutput, AsciiProfile
 from hilctl_drivers.text.session import AsciiSession
 from hilctl_drivers.text.timing import exchange_time, feed_time, query_time
 from hilctl_drivers.wire.errors import WatchdogTripped
-from hilctl_drivers.wire.links import LostError
+from hilctl_drivers.wire.links import LostError, naming
 from hilctl_drivers.wire.timing import RateLimit, check_feeds
 
 
@@ -36,7 +33,10 @@ class AsciiWire(SerialWire):
         self._link = setup.link()
         self._writer = AsciiSession(self._profile, self._link, self._address)
         self._reader_link = setup.reader_link(self._link)
-        self._reader = self._writer
+        self._reader, self._reader_name = self._writer, ""
+        if reader is not None:
+            where = reader.serial_port or f"unit {self._reader_address}"
+            self._reader_name = f"reader {self._reader_profile.title} at {where}"
         if setup.reads_elsewhere:
             self._reader = AsciiSession(
                 self._reader_profile, self._reader_link, self._reader_address
@@ -70,18 +70,20 @@ class AsciiWire(SerialWire):
         self._open_links()
         writer, watchdog = self._writer, self._profile.watchdog
         writer.check_selftest()
+        # A device that has tripped refuses the steps that follow.
         self._clear_trip()
         writer.run(self._profile.init)
         if self._setup.reads_elsewhere:
-            with self._reader_named():
+            with naming(self._reader_name):
                 self._reader.check_selftest()
                 self._reader.run(self._reader_profile.init)
         self._feed_every = 0
         if watchdog != "none" and self._setup.options.watchdog != "none":
+            # The safe value before the time-out: once it counts, it must know where to go.
             self._run("safe")
             self._run("arm")
             self._feed_every = feed_every if watchdog.kick == "strict" else 0
-        writer.check_errors()
+        writer.check_errors()  # after all steps: commands without a reply leave theirs there
         self._ticks = 0
 
     def exchange(self, first_sample: int, output: F64, reading: F64, measured: F64) -> None:
@@ -115,6 +117,7 @@ class AsciiWire(SerialWire):
     def close(self) -> None:
         """See :meth:`~hilctl_drivers.serial.wire.SerialWire.close`."""
         if self._profile.watchdog != "none" and self._setup.options.watchdog != "none":
+            # First: nothing feeds it any more, and it would trip while the close steps run.
             self._run("disarm")
         self._writer.run(self._profile.close)
         self._writer.check_errors()
@@ -134,29 +137,12 @@ class AsciiWire(SerialWire):
     def _open_links(self) -> None:
         self._link.open()
         if self._reader_link is not self._link:
-            with self._reader_named():
+            with naming(self._reader_name):
                 self._reader_link.open()
 
     def _read(self) -> float:
-        try:
+        with naming(self._reader_name):
             return self._reader.number(self._input)
-        except DeviceError as error:
-            raise self._named(error) from None
-
-    @contextmanager
-    def _reader_named(self) -> Iterator[None]:
-        try:
-            yield
-        except DeviceError as error:
-            raise self._named(error) from None
-
-    def _named(self, error: DeviceError) -> DeviceError:
-        """Return an error that says that the reader made it, where it is another device."""
-        reader = self._setup.options.reader
-        if reader is None:
-            return error
-        where = reader.serial_port or f"unit {self._reader_address}"
-        return DeviceError(f"reader {self._reader_profile.title} at {where}: {error}")
 
     def _write(self, value: float) -> None:
         text = self._writer.text(self._output.write, value=value)
@@ -169,6 +155,7 @@ class AsciiWire(SerialWire):
         except WatchdogTripped:
             self._clear_trip()
             self._write(value)
+        # A command without a reply may have been ignored: the safe value must be seen to stand.
         readback = self._output.readback
         if readback == "none":
             self._writer.check_errors()

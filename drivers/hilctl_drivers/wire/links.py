@@ -8,7 +8,8 @@ This is what all links have in common; :mod:`hilctl_drivers.wire.tcp` and
 :mod:`hilctl_drivers.wire.serial_port` are the links.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Protocol, TypeAlias
 
 from hilctl.base.errors import DeviceError
@@ -63,6 +64,17 @@ class Link(Protocol):
     def close(self) -> None:
         """Let go of it; closing twice is fine."""
         ...
+
+
+@contextmanager
+def naming(who: str) -> Iterator[None]:
+    """Let errors of a device say which one it is; an empty name leaves them as they are."""
+    try:
+        yield
+    except DeviceError as error:
+        if who:
+            raise DeviceError(f"{who}: {error}") from None
+        raise
 
 
 def why(error: OSError) -> str:

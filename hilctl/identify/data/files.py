@@ -19,7 +19,7 @@ from hilctl.recording.reader import read
 def load_records(
     paths: Sequence[Path], settings: IdentifySettings, lag_samples: int
 ) -> tuple[list[Record], CommandUnit | None]:
-    """Read everything that a model is to be found from.
+    """Read everything that a model is to be identified from.
 
     Args:
         paths: Recordings (``.mcap``) and text tables.

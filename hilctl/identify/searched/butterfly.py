@@ -27,7 +27,7 @@ _ROUNDS = 4
 
 
 def fit_butterfly(job: FitJob) -> FoundModel:
-    """Find a butterfly model; the command is all of the current, bias current included.
+    """Identify a butterfly model; the command is all of the current, bias current included.
 
     Raises:
         DataError: A record is not a steady loop, or lies below the turning point altogether.

@@ -1,4 +1,4 @@
-"""Find lag, hysteresis, structure and delay together."""
+"""Identify lag, hysteresis, structure and delay together."""
 
 import math
 from dataclasses import dataclass

@@ -192,7 +192,7 @@ class TestCutShort:
         assert "cut short" in report.reason
 
     def test_ramp_ends_what_is_judged(self, lagging) -> None:
-        """A run stopped in its fourth cycle is not judged on its way out."""
+        """A run stopped in its fourth cycle is not judged in its safe ramp."""
         recording = lagging(cycles=6, end={"reason": "stopped"})
         samples = recording.samples
         samples.flags[3700:] |= Flag.RAMP.value

@@ -19,7 +19,7 @@ SAMPLES = PERIOD * CYCLES
 
 
 def tuned(at: int, gain: float, over: int) -> tuple[Event, Tuning]:
-    """Return a change of the gain, as it is recorded and as the loop is told of it."""
+    """Return a change of the gain, as it is recorded and as the loop receives it."""
     change = Tuning(gain, 0.0, over)
     values = {"gain": gain, "offset": 0.0, "samples": float(over)}
     return Event(at, "info", TUNED, "gain changed", values), change

@@ -19,8 +19,8 @@ from hilctl.comparison.trials import (
 from hilctl.experiment.load import load_experiment, resolve
 from hilctl.identify.data.records import SteadyLoop
 from hilctl.models.plays import PpiModel
-from hilctl.models.published import piezo_ppi
 from hilctl.waveforms.spec import Chirp, Sine, Triangle
+from tests.published import piezo_ppi
 
 CONFIGS = Path(__file__).parents[3] / "configs"
 TEXT = """

@@ -104,8 +104,8 @@ BROKEN: list[tuple[str, dict[str, Any], str]] = [
     ("modbus", {"outputs": {}, "exchange": 76}, "exchange must be none where there are no outputs"),
     ("modbus", {"inputs": {}, "exchange": 23}, "exchange must be none where there are no outputs"),
     ("modbus", {"outputs": {}, "watchdog": WATCHDOG}, "watchdog must be none where there are no"),
-    ("modbus", {"link.kind": "udp"}, "link.kind: must be one of tcp, rtu, ascii, frames, got"),
-    ("modbus", {"link": None}, "link.kind: must be one of tcp, rtu, ascii, frames, got nothing"),
+    ("modbus", {"link.kind": "udp"}, "link.kind: must be one of ascii, frames, rtu, tcp, got"),
+    ("modbus", {"link": None}, "link.kind: must be one of ascii, frames, rtu, tcp, got nothing"),
     ("modbus", {"link.parity": "X"}, "link.parity: must be one of 'N', 'E' or 'O', got 'X'"),
     ("modbus", {"link.baud": 9600.5}, "link.baud: must be a whole number, got 9600.5"),
     ("modbus", {"link.gap_s": -1.0}, "link.gap_s: must be >= 0.0, got -1.0"),
@@ -242,7 +242,7 @@ class TestRules:
             ("unverified: [turnaround_s]", "unverified:\n- turnaround_s\n- outputs.A1",
              "acme.yaml:7: unverified: must name keys that are in this file, got outputs.A1"),
             ("kind: rtu", "kind: udp",
-             "acme.yaml:6: link.kind: must be one of tcp, rtu, ascii, frames, got 'udp'"),
+             "acme.yaml:6: link.kind: must be one of ascii, frames, rtu, tcp, got 'udp'"),
             ("max: 10.0}\ninputs", "max: 40.0}\ninputs",
              "acme.yaml:12: outputs.AO: min and max must be inside what the register holds, "
              "-32.768 to 32.767 V, got -10 to 40"),
@@ -366,7 +366,7 @@ class TestSchema:
         """Each kind of profile is a choice, and unknown keys are refused everywhere."""
         schema = json.loads(profile_schema_text())
         names = [choice["$ref"].rsplit("/", 1)[1] for choice in schema["oneOf"]]
-        kinds = (ModbusProfile, AsciiProfile, FrameProfile)
+        kinds = (AsciiProfile, FrameProfile, ModbusProfile)
         assert names == [kind.__name__ for kind in kinds]
         objects = [part for part in schema["$defs"].values() if "properties" in part]
         assert len(objects) > 30

@@ -16,7 +16,7 @@ from hilctl.experiment.check import Checked, check
 from hilctl.experiment.load import LoadedExperiment, resolve
 from hilctl.models.base import HysteresisModel, Operator
 from hilctl.models.plays import RdpiModel
-from hilctl.models.published import piezo_ppi, terfenol_rdpi
+from tests.published import piezo_ppi, terfenol_rdpi
 
 CURRENT = """\
 name: current

@@ -15,9 +15,9 @@ from hilctl.experiment.correction import (
     model_sha256,
     signature,
 )
-from hilctl.models.published import terfenol_rdpi
 from hilctl.waveforms.build import Reference, build
 from hilctl.waveforms.spec import Sequence, Sine
+from tests.published import terfenol_rdpi
 
 RATE_HZ = 10_000.0
 COEFFICIENTS = np.array([0.5, 0.2 - 0.1j, 0.0, 0.05j])

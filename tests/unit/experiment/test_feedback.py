@@ -58,7 +58,7 @@ class TestExperiment:
         """It starts, and its input is recorded beside the reference."""
         (tmp_path / "model.yaml").write_text(MODEL)
         checked = check(resolve(Document("experiment", EXPERIMENT), tmp_path, []))
-        np.testing.assert_array_equal(checked.input_um, checked.reference.values)
+        np.testing.assert_array_equal(checked.begun.input_um, checked.reference.values)
 
     def test_block_of_more_than_one(self, tmp_path):
         """Feedback needs a block of 1."""

@@ -193,7 +193,7 @@ class TestAccepted:
             config.block = 2  # type: ignore[misc]
 
     def test_ramp(self, folder: Path) -> None:
-        """The way out takes ramp_s from the command furthest away, within the slew limit."""
+        """The safe ramp takes ramp_s from the command furthest away, within the slew limit."""
         limits = load(FULL, folder).config.command_limits()
         assert (limits.low, limits.high, limits.safe) == (-7.07, 7.07, 0.5)
         assert limits.ramp_per_s == pytest.approx(7.57 / 0.2)

@@ -14,8 +14,8 @@ from hilctl.base.yaml.document import Document
 from hilctl.experiment.check import Checked, check, check_tuned
 from hilctl.experiment.load import LoadedExperiment, resolve
 from hilctl.models.base import HysteresisModel
-from hilctl.models.published import terfenol_rdpi
 from hilctl.models.staged import FieldLag, StagedModel
+from tests.published import terfenol_rdpi
 
 CURRENT = """\
 name: current
@@ -164,15 +164,15 @@ class TestForecast:
         result = checked(DISPLACEMENT, model=model)
         values = result.reference.values
         assert result.records_input
-        assert result.input_um.tolist() == [*values[4:].tolist(), *[values[-1]] * 4]
+        assert result.begun.input_um.tolist() == [*values[4:].tolist(), *[values[-1]] * 4]
         inverse = model.inverse(10e3)
         inverse.process(values[:4].copy())
-        command = inverse.process(result.input_um.copy())
+        command = inverse.process(result.begun.input_um.copy())
         assert result.forecast.command_max == command.max()
         plain = checked(DISPLACEMENT, model=terfenol_rdpi())
         assert not plain.records_input
-        assert plain.state is None
-        assert plain.input_um is plain.reference.values
+        assert plain.begun.state is None
+        assert plain.begun.input_um is plain.reference.values
         assert result.forecast.recording_mb > plain.forecast.recording_mb
 
     def test_tuned_run_that_looks_ahead_is_worked_out_on_what_is_fed(self) -> None:

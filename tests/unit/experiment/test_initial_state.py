@@ -8,10 +8,11 @@ import pytest
 from hilctl.base.errors import DataError
 from hilctl.base.samples import COLUMNS, Batch, Head
 from hilctl.experiment.initial_state import InitialState, initial_state_after
-from hilctl.models.published import exponential_integrated, piezo_ppi
+from hilctl.models.published import exponential_integrated
 from hilctl.models.staged import FieldLag, StagedModel
 from hilctl.recording.messages import RecordingLayout
 from hilctl.recording.writer import RecordingWriter, RunFacts
+from tests.published import piezo_ppi
 
 RATE_HZ = 10_000.0
 BLOCK = 50

@@ -13,7 +13,7 @@ from hilctl.experiment.check import check
 from hilctl.experiment.interlocks import interlock_context
 from hilctl.experiment.load import resolve
 from hilctl.loop.interlocks import Interlocks, InterlockSettings
-from hilctl.models.published import terfenol_rdpi
+from tests.published import terfenol_rdpi
 
 CURRENT = """\
 name: current

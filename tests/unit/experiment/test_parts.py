@@ -3,7 +3,7 @@
 import pytest
 from pydantic import TypeAdapter, ValidationError
 
-from hilctl.experiment.parts import Interval, Name, RecordingConfig
+from hilctl.experiment.parts import FeedbackConfig, Interval, Name, RecordingConfig
 
 NAME, INTERVAL = TypeAdapter(Name), TypeAdapter(Interval)
 
@@ -32,3 +32,16 @@ def test_the_ring_bridges_three_flushes():
     assert RecordingConfig(flush_s=2.0, ring_s=6.0).ring_s == 6.0
     with pytest.raises(ValidationError, match="at least three times flush_s"):
         RecordingConfig(flush_s=2.0, ring_s=5.9)
+
+
+@pytest.mark.parametrize("way", [{"bandwidth_hz": 5.0}, {"ki_per_s": 3.0},
+                                 {"ki_per_s": 3.0, "kp": 0.0}])  # fmt: skip
+def test_one_way_of_feedback_is_enough(way):
+    assert FeedbackConfig(limit_um=1.0, **way).limit_um == 1.0
+
+
+@pytest.mark.parametrize("ways", [{}, {"kp": 0.1}, {"bandwidth_hz": 5.0, "ki_per_s": 3.0},
+                                  {"bandwidth_hz": 5.0, "kp": 0.1}])  # fmt: skip
+def test_no_way_of_feedback_and_both_are_refused(ways):
+    with pytest.raises(ValidationError, match="must have either bandwidth_hz or ki_per_s"):
+        FeedbackConfig(limit_um=1.0, **ways)

@@ -17,12 +17,8 @@ from hilctl.identify.settings import FitKind, FitSettings
 from hilctl.models.files import dump_model, parse_model
 from hilctl.models.integrated import IntegratedModel
 from hilctl.models.plays import PpiModel, RdpiModel
-from hilctl.models.published import (
-    even_thresholds,
-    exponential_integrated,
-    piezo_ppi,
-    terfenol_rdpi,
-)
+from hilctl.models.published import even_thresholds, exponential_integrated
+from tests.published import piezo_ppi, terfenol_rdpi
 
 Loops = Callable[..., list[SteadyLoop]]
 GRID = [(a, f) for a in (3.0, 6.0) for f in (10.0, 50.0, 100.0, 150.0, 250.0)]
@@ -52,7 +48,7 @@ def omega() -> IntegratedModel:
 
 def check(found: FittedModel, peak_percent: float = 0.1) -> None:
     assert found.own_peak_percent < peak_percent
-    assert found.peak_percent <= found.own_peak_percent
+    assert found.peak_percent <= found.own_peak_percent * (1.0 + 1e-12)
     assert all(abs(error.area_error_percent or 0.0) < 1.0 for error in found.errors)
 
 

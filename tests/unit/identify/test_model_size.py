@@ -15,7 +15,8 @@ from hilctl.identify.model_size import ORDERS, choose_lag, choose_order
 from hilctl.identify.settings import FitSettings
 from hilctl.identify.workers import one_by_one
 from hilctl.models.plays import PpiModel
-from hilctl.models.published import exponential_integrated, terfenol_rdpi
+from hilctl.models.published import exponential_integrated
+from tests.published import terfenol_rdpi
 
 Loops = Callable[..., list[SteadyLoop]]
 GRID = [(a, f) for a in (2.0, 3.0, 6.0) for f in (10.0, 100.0, 250.0)]

@@ -80,19 +80,10 @@ def run(kernel, v, *parameters, operators=THRESHOLDS.size):
 )
 def test_play_starts_as_published(v0, start):
     """From rest the first output is max{v0 - r, min{v0 + r, 0}}."""
-    assert hysteresis.play_step(v0, 0.5, 0.0) == start
     outputs = np.empty((1, 1))
     at_rest = hysteresis.rest_memory(1)
     hysteresis.play_outputs(np.array([v0]), np.zeros(1), np.array([0.5]), at_rest, outputs)
     assert outputs[0, 0] == start
-
-
-def test_play_step_follows_its_equation(signal):
-    """Step by step the play is the published one, bit for bit."""
-    held = 0.0
-    for now, expected in zip(signal, play(signal, np.full(signal.size, 0.6)), strict=True):
-        held = hysteresis.play_step(now, 0.6, held)
-        assert held == expected
 
 
 def test_play_outputs_are_single_plays(signal):

@@ -5,8 +5,8 @@ import pytest
 
 from hilctl.base.errors import ModelError
 from hilctl.loop.compensator import Compensator
-from hilctl.models.published import terfenol_rdpi
 from hilctl.models.staged import FieldLag, StagedModel
+from tests.published import terfenol_rdpi
 
 RATE_HZ = 10_000.0
 STAGED = StagedModel.around(terfenol_rdpi(), lag=FieldLag(tau_s=2e-4), delay_s=3e-4)

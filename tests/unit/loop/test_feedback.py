@@ -12,8 +12,8 @@ from hilctl.experiment.feedback import (
     gains_for,
     make_feedback,
 )
-from hilctl.experiment.feedback_keys import FeedbackConfig
 from hilctl.experiment.file import Experiment
+from hilctl.experiment.parts import FeedbackConfig
 from hilctl.loop.compensator import Compensator
 from hilctl.loop.feedback import Feedback, Gains
 from hilctl.models.plays import PpiModel

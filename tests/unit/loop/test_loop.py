@@ -14,8 +14,8 @@ from hilctl.loop.loop import Loop
 from hilctl.loop.pacer import LateRules
 from hilctl.loop.plan import Plan
 from hilctl.models.files import load_model
-from hilctl.models.published import terfenol_rdpi
 from tests.fakes import FakeClock, FakeDevice, FakeFifoDevice, FakeHost
+from tests.published import terfenol_rdpi
 
 RATE_HZ = 1000.0
 LIMITS = CommandLimits(low=-5.0, high=5.0, slew_per_s=2000.0, safe=0.0, ramp_per_s=100.0)
@@ -160,7 +160,7 @@ def test_stop_request_ramps_down():
 
 @pytest.mark.parametrize("block", [1, 10])
 def test_lost_sensor_ramps_down(block):
-    """A displacement that is not a number ends the run by its way out."""
+    """A displacement that is not a number ends the run by its safe ramp."""
     rig = Rig(np.full(1000, 2.0), block=block, device=FakeDevice(nan_at=45))
     outcome = rig.run()
     assert outcome.code == "fault"
@@ -225,7 +225,7 @@ def test_lost_device_that_stays_lost_is_said():
 
 
 def test_device_lost_on_the_ramp_keeps_the_first_reason():
-    """A second fault on the way out does not hide the first."""
+    """A second fault in the safe ramp does not hide the first."""
     device = FakeDevice(nan_at=40, break_at=45)
     outcome = Rig(np.full(1000, 2.0), device=device).run()
     assert outcome.reason.startswith("displacement nan um at sample 40")
@@ -233,7 +233,7 @@ def test_device_lost_on_the_ramp_keeps_the_first_reason():
 
 
 def test_very_late_tick_ends_the_run():
-    """A stall beyond the limit ends the run by its way out."""
+    """A stall beyond the limit ends the run by its safe ramp."""
     clock = FakeClock(stall_ns={30: 2_000_000_000})
     rig = Rig(np.full(10_000, 2.0), clock=clock)
     outcome = rig.run()

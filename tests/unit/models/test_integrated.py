@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from hilctl.kernels.hysteresis import play_sum_shared, rest_memory
-from hilctl.models.published import exponential_integrated, terfenol_rdpi
+from hilctl.models.published import exponential_integrated
+from tests.published import terfenol_rdpi
 
 SAMPLE_RATE_HZ = 50_000.0
 FREQUENCIES_HZ = [1.0, 10.0, 50.0, 100.0, 200.0, 250.0]

@@ -6,7 +6,8 @@ import pytest
 from hilctl.kernels.hysteresis import play_sum_shared, rest_memory
 from hilctl.models.deadband import DeadbandFunction
 from hilctl.models.plays import inverse_plays
-from hilctl.models.published import exponential_integrated, piezo_ppi, terfenol_rdpi
+from hilctl.models.published import exponential_integrated
+from tests.published import piezo_ppi, terfenol_rdpi
 
 SAMPLE_RATE_HZ = 50_000.0
 FREQUENCIES_HZ = [1.0, 10.0, 50.0, 100.0, 200.0, 250.0]

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from hilctl.models.published import piezo_ppi
 from hilctl.models.spi import SpiModel
+from tests.published import piezo_ppi
 
 SAMPLE_RATE_HZ = 50_000.0
 SPI_DIRECT = 2.146

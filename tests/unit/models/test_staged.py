@@ -8,8 +8,9 @@ from hilctl.base.errors import ModelError
 from hilctl.models.base import Provenance
 from hilctl.models.chain import smoothing_weights
 from hilctl.models.files import dump_model, parse_model
-from hilctl.models.published import exponential_integrated, piezo_ppi, terfenol_rdpi
+from hilctl.models.published import exponential_integrated
 from hilctl.models.staged import FieldLag, StagedModel, Structure
+from tests.published import piezo_ppi, terfenol_rdpi
 
 RATE_HZ = 50_000.0
 LAG = FieldLag(tau_s=1e-4, growth_per_unit=0.28)

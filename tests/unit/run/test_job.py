@@ -34,7 +34,7 @@ def test_the_job_is_what_was_checked_even_where_its_files_have_gone(folder, tmp_
     assert loaded.model == checked.loaded.model
     reference, input_um = again.arrays()
     np.testing.assert_array_equal(reference, checked.reference.values)
-    np.testing.assert_array_equal(input_um, checked.input_um)
+    np.testing.assert_array_equal(input_um, checked.begun.input_um)
     assert (again.supervisor, again.silence_s, again.ring_path) == (7, 5.0, folder.ring)
 
 
@@ -42,5 +42,5 @@ def test_an_input_that_is_the_reference_is_kept_once(folder):
     """Without a correction or a preview both are one file; the memory before the run goes along."""
     plain = checked_experiment(CONFIGS / "terfenol_sine_6a_uncompensated.yaml", [])
     job = Job.of(plain, folder, supervisor=1, silence_s=1.0)
-    assert (job.reference == job.input_um) == (plain.input_um is plain.reference.values)
-    assert job.memory is None if plain.state is None else job.memory is not None
+    assert (job.reference == job.input_um) == (plain.begun.input_um is plain.reference.values)
+    assert job.memory is None if plain.begun.state is None else job.memory is not None

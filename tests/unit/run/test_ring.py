@@ -189,3 +189,18 @@ def test_sizes_that_can_not_be_are_refused(tmp_path, field, value):
     ring.page.put(field, value)
     with pytest.raises(ValueError, match=r"is damaged|is shorter than it says"):
         SampleRing(ring.path)
+
+
+def test_slots_are_handed_out_clean(tmp_path):
+    """Nothing of an earlier lap stays in a slot: no flag, no answer that a device did not give."""
+    ring = make(tmp_path, slots=3)
+    other = SampleRing(ring.path)
+    for number in range(20):
+        block = ring.claim()
+        assert not block.flags.any()
+        assert np.isnan(block.displacement_um).all()
+        assert np.isnan(block.measured).all()
+        assert push(ring, number + 1)
+        if number % 3 != 1:
+            other.pop()
+            other.release()

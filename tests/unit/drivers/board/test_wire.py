@@ -17,12 +17,11 @@ from hilctl.loop.pacer import SystemClock
 from hilctl.loop.plan import Plan
 from hilctl_drivers.emulator.faults import parse_fault
 from hilctl_drivers.emulator.options import EmulatorOptions
-from hilctl_drivers.emulator.setup import emulated
 from hilctl_drivers.profile import shipped_profiles
 from hilctl_drivers.serial.device import SerialDac
 from hilctl_drivers.serial.setup import SerialOptions
 from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
-from tests.fakes import FakeHost, ShiftedClock
+from tests.fakes import FakeHost, ShiftedClock, emulated
 
 RATE_HZ = 10_000.0
 BLOCK = 100

@@ -7,7 +7,8 @@ from contextlib import ExitStack
 import pytest
 
 from hilctl_drivers.emulator.options import EmulatorOptions
-from hilctl_drivers.emulator.setup import build, emulated
+from hilctl_drivers.emulator.setup import build
+from tests.fakes import emulated
 
 MS = 1_000_000
 START_NS = 10_000_000_000

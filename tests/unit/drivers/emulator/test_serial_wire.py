@@ -8,8 +8,8 @@ from pathlib import Path
 from cobs import cobs
 
 from hilctl_drivers.emulator.options import EmulatorOptions
-from hilctl_drivers.emulator.setup import emulated
 from hilctl_drivers.wire.framing import binary_framing
+from tests.fakes import emulated
 
 
 def test_the_examples_for_firmware_are_right():

@@ -11,11 +11,10 @@ import pytest
 from hilctl.base.errors import DeviceError, InputError
 from hilctl_drivers.emulator.faults import parse_fault
 from hilctl_drivers.emulator.options import EmulatorOptions
-from hilctl_drivers.emulator.setup import emulated
 from hilctl_drivers.profile import shipped_profiles
 from hilctl_drivers.serial.device import SerialDac
 from hilctl_drivers.serial.setup import SerialOptions
-from tests.fakes import ShiftedClock
+from tests.fakes import ShiftedClock, emulated
 
 DCON = (Path(__file__).parents[3] / "data" / "dcon_module.yaml").read_text()
 KINDS = ["dcon", "scpi", "cobs", "length"]

@@ -183,13 +183,13 @@ class TestMakeSafe:
     def test_works_open_or_closed(self, closed: SimulatedDevice) -> None:
         """It sets the output without a connection, with one, and after one."""
         closed.make_safe(1.0)
-        assert closed.last_command == 1.0
+        assert closed._last_command == 1.0
         send(opened(closed), 0, np.full(BLOCK, 3.0))
         closed.make_safe(0.5)
-        assert closed.last_command == 0.5
+        assert closed._last_command == 0.5
         closed.close()
         closed.make_safe(0.0)
-        assert closed.last_command == 0.0
+        assert closed._last_command == 0.0
 
     def test_holds_until_it_is_opened_again(self) -> None:
         """It lets go of the device: nothing that is sent afterwards can move the output."""
@@ -198,7 +198,7 @@ class TestMakeSafe:
         device.make_safe(1.0)
         with pytest.raises(DeviceError, match="not open"):
             send(device, BLOCK, np.zeros(BLOCK))
-        assert device.last_command == 1.0
+        assert device._last_command == 1.0
         send(opened(device), 0, np.zeros(BLOCK))
 
     @pytest.mark.parametrize("value", [11.0, np.nan])
@@ -207,7 +207,7 @@ class TestMakeSafe:
         device = terfenol()
         with pytest.raises(DeviceError, match="simulated_terfenol"):
             device.make_safe(value)
-        assert device.last_command == 0.0
+        assert device._last_command == 0.0
 
 
 class TestFaults:

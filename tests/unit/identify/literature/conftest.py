@@ -8,7 +8,7 @@ from hilctl.identify.fit_data import FitData
 from hilctl.identify.job import FitJob
 from hilctl.identify.judge import judge
 from hilctl.identify.settings import FitSettings
-from hilctl.models.published import piezo_ppi
+from tests.published import piezo_ppi
 
 
 def found_by(fit, data):
