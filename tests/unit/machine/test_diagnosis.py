@@ -10,11 +10,11 @@ from hilctl.cli.machine_view import render
 from hilctl.machine.diagnosis import Diagnosis, examine, machine_facts
 from hilctl.machine.files import Finding
 from hilctl.machine.latency import Latency
-from hilctl.machine.realtime import Step
+from hilctl.machine.realtime import SetUpStep
 from hilctl.machine.settings import Realtime
 
 MS = 1_000_000
-STEPS = (Step("fifo", "refused", "SCHED_FIFO 80: Operation not permitted", "rtprio"),)
+STEPS = (SetUpStep("fifo", "refused", "SCHED_FIFO 80: Operation not permitted", "rtprio"),)
 
 
 def latency(late_ns, rate_hz=1000.0):
