@@ -30,4 +30,6 @@ def finish_orphans() -> None:
 
     for orphan in recover_orphans():
         print(f"hilctl: {orphan.name} had died: {orphan.text}", file=sys.stderr)
-        print(f"hilctl: recovered into {orphan.recording}", file=sys.stderr)
+        kept = f"its samples are kept in {orphan.kept}; the next command tries again"
+        done = f"recovered into {orphan.recording}"
+        print(f"hilctl: {kept if orphan.kept else done}", file=sys.stderr)

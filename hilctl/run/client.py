@@ -1,5 +1,6 @@
 """Runs in the background: start one, find it, send it a request, stop it."""
 
+import os
 import subprocess
 import sys
 import time
@@ -47,12 +48,12 @@ def start_detached(
     """
     checked = checked_experiment(experiment, settings)
     output = output_of(checked, output)
-    log = output.with_suffix(".log")
+    log = free_log(output)
     command = [sys.executable, "-P", "-m", "hilctl.cli", "run", str(experiment), *flags]
     command += ["--output", str(output)]
     command += [word for setting in settings for word in ("--set", setting)]
     try:
-        with log.open("wb") as stream:
+        with log.open("xb") as stream:
             process = subprocess.Popen(
                 command,
                 stdin=subprocess.DEVNULL,
@@ -63,6 +64,15 @@ def start_detached(
     except OSError as error:
         raise InputError(f"{log}: can't be written: {error.strerror}") from None
     return Detached(_await_running(process, log), log)
+
+
+def free_log(output: Path) -> Path:
+    """Return the log of a run into ``output``: beside it, and no file that is there already."""
+    log, number = output.with_suffix(".log"), 2
+    while os.path.lexists(log):  # a link that leads nowhere is there too
+        log = output.with_suffix(f".{number}.log")
+        number += 1
+    return log
 
 
 def _await_running(process: "subprocess.Popen[bytes]", log: Path) -> RunFolder:

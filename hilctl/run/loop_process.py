@@ -9,7 +9,7 @@ import signal
 import sys
 import time
 
-from hilctl.base.errors import DeviceError, HilctlError, InputError
+from hilctl.base.errors import DeviceError, HilctlError, InputError, RunError
 from hilctl.experiment.load import LoadedExperiment
 from hilctl.loop.pacer import SystemClock
 from hilctl.loop.plan import Outcome
@@ -71,8 +71,14 @@ def run_job(job: Job, ring: SampleRing, loaded: LoadedExperiment) -> Outcome:
         outcome = loop.run(page.get(Field.START_NS))
         # Before the device is closed: that may take its time-outs, and is no hang.
         host.closing()
-    except BaseException:
-        device.make_safe(config.safe.value)
+    except BaseException as error:
+        try:
+            device.make_safe(config.safe.value)
+        except DeviceError as second:
+            # The cause first: a device that can't be reached is often only what follows from it.
+            cause = str(error) if isinstance(error, HilctlError) else f"the loop broke: {error!r}"
+            text = f"{cause}; the safe value could not be confirmed: {second}"
+            raise RunError(text) from error
         raise
     finally:
         device.close()

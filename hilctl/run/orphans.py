@@ -26,12 +26,14 @@ class Orphan:
         recording: Its recording.
         safe: Whether the loop has put the output at its safe value before it left.
         text: What became of it, for people.
+        kept: Folder that still holds what could not be recovered; None where all of it was.
     """
 
     name: str
     recording: Path
     safe: bool
     text: str
+    kept: Path | None = None
 
 
 def recover_orphans() -> list[Orphan]:
@@ -42,8 +44,9 @@ def recover_orphans() -> list[Orphan]:
             continue
         with taken_over(run) as ours, _undisturbed():
             if ours:
-                found.append(_recover(run))
-                run.remove()
+                found.append(orphan := _recover(run))
+                if orphan.kept is None:  # else its samples are nowhere but there
+                    run.remove()
     return found
 
 
@@ -56,6 +59,7 @@ def _recover(run: RunFolder) -> Orphan:
         text = f"{outcome.reason}; output {where}; {recovered.samples} samples: {recovered.reason}"
     except (HilctlError, OSError) as error:
         text = f"{outcome.reason}; output {where}; its recording could not be recovered: {error}"
+        return Orphan(run.card.name, path, outcome.safe, text, run.path)
     return Orphan(run.card.name, path, outcome.safe, text)
 
 

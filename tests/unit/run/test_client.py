@@ -6,7 +6,7 @@ import pytest
 
 from hilctl.base.errors import InputError, RunError
 from hilctl.run import client
-from hilctl.run.client import find_run, set_run, status_of, stop_run
+from hilctl.run.client import find_run, free_log, set_run, status_of, stop_run
 
 
 def run(name, *, supervised=True, alive=True):
@@ -92,3 +92,12 @@ def test_what_is_no_setting_is_not_sent(answers, text, said):
     with pytest.raises(InputError, match=said):
         set_run(run("a"), ["offset=1", text], 1.0)
     assert answers == []
+
+
+def test_no_log_takes_the_place_of_another_file(tmp_path):
+    """Neither one of another run, nor a user's own, nor a link that leads nowhere."""
+    output = tmp_path / "run.mcap"
+    assert free_log(output) == tmp_path / "run.log"
+    (tmp_path / "run.log").write_text("mine")
+    (tmp_path / "run.2.log").symlink_to(tmp_path / "nowhere")
+    assert free_log(output) == tmp_path / "run.3.log"

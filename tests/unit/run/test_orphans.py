@@ -61,14 +61,23 @@ def test_a_loop_that_ended_by_its_ramp_is_believed(dead):
     assert orphan.text.startswith("stopped because the supervisor died; output at its safe value")
 
 
-def test_a_recording_that_has_gone_is_said_and_not_asked_for_again(dead):
-    dead().unlink()
-    (orphan,) = recover_orphans()
-    assert "could not be recovered" in orphan.text
-    assert recover_orphans() == []
-
-
 def test_a_living_run_is_left_alone(tmp_path):
     with run_folder("sine", tmp_path / "a.mcap", 12.0) as (folder, _):
         assert recover_orphans() == []
         assert folder.path.is_dir()
+
+
+def test_what_can_not_be_recovered_is_kept(dead):
+    """The samples are nowhere else; once the recording can be had again, they go into it."""
+    recording = dead()
+    cut = recording.read_bytes()
+    recording.unlink()
+    (orphan,) = recover_orphans()
+    assert orphan.kept is not None
+    assert orphan.kept.is_dir()
+    assert "could not be recovered" in orphan.text
+    recording.write_bytes(cut)
+    (orphan,) = recover_orphans()
+    assert orphan.kept is None
+    assert read(recording).samples.index.size > 0
+    assert runs() == []
