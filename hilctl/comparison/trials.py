@@ -1,25 +1,27 @@
 """Each inverse before a simulated device, in this process: what a run would come to, and how fast.
 
-The device is made by its registered name and driven through :class:`hilctl.base.device.Device`,
-with compensator and limiter as a run has them; feedback is left out. Nothing is recorded, nothing
-keeps the pace: that is for devices whose time is the sample count, so any other is refused.
+A trial is a run that keeps no pace and records nothing, without interlocks and feedback. That is
+for devices whose time is the sample count: any other is refused.
 """
 
+import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from hilctl.analysis.metrics import fold, peak, peak_hysteresis_percent, peak_to_peak, percent, rms
 from hilctl.base.arrays import F64, U32
-from hilctl.base.errors import InputError
+from hilctl.base.errors import DeviceError, InputError
 from hilctl.base.samples import Flag
+from hilctl.experiment.initial_state import begin
 from hilctl.experiment.load import LoadedExperiment
 from hilctl.identify.data.records import SteadyLoop
-from hilctl.loop.compensator import Compensator
-from hilctl.loop.limiter import Limiter
+from hilctl.loop.interlocks import InterlockContext, InterlockSettings
 from hilctl.models.base import HysteresisModel
+from hilctl.run.assemble import assemble
+from hilctl.run.unpaced import run_in_memory
 from hilctl.waveforms.build import Reference, build
 from hilctl.waveforms.spec import AnyWaveform, Sine, Triangle
 
@@ -120,8 +122,7 @@ class TrialDevice:
                 f"inverses are tried on simulated devices only, not on {info.name}: run each with "
                 "'hilctl run'"
             )
-        self._device = loaded.device
-        self._config = loaded.config
+        self._loaded = loaded
         rate_hz = loaded.config.sample_rate_hz
         self.references = tuple(build(waveform, rate_hz, folder) for waveform in waveforms)
         for reference in self.references:
@@ -132,12 +133,12 @@ class TrialDevice:
     @property
     def description(self) -> str:
         """The device, for people."""
-        return self._device.info.description
+        return self._loaded.device.info.description
 
     @property
     def sample_rate_hz(self) -> float:
         """Samples a second."""
-        return self._config.sample_rate_hz
+        return self._loaded.config.sample_rate_hz
 
     def run(self, model: HysteresisModel, reference: Reference) -> list[InverseTrial]:
         """Run one model's inverse before the device from rest, and judge each segment.
@@ -146,27 +147,20 @@ class TrialDevice:
             ModelError: The model can't be inverted.
             DeviceError: The device refuses something.
         """
-        rate_hz = self.sample_rate_hz
-        compensator = Compensator(model, rate_hz)
-        wanted = np.empty(reference.values.size)
-        compensator.process(compensator.ahead(reference.values), wanted)
-        limiter = Limiter(self._config.command_limits(), 1.0 / rate_hz)
-        command, flags = np.empty_like(wanted), np.zeros(wanted.size, dtype=np.uint32)
-        limiter.limit(wanted, command, flags)
-        displacement_um = self._drive(command)
-        return _judged(reference, displacement_um, flags)
-
-    def _drive(self, command: F64) -> F64:
-        block = self._config.block
-        displacement_um, measured = np.empty_like(command), np.empty_like(command)
-        self._device.open(self.sample_rate_hz, block)
-        try:
-            for start in range(0, command.size, block):
-                part = slice(start, start + block)
-                self._device.exchange(start, command[part], displacement_um[part], measured[part])
-        finally:
-            self._device.close()
-        return displacement_um
+        loaded = replace(self._loaded, model=model)
+        begun = begin(loaded, reference.values, at_rest=True)
+        values = (reference.values, begun.input_um, begun.state)
+        plan = replace(
+            assemble(loaded, *values, paced=False),
+            # A model that is far off is to be judged, and not to be stopped.
+            interlocks=InterlockContext(stroke_um=(-math.inf, math.inf)),
+            interlock_settings=InterlockSettings(),
+            feedback=None,
+        )
+        outcome, samples = run_in_memory(plan, loaded.device)
+        if outcome.code == "fault":
+            raise DeviceError(outcome.reason)
+        return _judged(reference, samples.displacement_um, samples.flags)
 
 
 def _judged(reference: Reference, displacement_um: F64, flags: U32) -> list[InverseTrial]:

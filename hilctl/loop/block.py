@@ -31,24 +31,6 @@ class Block:
         skipped: Samples that were skipped just before it.
     """
 
-    __slots__ = (
-        "columns",
-        "command",
-        "displacement_um",
-        "due",
-        "flags",
-        "following",
-        "head",
-        "input_um",
-        "measured",
-        "memory",
-        "number",
-        "reference",
-        "skipped",
-        "state",
-        "wanted",
-    )
-
     def __init__(self, head: "memoryview[int]", state: F64, columns: F64, flags: U32) -> None:
         self.head, self.state, self.columns, self.flags = head, state, columns, flags
         self.memory = state[:-1]

@@ -2,7 +2,7 @@
 
 start.py           from an experiment file to a finished run
 job.py             the experiment as it goes to the loop's process
-assemble.py        from a checked experiment to its loop
+assemble.py        from a checked experiment to the plan of its loop
 supervisor.py      starts the loop's process, records, makes the rig safe
 child.py           the supervisor's hold on that process; hang_watch.py  whether it hangs
 loop_process.py    the loop's process; host.py  its side of the shared memory

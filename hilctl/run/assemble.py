@@ -1,4 +1,4 @@
-"""From a checked experiment to the loop that runs it: one way for every host."""
+"""From a checked experiment to the plan of its loop: one way for every host."""
 
 import math
 
@@ -9,16 +9,19 @@ from hilctl.experiment.file import Experiment
 from hilctl.experiment.interlocks import interlock_context
 from hilctl.experiment.load import LoadedExperiment
 from hilctl.loop.compensator import Compensator
-from hilctl.loop.host import Host
-from hilctl.loop.loop import Loop
 from hilctl.loop.pacer import LatePolicy, LateRules
 from hilctl.loop.plan import Plan
 
 _ALWAYS_LATE_S = 2.0
 
 
-def plan_of(
-    loaded: LoadedExperiment, reference: F64, input_um: F64, state: F64 | None, *, paced: bool
+def assemble(
+    loaded: LoadedExperiment,
+    reference: F64,
+    input_um: F64,
+    state: F64 | None,
+    *,
+    paced: bool = True,
 ) -> Plan:
     """Return what a run does; its compensator is warmed up.
 
@@ -50,20 +53,6 @@ def plan_of(
         feedback=make_feedback(config, compensator),
         keep_all=config.recording.on_failure == "stop",
     )
-
-
-def assemble(
-    loaded: LoadedExperiment,
-    reference: F64,
-    input_um: F64,
-    state: F64 | None,
-    host: Host,
-    *,
-    paced: bool = True,
-) -> Loop:
-    """Return the loop of a run; its device is still to be opened. See :func:`plan_of`."""
-    plan = plan_of(loaded, reference, input_um, state, paced=paced)
-    return Loop(plan, loaded.device, host)
 
 
 def _late_policy(config: Experiment, info: DeviceInfo) -> LatePolicy:

@@ -11,6 +11,7 @@ import time
 
 from hilctl.base.errors import DeviceError, HilctlError, InputError, RunError
 from hilctl.experiment.load import LoadedExperiment
+from hilctl.loop.loop import Loop
 from hilctl.loop.pacer import SystemClock
 from hilctl.loop.plan import Outcome
 from hilctl.machine.realtime import prepare, require, step_facts
@@ -55,7 +56,7 @@ def run_job(job: Job, ring: SampleRing, loaded: LoadedExperiment) -> Outcome:
     """
     config, device, page = loaded.config, loaded.device, ring.page
     host = RingHost(ring, SystemClock(), job.supervisor, job.silence_s)
-    loop = assemble(loaded, *job.arrays(), job.memory, host)
+    loop = Loop(assemble(loaded, *job.arrays(), job.memory), device, host)
     # After the warm-up, so that all it has mapped gets locked; before the device is opened, so that
     # a refusal moves nothing.
     steps = prepare(config.realtime)

@@ -10,15 +10,16 @@ from pathlib import Path
 
 import numpy as np
 
-from hilctl.base.device import Clock
+from hilctl.base.device import Clock, Device
 from hilctl.base.errors import InputError
 from hilctl.base.events import Event
-from hilctl.base.samples import ANSWERS, Batch
+from hilctl.base.samples import ANSWERS, Batch, Samples
 from hilctl.experiment.check import Checked
 from hilctl.loop.block import Block
 from hilctl.loop.host import Tuning
+from hilctl.loop.loop import Loop
 from hilctl.loop.pacer import Lateness
-from hilctl.loop.plan import Outcome
+from hilctl.loop.plan import Outcome, Plan
 from hilctl.run.assemble import assemble
 from hilctl.run.metadata import end_facts
 from hilctl.run.recorder import Recorder
@@ -46,9 +47,7 @@ class BatchHost:
     """A host that gathers blocks in this process's own memory; supervises nothing.
 
     Args:
-        block: Samples in a block.
-        state_size: Numbers of state kept with each block.
-        latency_blocks: Exchanges from a block's commands to its displacements.
+        plan: The run.
         on_batch: Takes blocks, some at a time; they are valid until it returns.
         on_event: Takes events.
         stop: Why the run should end, or an empty text.
@@ -56,9 +55,7 @@ class BatchHost:
 
     def __init__(
         self,
-        block: int,
-        state_size: int,
-        latency_blocks: int,
+        plan: Plan,
         *,
         on_batch: Callable[[Batch], None],
         on_event: Callable[[Event], None] = lambda event: None,
@@ -66,7 +63,8 @@ class BatchHost:
     ) -> None:
         self.clock: Clock = SampleClock()
         # No slot is used again before the batch that its block is in has been taken.
-        self._room = Batch.empty(_BLOCKS_A_BATCH + 2 * (latency_blocks + 1), block, state_size)
+        slots = _BLOCKS_A_BATCH + 2 * (plan.latency_blocks + 1)
+        self._room = Batch.empty(slots, plan.block, plan.compensator.state_size + 1)
         self._claimed = self._first = self._answered = 0
         self._on_batch, self._on_event, self._stop = on_batch, on_event, stop
 
@@ -153,19 +151,35 @@ def run_unpaced(checked: Checked, output: Path, *, overwrite: bool = False) -> R
 
 
 def _run(checked: Checked, recorder: Recorder) -> tuple[Outcome, Lateness]:
-    loaded = checked.loaded
-    config, device = loaded.config, loaded.device
+    loaded, begun = checked.loaded, checked.begun
+    plan = assemble(loaded, checked.reference.values, begun.input_um, begun.state, paced=False)
     host = BatchHost(
-        config.block,
-        checked.state_size,
-        device.info.latency_blocks,
-        on_batch=recorder.batch,
-        on_event=recorder.event,
-        stop=lambda: recorder.error,
+        plan, on_batch=recorder.batch, on_event=recorder.event, stop=lambda: recorder.error
     )
-    samples = (checked.reference.values, checked.begun.input_um, checked.begun.state)
-    loop = assemble(loaded, *samples, host, paced=False)
-    device.open(config.sample_rate_hz, config.block)
+    return _drive(plan, loaded.device, host)
+
+
+def run_in_memory(plan: Plan, device: Device) -> tuple[Outcome, Samples]:
+    """Run a plan on a simulated device, and keep its samples.
+
+    Args:
+        plan: What to do, without a pace.
+        device: Not yet open.
+
+    Raises:
+        DeviceError: It can't be opened, or can't keep this rate or block.
+    """
+    parts: list[Samples] = []
+    host = BatchHost(plan, on_batch=lambda batch: parts.append(batch.samples(slice(None))))
+    outcome, _ = _drive(plan, device, host)
+    values = np.concatenate([[*part.columns().values()] for part in parts], axis=1)
+    index = np.concatenate([part.index for part in parts])
+    return outcome, Samples.of(index, values, np.concatenate([part.flags for part in parts]))
+
+
+def _drive(plan: Plan, device: Device, host: BatchHost) -> tuple[Outcome, Lateness]:
+    loop = Loop(plan, device, host)
+    device.open(plan.sample_rate_hz, plan.block)
     try:
         outcome = loop.run(0)
     finally:

@@ -11,11 +11,18 @@ from hilctl.base.errors import InputError
 from hilctl.base.events import Event
 from hilctl.base.samples import Head
 from hilctl.recording.reader import read
+from hilctl.run.assemble import assemble
 from hilctl.run.start import checked_experiment
-from hilctl.run.unpaced import BatchHost, SampleClock, run_unpaced
+from hilctl.run.unpaced import BatchHost, SampleClock, run_in_memory, run_unpaced
 
 UNCOMPENSATED = Path(__file__).parents[3] / "configs" / "terfenol_sine_6a_uncompensated.yaml"
 SHORT = ["waveform.duration_s=0.25", "waveform.frequency_hz=100"]
+
+
+def plan(block, latency_blocks):
+    """What a host asks of a plan."""
+    compensator = SimpleNamespace(state_size=0)
+    return SimpleNamespace(block=block, latency_blocks=latency_blocks, compensator=compensator)
 
 
 def test_time_passes_in_sleeps_only():
@@ -34,7 +41,7 @@ def test_every_block_comes_once_and_in_order(latency):
         firsts.extend(batch.heads[:, Head.FIRST_SAMPLE].tolist())
         seen.extend(batch.columns[:, 0, 0].tolist())
 
-    host = BatchHost(2, 1, latency, on_batch=take)
+    host = BatchHost(plan(2, latency), on_batch=take)
     waiting = []
     for number in range(1000):
         block = host.claim()
@@ -53,7 +60,7 @@ def test_every_block_comes_once_and_in_order(latency):
 def test_an_event_comes_after_the_blocks_before_it():
     order = []
     host = BatchHost(
-        1, 1, 0, on_batch=lambda batch: order.append(len(batch.heads)),
+        plan(1, 0), on_batch=lambda batch: order.append(len(batch.heads)),
         on_event=lambda event: order.append(event.code),
     )  # fmt: skip
     host.answered(host.claim())
@@ -77,3 +84,17 @@ def test_real_devices_are_refused_before_a_file_is_made(tmp_path):
     with pytest.raises(InputError, match="only a simulated device can run without real time"):
         run_unpaced(replace(checked, loaded=loaded), tmp_path / "run.mcap")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_in_memory_and_in_a_file_it_is_the_same_run(tmp_path):
+    """Every sample, the safe ramp too, bit for bit."""
+    checked = checked_experiment(UNCOMPENSATED, SHORT)
+    recorded = read(run_unpaced(checked, tmp_path / "run.mcap").path).samples
+    loaded, begun = checked.loaded, checked.begun
+    made = assemble(loaded, checked.reference.values, begun.input_um, begun.state, paced=False)
+    outcome, samples = run_in_memory(made, loaded.device)
+    assert outcome.code == "completed"
+    assert samples.index.tolist() == recorded.index.tolist()
+    assert samples.command.tobytes() == recorded.command.tobytes()
+    assert samples.displacement_um.tobytes() == recorded.displacement_um.tobytes()
+    assert samples.flags.tobytes() == recorded.flags.tobytes()
