@@ -176,7 +176,7 @@ def test_a_fault_later_on_keeps_what_was_learned(tmp_path):
 
     learned = learn(tmp_path, at(100.0), run=breaks)
     assert learned.fault
-    assert learned.reason.startswith("run 2: simulated_terfenol: must accept the block")
+    assert learned.reason.startswith("run 2: simulated_terfenol: the block was refused")
     assert runs == ["run-00.mcap", "run-01.mcap", "run-02.mcap"]
     assert learned.correction.cycles[0].error_percent == min(errors(learned))
     assert not learned.check
