@@ -32,7 +32,7 @@ class Safe(Strict):
     """
 
     value: float = 0.0
-    ramp_s: Annotated[float, Field(gt=0.0, le=600.0)] = 0.2
+    ramp_s: Annotated[float, Field(gt=0.0, le=3600.0)] = 0.2
 
 
 class CompensatorConfig(Strict):

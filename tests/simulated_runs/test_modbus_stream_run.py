@@ -32,7 +32,7 @@ def port():
 def test_every_sample_is_put_out_and_answered(port, tmp_path):
     """At a rate that a busy machine keeps: none is missing, and the loop follows its reference."""
     path = tmp_path / "run.mcap"
-    changes = {"device.port": port, "sample_rate_hz": 10000, "waveform.duration_s": 2.0}
+    changes = {"device.tcp_port": port, "sample_rate_hz": 10000, "waveform.duration_s": 2.0}
     settings = [word for key, value in changes.items() for word in ("--set", f"{key}={value}")]
     ran = start("run", CONFIG, *settings, "--output", path, "--json")
     out, err = ran.communicate(timeout=120)

@@ -31,7 +31,7 @@ RATES_HZ = {
     "Modbus RTU": 100.0,
     "SCPI": 15.0,
     "SCPI, measured": 15.0,
-    "DCON": 40.0,
+    "DCON": 35.0,
     "COBS": 200.0,
     "COBS FIFO": 10_000.0,
 }
