@@ -97,6 +97,9 @@ class FakeDevice:
     firsts: list[int] = field(default_factory=list)
     made_safe: list[float] = field(default_factory=list)
 
+    def output(self):
+        return 0.0
+
     def exchange(self, first_sample, command, displacement_um, measured):
         if first_sample + command.size > self.break_at:
             raise DeviceError("fake: no answer within 0.1 s")
@@ -127,6 +130,9 @@ class FakeFifoDevice:
     commands: list[float] = field(default_factory=list)
     made_safe: list[float] = field(default_factory=list)
     exchanges: int = 0
+
+    def output(self):
+        return 0.0
 
     def exchange(self, first_sample, command, displacement_um, measured):
         assert first_sample == len(self.commands)

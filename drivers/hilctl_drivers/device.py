@@ -58,6 +58,21 @@ class DacDevice(ABC):
             raise self._error("open", str(error)) from None
         self._block = block
 
+    def output(self) -> float | None:
+        """Return what the open device puts out, see :meth:`hilctl.base.device.Device.output`.
+
+        Raises:
+            DeviceError: Not open, or no good answer in time; it must be opened again.
+        """
+        if not self._block:
+            raise self._error("read the output back", "not open")
+        try:
+            return self._output()
+        except DeviceError as error:
+            self._block = 0
+            self._release()
+            raise self._error("read the output back", str(error)) from None
+
     def exchange(
         self, first_sample: int, command: F64, displacement_um: F64, measured: F64
     ) -> None:
@@ -133,6 +148,10 @@ class DacDevice(ABC):
     @abstractmethod
     def _open(self, sample_rate_hz: float, block: int) -> None:
         """Connect and set up; block and rate are good. :meth:`_release` follows an error."""
+
+    def _output(self) -> float | None:
+        """Return the output of a device that is open; None where it can't be known."""
+        return None
 
     @abstractmethod
     def _exchange(

@@ -98,6 +98,17 @@ class Device(Protocol):
         """
         ...
 
+    def output(self) -> float | None:
+        """Return what the open device puts out, before the first exchange.
+
+        Read back where that can be had. The run begins with a ramp from there, so a guess can do
+        harm: None where the device can't know.
+
+        Raises:
+            DeviceError: It did not answer, or is not open.
+        """
+        ...
+
     def exchange(
         self, first_sample: int, command: F64, displacement_um: F64, measured: F64
     ) -> None:

@@ -66,6 +66,9 @@ class SimulatedDevice(DacDevice):
         self._last_command = 0.0
         self._last_reading_um = 0.0
 
+    def _output(self) -> float:
+        return self._last_command
+
     def _exchange(
         self, first_sample: int, command: F64, displacement_um: F64, measured: F64
     ) -> None:

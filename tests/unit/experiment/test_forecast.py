@@ -64,6 +64,10 @@ class DescribedDevice:
         """Refuse: nothing may be opened before the run."""
         raise AssertionError("opened")
 
+    def output(self) -> float:
+        """Refuse: nothing may be opened before the run."""
+        raise AssertionError("opened")
+
     def exchange(
         self, first_sample: int, command: F64, displacement_um: F64, measured: F64
     ) -> None:

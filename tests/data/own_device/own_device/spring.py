@@ -63,6 +63,10 @@ class Spring(Device):
         self._block = block
         self._step = 1.0 - float(np.exp(-1.0 / (sample_rate_hz * self._options.lag_s)))
 
+    def output(self) -> float:
+        """Return the current that it puts out; it keeps it while it is not open."""
+        return self._current_a
+
     def exchange(
         self, first_sample: int, command: F64, displacement_um: F64, measured: F64
     ) -> None:
