@@ -5,13 +5,18 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 
-.PHONY: run test lint clean
+.PHONY: run test test-slow lint clean
 
 run: $(VENV)/.ready
 	$(BIN)/hilctl run configs/demo.yaml
 
 test: $(VENV)/.ready
-	$(BIN)/pytest
+	@echo "Takes about 4 minutes of one core; whole runs have a target of their own: make test-slow."
+	$(BIN)/pytest -m "not slow"
+
+test-slow: $(VENV)/.ready
+	@echo "Takes about 15 minutes: most of them real time, in which runs go on."
+	$(BIN)/pytest -m slow
 
 lint: $(VENV)/.ready
 	$(BIN)/ruff check .

@@ -11,6 +11,8 @@ from hypothesis import settings
 from hilctl.run.ring import memory_folder
 
 HARDWARE = Path(__file__).parent / "hardware"
+SLOW = tuple(Path(__file__).parent / name for name in ("faults", "peers", "simulated_runs"))
+"""Folders whose tests are marked ``slow``; ``make test`` leaves them to ``make test-slow``."""
 
 # A shared machine stalls now and then, and a failure in CI must come back when it is run again.
 settings.register_profile("local", deadline=None)
@@ -28,7 +30,10 @@ def pytest_addoption(parser):
 
 
 def pytest_collection_modifyitems(config, items):
-    """Leave tests on real devices out, unless one is named."""
+    """Mark the slow ones; leave tests on real devices out, unless one is named."""
+    for item in items:
+        if set(SLOW) & set(item.path.parents):
+            item.add_marker(pytest.mark.slow)
     if config.getoption("--device") is not None:
         return
     hardware = [item for item in items if HARDWARE in item.path.parents]

@@ -100,7 +100,9 @@ def refusal(text: str, folder: Path) -> InputError | None:
     return None
 
 
-@pytest.mark.parametrize("part", range(4))
+@pytest.mark.parametrize(
+    "part", [0, *(pytest.param(part, marks=pytest.mark.slow) for part in range(1, 4))]
+)
 def test_damaged_experiments_are_refused_in_words(tmp_path: Path, part: int) -> None:
     """No crash and no hang; what is refused says where, and nothing is written."""
     (tmp_path / "model.yaml").write_text(MODEL, encoding="utf-8")

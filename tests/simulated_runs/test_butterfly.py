@@ -20,7 +20,6 @@ from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParamete
 CONFIG = Path(__file__).parents[2] / "configs" / "terfenol_sine_6a.yaml"
 RATE_HZ = 50_000.0
 BARE = replace(TerfenolParameters(), magnet_field_a_per_m=0.0)
-pytestmark = pytest.mark.rig
 
 
 def loop(amplitude_a, frequency_hz, bias_a=0.0):

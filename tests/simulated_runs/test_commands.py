@@ -11,7 +11,6 @@ from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
 CONFIGS = Path(__file__).parents[2] / "configs"
-pytestmark = pytest.mark.rig
 
 
 def hilctl(*arguments, code=0):

@@ -9,7 +9,6 @@ from hilctl.recording.reader import read
 from hilctl.run.start import start_run
 
 CONFIGS = Path(__file__).parents[2] / "configs"
-pytestmark = pytest.mark.rig
 
 
 @pytest.fixture(scope="module")

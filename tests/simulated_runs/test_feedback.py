@@ -24,7 +24,6 @@ FEEDBACK = (
     "feedback={limit_um: 10.0, bandwidth_hz: 100.0, resonance_hz: 2300.0, damping_ratio: 0.12}"
 )
 DRIFT = "device.drift={um: 6.0, tau_s: 0.3}"
-pytestmark = pytest.mark.rig
 
 
 @pytest.fixture

@@ -20,8 +20,6 @@ from hilctl.identify.judge import judge
 from hilctl.identify.settings import FitKind, FitSettings
 from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
 
-pytestmark = pytest.mark.rig
-
 RATE_HZ = 50_000.0
 Tone = tuple[float, float]
 """Amplitude in A, frequency in Hz."""

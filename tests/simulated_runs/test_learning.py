@@ -22,7 +22,6 @@ from hilctl.run.unpaced import run_unpaced
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 SINE = CONFIGS / "terfenol_sine_6a.yaml"
-pytestmark = pytest.mark.rig
 
 
 def at(frequency_hz, *more):

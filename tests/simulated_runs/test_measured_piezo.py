@@ -20,7 +20,6 @@ FIT = shlex.split(
 )
 
 pytestmark = [
-    pytest.mark.rig,
     pytest.mark.data,
     pytest.mark.skipif(not DATA.is_dir(), reason=f"measured piezo data not found at {DATA}"),
 ]

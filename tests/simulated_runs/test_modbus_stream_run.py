@@ -11,7 +11,6 @@ import pytest
 from hilctl.recording.reader import read
 
 CONFIG = Path(__file__).parents[2] / "configs" / "modbus_labjack_t7_stream.yaml"
-pytestmark = pytest.mark.rig
 
 
 def start(*words):

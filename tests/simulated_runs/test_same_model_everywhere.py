@@ -23,8 +23,6 @@ from hilctl.identify.fit_model import fit_model
 from hilctl.identify.settings import FitSettings
 from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
 
-pytestmark = pytest.mark.rig
-
 RATE_HZ = 50_000.0
 POINTS = 64
 TONES = [(a, f) for a in (3.0, 7.0) for f in (10.0, 100.0, 200.0)]

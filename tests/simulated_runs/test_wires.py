@@ -10,8 +10,6 @@ import pytest
 from hilctl.analysis.replay import replay
 from hilctl.recording.reader import read
 
-pytestmark = pytest.mark.rig
-
 
 def _wire_runs():
     """Return the benchmark's module: test files can't import each other."""
