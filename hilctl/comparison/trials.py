@@ -148,7 +148,7 @@ class TrialDevice:
             DeviceError: The device refuses something.
         """
         loaded = replace(self._loaded, model=model)
-        begun = begin(loaded, reference.values, at_rest=True)
+        begun = begin(model, self.sample_rate_hz, reference.values)
         values = (reference.values, begun.input_um, begun.state)
         plan = replace(
             assemble(loaded, *values, paced=False),
