@@ -1,7 +1,6 @@
 """What a recording says: figures of merit, tables, plots and a page.
 
-metrics.py  pure: folding onto one cycle, peak hysteresis, loop area, errors
-noise.py    pure: sensor noise and the floor it puts under the peak hysteresis
+metrics.py  pure: folding onto one cycle, peak hysteresis, loop area, errors, sensor noise
 timing.py   pure: lateness percentiles, late ticks
 steady.py   which part of a recording is judged, and its average cycle
 figures.py  what a report holds

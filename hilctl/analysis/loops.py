@@ -58,12 +58,8 @@ def hysteresis_loop(recording: Recording, focus: int = 0) -> Figure | None:
 def _loop(part: SteadyPart) -> F64:
     """Return one loop, float64[2, m]: input and displacement, closed where it is an average."""
     if part.cycle is not None:
-        signals = part.cycle.signals
-        return np.concatenate((signals, signals[:, :1]), axis=1)
-    if part.cycles > 0:
-        return np.empty((2, 0))
-    path = np.array((part.loop_input, part.samples.displacement_um))[:, -_LONGEST_PATH:]
-    return path[:, np.isfinite(path).all(axis=0)]
+        return np.concatenate((part.loop, part.loop[:, :1]), axis=1)
+    return part.loop[:, -_LONGEST_PATH:]
 
 
 def _closest_line(everything: F64) -> F64:

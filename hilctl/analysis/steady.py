@@ -19,16 +19,23 @@ class SteadyPart:
     Attributes:
         samples: Whole cycles where the waveform has a period, otherwise all at full amplitude.
         cycles: Number of whole cycles; 0 without a period.
-        loop_input: float64[n], what the displacement is held against: reference_um where a
-            compensator stood before the actuator, otherwise the command.
-        cycle: The average cycle of ``loop_input`` and displacement_um, phase 0 at the segment's
+        cycle: The average cycle of the loop's input and displacement_um, phase 0 at the segment's
             first sample; None without a whole cycle, or where samples are missing all through it.
+        loop: float64[2, m], the loop that is judged, input and displacement: the average cycle; of
+            what has no period every finite sample; nothing where a cycle is missing. Its input is
+            reference_um where a compensator stood before the actuator, otherwise the command.
     """
 
     samples: Samples
     cycles: int
-    loop_input: F64
     cycle: Fold | None
+    loop: F64
+
+    @property
+    def raw_error_um(self) -> F64:
+        """Displacement less reference of every sample where both are finite, in um."""
+        error = self.samples.displacement_um - self.samples.reference_um
+        return error[np.isfinite(error)]
 
 
 def waveform_end(samples: Samples) -> int:
@@ -70,15 +77,10 @@ def steady_part(recording: Recording, segment: Segment) -> SteadyPart:
     """Return what there is to judge of a segment, with its average cycle."""
     samples, cycles = steady_samples(recording, segment)
     loop_input = samples.reference_um if recording.compensated else samples.command
-    cycle = None
-    if cycles > 0:
-        signals = (loop_input, samples.displacement_um)
-        folded = fold(samples.index - segment.start, segment.period, signals)
-        cycle = folded if folded.whole else None
-    return SteadyPart(samples, cycles, loop_input, cycle)
-
-
-def error_um(part: SteadyPart) -> F64:
-    """Return displacement less reference of every sample where both are finite, in um."""
-    error = part.samples.displacement_um - part.samples.reference_um
-    return error[np.isfinite(error)]
+    signals = np.array((loop_input, samples.displacement_um))
+    if cycles == 0:
+        return SteadyPart(samples, 0, None, signals[:, np.isfinite(signals).all(axis=0)])
+    cycle = fold(samples.index - segment.start, segment.period, signals)
+    if not cycle.whole:
+        return SteadyPart(samples, cycles, None, np.empty((2, 0)))
+    return SteadyPart(samples, cycles, cycle, cycle.signals)

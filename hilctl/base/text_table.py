@@ -110,7 +110,7 @@ class TextTable:
         numbers = [str(i + 1) for i in range(len(cells))]
         self.names = cells if self._has_header else [*above, numbers][0]
 
-    def index(self, column: Column) -> int:
+    def index(self, column: Column | None) -> int:
         """Return a column's index from 0, see :func:`column_index`."""
         return column_index(self.path, column, self.names)
 
@@ -227,17 +227,21 @@ class TextTable:
         return f"column {number}" if name == number else f"column {number} ({name})"
 
 
-def column_index(path: Path, column: Column, names: Sequence[str]) -> int:
+def column_index(path: Path, column: Column | None, names: Sequence[str]) -> int:
     """Return a column's index from 0.
 
     Args:
         path: The file, for the message.
-        column: Its name, or its number from 1.
+        column: Its name, or its number from 1; None for the only one.
         names: The names of all columns, in order.
 
     Raises:
-        DataError: There is no such column, or more than one of that name.
+        DataError: There is no such column, or more than one.
     """
+    if column is None:
+        if len(names) == 1:
+            return 0
+        raise DataError(f"{path}: has several columns: set column to one of {', '.join(names)}")
     if isinstance(column, int) and 1 <= column <= len(names):
         return column - 1
     found = [index for index, name in enumerate(names) if name == column]

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hilctl.analysis.metrics import fold, peak, peak_hysteresis_percent, peak_to_peak, percent, rms
+from hilctl.analysis import metrics
 from hilctl.base.arrays import F64, U32
 from hilctl.base.errors import DeviceError, InputError
 from hilctl.base.samples import Flag
@@ -148,7 +148,7 @@ class TrialDevice:
             DeviceError: The device refuses something.
         """
         loaded = replace(self._loaded, model=model)
-        begun = begin(loaded, reference.values, at_rest=True)
+        begun = begin(model, self.sample_rate_hz, reference.values)
         values = (reference.values, begun.input_um, begun.state)
         plan = replace(
             assemble(loaded, *values, paced=False),
@@ -170,16 +170,16 @@ def _judged(reference: Reference, displacement_um: F64, flags: U32) -> list[Inve
         if cycles == 0:
             raise InputError(f"{segment.label}: no steady cycle: give the waveform more time")
         signals = (reference.values[start:stop], displacement_um[start:stop])
-        cycle = fold(np.arange(start, stop) - segment.start, segment.period, signals)
+        cycle = metrics.fold(np.arange(start, stop) - segment.start, segment.period, signals)
         wanted, moved = cycle.signals
-        swing = peak_to_peak(moved)
+        peak, rms = metrics.peak_and_rms_percent(moved - wanted, metrics.peak_to_peak(moved))
         trials.append(
             InverseTrial(
                 label=segment.label,
                 frequency_hz=reference.sample_rate_hz / segment.period,
-                peak_hysteresis_percent=peak_hysteresis_percent(wanted, moved),
-                peak_error_percent=percent(peak(moved - wanted), swing),
-                rms_error_percent=percent(rms(moved - wanted), swing),
+                peak_hysteresis_percent=metrics.peak_hysteresis_percent(wanted, moved),
+                peak_error_percent=peak,
+                rms_error_percent=rms,
                 limited_samples=int(np.count_nonzero(flags[start:stop] & _LIMITED)),
             )
         )

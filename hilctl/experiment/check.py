@@ -13,10 +13,9 @@ from hilctl.base.arrays import F64
 from hilctl.base.errors import ConfigError, DataError, InputError, ModelError, Problem
 from hilctl.experiment.feedback import feedback_problems
 from hilctl.experiment.forecast import Forecast, forecast_of
-from hilctl.experiment.initial_state import Begun, begin
+from hilctl.experiment.initial_state import Begun, InitialState, begin, initial_state_of
 from hilctl.experiment.interlocks import interlock_problems
 from hilctl.experiment.load import LoadedExperiment
-from hilctl.loop.compensator import Compensator
 from hilctl.waveforms.build import Reference, build
 
 
@@ -39,8 +38,7 @@ class Checked:
     @property
     def state_size(self) -> int:
         """Numbers of state that are kept with each block: the memory, and the command before."""
-        model, rate_hz = self.loaded.model, self.loaded.config.sample_rate_hz
-        return Compensator(model, rate_hz).state_size + 1
+        return self.begun.state_size + 1
 
     @property
     def records_input(self) -> bool:
@@ -66,9 +64,14 @@ def check(loaded: LoadedExperiment) -> Checked:
         problems.append(_problem(loaded, "waveform", str(error)))
         raise ConfigError(problems) from None
     problems += _reference_problems(loaded, reference)
+    values = _corrected(loaded, reference, problems)
     try:
-        problems += feedback_problems(loaded)
-        begun = _begun(loaded, _corrected(loaded, reference, problems), problems)
+        before = _state_before(loaded, problems)
+        if before is not None:
+            lead_in = max(1, round(config.safe.ramp_s * config.sample_rate_hz))
+            values = before.lead_in(values, lead_in)
+        begun = begin(loaded.model, config.sample_rate_hz, values, before)
+        problems += feedback_problems(loaded, begun.preview)
         forecast = forecast_of(loaded, reference, begun.input_um, begun.state)
     except ModelError as error:
         problems.append(_problem(loaded, "compensator.model", str(error)))
@@ -77,15 +80,6 @@ def check(loaded: LoadedExperiment) -> Checked:
     if problems:
         raise ConfigError(problems)
     return Checked(loaded, reference, forecast, begun)
-
-
-def _begun(loaded: LoadedExperiment, values: F64, problems: list[Problem]) -> Begun:
-    """Return the compensator's input; without the run before where that can't be used."""
-    try:
-        return begin(loaded, values)
-    except DataError as error:
-        problems.append(_problem(loaded, "compensator.initial_state", str(error)))
-        return begin(loaded, values, at_rest=True)
 
 
 def _corrected(loaded: LoadedExperiment, reference: Reference, problems: list[Problem]) -> F64:
@@ -99,6 +93,15 @@ def _corrected(loaded: LoadedExperiment, reference: Reference, problems: list[Pr
         hint = "learn again with 'hilctl learn', or take it out"
         problems.append(_problem(loaded, "compensator.correction", str(error), hint=hint))
         return reference.values
+
+
+def _state_before(loaded: LoadedExperiment, problems: list[Problem]) -> InitialState | None:
+    """Return where the run before left the actuator; None where that can't be used."""
+    try:
+        return initial_state_of(loaded)
+    except DataError as error:
+        problems.append(_problem(loaded, "compensator.initial_state", str(error)))
+        return None
 
 
 def check_tuned(

@@ -36,11 +36,12 @@ def make_feedback(config: Experiment, compensator: Compensator) -> Feedback | No
     return Feedback(_gains(wanted, rate_hz), rate_hz, wanted.limit_um, due_after)
 
 
-def feedback_problems(loaded: LoadedExperiment) -> list[Problem]:
+def feedback_problems(loaded: LoadedExperiment, preview: int) -> list[Problem]:
     """Return why an experiment can't have the feedback that it asks for.
 
-    Raises:
-        ModelError: The model has no inverse.
+    Args:
+        loaded: The experiment.
+        preview: Samples by which its compensator looks ahead: so long a correction takes to show.
     """
     config, info = loaded.config, loaded.device.info
     wanted = config.feedback
@@ -57,8 +58,6 @@ def feedback_problems(loaded: LoadedExperiment) -> list[Problem]:
         hint = "a block's first displacement would be as old as the block"
         found.append(("block", "must be 1 with feedback", str(config.block), hint))
     if not found:
-        # As far as the compensator looks ahead, so long a correction takes to show.
-        preview = Compensator(loaded.model, config.sample_rate_hz).preview
         delay_s = wanted.sensor_delay_s + max(0, preview - 1) / config.sample_rate_hz
         found += _gain_problems(wanted, config.sample_rate_hz, delay_s)
         found += _resonance_problems(loaded, wanted)

@@ -22,39 +22,17 @@ class Begun:
 
     Attributes:
         input_um: float64[n], its input; the values themselves where it is those.
+        preview: Samples by which its input runs ahead of the commands.
+        state_size: Numbers in its memory.
         state: float64[state_size], its memory before the first sample; None where it is at rest.
         run_id: The run that left this memory; empty where the actuator is at rest.
     """
 
     input_um: F64
+    preview: int
+    state_size: int
     state: F64 | None = None
     run_id: str = ""
-
-
-def begin(loaded: LoadedExperiment, values: F64, *, at_rest: bool = False) -> Begun:
-    """Return the compensator's input, begun from where the run before left the actuator.
-
-    Args:
-        loaded: The experiment.
-        values: float64[n], the reference with what is added to it.
-        at_rest: Whether a run before that the experiment names is left out.
-
-    Raises:
-        DataError: That run can't be used, see :func:`initial_state_after`.
-        ModelError: The model has no inverse.
-    """
-    config, model = loaded.config, loaded.model
-    compensator = Compensator(model, config.sample_rate_hz)
-    named = config.compensator.initial_state if config.compensator and not at_rest else None
-    before = None
-    if named is not None and model is not None:
-        before = initial_state_after(loaded.folder / named, model, config.sample_rate_hz)
-        compensator.restore(before.state)
-        samples = max(1, round(config.safe.ramp_s * config.sample_rate_hz))
-        values = before.lead_in(values, samples)
-    compensator.begin(values)
-    state = None if before is None and not compensator.preview else compensator.state()
-    return Begun(compensator.ahead(values), state, before.run_id if before else "")
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,6 +60,51 @@ class InitialState:
         led = input_um.copy()
         led[: way.size] += 0.5 * (1.0 + np.cos(np.pi * way)) * (self.stands_um - input_um[0])
         return led
+
+
+def initial_state_of(loaded: LoadedExperiment) -> InitialState | None:
+    """Return where the run before left the actuator; None where the experiment names none.
+
+    Raises:
+        DataError: That run can't be used, see :func:`initial_state_after`.
+        ModelError: The model has no inverse.
+    """
+    config, model = loaded.config, loaded.model
+    named = config.compensator.initial_state if config.compensator else None
+    if named is None or model is None:
+        return None
+    return initial_state_after(loaded.folder / named, model, config.sample_rate_hz)
+
+
+def begin(
+    model: HysteresisModel | None,
+    sample_rate_hz: float,
+    values: F64,
+    before: InitialState | None = None,
+) -> Begun:
+    """Return what the compensator is fed, and its memory once it has begun.
+
+    Args:
+        model: Its model, or None.
+        sample_rate_hz: Samples a second.
+        values: float64[n], the reference with what is added to it, led in from where it begins.
+        before: Where the run before left the actuator; at rest where None.
+
+    Raises:
+        ModelError: The model has no inverse.
+    """
+    compensator = Compensator(model, sample_rate_hz)
+    if before is not None:
+        compensator.restore(before.state)
+    compensator.begin(values)
+    state = compensator.state()
+    return Begun(
+        input_um=compensator.ahead(values),
+        preview=compensator.preview,
+        state_size=state.size,
+        state=state if before is not None or compensator.preview else None,
+        run_id=before.run_id if before else "",
+    )
 
 
 def initial_state_after(path: Path, model: HysteresisModel, sample_rate_hz: float) -> InitialState:

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from hilctl.analysis import metrics
-from hilctl.analysis.noise import SHORTEST_PERIOD, expected_maximum, sensor_noise_um
 from hilctl.analysis.steady import SteadyPart, steady_part
 from hilctl.base.arrays import F64, I64
 from hilctl.base.errors import DataError
@@ -162,7 +161,8 @@ def _answer(part: SteadyPart, segment: Segment, step_hz: float) -> tuple[float, 
 def _floor_um(part: SteadyPart, period: float) -> float:
     assert part.cycle is not None
     samples, counts = part.samples, part.cycle.counts
-    noise = None
-    if period >= SHORTEST_PERIOD:
-        noise = sensor_noise_um(samples.index, samples.displacement_um)
-    return (noise or 0.0) * float(np.sqrt(np.mean(1.0 / counts))) * expected_maximum(counts.size)
+    if period < metrics.SHORTEST_PERIOD:
+        return 0.0
+    noise_um = metrics.sensor_noise_um(samples.index, samples.displacement_um) or 0.0
+    average_um = noise_um * float(np.sqrt(np.mean(1.0 / counts)))
+    return average_um * metrics.expected_maximum(counts.size)

@@ -81,17 +81,13 @@ def _part(
         values, period = read_samples(w, sample_rate_hz, folder)
         label = f"file {Path(w.path).name}"
     else:
-        highest_hz, period_s = _spectrum(w)
+        label, highest_hz, period_s = shapes.outline(w, unit)
         if highest_hz >= sample_rate_hz / 2.0:
             raise InputError(
                 f"{name}: every frequency must be below half the sample rate, "
                 f"{sample_rate_hz / 2.0:.10g} Hz: {highest_hz:.10g} Hz"
             )
-        duration_s = w.dwell_s * len(w.levels) if w.kind == "step" else w.duration_s
-        n = shapes.sample_count(duration_s, sample_rate_hz)
-        values = w.offset + _shape(w, np.arange(n) / sample_rate_hz)
-        period = period_s * sample_rate_hz
-        label = _label(w, unit)
+        values, period = shapes.sampled(w, sample_rate_hz), period_s * sample_rate_hz
     soft_start, soft_end = _soften(w, name, values, sample_rate_hz)
     n = values.size
     period = period if math.isfinite(period) else 0.0
@@ -118,65 +114,3 @@ def _soften(w: spec.SinglePart, name: str, values: F64, sample_rate_hz: float) -
 def _soft(n: int) -> F64:
     """Return a raised cosine from 0 to 1: float64[n]."""
     return 0.5 - 0.5 * np.cos(np.pi * np.arange(n) / max(n, 1))
-
-
-def _shape(w: spec.SinglePart, t: F64) -> F64:
-    match w:
-        case spec.Sine():
-            return shapes.sine(w, t)
-        case spec.Triangle():
-            return shapes.triangle(w, t)
-        case spec.ComplexHarmonic():
-            return shapes.complex_harmonic(w, t)
-        case spec.GrowingOrDecaying():
-            return shapes.growing_or_decaying(w, t)
-        case spec.Chirp():
-            return shapes.chirp(w, t)
-        case spec.Step():
-            return shapes.step(w, t)
-        case spec.Hold():
-            return np.full_like(t, w.level)
-        case spec.Multisine():
-            return shapes.multisine(w, t)
-        case spec.FileWaveform():
-            raise TypeError("a file has samples of its own")
-
-
-def _spectrum(w: spec.SinglePart) -> tuple[float, float]:
-    """Return the highest frequency in Hz, and the period in s or 0.0."""
-    match w:
-        case spec.Sine() | spec.Triangle():
-            return w.frequency_hz, 1.0 / w.frequency_hz
-        case spec.ComplexHarmonic():
-            frequencies = [part.frequency_hz for part in w.components]
-            return max(frequencies), shapes.common_period_s(frequencies)
-        case spec.GrowingOrDecaying():
-            return w.frequency_hz, 0.0
-        case spec.Chirp():
-            return max(w.start_hz, w.stop_hz), 0.0
-        case spec.Multisine():
-            count = shapes.multisine_count(w)
-            last_hz = w.first_hz + (count - 1) * w.step_hz
-            common = [w.first_hz] if count == 1 else [w.first_hz, w.step_hz]
-            return last_hz, shapes.common_period_s(common)
-        case _:
-            return 0.0, 0.0
-
-
-def _label(w: spec.SinglePart, unit: str) -> str:
-    match w:
-        case spec.Sine() | spec.Triangle() | spec.GrowingOrDecaying():
-            return f"{w.kind} {w.amplitude:g} {unit} {w.frequency_hz:g} Hz"
-        case spec.ComplexHarmonic():
-            parts = " + ".join(
-                f"{c.amplitude:g} {unit} {c.frequency_hz:g} Hz" for c in w.components
-            )
-            return f"complex harmonic {parts}"
-        case spec.Chirp():
-            return f"chirp {w.amplitude:g} {unit} {w.start_hz:g}-{w.stop_hz:g} Hz"
-        case spec.Multisine():
-            return f"multisine {w.amplitude:g} {unit} {w.first_hz:g}-{w.last_hz:g} Hz"
-        case spec.Hold():
-            return f"hold {w.level:g} {unit}"
-        case _:
-            return w.kind

@@ -1,4 +1,4 @@
-"""One waveform and a sample rate to samples: pure functions of time."""
+"""One waveform and a sample rate to samples: what each kind is, as pure functions of time."""
 
 import math
 from fractions import Fraction
@@ -36,37 +36,76 @@ def check_length(samples: float) -> None:
         )
 
 
+def outline(w: spec.Shape, unit: str) -> tuple[str, float, float]:
+    """Return a waveform's label, its highest frequency in Hz, and its period in s or 0.0."""
+    match w:
+        case spec.Sine() | spec.Triangle():
+            label = f"{w.kind} {w.amplitude:g} {unit} {w.frequency_hz:g} Hz"
+            return label, w.frequency_hz, 1.0 / w.frequency_hz
+        case spec.ComplexHarmonic():
+            parts = [f"{c.amplitude:g} {unit} {c.frequency_hz:g} Hz" for c in w.components]
+            frequencies = [c.frequency_hz for c in w.components]
+            label = f"complex harmonic {' + '.join(parts)}"
+            return label, max(frequencies), common_period_s(frequencies)
+        case spec.GrowingOrDecaying():
+            label = f"{w.kind} {w.amplitude:g} {unit} {w.frequency_hz:g} Hz"
+            return label, w.frequency_hz, 0.0
+        case spec.Chirp():
+            label = f"{w.kind} {w.amplitude:g} {unit} {w.start_hz:g}-{w.stop_hz:g} Hz"
+            return label, max(w.start_hz, w.stop_hz), 0.0
+        case spec.Multisine():
+            label = f"{w.kind} {w.amplitude:g} {unit} {w.first_hz:g}-{w.last_hz:g} Hz"
+            count = _multisine_count(w)
+            common = [w.first_hz] if count == 1 else [w.first_hz, w.step_hz]
+            return label, w.first_hz + (count - 1) * w.step_hz, common_period_s(common)
+        case spec.Hold():
+            return f"hold {w.level:g} {unit}", 0.0, 0.0
+        case spec.Step():
+            return w.kind, 0.0, 0.0
+
+
+def sampled(w: spec.Shape, sample_rate_hz: float) -> F64:
+    """Return every sample of a waveform, offset included and not yet softened: float64[n].
+
+    Raises:
+        InputError: They do not fit in memory.
+    """
+    duration_s = w.dwell_s * len(w.levels) if w.kind == "step" else w.duration_s
+    t = np.arange(sample_count(duration_s, sample_rate_hz)) / sample_rate_hz
+    return w.offset + _shape(w, t)
+
+
+def _shape(w: spec.Shape, t: F64) -> F64:
+    match w:
+        case spec.Sine():
+            return w.amplitude * np.sin(_angle(w.frequency_hz, w.phase_deg, t))
+        case spec.Triangle():  # starts at 0 and rises
+            phase = np.mod(w.frequency_hz * t + 0.25, 1.0)
+            return w.amplitude * (1.0 - 4.0 * np.abs(phase - 0.5))
+        case spec.ComplexHarmonic():
+            total = np.zeros_like(t)
+            for part in w.components:
+                total += part.amplitude * np.sin(_angle(part.frequency_hz, part.phase_deg, t))
+            return total
+        case spec.GrowingOrDecaying():
+            elapsed = t / w.duration_s
+            envelope = elapsed if w.kind == "growing" else 1.0 - elapsed
+            return w.amplitude * envelope * np.sin(_angle(w.frequency_hz, 0.0, t))
+        case spec.Chirp():
+            return _chirp(w, t)
+        case spec.Step():
+            return _step(w, t)
+        case spec.Hold():
+            return np.full_like(t, w.level)
+        case spec.Multisine():
+            return _multisine(w, t)
+
+
 def _angle(frequency_hz: float, phase_deg: float, t: F64) -> F64:
     return 2.0 * np.pi * frequency_hz * t + math.radians(phase_deg)
 
 
-def sine(w: spec.Sine, t: F64) -> F64:
-    """Return a sine: float64[n] for times float64[n] in s."""
-    return w.amplitude * np.sin(_angle(w.frequency_hz, w.phase_deg, t))
-
-
-def triangle(w: spec.Triangle, t: F64) -> F64:
-    """Return a triangle that starts at 0 and rises: float64[n]."""
-    phase = np.mod(w.frequency_hz * t + 0.25, 1.0)
-    return w.amplitude * (1.0 - 4.0 * np.abs(phase - 0.5))
-
-
-def complex_harmonic(w: spec.ComplexHarmonic, t: F64) -> F64:
-    """Return a sum of sines: float64[n]."""
-    total = np.zeros_like(t)
-    for part in w.components:
-        total += part.amplitude * np.sin(_angle(part.frequency_hz, part.phase_deg, t))
-    return total
-
-
-def growing_or_decaying(w: spec.GrowingOrDecaying, t: F64) -> F64:
-    """Return a sine of linearly changing amplitude: float64[n]."""
-    part = t / w.duration_s
-    envelope = part if w.kind == "growing" else 1.0 - part
-    return w.amplitude * envelope * np.sin(_angle(w.frequency_hz, 0.0, t))
-
-
-def chirp(w: spec.Chirp, t: F64) -> F64:
+def _chirp(w: spec.Chirp, t: F64) -> F64:
     """Return a sine of moving frequency: float64[n]."""
     growth = (math.log(w.stop_hz) - math.log(w.start_hz)) / w.duration_s
     if w.spacing == "linear" or growth == 0.0:
@@ -77,7 +116,7 @@ def chirp(w: spec.Chirp, t: F64) -> F64:
     return w.amplitude * np.sin(2.0 * np.pi * cycles)
 
 
-def step(w: spec.Step, t: F64) -> F64:
+def _step(w: spec.Step, t: F64) -> F64:
     """Return levels, each reached linearly in ``rise_s``: float64[n]."""
     levels = np.array((0.0, *w.levels))
     index = np.minimum((t / w.dwell_s + 1e-12).astype(np.int64), len(w.levels) - 1)
@@ -87,13 +126,13 @@ def step(w: spec.Step, t: F64) -> F64:
     return values
 
 
-def multisine(w: spec.Multisine, t: F64) -> F64:
+def _multisine(w: spec.Multisine, t: F64) -> F64:
     """Return evenly spaced sines with Schroeder phases, peak ``amplitude``: float64[n].
 
     Source: M. R. Schroeder, IEEE Trans. Information Theory 16 (1970) 85: phases of a low crest
     factor, ``phi_m = -pi m (m - 1) / M``.
     """
-    count = multisine_count(w)
+    count = _multisine_count(w)
     total = np.zeros_like(t)
     for m in range(count):
         frequency_hz = w.first_hz + m * w.step_hz
@@ -102,7 +141,7 @@ def multisine(w: spec.Multisine, t: F64) -> F64:
     return total if peak == 0.0 else w.amplitude / peak * total
 
 
-def multisine_count(w: spec.Multisine) -> int:
+def _multisine_count(w: spec.Multisine) -> int:
     """Return how many sines a multisine has."""
     return int((w.last_hz - w.first_hz) / w.step_hz + 1e-9) + 1
 

@@ -198,17 +198,10 @@ class FileWaveform(_Shape):
         return last_row
 
 
-_Single: TypeAlias = (
-    Sine
-    | Triangle
-    | ComplexHarmonic
-    | GrowingOrDecaying
-    | Chirp
-    | Step
-    | Hold
-    | Multisine
-    | FileWaveform
+Shape: TypeAlias = (
+    Sine | Triangle | ComplexHarmonic | GrowingOrDecaying | Chirp | Step | Hold | Multisine
 )
+_Single: TypeAlias = Shape | FileWaveform
 SinglePart: TypeAlias = Annotated[_Single, Field(discriminator="kind")]
 
 

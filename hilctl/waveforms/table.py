@@ -1,6 +1,5 @@
 """Waveforms from files: CSV, NPY or MCAP, resampled only where the experiment says so."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -77,32 +76,18 @@ def _resampled(w: FileWaveform, path: Path, raw: F64, rate_hz: float, sample_rat
 
 def _read(w: FileWaveform, path: Path) -> tuple[F64, float | None]:
     suffix = path.suffix.lower()
-    if suffix == ".npy":
-        return _read_npy(w, path)
-    if suffix == ".mcap":
-        return _read_mcap(w, path)
-    return _read_text(w, path)
-
-
-def _read_npy(w: FileWaveform, path: Path) -> tuple[F64, float | None]:
-    try:
-        table = np.load(
-            path, mmap_mode="r", allow_pickle=False
-        )  # its size is known before it is read
-    except (ValueError, OSError, EOFError):
-        raise InputError(f"{path}: is not a whole NumPy file (.npy) of numbers") from None
-    if not (isinstance(table, np.ndarray) and table.dtype.kind in "fiu" and table.ndim in (1, 2)):
-        raise InputError(f"{path}: must hold a one- or two-dimensional array of numbers")
-    if table.size == 0:
-        raise InputError(f"{path}: holds no data")
-    columns = table.reshape(table.shape[0], -1).T
-    names = [str(i + 1) for i in range(len(columns))]
-    return _rows(w, path, columns[_column(w, path, names)]), None
+    if suffix not in {".npy", ".mcap"}:
+        return _read_text(w, path)
+    columns, own_rate_hz = _read_mcap(path) if suffix == ".mcap" else (_read_npy(path), None)
+    names = list(columns)
+    values = columns[names[column_index(path, w.column, names)]]
+    check_rows(path, values.size, w.first_row, w.last_row)
+    return _finite(path, values[w.first_row - 1 : w.last_row], w.first_row), own_rate_hz
 
 
 def _read_text(w: FileWaveform, path: Path) -> tuple[F64, float | None]:
     table = TextTable(path)
-    columns = [_column(w, path, table.names)]
+    columns = [table.index(w.column)]
     has_time = "t_s" in table.names
     columns += [table.index("t_s")] if has_time else []
     rows = table.read(columns, w.first_row, w.last_row)
@@ -110,26 +95,37 @@ def _read_text(w: FileWaveform, path: Path) -> tuple[F64, float | None]:
     return rows.values[0], rows.sample_rate_hz(1, _TIME_TOLERANCE) if has_time else None
 
 
-def _read_mcap(w: FileWaveform, path: Path) -> tuple[F64, float | None]:
+def _read_npy(path: Path) -> dict[str, npt.NDArray[Any]]:
+    try:  # mapped, so that its size is known before it is read
+        table = np.load(path, mmap_mode="r", allow_pickle=False)
+    except (ValueError, OSError, EOFError):
+        raise InputError(f"{path}: is not a whole NumPy file (.npy) of numbers") from None
+    if not (isinstance(table, np.ndarray) and table.dtype.kind in "fiu" and table.ndim in (1, 2)):
+        raise InputError(f"{path}: must hold a one- or two-dimensional array of numbers")
+    if table.size == 0:
+        raise InputError(f"{path}: holds no data")
+    columns = table.reshape(table.shape[0], -1).T
+    return {str(number): column for number, column in enumerate(columns, start=1)}
+
+
+def _read_mcap(path: Path) -> tuple[dict[str, npt.NDArray[Any]], float]:
     from hilctl.recording.reader import read
 
     recording = read(path)
-    if np.any(np.diff(recording.samples.index) != 1):
+    samples = recording.samples
+    if np.any(np.diff(samples.index) != 1):
         raise InputError(f"{path}: samples are missing in it, a waveform needs every one")
-    names = ["reference_um", "displacement_um", "command", "wanted"]
-    values = getattr(recording.samples, names[_column(w, path, names)])
-    return _rows(w, path, values), recording.sample_rate_hz
+    names = ("reference_um", "displacement_um", "command", "wanted")
+    return {name: getattr(samples, name) for name in names}, recording.sample_rate_hz
 
 
-def _rows(w: FileWaveform, path: Path, values: npt.NDArray[Any]) -> F64:
+def _finite(path: Path, chosen: npt.NDArray[Any], first_row: int) -> F64:
     """Return the rows that are asked for: float64[n], all finite."""
-    check_rows(path, values.size, w.first_row, w.last_row)
-    chosen = values[w.first_row - 1 : w.last_row]
     _check_count(path, chosen.size)
     raw = np.array(chosen, dtype=np.float64)
     bad = np.flatnonzero(~np.isfinite(raw))
     if bad.size:
-        row = w.first_row + int(bad[0])
+        row = first_row + int(bad[0])
         raise InputError(f"{path}: row {row}: value must be finite, got {raw[bad[0]]}")
     return raw
 
@@ -141,11 +137,3 @@ def _check_count(path: Path, count: int) -> None:
         check_length(count)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-
-
-def _column(w: FileWaveform, path: Path, names: Sequence[str]) -> int:
-    if w.column is not None:
-        return column_index(path, w.column, names)
-    if len(names) == 1:
-        return 0
-    raise InputError(f"{path}: has several columns: set column to one of {', '.join(names)}")

@@ -57,7 +57,7 @@ def test_only_what_lies_behind_the_last_change_is_judged(run):
     assert part.samples.index[0] == 1200  # of 9 whole cycles from 1030 on, one is left out
     assert part.cycles == 8
     assert part.cycle is not None
-    assert np.ptp(part.loop_input) == pytest.approx(10.0, rel=1e-3)
+    assert np.ptp(part.loop[0]) == pytest.approx(10.0, rel=1e-3)
     assert summarize(recording).peak_to_peak_um == pytest.approx(10.0, rel=1e-3)
 
 
@@ -90,7 +90,7 @@ def test_segments_before_a_change_are_judged_as_ever(run):
     recording = run(tuned(half + 50, 0.5, 100), segments=[first, second])
     parts = [steady_part(recording, each) for each in recording.segments]
     assert [part.cycles for part in parts] == [9, 7]
-    assert [np.ptp(part.loop_input) for part in parts] == pytest.approx([20.0, 10.0], rel=1e-3)
+    assert [np.ptp(part.loop[0]) for part in parts] == pytest.approx([20.0, 10.0], rel=1e-3)
 
 
 def test_untuned_run_loses_nothing(run):

@@ -133,6 +133,14 @@ def test_columns(tmp_path: Path) -> None:
         assert refusal(column_index, path, column, names) == text
 
 
+def test_column_that_nobody_named(tmp_path: Path) -> None:
+    """The only one there is; where there are several, one has to be named."""
+    path = tmp_path / "t.csv"
+    assert column_index(path, None, ["x"]) == 0
+    text = "t.csv: has several columns: set column to one of x, y"
+    assert refusal(column_index, path, None, ["x", "y"]) == text
+
+
 @pytest.mark.parametrize(("times", "tolerance", "message"), [
     ([0, 1, 2, 3, 5], 0.5, "t.csv:5: samples must be evenly spaced in time: this one is 2 s"),
     ([0, 1, 2, 2, 3], 0.5, "t.csv:4: samples must be evenly spaced in time: this one is 0 s"),
