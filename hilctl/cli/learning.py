@@ -68,9 +68,10 @@ def _print_rows(rows: "Sequence[Row]") -> None:
 
 
 def _print_end(learned: "Learned", output: Path, folder: Path) -> None:
-    from rich.console import Console
     from rich.table import Table
     from rich.text import Text
+
+    from hilctl.cli.console import console
 
     checks = {row.label: row for row in learned.check}
     last = {row.label: row for row in learned.rows}
@@ -90,7 +91,7 @@ def _print_end(learned: "Learned", output: Path, folder: Path) -> None:
             f"{row.delay_samples:.2f} samples",
             natural,
         )
-    console = Console()
-    console.print(table)
-    console.print(f"correction: {output}; runs: {folder}", soft_wrap=True, highlight=False)
-    console.print(f"  compensator.correction={output.resolve()}", soft_wrap=True, highlight=False)
+    terminal = console()
+    terminal.print(table)
+    terminal.print(f"correction: {output}; runs: {folder}", soft_wrap=True)
+    terminal.print(f"  compensator.correction={output.resolve()}", soft_wrap=True)
