@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-from hilctl.run.ring import memory_folder
+from hilctl.base.private import memory_folder
 
 HARDWARE = Path(__file__).parent / "hardware"
 SLOW = tuple(Path(__file__).parent / name for name in ("faults", "peers", "simulated_runs"))

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hilctl.base.errors import DataError, InputError
-from hilctl.base.files import refuse_existing, write_file
+from hilctl.base.files import check_writable, write_file
 from hilctl.base.samples import COLUMNS
 from hilctl.recording.data import Recording
 
@@ -59,7 +59,7 @@ def export(
     if write is None:
         known = ", ".join(_FORMATS)
         raise InputError(f"{path}: the suffix must be one of {known}: got {path.suffix!r}")
-    refuse_existing(path, overwrite=overwrite)
+    check_writable(path, overwrite=overwrite)
     table = columns(recording, t0, t1)
     write_file(path, lambda stream: write(stream, table, facts(recording)), overwrite=overwrite)
     return int(table["sample"].size)

@@ -5,6 +5,7 @@ device.py    the contract of a device and of a clock
 errors.py    every exception that is raised on purpose
 strict.py    base of every pydantic model
 files.py     texts, each read once; files written whole or not at all
+private.py   folders that belong to one user alone
 samples.py   a sample's columns and flags, and blocks of samples
 events.py    what a run records beside its samples
 segments.py  which samples of a run are judged

@@ -3,8 +3,8 @@
 import errno
 import os
 import secrets
-from collections.abc import Callable, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import BinaryIO, Self
@@ -158,6 +158,18 @@ class AtomicFile:
         self.close()
 
 
+@contextmanager
+def _written(path: Path, *, overwrite: bool) -> Iterator[AtomicFile]:
+    try:
+        with AtomicFile(path, overwrite=overwrite) as file:
+            yield file
+    except FileExistsError:
+        hint = "give another name, or --overwrite"
+        raise InputError(f"{path}: exists already: {hint}") from None
+    except OSError as error:
+        raise InputError(f"{path}: can't be written: {error.strerror or error}") from None
+
+
 def write_file(path: Path, write: Callable[[BinaryIO], object], *, overwrite: bool) -> None:
     """Write a file that appears whole or not at all.
 
@@ -169,14 +181,9 @@ def write_file(path: Path, write: Callable[[BinaryIO], object], *, overwrite: bo
     Raises:
         InputError: A file of that name exists, or it can't be written.
     """
-    try:
-        with AtomicFile(path, overwrite=overwrite) as file:
-            write(file.stream)
-            file.commit()
-    except FileExistsError:
-        raise _exists_already(path) from None
-    except OSError as error:
-        raise InputError(f"{path}: can't be written: {error.strerror or error}") from None
+    with _written(path, overwrite=overwrite) as file:
+        write(file.stream)
+        file.commit()
 
 
 def write_text(path: Path, text: str, *, overwrite: bool) -> None:
@@ -184,15 +191,11 @@ def write_text(path: Path, text: str, *, overwrite: bool) -> None:
     write_file(path, lambda stream: stream.write(text.encode()), overwrite=overwrite)
 
 
-def refuse_existing(path: Path, *, overwrite: bool) -> None:
-    """Refuse a name that is taken, before work is done that would be in vain.
+def check_writable(path: Path, *, overwrite: bool) -> None:
+    """Refuse a file that could not be written, before work is done that would be in vain.
 
     Raises:
-        InputError: There is something of that name, and it may not be replaced.
+        InputError: What :func:`write_file` would raise now.
     """
-    if not overwrite and os.path.lexists(path):
-        raise _exists_already(path)
-
-
-def _exists_already(path: Path) -> InputError:
-    return InputError(f"{path}: exists already: give another name, or --overwrite")
+    with _written(path, overwrite=overwrite):
+        pass  # not committed: nothing of it is left

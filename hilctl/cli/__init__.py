@@ -11,7 +11,8 @@ recordings.py  judge, replay, export and recover them, identify models;
 comparing.py   models against one another; compare_view.py
 learning.py    corrections from run to run
 machine.py     this computer and its devices; machine_view.py
-console.py     what recordings.py and comparing.py print; progress.py  a progress bar
+console.py     the console that tables go to, and what replay prints; progress.py  a progress bar
+streams.py     standard output and error, which all text passes: no control character goes through
 
 Exit codes: 0 done; 1 a replay that differs, or a rate that this machine does not keep; 2 the input
 can't be used, nothing has moved; 3 a run that ended by a fault; 128 + n a run stopped by signal n.
@@ -25,9 +26,10 @@ from typing import Annotated, NoReturn
 import typer
 
 from hilctl import __version__
-from hilctl.base.errors import ConfigError, HilctlError, InputError
+from hilctl.base.errors import ConfigError, HilctlError, InputError, RunError
 from hilctl.cli.commands import HELP_NAMES, CommandTable
 from hilctl.cli.options import print_json
+from hilctl.cli.streams import plain_streams
 
 __all__ = ["app", "main"]
 
@@ -45,15 +47,28 @@ app = typer.Typer(
 
 def main() -> None:
     """Run the command line; every error raised on purpose becomes a message and an exit code."""
-    shown = logging.StreamHandler()
-    shown.setFormatter(logging.Formatter("hilctl: %(message)s"))
-    logging.getLogger("hilctl").handlers[:] = [shown]
-    try:
-        app()
-    except HilctlError as error:
-        _refuse(error)
-    except KeyboardInterrupt:
-        raise SystemExit(128 + signal.SIGINT) from None
+    with plain_streams():
+        shown = logging.StreamHandler()
+        shown.setFormatter(logging.Formatter("hilctl: %(message)s"))
+        logging.getLogger("hilctl").handlers[:] = [shown]
+        try:
+            app()
+        except HilctlError as error:
+            _refuse(error)
+        except KeyboardInterrupt:
+            raise SystemExit(128 + signal.SIGINT) from None
+        except (OSError, MemoryError, ImportError) as error:
+            _refuse(RunError(_machine_refused(error)))
+
+
+def _machine_refused(error: OSError | MemoryError | ImportError) -> str:
+    """Say what this machine could not give."""
+    if isinstance(error, OSError):
+        where = f"{error.filename}: " if error.filename is not None else ""
+        return f"{where}{error.strerror or error}"
+    if isinstance(error, MemoryError):
+        return f"not enough memory{f': {error}' if str(error) else ''}"
+    return f"a part of the installation can't be loaded: {error}"
 
 
 def _refuse(error: HilctlError) -> NoReturn:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from hilctl.base.errors import InputError
+from hilctl.base.files import check_writable
 from hilctl.cli.options import AsJson, Overwrite, Settings, finish_orphans, print_json
 
 if TYPE_CHECKING:
@@ -90,10 +91,10 @@ def _numbers(text: str | None) -> list[float] | None:
 
 
 def check_page(html: Path | None, *, overwrite: bool) -> None:
-    """Refuse a page that would replace a file.
+    """Refuse a page that can't be written, before there is anything to put on it.
 
     Raises:
-        InputError: It exists, and may not be replaced.
+        InputError: It exists, and may not be replaced, or it can't be written.
     """
-    if html is not None and html.exists() and not overwrite:
-        raise InputError(f"{html}: exists already: give another name, or --overwrite")
+    if html is not None:
+        check_writable(html, overwrite=overwrite)

@@ -1,37 +1,65 @@
-"""Results of studies for people, in a terminal."""
+"""Tables and colours in a terminal: the only console, and results of studies on it."""
 
+import sys
+from collections.abc import Iterable
 from pathlib import Path
 
-from rich.console import Console, RenderableType
+from rich.console import Console, ConsoleOptions, RenderableType
+from rich.segment import Segment
+from rich.text import Text
 
 from hilctl.analysis.replay import ReplayResult
+from hilctl.cli.streams import PlainStream, visible
+
+
+class PlainConsole(Console):
+    """A console that takes no text for markup, and shows control characters in all it is given."""
+
+    def render(
+        self, renderable: RenderableType, options: ConsoleOptions | None = None
+    ) -> Iterable[Segment]:
+        """Return the segments of what is to be printed; those that move the cursor stay."""
+        for segment in super().render(renderable, options):
+            text, style, control = segment
+            yield segment if control or text.isprintable() else Segment(visible(text), style)
+
+
+def console(*, stderr: bool = False) -> Console:
+    """Return the console on standard output or error."""
+    stream = sys.stderr if stderr else sys.stdout
+    return PlainConsole(
+        file=stream.styled if isinstance(stream, PlainStream) else stream,
+        markup=False,
+        emoji=False,
+        highlight=False,
+    )
 
 
 def print_rich(renderable: RenderableType) -> None:
     """Print a table or text."""
-    Console().print(renderable)
+    console().print(renderable)
 
 
 def print_replay(result: ReplayResult, *, other: Path | None) -> None:
     """Print how recomputed commands compare with the recorded ones."""
-    console = Console()
+    terminal = console()
     unit = result.command_unit
     if result.left_out_samples:
-        console.print(f"{result.left_out_samples} samples behind lost ones can't be replayed")
+        terminal.print(f"{result.left_out_samples} samples behind lost ones can't be replayed")
     if other is None and result.identical:
-        console.print(f"[green]identical[/]: {result.samples} commands, bit for bit")
+        terminal.print(Text("identical", "green") + f": {result.samples} commands, bit for bit")
         return
     if other is None:
-        console.print(
-            f"[red]different[/]: {result.differing_samples} of {result.samples} commands, "
-            f"the first at sample {result.first_difference}"
+        terminal.print(
+            Text("different", "red") + f": {result.differing_samples} of {result.samples} "
+            f"commands, the first at sample {result.first_difference}"
         )
     else:
-        console.print(
+        terminal.print(
             f"with {other} the command would have run from {result.command_min:.4g} to "
             f"{result.command_max:.4g} {unit}, {result.limited_samples} samples limited"
         )
-    console.print(
+    terminal.print(
         f"largest difference {result.largest_difference:.4g} {unit}, "
         f"rms {result.rms_difference:.4g} {unit}"
     )

@@ -3,9 +3,9 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from rich.console import Console
 from rich.table import Table
 
+from hilctl.cli.console import console
 from hilctl.identify.catalogue import CATALOGUE
 from hilctl.identify.command import Identification
 from hilctl.identify.judge import LoopError
@@ -16,20 +16,20 @@ from hilctl.identify.summary import HEADINGS, error_rows, parameter_texts, summa
 
 def print_identification(found: Identification, output: Path | None) -> None:
     """Print errors loop by loop, parameters, and where the model went."""
-    console = Console()
+    terminal = console()
     fit, held_out = found.fit, found.held_out
     if found.orders:
-        console.print(_orders_table(found.orders))
-    console.print(_errors_table(fit.model.provenance.method, fit.errors))
+        terminal.print(_orders_table(found.orders))
+    terminal.print(_errors_table(fit.model.provenance.method, fit.errors))
     if held_out is not None:
-        console.print(_errors_table("not fitted, to check the model", held_out.errors))
+        terminal.print(_errors_table("not fitted, to check the model", held_out.errors))
     rows = ", ".join(f"{name} {text}" for name, text in parameter_texts(fit))
     if rows:
-        console.print(f"parameters: {rows}", highlight=False)
+        terminal.print(f"parameters: {rows}")
     for line in summary(found):
-        console.print(line, highlight=False)
+        terminal.print(line)
     if output is not None:
-        console.print(f"model: {output}", soft_wrap=True, highlight=False)
+        terminal.print(f"model: {output}", soft_wrap=True)
 
 
 def _errors_table(title: str, errors: Sequence[LoopError]) -> Table:
@@ -61,7 +61,7 @@ def print_settings() -> None:
     settings.columns[0].no_wrap = True
     for row in setting_rows():
         settings.add_row(*row)
-    console = Console()
-    console.print(kinds)
-    console.print()
-    console.print(settings)
+    terminal = console()
+    terminal.print(kinds)
+    terminal.print()
+    terminal.print(settings)

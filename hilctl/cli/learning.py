@@ -1,5 +1,6 @@
 """The command that learns on references that repeat."""
 
+import shlex
 import signal
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -7,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from hilctl.base.errors import InputError
-from hilctl.base.files import refuse_existing
+from hilctl.base.files import check_writable
 from hilctl.cli.options import (
     AsJson,
     ExperimentFile,
@@ -41,7 +42,7 @@ def learn(
     from hilctl.experiment.correction import write_correction
     from hilctl.learning.session import Session, paced, unpaced
 
-    refuse_existing(output, overwrite=overwrite)
+    check_writable(output, overwrite=overwrite)
     chosen = folder or output.with_name(f"{output.stem}-runs")
     if not overwrite and any(chosen.glob("run-*.mcap")):
         raise InputError(f"{chosen}: holds runs already: give another --folder, or --overwrite")
@@ -68,9 +69,11 @@ def _print_rows(rows: "Sequence[Row]") -> None:
 
 
 def _print_end(learned: "Learned", output: Path, folder: Path) -> None:
-    from rich.console import Console
     from rich.table import Table
     from rich.text import Text
+
+    from hilctl.cli.console import console
+    from hilctl.learning.session import correction_setting
 
     checks = {row.label: row for row in learned.check}
     last = {row.label: row for row in learned.rows}
@@ -90,7 +93,8 @@ def _print_end(learned: "Learned", output: Path, folder: Path) -> None:
             f"{row.delay_samples:.2f} samples",
             natural,
         )
-    console = Console()
-    console.print(table)
-    console.print(f"correction: {output}; runs: {folder}", soft_wrap=True, highlight=False)
-    console.print(f"  compensator.correction={output.resolve()}", soft_wrap=True, highlight=False)
+    terminal = console()
+    terminal.print(table)
+    terminal.print(f"correction: {output}; runs: {folder}", soft_wrap=True)
+    setting = shlex.quote(correction_setting(output))
+    terminal.print(f"  --set {setting}", soft_wrap=True)

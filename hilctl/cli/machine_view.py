@@ -4,11 +4,12 @@ import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from rich.console import Console, Group, RenderableType
+from rich.console import Group, RenderableType
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 from rich.text import Text
 
+from hilctl.cli.console import console
 from hilctl.experiment.inventory import Inventory, Probed
 from hilctl.machine.diagnosis import Diagnosis, lateness_counts
 from hilctl.machine.latency import Latency
@@ -82,13 +83,13 @@ def _lateness(latency: Latency) -> RenderableType:
 @contextmanager
 def measuring(seconds: float, *, quiet: bool) -> Iterator[Callable[[float], None]]:
     """Show a bar on standard error; yield what to call with the time that has passed, in s."""
-    console = Console(stderr=True)
+    terminal = console(stderr=True)
     with Progress(
         TextColumn("[bold]measuring"),
         BarColumn(bar_width=24),
         TimeRemainingColumn(),
-        console=console,
-        disable=quiet or not console.is_terminal,
+        console=terminal,
+        disable=quiet or not terminal.is_terminal,
         transient=True,
     ) as progress:
         task = progress.add_task("measuring", total=seconds)
@@ -106,16 +107,16 @@ def print_inventory(found: Inventory) -> None:
     ports = Table(title="serial ports", title_justify="left", show_header=False, box=None)
     for port in found.serial_ports:
         ports.add_row(port.path, port.description)
-    console = Console()
-    console.print(table, profiles)
-    console.print(ports if found.serial_ports else "no serial port found", soft_wrap=True)
+    terminal = console()
+    terminal.print(table, profiles)
+    terminal.print(ports if found.serial_ports else "no serial port found", soft_wrap=True)
 
 
 def print_probed(answered: Probed) -> None:
     """Print what a device said of itself."""
-    console = Console()
-    console.print(f"[green]{answered.name} answers[/]: {answered.description}", highlight=False)
+    terminal = console()
+    terminal.print(Text(f"{answered.name} answers", "green") + f": {answered.description}")
     note = f": {answered.rate_note}" if answered.rate_note else ""
-    console.print(f"at most {answered.max_rate_hz:.6g} samples a second{note}", highlight=False)
+    terminal.print(f"at most {answered.max_rate_hz:.6g} samples a second{note}")
     for key, value in answered.details.items():
-        console.print(f"  {key}: {value}", highlight=False, markup=False)
+        terminal.print(f"  {key}: {value}")

@@ -1,17 +1,18 @@
 """Runs for people, in a terminal: progress, forecast, how each stands and how it ended."""
 
+import shlex
 import time
 from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
-from rich.console import Console
-from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from rich.table import Table
+from rich.text import Text
 
 from hilctl.analysis.figures import RunReport
 from hilctl.analysis.report import summarize
+from hilctl.cli.console import console
 from hilctl.cli.report_view import render
 from hilctl.experiment.check import Checked
 from hilctl.recording.reader import read
@@ -30,15 +31,15 @@ class LiveView:
     """
 
     def __init__(self, *, quiet: bool) -> None:
-        console = Console(stderr=True)
+        terminal = console(stderr=True)
         self._progress = Progress(
             TextColumn("[bold]run"),
             BarColumn(bar_width=24),
             TextColumn("{task.percentage:>3.0f} %"),
             TextColumn("{task.fields[live]}"),
             TimeRemainingColumn(),
-            console=console,
-            disable=quiet or not console.is_terminal,
+            console=terminal,
+            disable=quiet or not terminal.is_terminal,
             refresh_per_second=8,
         )
         self._task: TaskID | None = None
@@ -108,17 +109,18 @@ def run_mapping(result: RunResult, report: RunReport | None) -> dict[str, Any]:
 
 def print_run(result: RunResult, report: RunReport | None) -> None:
     """Print how a run ended and, unless it is very long, its report."""
-    console = Console()
+    terminal = console()
     colour = {"completed": "green", "stopped": "yellow"}.get(result.code, "red")
-    console.print(f"[{colour}]{result.code}[/]: {result.reason}", highlight=False)
+    terminal.print(Text(result.code, colour) + f": {result.reason}")
     if not result.safe:
-        console.print("[bold red]The output is not known to be at its safe value.[/]")
+        terminal.print("The output is not known to be at its safe value.", style="bold red")
     if result.samples == 0:
-        console.print("no sample was recorded")
+        terminal.print("no sample was recorded")
     elif report is not None:
-        console.print(render(report))
-    console.print(f"recorded: {result.path}", soft_wrap=True, highlight=False)
-    console.print(f"  hilctl report {result.path} --html run.html", soft_wrap=True, highlight=False)
+        terminal.print(render(report))
+    terminal.print(f"recorded: {result.path}", soft_wrap=True)
+    path = shlex.quote(str(result.path))
+    terminal.print(f"  hilctl report {path} --html run.html", soft_wrap=True)
 
 
 def print_forecast(checked: Checked) -> None:
@@ -146,22 +148,22 @@ def print_forecast(checked: Checked) -> None:
         rows["heating"] = f"{forecast.heating_rms_a:.4g} A rms (limit {limits.rms_current_a:g})"
     for name, text in rows.items():
         table.add_row(name, text)
-    console = Console()
-    console.print(table)
-    console.print("[green]may start[/]")
+    terminal = console()
+    terminal.print(table)
+    terminal.print("may start", style="green")
 
 
 def print_status(found: list[dict[str, Any]]) -> None:
     """Print which runs are going on, a block of lines each."""
-    console = Console()
+    terminal = console()
     if not found:
-        console.print("no run is going on")
+        terminal.print("no run is going on")
     for run in found:
-        console.print(f"[bold]{escape(run['name'])}[/]  {run['state']}", highlight=False)
+        terminal.print(Text(run["name"], "bold") + f"  {run['state']}")
         for name, text in _status_lines(run).items():
             # A path is left whole, wherever the line ends, so that it can be copied.
             line = f"  {name:10} {text}"
-            console.print(line, highlight=False, markup=False, soft_wrap=True)
+            terminal.print(line, soft_wrap=True)
 
 
 def _status_lines(run: dict[str, Any]) -> dict[str, str]:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from hilctl.base.errors import InputError
-from hilctl.base.files import write_text
+from hilctl.base.files import check_writable, write_text
 from hilctl.base.yaml.document import Document
 from hilctl.identify.catalogue import entry
 from hilctl.identify.data.files import load_records
@@ -89,8 +89,8 @@ def identify_files(
     Raises:
         InputError: A file or a setting can't be used; nothing is written.
     """
-    if output is not None and output.exists() and not overwrite:
-        raise InputError(f"{output}: exists already: give another --output, or --overwrite")
+    if output is not None:
+        check_writable(output, overwrite=overwrite)
     with workers(scheduler) as run:
         lag = _lag(paths, settings, run, progress)
         records, recorded = load_records(paths, settings, lag)

@@ -1,5 +1,6 @@
 """Learning, run by run: the same experiment over and over, each time with the next correction."""
 
+import json
 import signal
 import time
 from collections.abc import Callable, Sequence
@@ -39,6 +40,12 @@ def paced(path: Path, settings: Sequence[str], output: Path) -> RunResult:
 def unpaced(path: Path, settings: Sequence[str], output: Path) -> RunResult:
     """Run a simulated device as fast as it goes."""
     return run_unpaced(checked_experiment(path, settings), output, overwrite=True)
+
+
+def correction_setting(file: Path) -> str:
+    """Return the ``key=value`` text that has an experiment use a correction, whatever its name."""
+    # Quoted: "lab #3" would end at the space, and "a: b" be a mapping.
+    return f"compensator.correction={json.dumps(str(file.resolve()), ensure_ascii=False)}"
 
 
 class _StoppedError(Exception):
@@ -133,7 +140,7 @@ class Session:
             for segment, each in zip(self._segments, coefficients, strict=True)
         ]
         write_correction(file, self._whole(cycles), overwrite=True)
-        settings = [*self._settings, f"compensator.correction={file.resolve()}"]
+        settings = [*self._settings, correction_setting(file)]
         settings += self._other_noise(number)
         result = self._run(self._experiment, settings, self._folder / f"{name}.mcap")
         if result.stop_signal and self._rows:

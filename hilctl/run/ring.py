@@ -242,16 +242,6 @@ class SampleRing:
         return batch
 
 
-def memory_folder() -> Path:
-    """Return a folder whose files live in memory, or the folder for temporary files."""
-    shared = Path("/dev/shm")  # noqa: S108  the kernel's own shared-memory mount
-    if shared.is_dir() and os.access(shared, os.W_OK):
-        return shared
-    import tempfile
-
-    return Path(tempfile.gettempdir())
-
-
 def _shapes(slots: int, block: int, state_size: int) -> tuple[tuple[int, ...], ...]:
     """Return the shapes of heads, states, columns and flags."""
     width = len(COLUMNS)

@@ -3,13 +3,20 @@
 Each run has a folder in memory, owned by its user alone. Locks, not process numbers, say who lives:
 the kernel drops them with the process that held them. The loop inherits the run's and the device's
 locks, so that both stay held until the output is safe, whatever becomes of the supervisor.
+
+A device's lock is a name of an abstract Unix socket: it holds against every user of the machine
+(of one network namespace), and there is no file of it that one user could put in another's way.
 """
 
+import errno
 import fcntl
+import hashlib
 import json
 import os
-import re
+import pwd
 import shutil
+import socket
+import struct
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass
@@ -17,9 +24,11 @@ from pathlib import Path
 from typing import Any
 
 from hilctl.base.errors import InputError, RunError
-from hilctl.run.ring import memory_folder
+from hilctl.base.private import private_folder, user_folders
 
 _CARD = "run.json"
+_PEER = struct.Struct("3i")  # process, user and group, as in unix(7)
+_REFUSED_ONES = 1000  # so many may ask a lock's socket who holds it
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,6 +94,8 @@ class RunFolder:
 
     def remove(self) -> None:
         """Remove it and all that is in it."""
+        # The card first: whoever looks in between must not take what is left for a dead run.
+        (self.path / _CARD).unlink(missing_ok=True)
         shutil.rmtree(self.path, ignore_errors=True)
 
 
@@ -94,24 +105,49 @@ def base_folder() -> Path:
     ``HILCTL_RUNS`` names another one.
 
     Raises:
-        RunError: It can't be used, or belongs to somebody else.
+        RunError: There is none that can be used and is this user's alone.
     """
+    return _base_folders(make=True)[0]
+
+
+def _base_folders(*, make: bool) -> list[Path]:
+    """Return the folders that runs of this user may be in; the first one made where there is none.
+
+    All of them: where somebody takes the first place, or leaves it, running runs are found still.
+    """
+    found: list[Path] = []
+    problems: list[str] = []
     given = os.environ.get("HILCTL_RUNS")
-    folder = Path(given) if given else memory_folder() / f"hilctl-{os.getuid()}"
     try:
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        found = folder.lstat()  # a link that somebody else has put there is not ours to follow
+        places = [Path(given)] if given else user_folders()
     except OSError as error:
-        raise RunError(f"{folder}: can't be made: {error.strerror}") from None
-    if found.st_uid != os.getuid() or found.st_mode & 0o022:
-        raise RunError(f"{folder}: must be yours, and writable by nobody else: remove it")
-    return folder
+        raise RunError(f"no folder for runs: {error.strerror}") from None
+    for place in places:
+        try:
+            found.append(private_folder(place, make=make and not found))
+        except OSError as error:
+            if make or _is_own(place):  # where somebody else's stands, no run of ours can be
+                problems.append(f"{place}: {error.strerror}")
+    if problems and not found:
+        hint = "remove it, or name another one by HILCTL_RUNS"
+        raise RunError(f"no folder for runs: {'; '.join(problems)} ({hint})")
+    return found
+
+
+def _is_own(path: Path) -> bool:
+    with suppress(OSError):
+        return path.lstat().st_uid == os.geteuid()
+    return False
 
 
 def runs() -> list[RunFolder]:
-    """Return all runs of this user, the oldest first, dead ones included."""
+    """Return all runs of this user, the oldest first, dead ones included.
+
+    Raises:
+        RunError: The folder of this user's runs can't be trusted.
+    """
     found = []
-    for folder in sorted(base_folder().iterdir()):
+    for folder in (each for base in _base_folders(make=False) for each in sorted(base.iterdir())):
         with suppress(OSError, ValueError, TypeError):  # being made or removed at this moment
             card = RunCard(**json.loads((folder / _CARD).read_text(encoding="utf-8")))
             found.append(RunFolder(folder, card))
@@ -130,75 +166,95 @@ def run_folder(
     Raises:
         RunError: It can't be made.
     """
-    number = os.getpid()
-    path = base_folder() / f"{experiment}-{number}"
-    card = RunCard(path.name, experiment, str(recording.resolve()), number, started)
-    shutil.rmtree(path, ignore_errors=True)  # of a dead process that had the same number
-    path.mkdir(mode=0o700)
+    base, number = base_folder(), os.getpid()
     with ExitStack() as stack:
-        stack.callback(shutil.rmtree, path, ignore_errors=True)
-        shared = stack.enter_context(_locked(path / "run.lock"))
-        stack.enter_context(_locked(path / "supervisor.lock"))
-        # After the locks: others know a run by its card, and take one without locks for dead.
-        (path / _CARD).write_text(json.dumps(asdict(card)), encoding="utf-8")
-        yield RunFolder(path, card), [shared]
+        try:
+            path = _new_folder(base / f"{experiment}-{number}")
+            stack.callback(shutil.rmtree, path, ignore_errors=True)
+            card = RunCard(path.name, experiment, str(recording.resolve()), number, started)
+            folder = RunFolder(path, card)
+            shared = stack.enter_context(_locked(path / "run.lock"))
+            stack.enter_context(_locked(path / "supervisor.lock"))
+            # Under the locks: a folder with a card and without locks is a dead run to others.
+            stack.callback(folder.remove)
+            (path / _CARD).write_text(json.dumps(asdict(card)), encoding="utf-8")
+        except OSError as error:
+            raise RunError(f"{base}: no run's folder can be made: {error.strerror}") from None
+        yield folder, [shared]
+
+
+def _new_folder(path: Path) -> Path:
+    """Make a folder; one of that name may hold the samples of a process of the same number."""
+    number, made = 1, path
+    while True:
+        try:
+            made.mkdir(mode=0o700)
+            return made
+        except FileExistsError:
+            number += 1
+            made = path.with_name(f"{path.name}-{number}")
 
 
 @contextmanager
-def held_devices(holds: Sequence[str], user: str) -> Iterator[list[int]]:
+def held_devices(holds: Sequence[str]) -> Iterator[list[int]]:
     """Hold what a device holds alone, against every other run on this machine.
 
     Args:
         holds: Names, as :attr:`hilctl.base.device.DeviceInfo.holds`.
-        user: Who holds it, for the message that the next one gets.
 
     Yields:
         Descriptors of the locks, for the loop to inherit.
 
     Raises:
         InputError: Another run holds one of them; the message names it.
+        RunError: The kernel refuses a lock.
     """
-    folder = memory_folder() / "hilctl-devices"
-    with suppress(FileExistsError):
-        folder.mkdir()
-        folder.chmod(0o1777)  # the umask cuts the mode that mkdir is given
     with ExitStack() as stack:
-        descriptors = []
         # In one order for all: else two runs might each get one of two, and both be refused.
-        for name in sorted(set(holds)):
-            path = folder / (re.sub(r"[^A-Za-z0-9.:_-]+", "_", name) + ".lock")
-            descriptors.append(stack.enter_context(_held(path, name, user)))
-        yield descriptors
+        yield [stack.enter_context(_held(name)) for name in sorted(set(holds))]
 
 
 @contextmanager
-def _held(path: Path, name: str, user: str) -> Iterator[int]:
-    descriptor = _open_shared(path)
+def _held(name: str) -> Iterator[int]:
     try:
+        lock = socket.socket(socket.AF_UNIX)
+    except OSError as error:
+        raise RunError(f"{name}: can't be locked: {error.strerror}") from None
+    with lock:
         try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            holder = os.pread(descriptor, 1000, 0).decode(errors="replace") or "another run"
+            lock.bind(_lock_address(name))
+            lock.listen(_REFUSED_ONES)
+        except OSError as error:
+            if error.errno != errno.EADDRINUSE:
+                raise RunError(f"{name}: can't be locked: {error.strerror}") from None
             raise InputError(
-                f"{name} is in use by {holder}: wait for its end, or stop it first"
+                f"{name} is in use by {_holder(name)}: wait for its end, or stop it first"
             ) from None
-        with suppress(OSError):  # a lock file of another user: who holds it can't be written down
-            os.ftruncate(descriptor, 0)
-            os.pwrite(descriptor, user.encode(), 0)
-        yield descriptor
-    finally:
-        os.close(descriptor)
+        yield lock.fileno()
 
 
-def _open_shared(path: Path) -> int:
-    """Open a lock file that every user of the machine may lock."""
+def _lock_address(name: str) -> bytes:
+    """Return the abstract address that stands for a name of any length."""
+    return b"\0hilctl/device/" + hashlib.sha256(os.fsencode(name)).hexdigest().encode()
+
+
+def _holder(name: str) -> str:
+    """Say who holds a lock, by what the kernel knows of its socket."""
+    with socket.socket(socket.AF_UNIX) as asking:
+        asking.setblocking(False)  # it never answers; the kernel does
+        try:
+            asking.connect(_lock_address(name))
+            peer = asking.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _PEER.size)
+        except OSError:  # let go of at this moment, or asked for by too many
+            return "another run"
+    process, user, _ = _PEER.unpack(peer)
+    for run in runs():
+        if run.card.supervisor == process:
+            return f"run {run.card.name} (process {process}, recording {run.card.recording})"
     try:
-        # Without O_CREAT first: in a sticky folder Linux may refuse it on another user's file.
-        return os.open(path, os.O_RDWR)
-    except PermissionError:
-        return os.open(path, os.O_RDONLY)
-    except FileNotFoundError:
-        return os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+        return f"process {process} of {pwd.getpwuid(user).pw_name}"
+    except KeyError:
+        return f"process {process} of user {user}"
 
 
 @contextmanager
@@ -220,12 +276,13 @@ def taken_over(run: RunFolder) -> Iterator[bool]:
     """
     try:
         descriptor = os.open(run.path / "run.lock", os.O_RDWR)
-    except OSError:
+    except FileNotFoundError:
         yield False
         return
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        held = run.path.exists()  # under the lock: who had it before may have removed the folder
+        # Under the lock: who had it before may have removed what there was.
+        held = (run.path / _CARD).exists()
     except BlockingIOError:
         held = False
     try:
@@ -237,7 +294,7 @@ def taken_over(run: RunFolder) -> Iterator[bool]:
 def _is_locked(path: Path) -> bool:
     try:
         descriptor = os.open(path, os.O_RDWR)
-    except OSError:
+    except FileNotFoundError:
         return False
     try:
         # Shared: two that look at once must not take each other for the holder.

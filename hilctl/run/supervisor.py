@@ -6,7 +6,6 @@ recording.
 """
 
 import json
-import os
 import signal
 import time
 from collections.abc import Callable, Iterator
@@ -78,9 +77,8 @@ class Supervisor:
         be_ordinary()
         config = self._config
         with ExitStack() as stack:
-            user = f"run {config.name} (process {os.getpid()}, recording {self._output})"
             # The device before the recording: a run that is refused must not touch a file.
-            locks = stack.enter_context(held_devices(self._checked.loaded.device.info.holds, user))
+            locks = stack.enter_context(held_devices(self._checked.loaded.device.info.holds))
             recorder = Recorder(self._checked, self._output, overwrite=self._overwrite)
             try:
                 folder, own = stack.enter_context(

@@ -18,6 +18,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from hilctl.base.private import memory_folder
 from hilctl.base.samples import Head
 from hilctl.experiment.check import Checked, check
 from hilctl.experiment.load import LoadedExperiment, load_experiment
@@ -26,7 +27,7 @@ from hilctl.machine.realtime import prepare
 from hilctl.machine.settings import Realtime
 from hilctl.run import loop_process
 from hilctl.run.job import Job
-from hilctl.run.ring import SampleRing, memory_folder
+from hilctl.run.ring import SampleRing
 from hilctl.run.run_folder import RunCard, RunFolder
 from hilctl.run.shared_page import Field
 

@@ -1,12 +1,13 @@
 """Text files are read once, and not at all once the texts are given; files are written whole."""
 
 import os
+from functools import partial
 from pathlib import Path
 
 import pytest
 
 from hilctl.base.errors import InputError
-from hilctl.base.files import TextFiles, read_text, refuse_existing, write_file, write_text
+from hilctl.base.files import TextFiles, check_writable, read_text, write_file, write_text
 
 
 def test_file_is_read_once(tmp_path):
@@ -88,8 +89,8 @@ class TestWriting:
             with pytest.raises(InputError, match="exists already: give another name, or --overw"):
                 write_text(name, "new", overwrite=False)
             with pytest.raises(InputError, match="exists already"):
-                refuse_existing(name, overwrite=False)
-            refuse_existing(name, overwrite=True)
+                check_writable(name, overwrite=False)
+            check_writable(name, overwrite=True)
         assert path.read_text() == "precious"
         write_text(link, "new", overwrite=True)
         assert path.read_text() == "new"
@@ -184,3 +185,26 @@ class TestWriting:
 
 def _refuse(*_arguments):
     raise PermissionError(1, "Operation not permitted")
+
+
+@pytest.mark.parametrize("name", ["folder", "fifo", "null", "missing/out.txt", "x" * 300])
+def test_what_could_not_be_written_is_refused_beforehand(tmp_path, name):
+    """With the words that writing has for it, and nothing is left or replaced."""
+    (tmp_path / "folder").mkdir()
+    os.mkfifo(tmp_path / "fifo")
+    (tmp_path / "null").symlink_to("/dev/null")
+    before = sorted(tmp_path.iterdir())
+    said = []
+    for write in (check_writable, partial(write_text, text="new")):
+        with pytest.raises(InputError, match=f"{name}: can't be written") as refused:
+            write(tmp_path / name, overwrite=True)
+        said.append(str(refused.value))
+    assert said[0] == said[1]
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_what_can_be_written_is_left_as_it_is(tmp_path):
+    (tmp_path / "old.txt").write_text("old")
+    check_writable(tmp_path / "old.txt", overwrite=True)
+    check_writable(tmp_path / "new.txt", overwrite=False)
+    assert [(each.name, each.read_text()) for each in tmp_path.iterdir()] == [("old.txt", "old")]

@@ -45,7 +45,7 @@ finally:
 """
     ended = in_a_process(code, *words)
     loaded = ended.stdout.splitlines()[-1]
-    assert loaded == "loaded: ['hilctl.cli.commands', 'hilctl.cli.options']"
+    assert loaded == "loaded: ['hilctl.cli.commands', 'hilctl.cli.options', 'hilctl.cli.streams']"
     assert ended.returncode == (2 if words == ["stauts"] else 0)
 
 

@@ -1,11 +1,15 @@
-"""What replay prints: the same bits, other bits, and another model."""
+"""What reaches the terminal as it is, and what replay prints: the same bits, or others."""
 
 from dataclasses import replace
 
 import pytest
+from rich.console import Group
+from rich.table import Table
+from rich.text import Text
 
 from hilctl.analysis.replay import ReplayResult
-from hilctl.cli.console import print_replay
+from hilctl.cli.console import print_replay, print_rich
+from hilctl.cli.streams import plain_streams
 
 SAME = ReplayResult(
     samples=900, left_out_samples=0, identical=True, first_difference=None, differing_samples=0,
@@ -48,3 +52,37 @@ def test_another_model_is_never_called_identical(shown, tmp_path):
 
 def test_samples_behind_lost_ones_are_told(shown):
     assert shown(replace(SAME, left_out_samples=50)).startswith("50 samples behind lost ones")
+
+
+@pytest.fixture
+def printed(monkeypatch, capsys):
+    """Return a function that gives what a terminal with colours gets."""
+    monkeypatch.setenv("COLUMNS", "120")
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    monkeypatch.setenv("TERM", "xterm")
+
+    def of(renderable):
+        with plain_streams():
+            print_rich(renderable)
+        return capsys.readouterr().out
+
+    return of
+
+
+def test_nothing_is_taken_for_markup(printed):
+    """File names and labels may look like markup, or like the name of a picture."""
+    table = Table("[/x]", title="[red]a[/]")
+    table.add_row(":smile: [/b]")
+    text = printed(table)
+    assert all(each in text for each in ("[/x]", "[red]a[/]", ":smile: [/b]"))
+
+
+def test_styles_are_sent_and_control_characters_shown(printed):
+    """Wherever the text stands: alone, styled, in a cell or in a title."""
+    hostile = "a\x1b[2Jb"
+    table = Table(hostile, title=Text(hostile))
+    table.add_row(Text(hostile, "green"))
+    text = printed(Group(hostile, table))
+    assert "\x1b[32m" in text
+    assert text.count(r"a\x1b") == 4  # a cell is cut where it was measured before
+    assert "\x1b[2J" not in text

@@ -57,7 +57,8 @@ def test_people_read_rows_and_where_the_correction_is(taught, tmp_path, capsys):
     shown = capsys.readouterr().out
     assert "run  1  peak error 0.5000 % (noise floor 0.0500 %)  reach 800 Hz" in shown
     assert "learned: the noise floor is reached" in shown
-    assert f"compensator.correction={(tmp_path / 'correction.yaml').resolve()}" in shown
+    file = (tmp_path / "correction.yaml").resolve()
+    assert f"--set 'compensator.correction=\"{file}\"'" in shown
     assert (tmp_path / "correction.yaml").is_file()
 
 

@@ -1,10 +1,13 @@
 """What compilation must not change: bits, block cuts, types."""
 
+import os
+from pathlib import Path
+
 import numba
 import numpy as np
 import pytest
 
-from hilctl.kernels import hysteresis
+from hilctl.kernels import hysteresis, jit
 from hilctl.kernels.limit import limit_block
 
 PLAYS = (1.3, np.array([0.2, 0.5, 0.9]), np.array([0.7, 0.1, 0.4]))
@@ -129,3 +132,61 @@ def test_a_strided_view_is_refused():
     kernel, parameters = STREAMING["play_sum"]
     with pytest.raises(TypeError, match="No matching definition"):
         kernel(SIGNAL[::2], *parameters, hysteresis.rest_memory(3), np.empty(200))
+
+
+@pytest.fixture
+def in_memory(tmp_path, monkeypatch):
+    """A user's folder in memory, and nothing else that could be written."""
+    cache = numba.core.caching
+    for locator in (cache.InTreeCacheLocator, cache.UserWideCacheLocator):
+        monkeypatch.setattr(locator, "get_cache_path", lambda self: "/proc/closed")
+    monkeypatch.setattr(numba.config, "CACHE_DIR", "")
+    monkeypatch.setenv("NUMBA_CACHE_DIR", "")
+    monkeypatch.setattr(jit, "user_folders", lambda: [Path("/proc/closed"), tmp_path / "own"])
+    jit._cache_in_memory.cache_clear()
+    yield tmp_path / "own" / "kernels"
+    jit._cache_in_memory.cache_clear()
+    monkeypatch.undo()
+    numba.config.reload_config()
+
+
+def double(value: float) -> float:
+    return 2.0 * value
+
+
+def test_kept_in_memory_where_no_folder_can_be_written(in_memory):
+    """A user with a read-only home waits for the compiler once, and so does the loop's process."""
+    assert jit.kernel("float64(float64)")(double)(1.5) == 3.0
+    assert list(in_memory.rglob("*.nbc"))
+    assert os.environ["NUMBA_CACHE_DIR"] == str(in_memory)
+    again = jit.kernel("float64(float64)")(double)
+    assert sum(again.stats.cache_hits.values()) == 1
+
+
+def test_compiled_where_nothing_can_be_kept(in_memory, monkeypatch):
+    """Not even memory: it takes longer, and runs."""
+    monkeypatch.setattr(jit, "user_folders", lambda: [Path("/proc/closed")])
+    assert jit.kernel("float64(float64)")(double)(1.5) == 3.0
+    assert not in_memory.exists()
+
+
+def test_full_disk_keeps_no_kernel_from_being_compiled(tmp_path, in_memory, monkeypatch):
+    """What numba's own folder has no room for goes into memory."""
+    full = tmp_path / "full"
+    monkeypatch.setattr(numba.core.caching.InTreeCacheLocator, "get_cache_path", lambda _: full)
+    save = numba.core.caching.IndexDataCacheFile.save
+
+    def save_where_there_is_room(self, key, data):
+        if full in Path(self._index_path).parents:
+            raise OSError(28, "No space left on device")
+        save(self, key, data)
+
+    monkeypatch.setattr(numba.core.caching.IndexDataCacheFile, "save", save_where_there_is_room)
+    assert jit.kernel("float64(float64)")(double)(1.5) == 3.0
+    assert list(in_memory.rglob("*.nbc"))
+
+
+def test_mistake_in_a_kernel_is_said(in_memory):
+    """What has nothing to do with the cache is not passed over."""
+    with pytest.raises(numba.TypingError):
+        jit.kernel("float64(unicode_type)")(double)

@@ -33,12 +33,12 @@ def learned(folder, runs, cycles=2):
 
 def test_each_run_has_the_next_correction_and_noise_of_its_own(tmp_path):
     """The correction of a run stands beside its recording; the check is one run more."""
-    runs = Runs()
-    found = learned(tmp_path, runs)
+    runs, folder = Runs(), tmp_path / "lab #3: ü"  # of a name that has a meaning in YAML
+    found = learned(folder, runs)
     assert len(runs.settings) == 4
     for number, settings in enumerate(runs.settings):
-        file = tmp_path / f"run-{number:02d}.yaml"
-        assert settings[-2:] == [f"compensator.correction={file}", f"device.seed={40 + number}"]
+        file = folder / f"run-{number:02d}.yaml"
+        assert settings[-2:] == [f'compensator.correction="{file}"', f"device.seed={40 + number}"]
         assert load_correction(file).sample_rate_hz == found.correction.sample_rate_hz
     assert [row.run for row in found.rows] == [0, 1, 2]
     assert [row.run for row in found.check] == [3]

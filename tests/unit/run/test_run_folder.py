@@ -2,6 +2,9 @@
 
 import json
 import os
+import shutil
+import subprocess
+import sys
 
 import pytest
 
@@ -12,7 +15,6 @@ from hilctl.run.run_folder import base_folder, held_devices, run_folder, runs, t
 @pytest.fixture(autouse=True)
 def folders(tmp_path, monkeypatch):
     monkeypatch.setenv("HILCTL_RUNS", str(tmp_path / "runs"))
-    monkeypatch.setattr("hilctl.run.run_folder.memory_folder", lambda: tmp_path)
     return tmp_path
 
 
@@ -38,7 +40,8 @@ def test_dead_run_is_taken_over_once(tmp_path):
     with made(tmp_path) as (folder, _), taken_over(folder) as ours:
         assert not ours
     folder.path.mkdir()
-    (folder.path / "run.lock").touch()
+    for name in ("run.lock", "run.json"):
+        (folder.path / name).touch()
     with taken_over(folder) as first, taken_over(folder) as second:
         assert (first, second) == (True, False)
     folder.remove()
@@ -64,24 +67,159 @@ def test_half_made_folders_are_passed_over(tmp_path):
         assert runs() == []
 
 
-def test_device_is_held_by_one_run():
-    """The second run is refused, and hears who the first is."""
-    with held_devices(("serial:/dev/ttyUSB0",), "run a (process 1)"):
+def test_finished_run_never_looks_dead(tmp_path, monkeypatch):
+    """While its folder is being removed it is either alive or not there: nobody recovers it."""
+    seen = []
+    remove = shutil.rmtree
+
+    def look_then_remove(path, **options):
+        seen.append([run.alive for run in runs()])
+        remove(path, **options)
+
+    with made(tmp_path):
+        monkeypatch.setattr(shutil, "rmtree", look_then_remove)
+    assert seen[0] == []
+    assert all(all(each) for each in seen)
+
+
+def test_lock_is_held_until_the_folder_is_gone(tmp_path, monkeypatch):
+    """Somebody who waits for the lock finds nothing to recover behind it."""
+    held = []
+    remove = shutil.rmtree
+
+    def try_then_remove(path, **options):
+        with taken_over(folder) as ours:
+            held.append(ours)
+        remove(path, **options)
+
+    with made(tmp_path) as (folder, _):
+        monkeypatch.setattr(shutil, "rmtree", try_then_remove)
+    assert not any(held)
+
+
+def test_samples_of_a_dead_process_of_the_same_number_stay(tmp_path):
+    """A new run takes another folder: the old one's ring may be all there is of its samples."""
+    old = base_folder() / f"sine-{os.getpid()}"
+    old.mkdir()
+    (old / "ring").write_text("samples")
+    with made(tmp_path) as (folder, _):
+        assert folder.path == old.with_name(f"{old.name}-2")
+        assert folder.card.name == folder.path.name
+    assert (old / "ring").read_text() == "samples"
+
+
+def test_folder_that_can_not_be_made_is_one_message(tmp_path, monkeypatch):
+    """A full or closed file system is said, and leaves nothing."""
+
+    def full(*_arguments, **_options):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("pathlib.Path.write_text", full)
+    with (
+        pytest.raises(RunError, match="no run's folder can be made: No space left"),
+        made(tmp_path),
+    ):
+        pass
+    assert list(base_folder().iterdir()) == []
+
+
+def test_no_descriptor_left_is_not_taken_for_a_dead_run(tmp_path, monkeypatch):
+    """A lock that can't be looked at says nothing of who holds it."""
+
+    def none_left(*_arguments):
+        raise OSError(24, "Too many open files")
+
+    with made(tmp_path) as (folder, _):
+        monkeypatch.setattr(os, "open", none_left)
+        for look in (lambda: folder.alive, lambda: folder.supervised):
+            with pytest.raises(OSError, match="Too many"):
+                look()
+        monkeypatch.undo()
+
+
+@pytest.fixture
+def places(tmp_path, monkeypatch):
+    """Two places for this user's folder; none is named by HILCTL_RUNS."""
+    monkeypatch.delenv("HILCTL_RUNS")
+    found = [tmp_path / "first", tmp_path / "second"]
+    monkeypatch.setattr("hilctl.run.run_folder.user_folders", lambda: found)
+    return found
+
+
+def test_somebody_in_the_first_place_locks_nobody_out(tmp_path, places, monkeypatch):
+    """The second is taken then, and a run there is still found once the first is free again."""
+    trap = tmp_path / "trap"
+    trap.mkdir(mode=0o700)
+    places[0].symlink_to(trap)
+    with pytest.raises(RunError, match="first: Not a directory"):
+        runs()  # a link of one's own is a mistake to be told of
+    monkeypatch.setattr("hilctl.run.run_folder._is_own", lambda _: False)
+    assert runs() == []
+    with made(tmp_path) as (folder, _):
+        assert folder.path.parent == places[1]
+        places[0].unlink()
+        assert base_folder() == places[0]
+        assert runs() == [folder]
+    assert not list(trap.iterdir())
+
+
+def test_no_place_at_all_says_what_is_wrong_with_each(places):
+    for place in places:
+        place.write_text("")
+    for ask in (base_folder, runs):
+        with pytest.raises(RunError, match=r"first: Not a directory; .*second: Not a directory"):
+            ask()
+
+
+NAME = f"test:{os.getpid()}:"  # locks are the whole machine's, and so is /dev/ttyUSB0
+
+
+def test_device_is_held_by_one_run(tmp_path):
+    """The second run is refused, and reads who the first is."""
+    device, other = f"{NAME}tty", f"{NAME}tcp"
+    with held_devices((device,)), made(tmp_path) as (folder, _):
+        who = f"run {folder.card.name} .process {os.getpid()}, recording {tmp_path}/a.mcap"
         with (
-            pytest.raises(InputError, match=r"serial:/dev/ttyUSB0 is in use by run a \(process 1"),
-            held_devices(("tcp:10.0.0.5:502", "serial:/dev/ttyUSB0"), "run b"),
+            pytest.raises(InputError, match=f"{device} is in use by {who}"),
+            held_devices((other, device)),
         ):
             pass
-        with held_devices(("tcp:10.0.0.5:502",), "run c"):
+        with held_devices((other,)):
             pass
-    with held_devices(("serial:/dev/ttyUSB0", "serial:/dev/ttyUSB0"), "run d"):
+    with held_devices((device, device)):
+        pass
+
+
+def test_holder_without_a_run_is_named_by_the_kernel():
+    """A process of somebody else, or one that has no folder yet."""
+    name = f"{NAME}{'long' * 50}"
+    with (
+        held_devices((name,)),
+        pytest.raises(InputError, match=f"in use by process {os.getpid()} of "),
+        held_devices((name,)),
+    ):
         pass
 
 
 def test_refused_run_lets_go_of_what_it_had():
     """A run that gets one device and not the other holds neither."""
-    with held_devices(("b",), "run a"):
-        with pytest.raises(InputError), held_devices(("a", "b"), "run b"):
+    first, second = f"{NAME}a", f"{NAME}b"
+    with held_devices((second,)):
+        with pytest.raises(InputError), held_devices((first, second)):
             pass
-        with held_devices(("a",), "run c"):
+        with held_devices((first,)):
             pass
+
+
+def test_lock_lives_as_long_as_a_process_that_inherited_it():
+    """The loop outlives its supervisor: nobody may have its device before it is safe."""
+    name = f"{NAME}inherited"
+    with held_devices((name,)) as locks:
+        child = subprocess.Popen(
+            [sys.executable, "-c", "input()"], stdin=subprocess.PIPE, pass_fds=locks
+        )
+    with pytest.raises(InputError, match="in use by"), held_devices((name,)):
+        pass
+    child.communicate(b"\n", timeout=30)
+    with held_devices((name,)):
+        pass

@@ -1,0 +1,112 @@
+"""What reaches a terminal, and what becomes of it where nobody reads."""
+
+import errno
+import io
+import os
+import subprocess
+import sys
+
+import pytest
+
+from hilctl.cli.streams import PlainStream, StandardStream, plain_streams, visible
+
+HOSTILE = "a\x1b]0;title\x07b\x9b2Jc\rd\x7fe\u202ef"
+SHOWN = r"a\x1b]0;title\x07b\x9b2Jc\rd\x7fe\u202ef"
+
+
+def test_control_characters_are_written_out():
+    """Escape sequences of 7 and 8 bits, a carriage return that hides a line, turned text."""
+    assert visible(HOSTILE) == SHOWN
+
+
+@pytest.mark.parametrize("text", ["plain", "µm ü 😀", "two\nlines\tand tab\n", ""])
+def test_text_stays_as_it_is(text):
+    assert visible(text) == text
+
+
+def wrapped(target, encoding="utf-8"):
+    return io.TextIOWrapper(target, encoding=encoding)
+
+
+def test_plain_and_styled_text_come_out_in_order():
+    target = io.BytesIO()
+    below = wrapped(target)
+    stream = PlainStream(below)
+    print("one\x1b", file=stream)
+    stream.styled.write("\x1b[1mtwo\x1b[0m\n")
+    print("three", file=stream)
+    assert stream.leave() is None
+    assert target.getvalue() == b"one\\x1b\n\x1b[1mtwo\x1b[0m\nthree\n"
+
+
+def test_letters_that_the_locale_lacks_are_written_out():
+    target = io.BytesIO()
+    below = wrapped(target, "ascii")
+    print("40 µm", file=(stream := PlainStream(below)))
+    stream.leave()
+    assert target.getvalue() == b"40 \\xb5m\n"
+
+
+def test_nobody_reads_and_nothing_fails():
+    """A run must not end by it; what went wrong is kept, and later output goes nowhere."""
+    reading, writing = os.pipe()
+    os.close(reading)
+    with os.fdopen(writing, "w") as below:
+        stream = StandardStream(below)
+        for _ in range(3):
+            assert stream.write("x" * 100_000) == 100_000
+            stream.flush()
+        stream.detach()
+        assert stream.failure is not None
+        assert stream.failure.errno == errno.EPIPE
+
+
+def in_a_process(code, shell, **environment):
+    """Run code behind a shell's redirection."""
+    command = ["sh", "-c", f'exec "$0" -c "$1" {shell}', sys.executable, code]
+    return subprocess.run(
+        command, capture_output=True, text=True, timeout=60, env={**os.environ, **environment}
+    )
+
+
+PRINTING = "from hilctl.cli.streams import plain_streams\nwith plain_streams():\n    print('µ' * 9)"
+
+
+def test_lost_output_is_an_error():
+    """A full disk below a redirection is said; the exit code is not 0."""
+    ended = in_a_process(PRINTING, "> /dev/full")
+    assert ended.returncode == 3
+    assert ended.stderr == "hilctl: standard output: No space left on device\n"
+
+
+def test_exit_code_stays_where_output_is_lost():
+    ended = in_a_process(f"{PRINTING}\n    raise SystemExit(2)", "> /dev/full")
+    assert ended.returncode == 2
+
+
+def test_a_reader_who_leaves_is_no_error():
+    code = f"import time\n{PRINTING}; time.sleep(0.0)\n    print('x' * 10**6)"
+    ended = in_a_process(code, "| head -c 2")
+    assert ended.stderr == ""
+
+
+@pytest.mark.parametrize("closed", ["0<&-", "1>&-", "2>&-", "0<&- 1>&- 2>&-"])
+def test_a_closed_descriptor_is_not_given_to_a_file(closed):
+    """Else a recording would be what others take for their standard output."""
+    code = """
+import os, sys
+from hilctl.cli.streams import plain_streams
+with plain_streams():
+    print("out"), print("err", file=sys.stderr)
+    opened = os.open("/dev/null", os.O_RDONLY)
+raise SystemExit(0 if opened > 2 else 1)
+"""
+    assert in_a_process(code, closed).returncode == 0
+
+
+def test_streams_are_as_before_afterwards(capsys):
+    before = sys.stdout, sys.stderr
+    with plain_streams():
+        print(HOSTILE)
+    assert (sys.stdout, sys.stderr) == before
+    assert capsys.readouterr().out == SHOWN + "\n"
