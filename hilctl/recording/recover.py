@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from google.protobuf.message import DecodeError
 
 from hilctl.base.errors import DataError, InputError
 from hilctl.base.events import Event
 from hilctl.base.samples import Batch, Head
+from hilctl.recording.checks import SoundMessages
 from hilctl.recording.messages import RecordingLayout
 from hilctl.recording.replace import Replacement
 from hilctl.recording.rewrite import Resaved, Survey
@@ -107,7 +107,7 @@ def recover_recording(
             layout = _check(path, survey, more)
             with closing(Replacement(path, output)) as replacement:
                 saved = Resaved(replacement.stream, survey)
-                saved.copy(Salvage(stream).records())
+                saved.copy(Salvage(stream, SoundMessages()).records())
                 if layout:
                     saved.add(more, events, layout)
                 reason = saved.finish(end, ended_at)
@@ -116,8 +116,6 @@ def recover_recording(
         raise DataError(f"{error.filename or path}: no such file or folder") from None
     except FileExistsError:
         raise InputError(f"{output}: exists already: give another --output") from None
-    except DecodeError as error:
-        raise DataError(f"{path}: holds what hilctl did not write: {error}") from None
     except OSError as error:
         where = error.filename or path
         raise InputError(f"{where}: can't be recovered: {error.strerror}") from None
