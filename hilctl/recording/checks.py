@@ -9,13 +9,16 @@ import math
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Annotated, Any
 
+import numpy as np
+import numpy.typing as npt
 from google.protobuf.message import DecodeError
 from mcap.records import Channel, McapRecord, Message, Schema
 from pydantic import Field, TypeAdapter, ValidationError
 
+from hilctl.base.device import CommandUnit
 from hilctl.base.events import TUNED
-from hilctl.base.samples import COLUMNS, SampleColumn
-from hilctl.base.segments import Segment
+from hilctl.base.samples import COLUMNS, Batch, Head
+from hilctl.base.segments import SHORTEST_PERIOD, Segment
 from hilctl.base.strict import Strict
 from hilctl.recording import schema
 from hilctl.recording.data import TICK_COLUMNS
@@ -28,9 +31,9 @@ RATES_HZ = (1e-6, 1e9)
 """Lowest and highest rate of samples: far beyond those of any experiment."""
 
 _LONGEST_NS = 2**60
-_SHORTEST_PERIOD = 1.0
 _MOST_SEGMENTS_TEXT = 2**24
 _MOST_VALUES = 1000
+_UNITS: tuple[CommandUnit, ...] = ("A", "V")
 _MOST_DIGITS = 15
 _LINE = 60
 
@@ -56,24 +59,24 @@ def block_problem(block: Any, next_sample: int) -> str:
         return "holds no sample"
     if not next_sample <= block.tick0 < LAST_SAMPLE:
         return f"sample {block.tick0} can't follow sample {next_sample - 1}"
-    lengths = {"flags": len(block.flags)}
-    for column in COLUMNS.values():
-        lengths |= _lengths(column, block)
-    wrong = [f"{length} of {name}" for name, length in lengths.items() if length != block.n]
-    if wrong:
-        return f"{block.n} samples with {', '.join(wrong)}"
+    if wrong := _wrong_lengths(block, "", block.n):
+        return f"{block.n} samples with {wrong}"
     before = block.previous_command
     if len(before) > 1 or not all(map(math.isfinite, before)):
         return "previous_command must be one finite number"
     return ""
 
 
-def _lengths(column: SampleColumn, block: Any) -> dict[str, int]:
-    """Return how many values there are by field; fields without any only where one must have."""
-    fields = {column.field("A").name, column.field("V").name}
-    given = {name: len(getattr(block, name)) for name in sorted(fields)}
-    filled = {name: length for name, length in given.items() if length}
-    return filled or ({} if column.when != "always" else {" or ".join(given): 0})
+def _wrong_lengths(message: Any, prefix: str, samples: int) -> str:
+    """Return which columns of a message have not one value a sample."""
+    lengths = {f"{prefix}flags": len(getattr(message, f"{prefix}flags"))}
+    for column in COLUMNS.values():
+        names = sorted({prefix + column.field(unit).name for unit in _UNITS})
+        given = {name: len(getattr(message, name)) for name in names}
+        filled = {name: length for name, length in given.items() if length}
+        missing = {" or ".join(names): 0} if column.when == "always" else {}
+        lengths |= filled or missing
+    return _listed({name: length for name, length in lengths.items() if length != samples})
 
 
 def ticks_problem(ticks: Any) -> str:
@@ -102,14 +105,20 @@ def event_problem(event: Any, time_ns: int) -> str:
     # How many samples a change takes is worked with.
     if event.code == TUNED and not all(0.0 <= abs(value) < LAST_SAMPLE for value in event.values):
         return f"a change of the reference by {list(event.values)}"
-    lengths = {
-        field.name: len(values)
-        for field, values in event.ListFields()
-        if field.name.startswith("before_")
-    }
-    if len(set(lengths.values())) > 1:
-        return "its columns differ in length: " + _listed(lengths)
+    before = len(event.before_sample)
+    if before and (wrong := _wrong_lengths(event, "before_", before)):
+        return f"{before} samples before it with {wrong}"
     return ""
+
+
+def sound_blocks(batch: Batch) -> npt.NDArray[np.bool_]:
+    """Return which blocks of a batch a loop can have written: bool[k]."""
+    first = batch.heads[:, Head.FIRST_SAMPLE]
+    times = batch.heads[:, [Head.DEADLINE_NS, Head.LATE_NS, Head.EXCHANGE_NS]]
+    in_time = ((times >= -_LONGEST_NS) & (times <= _LONGEST_NS)).all(axis=1)
+    in_run = (first >= 0) & (first < LAST_SAMPLE - batch.flags.shape[1])
+    begun = np.isfinite(batch.states[:, -1])
+    return np.asarray(in_time & in_run & begun)
 
 
 def _listed(lengths: Mapping[str, int]) -> str:
@@ -221,7 +230,7 @@ def _segment_problems(segments: Iterable[Segment]) -> Iterator[str]:
         places = [end, each.start, each.steady_start, each.steady_stop, each.stop]
         if places != sorted(places):
             yield f"{number}: its samples must follow those before it and rise: {places}"
-        if 0.0 < each.period < _SHORTEST_PERIOD:
+        if 0.0 < each.period < SHORTEST_PERIOD:
             yield f"{number}: a period of {each.period!r} samples can't be"
         end = each.stop
 
