@@ -16,6 +16,7 @@ import numpy.typing as npt
 from hilctl.base.errors import DataError, InputError
 from hilctl.base.files import check_writable, write_file
 from hilctl.base.samples import COLUMNS
+from hilctl.recording.checks import LAST_SAMPLE
 from hilctl.recording.data import Recording
 
 Columns: TypeAlias = Mapping[str, npt.NDArray[Any]]
@@ -23,6 +24,7 @@ Facts: TypeAlias = Mapping[str, str]
 Write: TypeAlias = Callable[[BinaryIO, Columns, Facts], None]
 
 _ROWS_AT_ONCE = 20_000
+_FAR = float(LAST_SAMPLE)
 
 
 def export(
@@ -113,7 +115,8 @@ def _first_at_or_after(t_s: float, rate_hz: float) -> int:
     """Return the index of the first sample at ``t_s`` or later, rounding errors forgiven."""
     if not math.isfinite(t_s):
         raise DataError(f"a time must be a finite number of seconds: {t_s!r}")
-    return math.ceil(t_s * rate_hz - 1e-6)
+    place = min(max(t_s * rate_hz, -_FAR), _FAR)  # beyond it there is no sample
+    return math.ceil(place - 1e-6)
 
 
 def _seconds(t_s: float | None, otherwise: str) -> str:

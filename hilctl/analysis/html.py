@@ -12,6 +12,7 @@ from hilctl.analysis.figures import RunReport
 from hilctl.analysis.report import worst_segment
 from hilctl.base.events import Event
 from hilctl.base.files import write_text
+from hilctl.base.printable import printable
 from hilctl.recording.data import Recording
 
 _MOST_EVENTS = 200
@@ -68,10 +69,10 @@ def write_page(text: str, path: Path) -> None:
 
 def page(recording: Recording, report: RunReport) -> str:
     """Return the page of a run as HTML."""
-    title = html.escape(report.name or "run")
+    title = _text(report.name or "run")
     body = [
         f"<h1>{title}</h1>",
-        f'<p class="file">{html.escape(report.path)}</p>',
+        f'<p class="file">{_text(report.path)}</p>',
         *_notes(report),
         '<div class="side">',
         _rows("Figures", table.quality_rows(report)),
@@ -91,28 +92,32 @@ def document(title: str, body: Iterable[str]) -> str:
     return "\n".join((_HEAD.format(title=title, css=_CSS), *body, "</body></html>\n"))
 
 
+def _text(text: str, *, lines: bool = False) -> str:
+    """Return a text, perhaps from a file, as HTML that shows it."""
+    return html.escape(printable(text, lines=lines))
+
+
 def _notes(report: RunReport) -> list[str]:
     notes = []
     if report.simulated:
         notes.append(f"The device is {table.SIMULATED}.")
     if not report.complete:
         notes.append(f"The run is not complete: {report.reason}.")
-    return [f'<p class="note">{html.escape(note)}</p>' for note in notes]
+    return [f'<p class="note">{_text(note)}</p>' for note in notes]
 
 
 def _rows(heading: str, rows: Sequence[tuple[str, str]]) -> str:
     cells = "\n".join(
-        f"<tr><th>{html.escape(name)}</th><td>{html.escape(value)}</td></tr>"
-        for name, value in rows
+        f"<tr><th>{_text(name)}</th><td>{_text(value)}</td></tr>" for name, value in rows
     )
     return f"<section><h2>{heading}</h2><table>{cells}</table></section>"
 
 
 def grid(headings: Iterable[str], rows: Iterable[Iterable[str]], css: str = "") -> str:
     """Return a table of plain texts."""
-    head = "".join(f"<th>{html.escape(heading)}</th>" for heading in headings)
+    head = "".join(f"<th>{_text(heading)}</th>" for heading in headings)
     body = "\n".join(
-        f"<tr>{''.join(f'<td>{html.escape(cell)}</td>' for cell in row)}</tr>" for row in rows
+        f"<tr>{''.join(f'<td>{_text(cell)}</td>' for cell in row)}</tr>" for row in rows
     )
     return f'<div class="wide"><table class="{css}"><tr>{head}</tr>\n{body}</table></div>'
 
@@ -159,4 +164,4 @@ def _events(events: Sequence[Event]) -> list[str]:
 def _details(heading: str, text: str) -> list[str]:
     if not text:
         return []
-    return [f"<details><summary>{heading}</summary><pre>{html.escape(text)}</pre></details>"]
+    return [f"<details><summary>{heading}</summary><pre>{_text(text, lines=True)}</pre></details>"]

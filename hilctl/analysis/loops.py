@@ -9,6 +9,7 @@ from hilctl.analysis import metrics
 from hilctl.analysis.canvas import DISPLACEMENT, MARK, REFERENCE, STYLE
 from hilctl.analysis.steady import SteadyPart, steady_part
 from hilctl.base.arrays import F64
+from hilctl.base.printable import short_name
 from hilctl.recording.data import Recording
 
 _LONGEST_PATH = 200_000
@@ -44,7 +45,7 @@ def hysteresis_loop(recording: Recording, focus: int = 0) -> Figure | None:
         for segment, loop, colour in zip(
             recording.segments, loops, _colours(len(loops)), strict=True
         ):
-            label = segment.label if loop[0].size else "_not reached"
+            label = short_name(segment.label) if loop[0].size else "_not reached"
             axes.plot(loop[0], loop[1] - np.polyval(taken_off, loop[0]), color=colour, label=label)
         straight = np.polyval(line - taken_off, ends)
         axes.plot(ends, straight, color=REFERENCE, linestyle=":", linewidth=0.9)

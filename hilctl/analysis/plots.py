@@ -24,6 +24,7 @@ from hilctl.analysis.canvas import (
 )
 from hilctl.analysis.steady import SteadyPart, steady_part, steady_samples
 from hilctl.base.arrays import F64, I64
+from hilctl.base.printable import short_name
 from hilctl.base.samples import Samples
 from hilctl.base.segments import Segment
 from hilctl.recording.data import Recording
@@ -58,7 +59,8 @@ def time_history(recording: Recording, focus: int = 0) -> Figure | None:
     legend(upper)
     if zoom is not None:
         _draw_zoom(axes[0, 1], axes[1, 1], zoom, recording.sample_rate_hz)
-        axes[0, 1].set_title(f"end of the steady part: {recording.segments[focus].label}")
+        label = short_name(recording.segments[focus].label)
+        axes[0, 1].set_title(f"end of the steady part: {label}")
     return figure
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hilctl.base.arrays import F64, U32
-from hilctl.base.errors import DataError
+from hilctl.base.errors import DataError, ModelError
 from hilctl.base.samples import Flag, Samples
 from hilctl.base.yaml.document import Document
 from hilctl.experiment.file import Experiment
@@ -68,13 +68,20 @@ def replay(recording: Recording, model: HysteresisModel | None = None) -> Replay
     Raises:
         DataError: The recording holds no samples or not what a replay needs, or ``model`` does not
             fit a run without a compensator.
+        ConfigError: The recorded experiment or model breaks a rule.
+        ModelError: The model has no inverse.
     """
     if recording.samples.index.size == 0 or not recording.starts:
         raise DataError(f"{recording.path}: holds no samples to replay")
     if model is not None and not recording.compensated:
         raise DataError(f"{recording.path}: had no compensator: there is no reference to replay")
+    if not np.isfinite(recording.samples.command).all():  # the limiter puts out no other
+        raise DataError(f"{recording.path}: /samples: every command must be finite")
     document = Document(f"{recording.path}: experiment.yaml", recording.experiment_yaml)
     config = document.validate(Experiment)
+    if config.sample_rate_hz != recording.sample_rate_hz:
+        rates = f"{recording.sample_rate_hz:g} Hz, its experiment is at {config.sample_rate_hz:g}"
+        raise DataError(f"{recording.path}: was recorded at {rates} Hz")
     chosen = model or _recorded_model(recording)
     compensator = Compensator(chosen, recording.sample_rate_hz)
     limiter = Limiter(config.command_limits(), 1.0 / recording.sample_rate_hz)
@@ -88,7 +95,7 @@ def replay(recording: Recording, model: HysteresisModel | None = None) -> Replay
         known[rows] = True
         limiter.last = start.previous_command
         if model is None:
-            compensator.restore(start.state)
+            _restore(recording, compensator, start)
         elif rows.start == 0:
             compensator.begin(samples.reference_um[rows])
         for part in _alike(samples.flags, rows):
@@ -104,6 +111,13 @@ def _recorded_model(recording: Recording) -> HysteresisModel | None:
     return parse_model(f"{recording.path}: model.yaml", recording.model_yaml)
 
 
+def _restore(recording: Recording, compensator: Compensator, start: ReplayStart) -> None:
+    try:
+        compensator.restore(start.state)
+    except ModelError as error:
+        raise DataError(f"{recording.path}: /samples: sample {start.sample}: {error}") from None
+
+
 def _stretches(recording: Recording) -> list[tuple[ReplayStart, slice]]:
     """Return where each gapless stretch starts, and its rows.
 
@@ -111,12 +125,14 @@ def _stretches(recording: Recording) -> list[tuple[ReplayStart, slice]]:
     the next start, is left out.
     """
     index = recording.samples.index
-    firsts = [int(np.searchsorted(index, start.sample)) for start in recording.starts]
-    gaps = np.append(np.flatnonzero(np.diff(index) != 1) + 1, index.size)
-    ends = gaps[np.searchsorted(gaps, firsts, side="right")].tolist()
+    firsts = np.searchsorted(index, [start.sample for start in recording.starts])
+    gaps = np.flatnonzero(np.diff(index) != 1) + 1
+    # No row twice: a start without a gap before it ends the stretch, too.
+    bounds = np.union1d(np.append(gaps, index.size), firsts)
+    ends = bounds[np.searchsorted(bounds, firsts, side="right")]
     return [
         (start, slice(first, end))
-        for start, first, end in zip(recording.starts, firsts, ends, strict=True)
+        for start, first, end in zip(recording.starts, firsts.tolist(), ends.tolist(), strict=True)
     ]
 
 
@@ -158,7 +174,9 @@ def _compare(
         & (flags == samples.flags[known] & np.uint32(_LIMIT_BITS))
     )
     different = np.flatnonzero(~same)
-    change = command - recorded
+    with np.errstate(over="ignore", invalid="ignore"):  # of commands near the end of all numbers
+        change = command - recorded
+        rms_difference = float(np.sqrt(np.mean(change**2)))
     limited = flags & (Flag.RANGE_LIMITED | Flag.SLEW_LIMITED).value
     return ReplayResult(
         samples=command.size,
@@ -167,7 +185,7 @@ def _compare(
         first_difference=int(samples.index[known][different[0]]) if different.size else None,
         differing_samples=different.size,
         largest_difference=float(np.max(np.abs(change))),
-        rms_difference=float(np.sqrt(np.mean(change**2))),
+        rms_difference=rms_difference,
         command_unit=recording.command_unit,
         command_min=float(command.min()),
         command_max=float(command.max()),

@@ -1,6 +1,7 @@
 """A report for people, as rows of text."""
 
 from hilctl.analysis.figures import RunReport, SegmentReport
+from hilctl.base.printable import printable
 
 MISSING = "-"
 SIMULATED = "simulated: no hardware was driven"
@@ -30,9 +31,10 @@ def run_rows(report: RunReport) -> list[tuple[str, str]]:
     """Return name and value of what the run was and how it ended."""
     simulated = f" ({SIMULATED})" if report.simulated else ""
     held_against = "reference" if report.compensated else "command: nothing compensated"
+    reason = printable(report.reason) or MISSING
     return [
-        ("device", f"{report.device or MISSING}{simulated}"),
-        ("ended", f"{report.reason or MISSING}{'' if report.complete else ' (NOT complete)'}"),
+        ("device", f"{printable(report.device) or MISSING}{simulated}"),
+        ("ended", f"{reason}{'' if report.complete else ' (NOT complete)'}"),
         (
             "samples",
             f"{report.samples:,} of the waveform, {report.ramp_samples:,} of the safe ramp",
@@ -83,7 +85,7 @@ def segment_table(report: RunReport) -> tuple[list[str], list[list[str]]]:
 
 def _segment_cells(segment: SegmentReport) -> list[str]:
     return [
-        segment.label,
+        printable(segment.label),
         number(segment.start_s),
         number(segment.frequency_hz),
         str(segment.steady_cycles),

@@ -5,6 +5,9 @@ import numpy as np
 from hilctl.base.arrays import I64
 from hilctl.recording.data import Ticks
 
+MOST_ROWS = 1440
+"""Most stretches that lateness is given for: a day has as many minutes."""
+
 _MINUTE_NS = 60_000_000_000
 _PERCENTILES = {"p50": 50.0, "p90": 90.0, "p99": 99.0, "p99.9": 99.9}
 
@@ -26,11 +29,14 @@ def by_minute(ticks: Ticks) -> list[dict[str, float]]:
 
     Returns:
         For each minute with ticks: ``minute`` from 0, its ``ticks``, and the figures of
-        :func:`percentiles_us`.
+        :func:`percentiles_us`. Of a run longer than a day, for stretches of several minutes, with
+        the first of them.
     """
     if ticks.deadline_ns.size == 0:
         return []
     minutes = ticks.deadline_ns // _MINUTE_NS
+    together = 1 + int(minutes.max() - minutes.min()) // MOST_ROWS
+    minutes = minutes // together * together
     numbers, first = np.unique(minutes, return_index=True)  # deadlines rise, so do minutes
     parts = np.split(ticks.late_ns, first[1:])
     return [

@@ -3,6 +3,9 @@
 from dataclasses import asdict, dataclass
 from typing import Any, Self
 
+SHORTEST_PERIOD = 1.0
+"""Samples in the shortest period of a waveform; fewer can't show it."""
+
 
 @dataclass(frozen=True, slots=True)
 class Segment:

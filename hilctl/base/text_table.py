@@ -11,6 +11,7 @@ import io
 import itertools
 import warnings
 from array import array
+from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,8 +29,11 @@ Column: TypeAlias = str | int
 
 MAX_TABLE_BYTES = 512 * 1024**2
 """Largest table that is read; it takes a few times that in memory."""
+MAX_COLUMNS = 1000
+"""Most columns of a table."""
 
 _COMMENT = "#%"
+_LONGEST_LINE = 100_000
 _LATE = 1.0  # largest departure of a sample from an even grid, in steps
 
 
@@ -95,20 +99,24 @@ class TextTable:
         self.path = path
         # Spreadsheets put a byte-order mark first: it would hide a name.
         self._text = read_text(path, MAX_TABLE_BYTES).removeprefix("\ufeff")
-        first, comments = "", []
+        first, comments = "", deque[str](maxlen=MAX_COLUMNS)  # nobody's header stands further up
         for _, line in self._lines():
             if line[0] not in _COMMENT:
                 first = line
                 break
-            comments.append(line[1:])
+            if len(line) <= _LONGEST_LINE:
+                comments.append(line[1:])
         self._separator = next((mark for mark in "\t;," if mark in first), " ")
-        cells = self._split(first)
+        cells = self._split(first) if len(first) <= _LONGEST_LINE else []
+        if first and not 0 < len(cells) <= MAX_COLUMNS:
+            rule = f"the first row must be a row of a table, of at most {MAX_COLUMNS} columns"
+            raise DataError(f"{path}: {rule}: {_short(first[:_LONGEST_LINE])}")
         self._has_header = not any(map(_is_number, cells))
         if not first:
             raise DataError(f"{path}: holds no rows of numbers")
         above = (names for names in map(self._split, comments) if len(names) == len(cells))
         numbers = [str(i + 1) for i in range(len(cells))]
-        self.names = cells if self._has_header else [*above, numbers][0]
+        self.names = cells if self._has_header else next(above, numbers)
 
     def index(self, column: Column | None) -> int:
         """Return a column's index from 0, see :func:`column_index`."""

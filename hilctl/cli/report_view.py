@@ -8,13 +8,14 @@ from rich.text import Text
 
 from hilctl.analysis.figures import RunReport
 from hilctl.analysis.table import quality_rows, run_rows, segment_table
+from hilctl.base.printable import printable
 
 _PAGE_ONLY = {"cycles", "start s", "freq. Hz", "floor %", "loop area"}  # a terminal has 80 columns
 
 
 def render(report: RunReport) -> Group:
     """Return a report as tables for a terminal; that of the segments where there are several."""
-    title = report.name or "run"
+    title = printable(report.name) or "run"
     quality = _two_columns(title, quality_rows(report))
     parts = [quality, _two_columns("", run_rows(report))]
     if len(report.segments) > 1:

@@ -128,6 +128,8 @@ def initial_state_after(path: Path, model: HysteresisModel, sample_rate_hz: floa
     still = np.full(round(_STILL_S * sample_rate_hz), command[-1])
     came = model.forward(sample_rate_hz).process(np.concatenate((command, still)))
     inverse = model.inverse(sample_rate_hz)
+    if not np.isfinite(came).all():
+        raise DataError(f"{path}: has commands that the model has no displacement for")
     inverse.process(came[inverse.preview :])
     return InitialState(inverse.state(), float(came[-1]), recording.run.get("run_id", ""))
 

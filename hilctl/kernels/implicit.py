@@ -93,7 +93,8 @@ def _preisach(v: float, memory: F64, thresholds: F64, values: F64, cells: F64) -
     for i in range(thresholds.size):
         held = max(min(memory[i], v + thresholds[i]), v - thresholds[i])
         place = (held - low) / width
-        cell = min(max(math.floor(place), 0.0), count - 1.0)
+        # A place that is not a number, from a memory that is none, must not become an index.
+        cell = float(math.floor(min(place, count - 1.0))) if place > 0.0 else 0.0
         j = i * stride + int(cell)
         total += values[j] + (values[j + 1] - values[j]) * (place - cell)
     return total
@@ -206,7 +207,7 @@ def _root(
     end = high if near_short > 0.0 else low
     step = (high - low) * (_FIRST_STEP if near_short > 0.0 else -_FIRST_STEP)
     while near != end:
-        far = max(low, min(high, near + step))
+        far = max(low, min(high, near + step)) if step != 0.0 else end  # a span of nearly nothing
         far_short = target - _peek(kind, far, memory, arrays)
         if (far_short > 0.0) != (near_short > 0.0):
             found = (near, far), (near_short, far_short)

@@ -2,10 +2,10 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from typing import Annotated, Any, TypeAlias
+from typing import Annotated, Any, Self, TypeAlias
 
 import numpy as np
-from pydantic import Field, field_validator
+from pydantic import Field, field_validator, model_validator
 
 from hilctl.base.arrays import F64
 from hilctl.base.device import CommandUnit
@@ -15,6 +15,9 @@ from hilctl.kernels.hysteresis import rest_memory
 
 BlockKernel: TypeAlias = Callable[[F64, F64, F64], None]
 """A kernel with its parameters bound: (input[n], memory, output[n])."""
+
+MAX_OPERATORS = 10_000
+"""Most operators of a model: more would take milliseconds a sample."""
 
 Thresholds: TypeAlias = tuple[Annotated[float, Field(allow_inf_nan=False)], ...]
 Weights: TypeAlias = tuple[Annotated[float, Field(allow_inf_nan=False)], ...]
@@ -87,6 +90,8 @@ class Operator:
                 f"state must have {self._memory.size} values, as this model's memory has: "
                 f"got {state.size}"
             )
+        if np.isinf(state).any():  # NaN is right: no input yet, or one that was none
+            raise ModelError("state must have no infinite value")
         self._memory[:] = state
 
     def keep_in(self, memory: F64) -> None:
@@ -147,6 +152,12 @@ class HysteresisModel(Strict, ABC):
         if limits is not None and not limits[0] < limits[1]:
             raise ValueError(f"the second value must be above the first: {list(limits)}")
         return limits
+
+    @model_validator(mode="after")
+    def _check_size(self) -> Self:
+        if self.operators > MAX_OPERATORS:
+            raise ValueError(f"must have at most {MAX_OPERATORS} operators: {self.operators}")
+        return self
 
     @abstractmethod
     def forward(self, sample_rate_hz: float) -> Operator:

@@ -19,6 +19,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from hilctl.base.arrays import F64
+from hilctl.base.errors import ModelError
 from hilctl.base.strict import Strict
 from hilctl.kernels.dynamics import (
     lag_block,
@@ -36,6 +37,7 @@ AnyHysteresis = Annotated[
     PpiModel | RdpiModel | IntegratedModel | PreisachModel, Field(discriminator="kind")
 ]
 _WHOLE = 1e-6
+_SLOWEST = 1e12  # samples in a radian of the structure: beyond it, it does not move
 
 
 class FieldLag(Strict):
@@ -79,7 +81,7 @@ class Structure(Strict):
         damping_ratio: zeta.
     """
 
-    natural_hz: float = Field(gt=0.0)
+    natural_hz: float = Field(gt=0.0, le=1e9)
     damping_ratio: float = Field(gt=0.0, le=10.0)
 
     def forward(self, sample_rate_hz: float) -> Operator:
@@ -107,6 +109,8 @@ class Structure(Strict):
         rates[0, 1] = 1.0
         rates[1, :3] = (-1.0, -2.0 * self.damping_ratio, 1.0)
         rates[2, 3] = 1.0 / (2.0 * math.pi * self.natural_hz * step_s)
+        if not rates[2, 3] < _SLOWEST:
+            raise ModelError(f"natural_hz is too low for a step of {step_s:g} s: {self.natural_hz}")
         motion: F64 = np.ascontiguousarray(expm(rates / rates[2, 3])[:2])
         motion[:, 2] -= motion[:, 3]
         return motion

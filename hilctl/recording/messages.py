@@ -9,13 +9,15 @@ from mcap.writer import Writer
 
 from hilctl.base.arrays import F64
 from hilctl.base.device import CommandUnit
-from hilctl.base.errors import DataError
+from hilctl.base.errors import DataError, InputError
 from hilctl.base.events import Event
 from hilctl.base.samples import COLUMNS, Batch, Head, RecordedField, SampleColumn, Samples
 from hilctl.recording import schema
+from hilctl.recording.checks import MAX_UNIX_NS, RATES_HZ
 from hilctl.recording.data import TICK_COLUMNS
 
 _MAX_BLOCK = 500
+_YEAR_NS = 366 * 86_400 * 10**9
 
 
 class Encoded(NamedTuple):
@@ -47,6 +49,23 @@ class RecordingLayout:
     start_unix_ns: int
     records_input: bool = False
     waveform_unit: str = "um"
+
+    def __post_init__(self) -> None:
+        """Refuse what no recording can hold.
+
+        Raises:
+            InputError: A rate is none, or the clock stands before 1970 or within a year of 2262,
+                where times in ns go beyond what 64 bits hold.
+        """
+        if not RATES_HZ[0] <= self.sample_rate_hz <= RATES_HZ[1] or not self.scope_rate_hz > 0.0:
+            rates = f"{self.sample_rate_hz!r}, {self.scope_rate_hz!r}"
+            raise InputError(f"sample_rate_hz and scope_rate_hz must be rates: {rates}")
+        if not 0 <= self.start_unix_ns <= MAX_UNIX_NS - _YEAR_NS:
+            seconds = f"{self.start_unix_ns * 1e-9:.0f} s from 1970 on"
+            raise InputError(
+                f"the clock must stand between 1970 and 2261 for a recording, it is at {seconds}: "
+                "set this computer's clock"
+            )
 
     def records(self, column: SampleColumn) -> bool:
         """Return whether a column is recorded."""
@@ -96,7 +115,7 @@ class RecordingLayout:
                 records_input=facts.get("records_input") == "true",
                 waveform_unit=facts.get("waveform_unit", "um"),
             )
-        except (KeyError, ValueError) as error:
+        except (KeyError, ValueError, InputError) as error:
             raise DataError(f"metadata hilctl.run: missing or damaged: {error}") from None
 
 

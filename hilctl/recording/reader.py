@@ -1,41 +1,54 @@
 """From an MCAP file to a recording in memory."""
 
-import json
 import logging
-from collections.abc import Callable
+from array import array
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from google.protobuf.message import DecodeError
-from mcap.records import Attachment, Channel, Message, Metadata
+from mcap.records import Attachment, McapRecord, Message, Metadata
 
-from hilctl.base.arrays import F64, I64
+from hilctl.base.arrays import F64, I64, U32
 from hilctl.base.device import CommandUnit
 from hilctl.base.errors import DataError
 from hilctl.base.events import Event
-from hilctl.base.samples import COLUMNS, Samples
-from hilctl.base.segments import Segment
-from hilctl.recording import schema
+from hilctl.base.samples import COLUMNS, RECORDED_FIELDS, Samples
+from hilctl.recording.allowance import Allowance
+from hilctl.recording.checks import (
+    RATES_HZ,
+    SoundMessages,
+    count_of,
+    number_of,
+    segments_of,
+    short,
+)
 from hilctl.recording.data import TICK_COLUMNS, Recording, ReplayStart, Ticks
 from hilctl.recording.salvage import Salvage
 from hilctl.recording.writer import is_being_recorded
 
 _log = logging.getLogger(__name__)
 
+_TEXTS = {"experiment.yaml", "model.yaml", "correction.yaml"}
+_NUMBER_BYTES = 8
+_EVENT_BYTES = 2048  # what Python itself takes for a message that is kept
+
 
 def read(path: Path) -> Recording:
     """Read a recording; of one that was cut short or damaged, all that is whole.
 
-    Nothing is written. That something is missing is logged as a warning, in one line.
+    Nothing is written. That something is missing is logged as a warning, in one line. All that is
+    given out is of one shape and rises where it must, whatever the file says; time and memory stay
+    in proportion to its size.
 
     Raises:
-        DataError: The file can't be read, is not an MCAP file, or was not written by hilctl.
+        DataError: The file can't be read, is not an MCAP file, or holds what hilctl can't have
+            written.
     """
-    contents = _Contents()
     try:
         with path.open("rb") as stream:
             salvage = Salvage(stream)
+            contents = _Contents(salvage.allowance)
             for record in salvage.records():
                 contents.take(record)
             live = not salvage.sound and is_being_recorded(stream)
@@ -43,8 +56,8 @@ def read(path: Path) -> Recording:
         raise DataError(f"{path}: no such file") from None
     except OSError as error:
         raise DataError(f"{path}: can't be read: {error.strerror}") from None
-    except (DecodeError, UnicodeDecodeError) as error:
-        raise DataError(f"{path}: holds what hilctl did not write: {error}") from None
+    except DataError as error:
+        raise DataError(f"{path}: {error}") from None
     if not contents.run:
         problem = "" if salvage.is_mcap else "is not an MCAP file, or its start is lost: "
         raise DataError(f"{path}: {problem}holds no run of hilctl (metadata hilctl.run is missing)")
@@ -60,14 +73,23 @@ def _warn(recording: Recording, problem: str, *, live: bool) -> None:
     _log.warning("%s: %s; %d samples are read%s", recording.path, problem, samples, advice)
 
 
-def _samples(index: I64, flags: F64, unit: CommandUnit, field: Callable[[str], F64]) -> Samples:
-    """Return samples by their fields' values; of those that are left out, what stands for them."""
+def _samples(index: I64, flags: U32, unit: CommandUnit, values_of: Callable[[str], F64]) -> Samples:
+    """Return samples by their fields' values; of those that are left out, what stands for them.
+
+    Raises:
+        DataError: A column that every recording has is missing, or has another length.
+    """
     columns: dict[str, F64] = {}
     for name, column in COLUMNS.items():
-        values = field(column.field(unit).name)
-        left_out = column.otherwise and not values.size
-        columns[name] = columns[column.otherwise] if left_out else values
-    return Samples(index=index, flags=flags.astype(np.uint32), **columns)
+        field = column.field(unit).name
+        values = values_of(field)
+        if not values.size and column.otherwise:
+            values = columns[column.otherwise]
+        if values.size not in {index.size} | ({0} if column.when == "measured" else set()):
+            counted = f"{values.size} values of {field} for {index.size} samples"
+            raise DataError(f"/samples: {counted}, commands in {unit}")
+        columns[name] = values
+    return Samples(index=index, flags=flags, **columns)
 
 
 def _event(time_ns: int, decoded: Any, unit: CommandUnit) -> Event:
@@ -75,7 +97,7 @@ def _event(time_ns: int, decoded: Any, unit: CommandUnit) -> Event:
     if decoded.before_sample:
         before = _samples(
             np.array(decoded.before_sample, dtype=np.int64),
-            np.array(decoded.before_flags),
+            np.array(decoded.before_flags, dtype=np.uint32),
             unit,
             lambda name: np.array(getattr(decoded, f"before_{name}"), dtype=np.float64),
         )
@@ -91,98 +113,118 @@ def _event(time_ns: int, decoded: Any, unit: CommandUnit) -> Event:
 
 
 class _Contents:
-    """What has been read so far."""
+    """What has been read so far: numbers in flat arrays, which many small messages don't inflate.
 
-    def __init__(self) -> None:
+    Args:
+        allowance: Counts what is kept.
+    """
+
+    def __init__(self, allowance: Allowance) -> None:
+        self._allowance = allowance
+        self._sound = SoundMessages()
         self.run: dict[str, str] = {}
         self.end: dict[str, str] = {}
         self._texts: dict[str, str] = {}
-        self._topics: dict[int, str] = {}
-        self._blocks: list[Any] = []
-        self._ticks: list[Any] = []
+        self._index = array("q")
+        self._flags = array("I")
+        self._columns = {field.name: array("d") for field in RECORDED_FIELDS}
+        self._starts: list[ReplayStart] = []
+        self._ticks = {name: array("q") for name in TICK_COLUMNS}
         self._events: list[tuple[int, Any]] = []
 
-    def take(self, record: Any) -> None:
+    def take(self, record: McapRecord) -> None:
+        """Take a record.
+
+        Raises:
+            DataError: hilctl can't have written it.
+        """
         match record:
-            case Message():
+            case Message() if self._sound.topic(record.channel_id):
                 self._message(record)
-            case Channel():
-                self._topics[record.id] = record.topic
             case Metadata(name="hilctl.run"):
                 self.run = dict(record.metadata)
             case Metadata(name="hilctl.end"):
                 self.end = dict(record.metadata)
-            case Attachment():
-                self._texts[record.name] = record.data.decode()
+            case Attachment() if record.name in _TEXTS:
+                try:
+                    self._texts[record.name] = record.data.decode()
+                except UnicodeDecodeError:
+                    raise DataError(f"{record.name}: is not UTF-8 text") from None
+            case _:
+                if problem := self._sound.problem(record):
+                    raise DataError(problem)
 
     def _message(self, record: Message) -> None:
-        topic = self._topics.get(record.channel_id, "")
-        if topic not in {"/samples", "/ticks", "/events"}:
-            return
-        decoded: Any = schema.message_class(schema.TOPICS[topic]).FromString(record.data)
+        decoded, problem = self._sound.decoded(record)
+        if problem:
+            raise DataError(f"{problem} ('hilctl recover' leaves such messages out)")
+        topic = self._sound.topic(record.channel_id)
         if topic == "/samples":
-            self._blocks.append(decoded)
+            self._block(decoded)
         elif topic == "/ticks":
-            self._ticks.append(decoded)
-        else:
+            self._allowance.keep(_NUMBER_BYTES * len(decoded.late_ns) * len(TICK_COLUMNS))
+            for name, values in self._ticks.items():
+                values.extend(getattr(decoded, name))
+        elif topic == "/events":
+            self._allowance.keep(_EVENT_BYTES + len(record.data))
             self._events.append((record.log_time, decoded))
+
+    def _block(self, block: Any) -> None:
+        self._allowance.keep(_NUMBER_BYTES * block.n * len(COLUMNS))
+        self._index.extend(range(block.tick0, block.tick0 + block.n))
+        self._flags.extend(block.flags)
+        for name, values in self._columns.items():
+            values.extend(getattr(block, name))
+        for previous in block.previous_command:
+            self._allowance.keep(_EVENT_BYTES + _NUMBER_BYTES * len(block.state))
+            self._starts.append(ReplayStart(block.tick0, np.array(block.state), previous))
 
     def recording(self, path: Path) -> Recording:
         """Put it together.
 
         Raises:
-            DataError: A fact of the run is missing or damaged.
+            DataError: A fact of the run is missing or damaged, or a column is incomplete.
         """
         try:
             return self._recording(path)
-        except (KeyError, ValueError, TypeError) as error:
+        except ValueError as error:
             text = f"{path}: metadata hilctl.run or hilctl.end: missing or damaged: {error}"
             raise DataError(text) from None
+        except DataError as error:
+            raise DataError(f"{path}: {error}") from None
 
     def _recording(self, path: Path) -> Recording:
-        unit: CommandUnit = "V" if self.run.get("command_unit") == "V" else "A"
+        unit = _unit(self.run)
+        index = np.array(self._index, dtype=np.int64)
+        flags = np.array(self._flags, dtype=np.uint32)
         return Recording(
             path=path,
             run=self.run,
             end=self.end,
-            sample_rate_hz=float(self.run["sample_rate_hz"]),
+            sample_rate_hz=number_of(self.run, "sample_rate_hz", *RATES_HZ),
             command_unit=unit,
             compensated=self.run.get("compensator", "none") != "none",
-            segments=tuple(
-                Segment.from_mapping(each) for each in json.loads(self.run.get("segments", "[]"))
-            ),
-            samples=_samples(self._index(), self._column("flags"), unit, self._column),
+            segments=segments_of(self.run.get("segments", "[]")),
+            samples=_samples(index, flags, unit, lambda name: np.array(self._columns[name])),
             dropped=self._dropped(),
-            ticks=self._all_ticks(),
+            ticks=Ticks(**{name: np.array(values) for name, values in self._ticks.items()}),
             events=tuple(_event(time_ns, each, unit) for time_ns, each in self._events),
             experiment_yaml=self._texts.get("experiment.yaml", ""),
             model_yaml=self._texts.get("model.yaml", ""),
             correction_yaml=self._texts.get("correction.yaml", ""),
-            starts=tuple(
-                ReplayStart(block.tick0, np.array(block.state), block.previous_command[0])
-                for block in self._blocks
-                if block.previous_command
-            ),
+            starts=tuple(self._starts),
         )
 
     def _dropped(self) -> int:
-        recorded: int = sum(block.n for block in self._blocks)
-        last = self._blocks[-1] if self._blocks else None
-        gaps = last.tick0 + last.n - recorded if last else 0
-        return max(gaps, int(self.end.get("missing_samples", "0")))
+        gaps = self._sound.next_sample - len(self._index)
+        return max(gaps, count_of(self.end, "missing_samples"))
 
-    def _index(self) -> I64:
-        ranges = [np.arange(b.tick0, b.tick0 + b.n, dtype=np.int64) for b in self._blocks]
-        return np.concatenate(ranges) if ranges else np.empty(0, dtype=np.int64)
 
-    def _column(self, name: str) -> F64:
-        parts = [np.array(getattr(block, name), dtype=np.float64) for block in self._blocks]
-        return np.concatenate(parts) if parts else np.empty(0)
-
-    def _all_ticks(self) -> Ticks:
-        nothing = np.empty(0, dtype=np.int64)
-        parts = {
-            name: [np.array(getattr(each, name), dtype=np.int64) for each in self._ticks]
-            for name in TICK_COLUMNS
-        }
-        return Ticks(**{name: np.concatenate([nothing, *each]) for name, each in parts.items()})
+def _unit(run: Mapping[str, str]) -> CommandUnit:
+    match run.get("command_unit", "A"):
+        case "A":
+            return "A"
+        case "V":
+            return "V"
+        case other:
+            raise ValueError(f"command_unit must be A or V, got {short(other)}")

@@ -15,7 +15,6 @@ from typing import Any, BinaryIO
 
 import lz4.frame
 import zstandard
-from google.protobuf.message import DecodeError
 from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
@@ -37,16 +36,17 @@ from mcap.records import (
     SummaryOffset,
 )
 
-from hilctl.base.samples import RECORDED_FIELDS
 from hilctl.recording import schema
+from hilctl.recording.allowance import LARGEST_CHUNK_BYTES, MOST_IN_CHUNK, Allowance
+from hilctl.recording.checks import block_problem, decode
 
 FRAME = struct.Struct("<BQ")
 """Opcode and length before every record."""
-LARGEST_BYTES = 2**30
+LARGEST_BYTES = 2 * LARGEST_CHUNK_BYTES
 """No record that hilctl writes is larger; a length beyond it is a damaged one."""
 
 _MESSAGE = struct.Struct("<HIQQ")
-_PIECE_BYTES = 4096
+_PIECE_BYTES = 65536
 _KINDS: dict[int, Any] = {
     Opcode.HEADER: Header,
     Opcode.FOOTER: Footer,
@@ -66,7 +66,6 @@ _CHUNK = struct.Struct("<QQQII")
 _LENGTH = struct.Struct("<Q")
 _WINDOW_BYTES = 4 * 2**20
 _IN_CHUNKS = {Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE}
-_PER_SAMPLE = {"t_rel", "flags", *(each.name for each in RECORDED_FIELDS)}
 # Lengths are little-endian and far below 2**40, so their three highest bytes are 0.
 _LIKELY = re.compile(
     rb"\x06.{5}\0{3}.{16}.{5}\0{3}.{4}(?:\x04\0{3}zstd|\x03\0{3}lz4|\0{4}).{5}\0{3}"
@@ -122,8 +121,8 @@ def split(data: bytes) -> Iterator[tuple[int, McapRecord]]:
         at = start + length
 
 
-def inflate(compression: str, data: bytes, size: int) -> bytes:
-    """Decompress as far as the bytes go, and at most little more than ``size`` bytes.
+def inflate(compression: str, data: bytes, size: int, allowance: Allowance) -> bytes:
+    """Decompress as far as the bytes go, and at most one byte more than ``size``.
 
     A decompressor gives out whole blocks (zstd: up to 128 KiB), so of a stream that is cut the last
     block is lost.
@@ -132,24 +131,32 @@ def inflate(compression: str, data: bytes, size: int) -> bytes:
         compression: ``zstd``, ``lz4`` or empty; any other gives nothing.
         data: The stream, perhaps cut or damaged.
         size: Bytes expected.
+        allowance: Counts what comes out.
+
+    Raises:
+        DataError: The file has given out more than its allowance.
     """
     if not compression:
         return data
     stream: Any
     if compression == "zstd":
-        stream = zstandard.ZstdDecompressor().decompressobj()
+        # A frame may ask for a window of gigabytes.
+        limited = zstandard.ZstdDecompressor(max_window_size=LARGEST_CHUNK_BYTES)
+        stream = limited.stream_reader(data)
     elif compression == "lz4":
-        stream = lz4.frame.LZ4FrameDecompressor()
+        stream = lz4.frame.open(BytesIO(data))
     else:
         return b""
     out = bytearray()
-    for at in range(0, len(data), _PIECE_BYTES):
+    while len(out) <= size:
         try:
-            out += stream.decompress(data[at : at + _PIECE_BYTES])
+            piece = stream.read(min(_PIECE_BYTES, size + 1 - len(out)))
         except (zstandard.ZstdError, RuntimeError, EOFError):  # damaged from here on
             break
-        if len(out) > size or stream.eof:
+        if not piece:
             break
+        allowance.expand(len(piece))
+        out += piece
     return bytes(out)
 
 
@@ -166,11 +173,11 @@ class Contents:
     indexes: dict[int, bytes]
 
 
-def contents(chunk: Chunk) -> Contents | None:
+def contents(chunk: Chunk, allowance: Allowance) -> Contents | None:
     """Return what a chunk holds, or None where its checksum or a record in it is wrong."""
-    if chunk.uncompressed_size > LARGEST_BYTES:
+    if chunk.uncompressed_size > LARGEST_CHUNK_BYTES:
         return None
-    data = inflate(chunk.compression, chunk.data, chunk.uncompressed_size)
+    data = inflate(chunk.compression, chunk.data, chunk.uncompressed_size, allowance)
     if len(data) != chunk.uncompressed_size:
         return None
     if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
@@ -183,6 +190,8 @@ def contents(chunk: Chunk) -> Contents | None:
         if isinstance(record, Message):
             entries.setdefault(record.channel_id, []).extend((record.log_time, at))
         end = at + FRAME.size + FRAME.unpack_from(data, at)[1]
+        if len(records) > MOST_IN_CHUNK:
+            return None
     if end != len(data):
         return None
     return Contents(tuple(records), {key: _index(key, each) for key, each in entries.items()})
@@ -194,11 +203,14 @@ def _index(channel_id: int, entries: list[int]) -> bytes:
 
 def next_likely(stream: BinaryIO, at: int, size: int) -> int:
     """Return the offset of what looks like a record from ``at`` on, or ``size``."""
-    for start in range(at, size, _WINDOW_BYTES):
-        stream.seek(start)
-        found = _LIKELY.search(stream.read(_WINDOW_BYTES + _LIKELY_BYTES))
+    window = _LIKELY_BYTES  # small at first: a file full of likely places is still read but once
+    while at < size:
+        stream.seek(at)
+        found = _LIKELY.search(stream.read(window + _LIKELY_BYTES))
         if found:
-            return start + found.start()
+            return at + found.start()
+        at += window
+        window = min(2 * window, _WINDOW_BYTES)
     return size
 
 
@@ -211,11 +223,12 @@ def tail_kind(stream: BinaryIO, at: int, size: int) -> str:
     return "zeros"
 
 
-def take_chunk(raw: bytes, *, last: bool) -> tuple[list[McapRecord], str]:
+def take_chunk(raw: bytes, allowance: Allowance, *, last: bool) -> tuple[list[McapRecord], str]:
     """Take what can be had of a chunk that is not whole.
 
     Args:
         raw: The chunk from its opcode on, up to the next readable record.
+        allowance: Counts what comes out of it.
         last: Whether the file ends with these bytes.
 
     Returns:
@@ -224,12 +237,13 @@ def take_chunk(raw: bytes, *, last: bool) -> tuple[list[McapRecord], str]:
     chunk = _as_far_as_it_goes(raw)
     if chunk is None:
         return [], "torn chunk" if last else "damaged chunk"
-    inside = contents(chunk)
+    inside = contents(chunk, allowance)
     if inside is not None:  # only the frame around it is damaged
         return list(inside.records), "index"
     if not last or not _is_cut(chunk, raw):
         return [], "damaged chunk"
-    data = inflate(chunk.compression, _before_zeros(chunk), chunk.uncompressed_size)
+    whole = _before_zeros(chunk)
+    data = inflate(chunk.compression, whole, chunk.uncompressed_size, allowance)
     return _believable(data), "torn chunk"
 
 
@@ -249,7 +263,7 @@ def _as_far_as_it_goes(raw: bytes) -> Chunk | None:
     first, last, size, crc, name_length = _CHUNK.unpack_from(raw, FRAME.size)
     name = raw[start : start + name_length]
     begin = start + name_length + _LENGTH.size
-    if name not in {b"", b"lz4", b"zstd"} or len(raw) < begin or size > LARGEST_BYTES:
+    if name not in {b"", b"lz4", b"zstd"} or len(raw) < begin or size > LARGEST_CHUNK_BYTES:
         return None
     (length,) = _LENGTH.unpack_from(raw, begin - _LENGTH.size)
     return Chunk(
@@ -280,6 +294,8 @@ def _believable(data: bytes) -> list[McapRecord]:
         if isinstance(record, Message) and not _decodes(record):
             return records[:-1]
         records.append(record)
+        if len(records) > MOST_IN_CHUNK:
+            return []
         end = at + FRAME.size + FRAME.unpack_from(data, at)[1]
     rest = data[end:]
     if len(rest) >= FRAME.size:
@@ -293,14 +309,10 @@ def _decodes(message: Message) -> bool:
     own = own_channels().get(message.channel_id)
     if own is None:
         return False
-    name = schema.TOPICS[own[1].topic]
-    decoded = schema.message(name)
-    try:
-        decoded.ParseFromString(message.data)
-    except DecodeError:
-        return False
-    columns = [values for field, values in decoded.ListFields() if field.name in _PER_SAMPLE]
-    return name != "SampleBlock" or all(len(each) == decoded.n for each in columns)
+    decoded, problem = decode(own[1].topic, message.data)
+    if problem or own[1].topic != "/samples":
+        return not problem
+    return not block_problem(decoded, 0)
 
 
 @cache

@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from google.protobuf.message import DecodeError
 
 from hilctl.base.errors import DataError, InputError
 from hilctl.base.events import Event
 from hilctl.base.samples import Batch, Head
+from hilctl.recording.checks import LAST_SAMPLE, MAX_UNIX_NS, SoundMessages, sound_blocks
 from hilctl.recording.messages import RecordingLayout
 from hilctl.recording.replace import Replacement
 from hilctl.recording.rewrite import Resaved, Survey
@@ -89,7 +89,8 @@ def recover_recording(
         end: Facts of the run's end where the file has none of its own, with ``code`` and
             ``reason``; else the code is ``recovered``.
         events: Events of the loop that were perhaps not written; added with the batches.
-        ended_at: Index after the last sample that was exchanged; 0 where that is not known.
+        ended_at: Index after the last sample that was exchanged; 0 where that is not known, and
+            where no run can have got there.
         output: Put the sound file here instead, and leave the old one where it is.
 
     Raises:
@@ -102,22 +103,21 @@ def recover_recording(
             lock(stream, fcntl.LOCK_SH)
             survey = Survey(stream)
             more = list(_not_in_file(extra, survey.next_sample))
+            events = [event for event in events if _is_one(event)]
             if survey.salvage.sound and not more:
                 return _sound(path, survey)
             layout = _check(path, survey, more)
             with closing(Replacement(path, output)) as replacement:
                 saved = Resaved(replacement.stream, survey)
-                saved.copy(Salvage(stream).records())
+                saved.copy(Salvage(stream, SoundMessages()).records())
                 if layout:
                     saved.add(more, events, layout)
-                reason = saved.finish(end, ended_at)
+                reason = saved.finish(end, ended_at if ended_at < LAST_SAMPLE else 0)
                 kept = replacement.put()
     except FileNotFoundError as error:
         raise DataError(f"{error.filename or path}: no such file or folder") from None
     except FileExistsError:
         raise InputError(f"{output}: exists already: give another --output") from None
-    except DecodeError as error:
-        raise DataError(f"{path}: holds what hilctl did not write: {error}") from None
     except OSError as error:
         where = error.filename or path
         raise InputError(f"{where}: can't be recovered: {error.strerror}") from None
@@ -130,6 +130,11 @@ def recover_recording(
         missing_samples=saved.missing,
         damages=tuple(survey.salvage.damages),
     )
+
+
+def _is_one(event: Event) -> bool:
+    """Return whether an event is one that a loop can have left in memory."""
+    return 0 <= event.sample < LAST_SAMPLE and 0 <= event.time_ns <= MAX_UNIX_NS
 
 
 def _sound(path: Path, survey: Survey) -> Recovered:
@@ -151,13 +156,17 @@ def _check(path: Path, survey: Survey, more: list[Batch]) -> RecordingLayout | N
 
 
 def _not_in_file(extra: Iterable[Batch], next_sample: int) -> Iterator[Batch]:
-    """Yield the blocks from ``next_sample`` on, with the gaps before them counted anew."""
+    """Yield the blocks from ``next_sample`` on, with the gaps before them counted anew.
+
+    They come from memory that a dying process has left: what no loop can have written is left out.
+    """
     for batch in extra:
         firsts = batch.heads[:, Head.FIRST_SAMPLE].tolist()
+        sound = sound_blocks(batch)
         rows: list[int] = []
         gaps: list[int] = []
         for row, first in enumerate(firsts):
-            if first >= next_sample:
+            if first >= next_sample and sound[row]:
                 rows.append(row)
                 gaps.append(first - next_sample)
                 next_sample = first + batch.flags.shape[1]

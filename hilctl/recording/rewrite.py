@@ -10,6 +10,7 @@ from hilctl import __version__
 from hilctl.base.events import Event
 from hilctl.base.samples import Batch
 from hilctl.recording import schema
+from hilctl.recording.checks import SoundMessages, count_of
 from hilctl.recording.messages import MessageMaker, RecordingLayout, Topics, event_message
 from hilctl.recording.salvage import Salvage
 
@@ -30,24 +31,22 @@ class Survey:
         run: Facts of the run, empty where they are lost.
         end: Facts of its end, empty where they are lost or were never written.
         samples: Samples in it.
-        next_sample: Index after the last of them.
         last_time_ns: Unix time of the last message or attachment, in ns.
         records: Metadata and messages that are whole.
 
     Raises:
         OSError: The file can't be read.
-        google.protobuf.message.DecodeError: Samples in it are not hilctl's.
+        DataError: It asks for more work or memory than a recording of its size can.
     """
 
     def __init__(self, stream: BinaryIO) -> None:
-        self.salvage = Salvage(stream)
+        self._sound = SoundMessages()
+        self.salvage = Salvage(stream, self._sound)
         self.run: dict[str, str] = {}
         self.end: dict[str, str] = {}
         self.samples = 0
-        self.next_sample = 0
         self.last_time_ns = 0
         self.records = 0
-        self._topics: dict[int, str] = {}
         for record in self.salvage.records():
             self._take(record)
 
@@ -57,20 +56,19 @@ class Survey:
                 self.run = dict(record.metadata)
             case Metadata(name="hilctl.end"):
                 self.end = dict(record.metadata)
-            case Channel():
-                self._topics[record.id] = record.topic
             case Attachment():
                 self.last_time_ns = max(self.last_time_ns, record.log_time)
             case Message():
                 self.last_time_ns = max(self.last_time_ns, record.log_time)
-                if self._topics[record.channel_id] == "/samples":
-                    self._count(record.data)
+                if self._sound.topic(record.channel_id) == "/samples":
+                    block: Any = schema.message_class("SampleBlock").FromString(record.data)
+                    self.samples += block.n
         self.records += isinstance(record, Metadata | Message)
 
-    def _count(self, data: bytes) -> None:
-        block: Any = schema.message_class("SampleBlock").FromString(data)
-        self.samples += block.n
-        self.next_sample = max(self.next_sample, block.tick0 + block.n)
+    @property
+    def next_sample(self) -> int:
+        """Index after the last sample in it."""
+        return self._sound.next_sample
 
 
 class Resaved:
@@ -205,5 +203,7 @@ class Resaved:
 
 def _number(facts: Mapping[str, str], name: str) -> int:
     """Return a counter, or 0 where there is none that can be read."""
-    text = facts.get(name, "")
-    return int(text) if text.isdecimal() else 0
+    try:
+        return count_of(facts, name)
+    except ValueError:
+        return 0

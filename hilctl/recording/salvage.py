@@ -26,6 +26,8 @@ from mcap.records import (
 )
 from mcap.writer import MCAP0_MAGIC as MAGIC
 
+from hilctl.recording.allowance import Allowance
+from hilctl.recording.checks import SoundMessages
 from hilctl.recording.records import (
     FRAME,
     LARGEST_BYTES,
@@ -50,7 +52,8 @@ class Damage:
         start: Offset of its first byte.
         size: Bytes.
         what: ``torn chunk``, ``damaged chunk``, ``damaged record``, ``index`` (nothing of the run
-            is lost with it), ``zeros``, ``unreadable bytes`` or ``message of no channel``.
+            is lost with it), ``zeros``, ``unreadable bytes``, ``message of no channel``, or what
+            is wrong with a message that hilctl can't have written.
         saved: Messages saved from it.
     """
 
@@ -77,18 +80,23 @@ class Salvage:
 
     Args:
         stream: Open binary file that can seek.
+        sound: Leaves out messages that hilctl can't have written, and notes them as damage; where
+            None, they are given out.
 
     Attributes:
         size: Bytes of the file.
+        allowance: What may still be done for it.
         is_mcap: Whether the file begins as an MCAP file does.
         header: The file's header, where it is whole.
         damages: Stretches that could not be read.
         finished: Whether footer and closing magic are there and the index fits the data.
     """
 
-    def __init__(self, stream: BinaryIO) -> None:
+    def __init__(self, stream: BinaryIO, sound: SoundMessages | None = None) -> None:
         self._stream = stream
+        self._sound = sound
         self.size = stream.seek(0, 2)
+        self.allowance = Allowance(self.size)
         self.is_mcap = self._read(0, len(MAGIC)) == MAGIC
         self.header: Header | None = None
         self.damages: list[Damage] = []
@@ -123,6 +131,7 @@ class Salvage:
 
         Raises:
             OSError: The file can't be read.
+            DataError: It asks for more work or memory than a recording of its size can.
         """
         at = len(MAGIC)
         if not self.is_mcap:
@@ -143,7 +152,9 @@ class Salvage:
 
     def _read(self, at: int, size: int) -> bytes:
         self._stream.seek(at)
-        return self._stream.read(size)
+        found = self._stream.read(size)
+        self.allowance.read(len(found))
+        return found
 
     def _whole(self, at: int) -> _Found | None:
         frame = self._read(at, FRAME.size)
@@ -158,7 +169,7 @@ class Salvage:
             right = self._indexes.pop(int.from_bytes(body[:2], "little"), None)
             return _Found(None, None, end) if body == right else None
         record = parse(opcode, body)
-        inside = contents(record) if isinstance(record, Chunk) else None
+        inside = contents(record, self.allowance) if isinstance(record, Chunk) else None
         if record is None or (isinstance(record, Chunk) and inside is None):
             return None
         return _Found(record, inside, end)
@@ -214,13 +225,21 @@ class Salvage:
                     self._note(at, 0, "message of no channel")
                     continue
                 self._messages += 1
-            yield record
+                self.allowance.message()
+            problem = self._sound.problem(record) if self._sound else ""
+            if problem:
+                self._note(at, 0, problem)
+            else:
+                yield record
 
     def _lost_channels(self) -> Iterator[McapRecord]:
         for number, pair in own_channels().items():
             if number not in self._channels:
                 self._channels.add(number)
-                yield from pair
+                for record in pair:
+                    if self._sound:
+                        self._sound.problem(record)
+                    yield record
 
     def _damaged(self, at: int, after: int) -> list[McapRecord]:
         """Note a damaged stretch; return what can be taken from it."""
@@ -229,7 +248,7 @@ class Salvage:
             what = "index"
         elif opcode == Opcode.CHUNK:
             raw = self._read(at, min(after - at, LARGEST_BYTES))
-            records, what = take_chunk(raw, last=after == self.size)
+            records, what = take_chunk(raw, self.allowance, last=after == self.size)
         elif opcode in _KNOWN:
             what = "damaged record"
         else:

@@ -1,6 +1,7 @@
 """Waveforms from files: CSV, NPY or MCAP, resampled only where the experiment says so."""
 
 from pathlib import Path
+from tokenize import TokenError
 from typing import Any
 
 import numpy as np
@@ -8,11 +9,13 @@ import numpy.typing as npt
 
 from hilctl.base.arrays import F64
 from hilctl.base.errors import InputError
+from hilctl.base.segments import SHORTEST_PERIOD
 from hilctl.base.text_table import TextTable, check_rows, column_index
 from hilctl.waveforms.shapes import check_length
 from hilctl.waveforms.spec import FileWaveform
 
 _RATE_TOLERANCE = 1e-6
+_MOST_COLUMNS = 10_000
 _TIME_TOLERANCE = 0.01  # largest departure of one step from the median
 
 
@@ -33,12 +36,19 @@ def read_samples(w: FileWaveform, sample_rate_hz: float, folder: Path) -> tuple[
             known, or it differs from the run's and ``resample`` is ``refuse``.
     """
     path = folder / w.path
-    if not path.is_file():
+    try:
+        found = path.is_file()
+    except OSError as error:  # a name that is too long
+        raise InputError(f"{path}: can't be read: {error.strerror}") from None
+    if not found:
         raise InputError(f"{path}: no such file")
     raw, own_rate_hz = _read(w, path)
     rate_hz = _file_rate(w, path, own_rate_hz)
     values = w.offset + w.scale * _resampled(w, path, raw, rate_hz, sample_rate_hz)
     period = 0.0 if w.period_s is None else w.period_s * sample_rate_hz
+    if w.period_s is not None and period < SHORTEST_PERIOD:
+        least_s = SHORTEST_PERIOD / sample_rate_hz
+        raise InputError(f"{path}: period_s must be {least_s:g} or more, a sample: {w.period_s!r}")
     return values, period
 
 
@@ -96,15 +106,20 @@ def _read_text(w: FileWaveform, path: Path) -> tuple[F64, float | None]:
 
 
 def _read_npy(path: Path) -> dict[str, npt.NDArray[Any]]:
-    try:  # mapped, so that its size is known before it is read
-        table = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (ValueError, OSError, EOFError):
+    try:
+        # Mapped, not read: what its head says of its size must fit the file. NumPy parses the head
+        # as Python, multiplies what it finds, and hands the parser's own errors on.
+        with np.errstate(over="ignore"):
+            table = np.load(path, mmap_mode="r", allow_pickle=False)
+    except (ValueError, OSError, EOFError, OverflowError, TypeError, TokenError):
         raise InputError(f"{path}: is not a whole NumPy file (.npy) of numbers") from None
     if not (isinstance(table, np.ndarray) and table.dtype.kind in "fiu" and table.ndim in (1, 2)):
         raise InputError(f"{path}: must hold a one- or two-dimensional array of numbers")
     if table.size == 0:
         raise InputError(f"{path}: holds no data")
     columns = table.reshape(table.shape[0], -1).T
+    if len(columns) > _MOST_COLUMNS:
+        raise InputError(f"{path}: holds {len(columns)} columns, at most {_MOST_COLUMNS} are read")
     return {str(number): column for number, column in enumerate(columns, start=1)}
 
 

@@ -23,6 +23,11 @@ from yaml.composer import ComposerError
 MAX_DEPTH = 32
 """Levels of nesting that are read; an experiment has about five."""
 
+MAX_CHARACTERS = 2_000_000
+"""Longest text that is read; a model of ten thousand operators has a fifth of it."""
+MAX_VALUES = 50_000
+"""Most values, lists and mappings in a text: their parser takes up to 0.1 ms for each."""
+
 _TAG = "tag:yaml.org,2002:"
 _INT = r"[-+]?[0-9]+|0o[0-7]+|0x[0-9a-fA-F]+"
 _FLOAT = (
@@ -42,10 +47,15 @@ class _PlainLoader(yaml.SafeLoader):
 
     yaml_implicit_resolvers = {}  # noqa: RUF012  PyYAML's own way; filled below
     _depth = 0
+    _values = 0
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
         event: Any = self.peek_event()  # type: ignore[no-untyped-call] # not in the stubs
         is_key = isinstance(parent, yaml.MappingNode) and index is None
+        self._values += not is_key
+        if self._values > MAX_VALUES:
+            problem = f"more than the {MAX_VALUES} values that are read"
+            raise ComposerError(None, None, problem, event.start_mark)
         if problem := _not_plain(event, is_key=is_key, depth=self._depth):
             raise ComposerError(None, None, problem, event.start_mark)
         self._depth += 1
@@ -91,8 +101,12 @@ def compose(text: str) -> yaml.Node | None:
     """Return the text's tree, or None where it holds nothing.
 
     Raises:
-        yaml.MarkedYAMLError: It is not YAML, or more than the plain part of it; says where.
+        yaml.MarkedYAMLError: It is not YAML, more than the plain part of it, or too much; says
+            where.
     """
+    if len(text) > MAX_CHARACTERS:
+        problem = f"{len(text)} characters, more than the {MAX_CHARACTERS} that are read"
+        raise yaml.MarkedYAMLError(problem=problem)
     try:
         loader = _PlainLoader(text)
     except yaml.reader.ReaderError as error:

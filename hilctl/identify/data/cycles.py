@@ -51,6 +51,8 @@ def average_cycle(label: str, phase: F64, values: F64, period: float, points: in
     offset = np.bincount(index, phase * bins - nearest, bins) / count
     knots = (np.arange(bins) + offset) / bins
     means = np.array([np.bincount(index, row, bins) / count for row in values])
+    if not np.isfinite(means).all():
+        raise DataError(f"{label}: holds values that are not finite, or too large to be averaged")
     spline = CubicSpline(
         np.append(knots, knots[0] + 1.0), np.hstack([means, means[:, :1]]), 1, bc_type="periodic"
     )

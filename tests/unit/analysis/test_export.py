@@ -288,3 +288,10 @@ def test_file_has_ordinary_permissions(tmp_path: Path) -> None:
     plain.touch()
     export(recording(), tmp_path / "out.mat")
     assert stat.S_IMODE((tmp_path / "out.mat").stat().st_mode) == stat.S_IMODE(plain.stat().st_mode)
+
+
+@pytest.mark.parametrize("t_s", [1e308, -1e308])
+def test_times_beyond_all_samples(t_s: float) -> None:
+    """They are no sample's, and no number too large to count with."""
+    with pytest.raises(DataError, match="holds no sample from"):
+        columns(recording(), *((t_s, None) if t_s > 0 else (None, t_s)))

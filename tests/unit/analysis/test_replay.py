@@ -60,3 +60,30 @@ def test_what_can_not_be_replayed_is_refused():
         replay(recording, model)
     with pytest.raises(DataError, match="holds no samples to replay"):
         replay(replace(recording, starts=()))
+
+
+def test_what_no_compensator_has_left_is_refused():
+    """States, commands and rates come from the file, and kernels work with them."""
+    recording = read(GOLDEN / "terfenol_compensated.mcap")
+    start = recording.starts[0]
+    for state in (start.state[:-1], np.full_like(start.state, np.inf)):
+        changed = replace(recording, starts=(replace(start, state=state),))
+        with pytest.raises(DataError, match="/samples: sample 0: state must have"):
+            replay(changed)
+    command = np.full_like(recording.samples.command, np.nan)
+    with pytest.raises(DataError, match="every command must be finite"):
+        replay(replace(recording, samples=replace(recording.samples, command=command)))
+    with pytest.raises(DataError, match="was recorded at 1000 Hz, its experiment is at 50000 Hz"):
+        replay(replace(recording, sample_rate_hz=1000.0))
+
+
+def test_no_sample_is_replayed_twice():
+    """A start without a gap before it ends the stretch before it: work stays in proportion."""
+    recording = read(GOLDEN / "terfenol_uncompensated.mcap")
+    start = recording.starts[0]
+    starts = tuple(
+        replace(start, sample=sample, previous_command=float(recording.samples.command[sample - 1]))
+        for sample in range(100, 3000)
+    )
+    found = replay(replace(recording, starts=(start, *starts)))
+    assert (found.identical, found.samples) == (True, recording.samples.index.size)

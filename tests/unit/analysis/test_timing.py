@@ -53,3 +53,12 @@ def test_minutes_are_told_apart() -> None:
     assert [(each["minute"], each["ticks"]) for each in found] == [(0, 60), (1, 60), (3, 10)]
     assert [each["max"] for each in found] == [1.0, 2.0, 5.0]
     assert timing.by_minute(ticks([])) == []
+
+
+def test_long_runs_are_told_in_longer_stretches() -> None:
+    """A table of a year by minutes is none; nor is one of ticks with absurd deadlines."""
+    deadline_ns = np.arange(500_000, dtype=np.int64) * 60_000_000_000
+    zeros = np.zeros_like(deadline_ns)
+    rows = timing.by_minute(Ticks(zeros, deadline_ns, zeros, zeros))
+    assert len(rows) <= timing.MOST_ROWS + 1
+    assert sum(row["ticks"] for row in rows) == 500_000

@@ -168,3 +168,17 @@ def test_a_table_too_large_is_not_read(table, monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(text_table, "MAX_TABLE_BYTES", 1_000_000)
     with pytest.raises(InputError, match=r"t\.csv: has 2 MB, more than the 1 MB that are read"):
         table(b"\xff" * 2_000_000)
+
+
+@pytest.mark.parametrize("line", ["1," * 5000, "1" * 200_000])
+def test_lines_that_are_no_row_are_refused_at_once(tmp_path, line):
+    path = tmp_path / "wide.csv"
+    path.write_text(line + "\n1\n")
+    with pytest.raises(DataError, match="a row of a table, of at most 1000 columns"):
+        TextTable(path)
+
+
+def test_comments_without_end_are_no_header(tmp_path):
+    path = tmp_path / "long.csv"
+    path.write_text("#" + "a" * 200_000 + "\n# b\n1\n2\n")
+    assert TextTable(path).names == ["b"]

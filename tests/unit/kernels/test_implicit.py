@@ -4,7 +4,13 @@ import numpy as np
 import pytest
 
 from hilctl.kernels.hysteresis import rest_memory
-from hilctl.kernels.implicit import BOUC_WEN, bouc_wen_step, implicit_forward, implicit_inverse
+from hilctl.kernels.implicit import (
+    BOUC_WEN,
+    PREISACH,
+    bouc_wen_step,
+    implicit_forward,
+    implicit_inverse,
+)
 
 NOTHING = np.zeros(0)
 SPAN = (-7.0, 8.0)
@@ -52,3 +58,21 @@ def test_what_can_not_be_reached_ends_at_the_span_and_nan_leaves_no_trace():
     assert np.isnan(command[2])
     np.testing.assert_array_equal(command[[0, 1, 3, 4]], without)
     assert (command[0], command[4]) == (8.0, -7.0)
+
+
+@pytest.mark.parametrize("wrong", [np.nan, np.inf, -np.inf, 1e300, -1e300])
+def test_no_number_leads_out_of_the_cells(wrong):
+    """Neither an input nor a memory that is none may become an index."""
+    preisach = np.array([0.0, 0.5]), np.arange(8.0), np.array([-1.0, 1.0, 3.0])
+    for memory in (np.full(3, wrong), rest_memory(2)):
+        out = np.zeros(2)
+        implicit_forward(PREISACH, np.array([wrong, 0.5]), preisach, memory, out)
+        assert not np.isfinite(wrong) or np.sign(out[0]) == np.sign(wrong)
+        assert np.isnan(out[1]) or -10.0 < out[1] < 10.0 or abs(wrong) >= 1e300
+
+
+@pytest.mark.timeout(20)
+def test_a_span_of_nearly_nothing_has_an_end():
+    out = np.empty(1)
+    implicit_inverse(BOUC_WEN, np.ones(1), (0.0, 5e-324), 1e-7, arrays(1.0), rest_memory(1), out)
+    assert 0.0 <= out[0] <= 5e-324

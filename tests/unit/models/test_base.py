@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
 from hilctl.base.errors import ModelError
 from hilctl.models.deadband import DeadbandFunction
@@ -108,3 +109,13 @@ def test_offset_moves_the_output_and_comes_off_first(model):
     np.testing.assert_array_equal(block, SIGNAL + 7.0)
     expected = model.inverse(SAMPLE_RATE_HZ).process(block - 7.0)
     np.testing.assert_array_equal(shifted, expected)
+
+
+def test_infinite_states_and_models_without_end_are_refused():
+    operator = PpiModel(direct=1.0, weights=(1.0,), thresholds=(1.0,)).forward(1.0)
+    operator.restore(np.array([1.0, np.nan]))
+    with pytest.raises(ModelError, match="no infinite value"):
+        operator.restore(np.array([np.inf, 0.0]))
+    many = tuple(float(i) for i in range(1, 10_002))
+    with pytest.raises(ValidationError, match="at most 10000 operators: 10001"):
+        PpiModel(direct=1.0, weights=many, thresholds=many)

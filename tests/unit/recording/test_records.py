@@ -8,6 +8,7 @@ from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Chunk, Header, Message, Metadata, Schema
 
+from hilctl.recording.allowance import Allowance
 from hilctl.recording.records import (
     contents,
     inflate,
@@ -61,14 +62,14 @@ def test_an_attachment_has_a_checksum():
 def test_a_chunk_must_be_records_to_its_last_byte():
     """Without a checksum, what is in a chunk still has to fit."""
     data = raw(message(1)) + raw(message(2))
-    found = contents(chunk(data))
+    found = contents(chunk(data), Allowance(2**20))
     assert found.records == (message(1), message(2))
     assert found.indexes == {4: struct.pack("<HIQQQQ", 4, 32, 1, 0, 2, len(data) // 2)}
     for wrong in (data[:-1], data + b"\x05"):
-        assert contents(chunk(wrong)) is None
-    assert contents(chunk(data, size=len(data) + 1)) is None
-    assert contents(chunk(data, size=2**40)) is None
-    assert contents(chunk(data, crc=1)) is None
+        assert contents(chunk(wrong), Allowance(2**20)) is None
+    assert contents(chunk(data, size=len(data) + 1), Allowance(2**20)) is None
+    assert contents(chunk(data, size=2**40), Allowance(2**20)) is None
+    assert contents(chunk(data, crc=1), Allowance(2**20)) is None
 
 
 def torn(data):
@@ -81,7 +82,7 @@ def test_nonsense_behind_a_message_costs_that_message():
     two = raw(message(1, b"\x08\x01")) + raw(message(2, b"\x08\x01"))
 
     def saved(behind):
-        records, what = take_chunk(torn(two + behind), last=True)
+        records, what = take_chunk(torn(two + behind), Allowance(2**20), last=True)
         assert what == "torn chunk"
         return len(records)
 
@@ -89,19 +90,19 @@ def test_nonsense_behind_a_message_costs_that_message():
     assert saved(b"\x05" + struct.pack("<Q", 90) + b"\x99") == 2
     assert saved(b"\x99") == saved(b"\x99" * 20) == 1
     assert saved(b"\x05" + struct.pack("<Q", 22) + b"\x99" * 40) == 1
-    assert take_chunk(torn(two), last=False) == ([], "damaged chunk")
+    assert take_chunk(torn(two), Allowance(2**20), last=False) == ([], "damaged chunk")
 
 
 def test_a_whole_chunk_with_a_wrong_checksum_gives_nothing():
     """That the file ends behind it is no reason to believe what is in it."""
     wrong = raw(chunk(raw(message(1, b"\x08\x01")), crc=1))
-    assert take_chunk(wrong, last=True) == ([], "damaged chunk")
+    assert take_chunk(wrong, Allowance(2**20), last=True) == ([], "damaged chunk")
 
 
 def test_zeros_at_the_end_cost_the_message_that_they_end():
     """What ends in zeros may have been something else before the power failed."""
     two = raw(message(1, b"\x08\x01")) + raw(message(2, b"\x08\x01"))
-    records, _ = take_chunk(torn(two)[:-1] + b"\0", last=True)
+    records, _ = take_chunk(torn(two)[:-1] + b"\0", Allowance(2**20), last=True)
     assert records == [message(1, b"\x08\x01")]
 
 
@@ -112,11 +113,11 @@ def test_a_sector_of_zeros_ends_a_compressed_stream(make):
     data = stream.getvalue()
     start = data.index(b"\x04\0\0\0zstd") - 37
     whole = data[start : start + 9 + struct.unpack_from("<Q", data, start + 1)[0]]
-    every, what = take_chunk(whole, last=True)
+    every, what = take_chunk(whole, Allowance(2**20), last=True)
     assert (what, len(every) > 90) == ("index", True)
     for at in (3000, 100_000, 150_000):
         holed = whole[:at] + bytes(600) + whole[at + 600 : -5000]
-        records, what = take_chunk(holed, last=True)
+        records, what = take_chunk(holed, Allowance(2**20), last=True)
         assert what == "torn chunk"
         assert records == every[: len(records)]
         assert len(records) > 20 or at < 150_000
@@ -124,7 +125,7 @@ def test_a_sector_of_zeros_ends_a_compressed_stream(make):
 
 def test_unknown_compression_gives_nothing():
     """What can't be decompressed is not guessed at."""
-    assert inflate("brotli", b"abc", 10) == b""
+    assert inflate("brotli", b"abc", 10, Allowance(3)) == b""
 
 
 def test_a_likely_record_is_found_across_windows(monkeypatch):

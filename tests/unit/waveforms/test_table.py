@@ -51,6 +51,18 @@ def rows(*columns: Any, delimiter: str = ",") -> str:
     )
 
 
+@pytest.mark.parametrize("suffix", [".csv", ".npy", ".mcap"])
+def test_name_that_no_file_can_have(made: Made, tmp_path: Path, suffix: str) -> None:
+    with pytest.raises(InputError, match="can't be read: File name too long"):
+        made(RATE_HZ, tmp_path, kind="file", path="x" * 300 + suffix, file_rate_hz=RATE_HZ)
+
+
+def test_period_shorter_than_a_sample(read: Read) -> None:
+    """It could be run, but its recording could not be judged."""
+    text = refusal(read, "1\n2\n", period_s=1e-9, file_rate_hz=RATE_HZ)
+    assert text.startswith("period_s must be")
+
+
 class TestText:
     """CSV and its relatives."""
 
@@ -408,6 +420,18 @@ class TestNpy:
         """One or two dimensions of real numbers, nothing else."""
         text = refusal(read, npy(tmp_path, array), "w.npy", file_rate_hz=RATE_HZ)
         assert text == "must hold a one- or two-dimensional array of numbers"
+
+    @pytest.mark.parametrize(
+        "shape",
+        ["(10**15,)", "(1000000000000000,)", "(4294967296, 4294967296)", "(9223372036854775808,)",
+         "(-1,)", "(True,)", "(" * 5000, "('''"],
+    )  # fmt: skip
+    def test_head_that_lies(self, read: Read, shape: str) -> None:
+        """What a head says of its size is held against the file, whatever it is."""
+        head = f"{{'descr': '<f8', 'fortran_order': False, 'shape': {shape}, }}\n".encode()
+        content = b"\x93NUMPY\x01\x00" + len(head).to_bytes(2, "little") + head + bytes(80)
+        text = refusal(read, content, "w.npy", file_rate_hz=RATE_HZ)
+        assert text == "is not a whole NumPy file (.npy) of numbers"
 
     @pytest.mark.parametrize("shape", [(0,), (0, 2), (5, 0)])
     def test_empty(self, read: Read, tmp_path: Path, shape: tuple[int, ...]) -> None:

@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hilctl.base.errors import ConfigError
+from hilctl.base.yaml import plain
 from hilctl.base.yaml.document import Document
 from hilctl.base.yaml.plain import dump
 from hilctl.experiment.load import resolve
@@ -209,3 +210,17 @@ def test_dumped_text_is_as_people_write_it() -> None:
     assert dump(data) == (
         "a: words\nb: 'on'\nc: '1e3'\nd: '0o10'\ne: 1.0e-05\nf: 1.0e+22\ng: '1:30'\n"
     )
+
+
+@pytest.mark.parametrize(
+    ("text", "rule"),
+    [
+        ("a: " + "x" * 3_000_000, "3000003 characters, more than the 2000000 that are read"),
+        ("a: [" + "1," * 600 + "]", "more than the 500 values that are read"),
+        ("a: &x [1]\nb: [" + "*x," * 9 + "]", "aliases"),
+    ],
+)
+def test_too_much_is_refused_at_once(text: str, rule: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(plain, "MAX_VALUES", 500)
+    with pytest.raises(ConfigError, match=rule):
+        Document("large.yaml", text)

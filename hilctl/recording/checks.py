@@ -1,0 +1,270 @@
+"""What facts and messages of a recording must be. Compiled kernels index with what comes of them.
+
+Every check returns what is wrong, in words, or nothing. The reader refuses a file for it; recovery
+leaves the message out.
+"""
+
+import json
+import math
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Annotated, Any
+
+import numpy as np
+import numpy.typing as npt
+from google.protobuf.message import DecodeError
+from mcap.records import Channel, McapRecord, Message, Schema
+from pydantic import Field, TypeAdapter, ValidationError
+
+from hilctl.base.device import CommandUnit
+from hilctl.base.events import TUNED
+from hilctl.base.samples import COLUMNS, Batch, Head
+from hilctl.base.segments import SHORTEST_PERIOD, Segment
+from hilctl.base.strict import Strict
+from hilctl.recording import schema
+from hilctl.recording.data import TICK_COLUMNS
+
+LAST_SAMPLE = 2**40
+"""No index reaches it: a hundred million samples, and a safe ramp of an hour at 1 MHz."""
+MAX_UNIX_NS = 2**63 - 1
+"""Latest time that 64 bits hold with a sign, as NumPy and Parquet have it: in the year 2262."""
+RATES_HZ = (1e-6, 1e9)
+"""Lowest and highest rate of samples: far beyond those of any experiment."""
+
+_LONGEST_NS = 2**60
+_MOST_SEGMENTS_TEXT = 2**24
+_MOST_VALUES = 1000
+_UNITS: tuple[CommandUnit, ...] = ("A", "V")
+_MOST_DIGITS = 15
+_LINE = 60
+
+
+def decode(topic: str, data: bytes) -> tuple[Any, str]:
+    """Return a message of one of hilctl's topics, and why it is none of hilctl's, if so."""
+    decoded = schema.message(schema.TOPICS[topic])
+    try:
+        decoded.ParseFromString(data)
+    except DecodeError as error:
+        return decoded, f"can't be decoded: {error}"
+    return decoded, ""
+
+
+def block_problem(block: Any, next_sample: int) -> str:
+    """Check samples.
+
+    Args:
+        block: A ``SampleBlock``.
+        next_sample: Index after the last sample before it.
+    """
+    if not block.n:
+        return "holds no sample"
+    if not next_sample <= block.tick0 < LAST_SAMPLE:
+        return f"sample {block.tick0} can't follow sample {next_sample - 1}"
+    if wrong := _wrong_lengths(block, "", block.n):
+        return f"{block.n} samples with {wrong}"
+    before = block.previous_command
+    if len(before) > 1 or not all(map(math.isfinite, before)):
+        return "previous_command must be one finite number"
+    return ""
+
+
+def _wrong_lengths(message: Any, prefix: str, samples: int) -> str:
+    """Return which columns of a message have not one value a sample."""
+    lengths = {f"{prefix}flags": len(getattr(message, f"{prefix}flags"))}
+    for column in COLUMNS.values():
+        names = sorted({prefix + column.field(unit).name for unit in _UNITS})
+        given = {name: len(getattr(message, name)) for name in names}
+        filled = {name: length for name, length in given.items() if length}
+        missing = {" or ".join(names): 0} if column.when == "always" else {}
+        lengths |= filled or missing
+    return _listed({name: length for name, length in lengths.items() if length != samples})
+
+
+def ticks_problem(ticks: Any) -> str:
+    """Check a ``TickBlock``."""
+    lengths = {name: len(getattr(ticks, name)) for name in TICK_COLUMNS}
+    if len(set(lengths.values())) != 1:
+        return "its columns differ in length: " + _listed(lengths)
+    if max(ticks.first_sample, default=0) >= LAST_SAMPLE:
+        return f"sample {max(ticks.first_sample)} is beyond any run"
+    for name in TICK_COLUMNS[1:]:
+        furthest = max(map(abs, getattr(ticks, name)), default=0)
+        if furthest > _LONGEST_NS:
+            return f"{name} of {furthest} ns is longer than any run"
+    return ""
+
+
+def event_problem(event: Any, time_ns: int) -> str:
+    """Check an ``Event``, and the time that it was logged at."""
+    names, values = len(event.value_names), len(event.values)
+    if names != values or names > _MOST_VALUES:
+        return f"{names} names for {values} values"
+    if not 0 <= time_ns <= MAX_UNIX_NS:
+        return f"its time, {time_ns} ns, is beyond the year 2262"
+    if max(event.sample, *event.before_sample, 0) >= LAST_SAMPLE:
+        return "a sample is beyond any run"
+    # How many samples a change takes is worked with.
+    if event.code == TUNED and not all(0.0 <= abs(value) < LAST_SAMPLE for value in event.values):
+        return f"a change of the reference by {list(event.values)}"
+    before = len(event.before_sample)
+    if before and (wrong := _wrong_lengths(event, "before_", before)):
+        return f"{before} samples before it with {wrong}"
+    return ""
+
+
+def sound_blocks(batch: Batch) -> npt.NDArray[np.bool_]:
+    """Return which blocks of a batch a loop can have written: bool[k]."""
+    first = batch.heads[:, Head.FIRST_SAMPLE]
+    times = batch.heads[:, [Head.DEADLINE_NS, Head.LATE_NS, Head.EXCHANGE_NS]]
+    in_time = ((times >= -_LONGEST_NS) & (times <= _LONGEST_NS)).all(axis=1)
+    in_run = (first >= 0) & (first < LAST_SAMPLE - batch.flags.shape[1])
+    begun = np.isfinite(batch.states[:, -1])
+    return np.asarray(in_time & in_run & begun)
+
+
+def _listed(lengths: Mapping[str, int]) -> str:
+    return ", ".join(f"{length} of {name}" for name, length in lengths.items())
+
+
+class SoundMessages:
+    """Tells the messages that hilctl wrote from others under its topics, in the order of a file."""
+
+    def __init__(self) -> None:
+        self._schemas: dict[int, str] = {}
+        self._topics: dict[int, str] = {}
+        self._refused: dict[int, str] = {}
+        self.next_sample = 0
+        """Index after the last sample of all messages that were found sound."""
+
+    def topic(self, channel: int) -> str:
+        """Return the topic of a channel where it is one of hilctl's; else nothing."""
+        return self._topics.get(channel, "")
+
+    def problem(self, record: McapRecord) -> str:
+        """Return why a record can't be hilctl's, though it says so; nothing where it can."""
+        match record:
+            case Schema():
+                self._schemas[record.id] = record.name
+            case Channel():
+                self._channel(record)
+                return self._refused.get(record.id, "")
+            case Message() if record.channel_id in self._refused:
+                return self._refused[record.channel_id]
+            case Message() if self.topic(record.channel_id):
+                return self.decoded(record)[1]
+        return ""
+
+    def _channel(self, channel: Channel) -> None:
+        self._topics.pop(channel.id, None)
+        self._refused.pop(channel.id, None)
+        if channel.topic not in schema.TOPICS:
+            return
+        own = f"hilctl.{schema.TOPICS[channel.topic]}"
+        name = self._schemas.get(channel.schema_id, "")
+        if name == own and channel.message_encoding == "protobuf":
+            self._topics[channel.id] = channel.topic
+        else:
+            text = f"{channel.topic}: must hold {own} in protobuf, got {short(name)}"
+            self._refused[channel.id] = text
+
+    def decoded(self, record: Message) -> tuple[Any, str]:
+        """Return a message under one of hilctl's topics, and what is wrong with it."""
+        topic = self._topics[record.channel_id]
+        if topic == "/scope":  # it repeats /samples, and nothing here reads it
+            return None, ""
+        message, problem = decode(topic, record.data)
+        if not problem:
+            if topic == "/samples":
+                problem = block_problem(message, self.next_sample)
+            elif topic == "/ticks":
+                problem = ticks_problem(message)
+            else:
+                problem = event_problem(message, record.log_time)
+        if topic == "/samples" and not problem:
+            self.next_sample = message.tick0 + message.n
+        return message, f"{topic}: {problem}" if problem else ""
+
+
+_Index = Annotated[int, Field(ge=0, lt=LAST_SAMPLE)]
+
+
+class _RecordedSegment(Strict):
+    """The fields of a :class:`~hilctl.base.segments.Segment` as a recording has them."""
+
+    label: str
+    start: _Index
+    stop: _Index
+    steady_start: _Index
+    steady_stop: _Index
+    period: Annotated[float, Field(ge=0.0)] = 0.0
+
+
+_SEGMENTS = TypeAdapter(list[_RecordedSegment])
+
+
+def segments_of(text: str) -> tuple[Segment, ...]:
+    """Return the stretches of a run from a fact of it.
+
+    Raises:
+        ValueError: They are not what :meth:`~hilctl.base.segments.Segment.to_mapping` gives, do not
+            follow one another, or have no such steady part or period.
+    """
+    if len(text) > _MOST_SEGMENTS_TEXT:
+        raise ValueError(f"segments: {len(text)} characters are more than any run has")
+    try:
+        given = _SEGMENTS.validate_python(json.loads(text))
+    except RecursionError:
+        raise ValueError("segments: nested too deep") from None
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        where = ".".join(map(str, first["loc"]))
+        raise ValueError(f"segments: {where}: {first['msg']}") from None
+    segments = tuple(Segment.from_mapping(each.model_dump()) for each in given)
+    for problem in _segment_problems(segments):
+        raise ValueError(f"segments: {problem}")
+    return segments
+
+
+def _segment_problems(segments: Iterable[Segment]) -> Iterator[str]:
+    end = 0
+    for number, each in enumerate(segments):
+        places = [end, each.start, each.steady_start, each.steady_stop, each.stop]
+        if places != sorted(places):
+            yield f"{number}: its samples must follow those before it and rise: {places}"
+        if 0.0 < each.period < SHORTEST_PERIOD:
+            yield f"{number}: a period of {each.period!r} samples can't be"
+        end = each.stop
+
+
+def number_of(facts: Mapping[str, str], name: str, low: float, high: float) -> float:
+    """Return a fact that is a number.
+
+    Raises:
+        ValueError: It is missing, is none, or lies outside of ``low`` to ``high``.
+    """
+    if name not in facts:
+        raise ValueError(f"{name} is missing")
+    text = facts[name]
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not low <= value <= high:
+        raise ValueError(f"{name} must be a number from {low:g} to {high:g}, got {short(text)}")
+    return value
+
+
+def count_of(facts: Mapping[str, str], name: str) -> int:
+    """Return a fact that counts samples; 0 where it is missing.
+
+    Raises:
+        ValueError: It is no such number.
+    """
+    text = facts.get(name, "0")
+    if not (text.isascii() and text.isdecimal() and len(text) <= _MOST_DIGITS):
+        raise ValueError(f"{name} must be a whole number, got {short(text)}")
+    return int(text)
+
+
+def short(text: str) -> str:
+    """Return a text from a file for a message: quoted, and no longer than a line."""
+    return repr(text if len(text) <= _LINE else text[: _LINE - 3] + "...")

@@ -1,0 +1,227 @@
+"""What facts and messages of a recording must be; a file that holds others is refused by a line."""
+
+import io
+import json
+import struct
+
+import pytest
+import zstandard
+from mcap.records import Attachment, Channel, Message, Metadata, Schema
+from mcap.writer import Writer
+
+from hilctl.base.errors import DataError, InputError
+from hilctl.base.events import TUNED, Event
+from hilctl.base.samples import Head
+from hilctl.base.segments import Segment
+from hilctl.recording import schema
+from hilctl.recording.checks import LAST_SAMPLE, count_of, number_of, segments_of, sound_blocks
+from hilctl.recording.messages import RecordingLayout
+from hilctl.recording.reader import read
+from hilctl.recording.recover import recover_recording
+from hilctl.recording.salvage import Salvage
+
+GOOD = Segment("sine", 0, 100, 10, 90, 20.0).to_mapping()
+
+
+@pytest.fixture
+def crafted(tmp_path, make):
+    """Write a recording whose records have gone through a function, with right checksums."""
+
+    def write(change):
+        sound = io.BytesIO()
+        make.write(sound, [make.batch(0, 4), make.batch(200, 4, seed=1)], events=[make.ended])
+        stream = io.BytesIO()
+        writer = Writer(stream)
+        writer.start("", "")
+        topics = {}
+        for record in Salvage(sound).records():
+            if isinstance(record, Channel):
+                topics[record.id] = record.topic
+            if isinstance(record, Message):
+                topic = topics[record.channel_id]
+                decoded = schema.message(schema.TOPICS[topic])
+                decoded.ParseFromString(record.data)
+                change(topic, decoded)
+                data, times = decoded.SerializeToString(), (record.log_time, record.publish_time)
+                writer.add_message(record.channel_id, times[0], data, times[1])
+            else:
+                _copy(writer, record, change)
+        writer.finish()
+        path = tmp_path / "crafted.mcap"
+        path.write_bytes(stream.getvalue())
+        return path
+
+    return write
+
+
+def _copy(writer, record, change):
+    match record:
+        case Schema():
+            change("schema", record)
+            writer.register_schema(record.name, record.encoding, record.data)
+        case Channel():
+            writer.register_channel(record.topic, record.message_encoding, record.schema_id)
+        case Metadata():
+            change(record.name, record.metadata)
+            writer.add_metadata(record.name, record.metadata)
+        case Attachment():
+            writer.add_attachment(0, 0, record.name, record.media_type, record.data)
+
+
+def _set(topic, **fields):
+    def change(where, decoded):
+        if where == topic:
+            for name, value in fields.items():
+                if isinstance(value, list):
+                    getattr(decoded, name)[:] = value
+                else:
+                    setattr(decoded, name, value)
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "problem"),
+    [
+        (_set("/samples", n=2**32 - 1), "4294967295 samples with"),
+        (_set("/samples", n=0), "holds no sample"),
+        (_set("/samples", wanted_a=[1.0]), "200 samples with 1 of wanted_a"),
+        (_set("/samples", current_a=[]), "200 samples with 0 of current_a or drive_v"),
+        (_set("/samples", flags=[0]), "200 samples with 1 of flags"),
+        (_set("/samples", measured_a=[0.0] * 3), "200 samples with 3 of measured_a"),
+        (_set("/samples", tick0=2**64 - 1), "can't follow sample -1"),
+        (_set("/samples", tick0=7), "sample 7 can't follow sample 206"),
+        (_set("/samples", previous_command=[float("nan")]), "must be one finite number"),
+        (_set("/samples", previous_command=[1.0, 2.0]), "must be one finite number"),
+        (_set("/ticks", late_ns=[1]), "its columns differ in length"),
+        (_set("/ticks", first_sample=[2**64 - 1] * 4), "is beyond any run"),
+        (_set("/ticks", deadline_ns=[-(2**63)] * 4), "is longer than any run"),
+        (_set("/events", values=[1.0]), "0 names for 1 values"),
+        (_set("/events", sample=2**63), "a sample is beyond any run"),
+        (_set("/events", before_sample=[1]), "1 samples before it with 0 of before_flags"),
+        (
+            _set("/events", code=TUNED, value_names=["samples"], values=[float("inf")]),
+            "a change of the reference by",
+        ),
+    ],
+)  # fmt: skip
+def test_messages_that_hilctl_can_not_have_written(crafted, tmp_path, change, problem):
+    """The reader refuses the file; recovery leaves the message out, and what is left is read."""
+    path = crafted(change)
+    with pytest.raises(DataError, match=problem) as caught:
+        read(path)
+    assert str(caught.value).startswith(f"{path}: /")
+    assert "\n" not in str(caught.value)
+    recovered = recover_recording(path, output=tmp_path / "sound.mcap")
+    assert not recovered.sound
+    assert read(recovered.path).samples.index.size == recovered.samples
+
+
+@pytest.mark.parametrize(
+    ("facts", "problem"),
+    [
+        ({"sample_rate_hz": "nan"}, "sample_rate_hz must be a number from"),
+        ({"sample_rate_hz": "1e999"}, "sample_rate_hz must be a number from"),
+        ({"sample_rate_hz": "-5" + "0" * 5000}, "sample_rate_hz must be a number from"),
+        ({"command_unit": "\x1b[31m"}, r"command_unit must be A or V, got '\\x1b\[31m'"),
+        ({"command_unit": "V"}, "0 values of wanted_v for 400 samples"),
+        ({"segments": "[" * 50_000}, "segments|nested"),
+    ],
+)
+def test_facts_that_are_none(crafted, facts, problem):
+    path = crafted(lambda where, data: data.update(facts) if where == "hilctl.run" else None)
+    with pytest.raises(DataError, match=problem):
+        read(path)
+
+
+@pytest.mark.parametrize("count", ["-1", "9" * 5000, "1e3", "٣"])
+def test_counts_that_are_none(crafted, count):
+    change = {"missing_samples": count}
+    path = crafted(lambda where, data: data.update(change) if where == "hilctl.end" else None)
+    with pytest.raises(DataError, match="missing_samples must be a whole number"):
+        read(path)
+    assert recover_recording(path).sound
+
+
+def test_a_topic_with_another_schema_is_refused(crafted, tmp_path):
+    def change(where, record):
+        if where == "schema" and record.name == "hilctl.SampleBlock":
+            record.name = "foxglove.Log"
+
+    path = crafted(change)
+    with pytest.raises(DataError, match=r"/samples: must hold hilctl.SampleBlock in protobuf"):
+        read(path)
+    recovered = recover_recording(path, output=tmp_path / "sound.mcap")
+    assert recovered.samples == 0
+    assert read(recovered.path).events
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"start": -1}, {"stop": 2**63}, {"start": 1.5}, {"start": 95}, {"steady_stop": 101},
+        {"period": -1.0}, {"period": 1e-300}, {"period": float("nan")}, {"label": 3}, {"more": 1},
+    ],
+)  # fmt: skip
+def test_segments_that_can_not_be(change):
+    assert segments_of(json.dumps([GOOD])) == (Segment.from_mapping(GOOD),)
+    with pytest.raises(ValueError, match="segments: "):
+        segments_of(json.dumps([{**GOOD, **change}]))
+
+
+def test_segments_follow_one_another():
+    with pytest.raises(ValueError, match="must follow those before it"):
+        segments_of(json.dumps([GOOD, GOOD]))
+
+
+def test_numbers_of_facts():
+    assert number_of({"rate": "2.5"}, "rate", 0.0, 9.0) == 2.5
+    assert count_of({}, "missing_samples") == 0
+    with pytest.raises(ValueError, match="rate is missing"):
+        number_of({}, "rate", 0.0, 9.0)
+
+
+@pytest.mark.parametrize("seconds", [-1, 9_223_372_036, 2**40])
+def test_clocks_that_no_recording_can_hold(seconds):
+    """Before 1970 and from 2262 on, times in ns are beyond what readers take."""
+    with pytest.raises(InputError, match="the clock must stand between 1970 and 2261"):
+        RecordingLayout(1000.0, "A", False, 100.0, seconds * 10**9)
+
+
+def _with_chunk(sound, say, real, times):
+    body = zstandard.ZstdCompressor(level=1).compress(bytes(real))
+    head = struct.pack("<QQQII", 0, 0, say, 0, 4) + b"zstd" + struct.pack("<Q", len(body))
+    chunk = b"\x06" + struct.pack("<Q", len(head) + len(body)) + head + body
+    at = sound.index(b"\x04\0\0\0zstd") - 37
+    return sound[:at] + chunk * times + sound[at:]
+
+
+@pytest.mark.parametrize(("say", "real"), [(2**40, 2**20), (2**20, 2**28), (2**25, 2**25)])
+def test_bombs_take_no_memory(tmp_path, make, say, real):
+    """What a chunk says of its size is bounded, and so is what comes out of it."""
+    stream = io.BytesIO()
+    make.write(stream, [make.batch(0, 40)])
+    path = tmp_path / "bomb.mcap"
+    path.write_bytes(_with_chunk(stream.getvalue(), say, real, 1))
+    assert read(path).samples.index.size == 2000
+    path.write_bytes(_with_chunk(stream.getvalue(), 2**25, 2**25, 20))
+    with pytest.raises(DataError, match="holds more bytes uncompressed than a recording"):
+        read(path)
+
+
+def test_what_a_dying_process_left_is_looked_at(tmp_path, make):
+    """Blocks and events of a ring that hold garbage are left out; the others are saved."""
+    path = tmp_path / "run.mcap"
+    with path.open("wb") as stream:
+        make.write(stream, [make.batch(0, 4)], finish=False)
+    left = make.batch(200, 4)
+    left.heads[0, Head.FIRST_SAMPLE] = -5
+    left.heads[2, Head.FIRST_SAMPLE] = 2**62
+    left.heads[3, Head.LATE_NS] = -(2**63)
+    assert sound_blocks(left).tolist() == [False, True, False, False]
+    events = [Event(-1, "info", "x", "y"), Event(3, "info", "x", "y", time_ns=-9), make.ended]
+    recovered = recover_recording(path, [left], events=events, ended_at=LAST_SAMPLE + 5)
+    back = read(recovered.path)
+    assert back.samples.index.tolist() == [*range(200), *range(250, 300)]
+    assert recovered.missing_samples == 50
+    assert [event.code for event in back.events] == ["run_ended", "recovered"]
