@@ -20,7 +20,7 @@ from hilctl_drivers.emulator.options import EmulatorOptions
 from hilctl_drivers.emulator.setup import build
 from hilctl_drivers.modbus.profile import ModbusProfile
 from hilctl_drivers.profile import load_profile, shipped_profiles
-from tests.fakes import ManualClock
+from tests.fakes import ManualClock, VirtualTime
 
 RATE_HZ = 10_000.0
 SAMPLES = 20
@@ -107,7 +107,8 @@ def modbus(words: list[str], stack: list[Callable[[], None]]) -> DrivenDevice:
     """Return a modbus_dac that is wired to an emulator of the profile, or of two."""
     clock = ManualClock()
     name, reader, line = [*words, None, None][:3]
-    emulator = build(EmulatorOptions(name, reader=reader, reader_line=line), clock)
+    options = EmulatorOptions(name, reader=reader, reader_line=line, current_a=0.0)
+    emulator = build(options, clock)
     thread = threading.Thread(target=emulator.server.run)
     thread.start()
 
@@ -120,7 +121,8 @@ def modbus(words: list[str], stack: list[Callable[[], None]]) -> DrivenDevice:
     options = _fast({**emulator.options, "timeout_s": 5.0})
     if "reader" in options:
         options["reader"] = _fast(options["reader"])
-    device = chosen(chosen.Options.model_validate(options))
+    time = VirtualTime()  # of what the device waits for alone
+    device = chosen(chosen.Options.model_validate(options), sleep=time.sleep, clock=time)
     rate_hz = min(RATE_HZ, device.info.max_rate_hz)
 
     def pass_time() -> None:

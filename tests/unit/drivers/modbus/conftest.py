@@ -12,7 +12,7 @@ from hilctl_drivers.emulator.options import EmulatorOptions
 from hilctl_drivers.emulator.setup import Emulator, build
 from hilctl_drivers.modbus.device import ModbusDac
 from hilctl_drivers.modbus.setup import ModbusOptions
-from tests.fakes import ManualClock
+from tests.fakes import ManualClock, VirtualTime
 
 READER = """\
 vendor: nobody
@@ -47,7 +47,8 @@ class ServedPair:
 
     def device(self, **changes) -> ModbusDac:
         options = {**self.emulator.options, "timeout_s": 2.0, **changes}
-        return ModbusDac(ModbusOptions.model_validate(options))
+        time = VirtualTime()
+        return ModbusDac(ModbusOptions.model_validate(options), sleep=time.sleep, clock=time)
 
     def events(self) -> list[dict]:
         return [json.loads(line) for line in self.log.read_text().splitlines()]

@@ -17,7 +17,7 @@ from hilctl_drivers.emulator.setup import Emulator, build
 from hilctl_drivers.modbus.device import ModbusDac
 from hilctl_drivers.modbus.setup import ModbusOptions
 from hilctl_drivers.profile import load_profile, shipped_profiles
-from tests.fakes import ManualClock
+from tests.fakes import ManualClock, VirtualTime
 
 T7 = {
     "profile": "labjack_t7",
@@ -80,7 +80,8 @@ class Served:
         host, _, port = self.emulator.address.partition(":")
         where = {"host": host, "tcp_port": int(port)} if port else {"serial_port": host}
         given = {**options, "timeout_s": 5.0, **where, **changes}
-        return ModbusDac(ModbusOptions.model_validate(given))
+        time = VirtualTime()
+        return ModbusDac(ModbusOptions.model_validate(given), sleep=time.sleep, clock=time)
 
     def events(self) -> list[dict]:
         return [json.loads(line) for line in self.log.read_text().splitlines()]
@@ -93,7 +94,7 @@ def serve(tmp_path) -> Iterator[Callable[..., Served]]:
 
     def start(profile: str, **options) -> Served:
         clock, log = ManualClock(0), tmp_path / f"writes{len(started)}.jsonl"
-        emulator = build(EmulatorOptions(profile, log=log, **options), clock)
+        emulator = build(EmulatorOptions(profile, log=log, **{"current_a": 0.0, **options}), clock)
         thread = threading.Thread(target=emulator.server.run)
         thread.start()
         started.append((Served(emulator, clock, log), thread))
@@ -121,7 +122,9 @@ def exchange(device: ModbusDac, value: float) -> float:
 
 
 def made(**changes) -> ModbusDac:
-    return ModbusDac(ModbusOptions.model_validate({**T7, "host": "h", **changes}))
+    time = VirtualTime()
+    options = ModbusOptions.model_validate({**T7, "host": "h", **changes})
+    return ModbusDac(options, sleep=time.sleep, clock=time)
 
 
 class TestOptions:
