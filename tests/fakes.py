@@ -342,6 +342,7 @@ class FaultyLink(InProcessLink):
         timeout_s: Time that a lost request costs.
         silent_until_s: Time until which no request reaches the device.
         late_s: How late the next write is carried out; None where nothing is wrong with it.
+        late_if: Which request that is.
     """
 
     timeout_s = 0.1
@@ -350,12 +351,13 @@ class FaultyLink(InProcessLink):
 
     def __init__(self, wire: ModbusWire, time: VirtualTime, message_s: float = 0.0) -> None:
         super().__init__(wire, time, message_s)
+        self.late_if: Callable[[bytes], bool] = lambda request: request[7] not in _READ_FUNCTIONS
         self._held_back: list[tuple[float, bytes]] = []
 
     def transact(self, request: bytes | bytearray, missing: Missing, usual: int = 0) -> bytes:
         """See :meth:`InProcessLink.transact`."""
         self.deliver()
-        if self.late_s is not None and request[7] not in _READ_FUNCTIONS:
+        if self.late_s is not None and self.late_if(bytes(request)):
             self._held_back.append((self._time() + self.late_s, bytes(request)))
             self.late_s = None
         elif self._time() >= self.silent_until_s:

@@ -67,6 +67,7 @@ class ModbusStream(DacDevice):
         self._stream: StreamSession | None = None
         self._calibration: InputCalibration | None = None
         self._next_sample = 0
+        self._armed_s = 0.0
         self._peer = writer
         self._last_write = StreamLastWrite(setup.base, connect, sleep, clock)
         # Until it was open here: another process may have sent it a message.
@@ -108,12 +109,27 @@ class ModbusStream(DacDevice):
         self._guard.arm(session, sample_rate_hz / block)
         self._stream = stream
         self._next_sample = 0
+        self._armed_s = self._clock()
         self._under_way = False
 
     def _output(self) -> float | None:
         assert self._session is not None
-        held = self._session.held(self._setup.base.output)
-        return None if held is None else self._setup.base.chain.command(held)
+        return self._command(self._session.held(self._setup.base.output))
+
+    def _command(self, output: float | None) -> float | None:
+        return None if output is None else self._setup.base.chain.command(output)
+
+    def _look(self) -> tuple[float, float | None]:
+        """Return displacement and output of a device that is not open; sends no step.
+
+        An input can't be read while a stream runs; that is an error then.
+        """
+        base = self._setup.base
+        self._session = session = self._connect(base.writer)
+        session.link.open()
+        session.check_selftest()
+        volts = base.input.format.decode(session.read_bytes(base.input))
+        return base.chain.displacement_um(volts), self._command(self._guard.look(session))
 
     def _stream_on(self, session: ModbusSession) -> StreamSession:
         base = self._setup.base
@@ -137,6 +153,8 @@ class ModbusStream(DacDevice):
         if first_sample != self._next_sample:
             rule = f"samples must follow one another, {self._next_sample} is next"
             raise DeviceError(f"{rule}, got {first_sample}: open again to start at 0")
+        if first_sample == 0:
+            self._guard.check_fed(self._clock() - self._armed_s)
         gain, offset, um_per_unit, offset_um = self._factors
         # Queued before the readings are waited for: meanwhile the device must not run dry.
         self._under_way = True

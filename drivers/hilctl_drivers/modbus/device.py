@@ -64,6 +64,7 @@ class ModbusDac(DacDevice):
         self._setup = setup
         self._connect = connect
         self._peer = setup.writer
+        self._clock = clock
         self._last_write = ModbusLastWrite(setup, connect, sleep, clock)
         self._factors = setup.chain.factors
         self._encode = setup.output.format.encode
@@ -91,19 +92,40 @@ class ModbusDac(DacDevice):
         # A device that has tripped refuses the steps that follow.
         self._guard.end_trip(pair.writer)
         pair.set_up()
-        self._swap, self.one_transaction = pair.find_swap()
+        swap, self.one_transaction = pair.find_swap()
         rates = self._setup.rates(self.one_transaction)
         how = "one transaction" if self.one_transaction else "a read and a write"
         replace(rates, note=f"{how} a sample; {rates.note}").check(sample_rate_hz)
         # Armed last: the steps above may take longer than its time-out.
         self._guard.arm(pair.writer, sample_rate_hz)
         self._feeds = self._guard.feed_every > 0
+        self._swap = self._first_of(swap, self._clock())
         self._under_way = False
+
+    def _first_of(self, swap: Swap, armed_s: float) -> Swap:
+        """Return a swap that is preceded, the first time, by a look at the watchdog's time."""
+
+        def first(data: bytes) -> bytes:
+            self._guard.check_fed(self._clock() - armed_s)
+            self._swap = swap
+            return swap(data)
+
+        return first
 
     def _output(self) -> float | None:
         assert self._pair is not None
-        held = self._pair.writer.held(self._setup.output)
-        return None if held is None else self._setup.chain.command(held)
+        return self._command(self._pair.writer.held(self._setup.output))
+
+    def _command(self, output: float | None) -> float | None:
+        return None if output is None else self._setup.chain.command(output)
+
+    def _look(self) -> tuple[float, float | None]:
+        """Return displacement and output of a device that is not open; sends no step."""
+        self._pair = pair = _Pair(self._setup, self._connect(self._setup.writer))
+        pair.open()
+        data = pair.reader.read_bytes(self._setup.input)
+        output = self._command(self._guard.look(pair.writer))
+        return self._setup.chain.displacement_um(self._decode(data)), output
 
     def _exchange(
         self, first_sample: int, command: F64, displacement_um: F64, measured: F64

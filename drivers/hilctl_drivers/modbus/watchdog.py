@@ -62,9 +62,30 @@ class ModbusGuard:
         if self._has.on_trip == "hold":
             self._clear(session)
             return
-        output = self._setup.output
-        data = output.format.encode(self._trip_value(session, self._has))
+        value = self._trip_value(session, self._has)
+        if value is None:
+            raise DeviceError(
+                "its watchdog has tripped, and where that has put the output is not known: "
+                "'hilctl safe' puts it at the safe value and clears the trip"
+            )
+        output, data = self._setup.output, self._setup.output.format.encode(value)
         self.write_through(session, lambda: session.put_out(output, data))
+
+    def look(self, session: ModbusSession) -> float | None:
+        """Return what the device puts out, in the output's unit, by reading alone.
+
+        Returns:
+            None where the output can't be read, or a trip does not show in any register.
+
+        Raises:
+            DeviceError: No answer, not a good one, or a refusal.
+        """
+        if self._has != "none" and self._has.clear:
+            if self._has.tripped == "none":
+                return None
+            if session.is_set(self._has.tripped) and self._has.on_trip != "hold":
+                return self._trip_value(session, self._has)
+        return session.held(self._setup.output)
 
     def _tripped(self, session: ModbusSession) -> bool:
         has, readback = self._has, self._setup.output.readback_register
@@ -79,8 +100,8 @@ class ModbusGuard:
             return True
         return False
 
-    def _trip_value(self, session: ModbusSession, has: ModbusWatchdog) -> float:
-        """Return what a tripped device puts out, in the output's unit."""
+    def _trip_value(self, session: ModbusSession, has: ModbusWatchdog) -> float | None:
+        """Return what a tripped device puts out, in the output's unit; None where not known."""
         output = self._setup.output
         for step in has.safe.get(self._setup.options.output, ()):
             if isinstance(step, RegisterStep) and step.value == "safe":
@@ -89,10 +110,7 @@ class ModbusGuard:
         if has.on_trip in {"zero", "reset"}:
             return 0.0
         if self._wanted == "none" or has.on_trip != "safe":
-            raise DeviceError(
-                "its watchdog has tripped, and where that has put the output is not known: "
-                "'hilctl safe' puts it at the safe value and clears the trip"
-            )
+            return None
         return self._setup.chain.output(self._wanted.safe_command)
 
     def _clear(self, session: ModbusSession) -> None:
@@ -117,6 +135,22 @@ class ModbusGuard:
         session.run(steps)
         if has.kick == "strict":
             self.feed_every = ticks
+
+    def check_fed(self, silent_s: float) -> None:
+        """Refuse a first exchange for which the armed watchdog was too short.
+
+        Args:
+            silent_s: Time since it was armed.
+
+        Raises:
+            DeviceError: It has tripped, so the output is not where the run begins.
+        """
+        if self._has == "none" or self._wanted == "none" or silent_s < self._wanted.timeout_s:
+            return
+        raise DeviceError(
+            f"watchdog.timeout_s must be longer, got {self._wanted.timeout_s:g}: {silent_s:.2g} s "
+            "passed from arming it to the first exchange, so it has tripped; nothing was sent"
+        )
 
     def disarm(self, session: ModbusSession) -> None:
         """Stop it, where the experiment wanted one.

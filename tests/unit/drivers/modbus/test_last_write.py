@@ -1,8 +1,5 @@
 """The last write against an emulated device in this process, in a time that tests make pass."""
 
-import json
-
-import numpy as np
 import pytest
 
 from hilctl.base.errors import DeviceError
@@ -10,81 +7,12 @@ from hilctl_drivers.emulator.options import EmulatorOptions
 from hilctl_drivers.modbus.device import ModbusDac
 from hilctl_drivers.modbus.last_write import ANSWER_S, RETRY_S, TRIES_S
 from hilctl_drivers.modbus.setup import ModbusOptions
-from hilctl_drivers.profile import shipped_profiles
-from tests.fakes import FaultyLink, InProcess, emulated
+from tests.fakes import FaultyLink, emulated
 
 MESSAGE_S = 0.001
 TIMEOUT_S = 0.1
 HOLD_S = 2 * ANSWER_S
 RATE_HZ = 100.0
-
-
-class Driven:
-    """A modbus_dac that is wired to an emulated device."""
-
-    def __init__(self, tmp_path, profile="generic_float32", link=FaultyLink, **changes):
-        self._log = tmp_path / "writes.jsonl"
-        self.emulated = InProcess.of(profile, link=link, log=self._log, message_s=MESSAGE_S)
-        self.link, self.time = self.emulated.link, self.emulated.time
-        wiring = self.emulated.device.wiring
-        options = {
-            "profile": profile,
-            "host": "h",
-            "output": next(iter(self.emulated.device.profile.outputs)),
-            "input": next(iter(self.emulated.device.profile.inputs)),
-            "amplifier": {"gain_a_per_v": wiring.gain_a, "offset_a": wiring.offset_a},
-            "sensor": {"um_per_v": wiring.sensor_um, "offset_um": wiring.offset_um},
-            "watchdog": "none",
-            "timeout_s": TIMEOUT_S,
-            **changes,
-        }
-        self.peers = []
-        self.device = ModbusDac(
-            ModbusOptions.model_validate(options), self._connect, self.time.sleep, self.time
-        )
-
-    def _connect(self, peer):
-        self.peers.append(peer)
-        return peer.session(self.link)
-
-    def open(self):
-        self.device.open(RATE_HZ, 1)
-
-    def exchange(self, value):
-        self.device.exchange(0, np.array([value]), np.empty(1), np.empty(1))
-
-    @property
-    def current_a(self):
-        """What the device puts out, with all delivered that is due."""
-        self.link.deliver()
-        return self.emulated.rig.current_a
-
-    def writes(self):
-        return [json.loads(line) for line in self._log.read_text().splitlines()]
-
-
-@pytest.fixture
-def driven(tmp_path):
-    """Return a function that wires a modbus_dac to an emulated device."""
-    made = []
-
-    def of(*words, **changes):
-        made.append(Driven(tmp_path, *words, **changes))
-        return made[-1]
-
-    yield of
-    for each in made:
-        each.emulated.log.close()
-
-
-@pytest.fixture
-def write_only(tmp_path):
-    """Return a profile whose output can't be read back, by path."""
-    text = shipped_profiles()["generic_float32"].read_text(encoding="utf-8")
-    path = tmp_path / "write_only.yaml"
-    text = text.replace("OUT: {address: 0,", "OUT: {readback: none, address: 0,")
-    path.write_text(text, encoding="utf-8")
-    return str(path)
 
 
 @pytest.mark.parametrize("late_s", [0.11, 0.3, 0.8])
