@@ -244,6 +244,8 @@ class ModbusSetup:
             max_rate_hz=rates.highest_hz,
             rate_note=rates.note,
             holds=tuple(dict.fromkeys((writer.holds, reader.holds))),
+            watchdog_command=options.watchdog_command,
+            watchdog_reason=options.watchdog_reason,
             details=details,
         )
 

@@ -222,6 +222,13 @@ class TestOptions:
         slow = ModbusDac(ModbusOptions.model_validate({**options, "baud": 9600})).info
         assert slow.max_rate_hz == pytest.approx(29.0, abs=1.0)
 
+    def test_watchdog_is_said_before_it_is_opened(self):
+        """Where it would put the output, and why that is another value than the run's."""
+        wanted = {"timeout_s": 1.0, "safe_command": 1.5, "reason": "holds a load"}
+        info = made(watchdog=wanted).info
+        assert (info.watchdog_command, info.watchdog_reason) == (1.5, "holds a load")
+        assert made().info.watchdog_command is None
+
     def test_calibration_is_kept(self):
         """Who calibrated what goes with every recording."""
         calibration = {"date": "2026-01-01", "by": "N. N.", "reference": "sheet 4"}
