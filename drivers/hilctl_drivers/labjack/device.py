@@ -114,22 +114,8 @@ class ModbusStream(DacDevice):
 
     def _output(self) -> float | None:
         assert self._session is not None
-        return self._command(self._session.held(self._setup.base.output))
-
-    def _command(self, output: float | None) -> float | None:
-        return None if output is None else self._setup.base.chain.command(output)
-
-    def _look(self) -> tuple[float, float | None]:
-        """Return displacement and output of a device that is not open; sends no step.
-
-        An input can't be read while a stream runs; that is an error then.
-        """
-        base = self._setup.base
-        self._session = session = self._connect(base.writer)
-        session.link.open()
-        session.check_selftest()
-        volts = base.input.format.decode(session.read_bytes(base.input))
-        return base.chain.displacement_um(volts), self._command(self._guard.look(session))
+        held = self._session.held(self._setup.base.output)
+        return None if held is None else self._setup.base.chain.command(held)
 
     def _stream_on(self, session: ModbusSession) -> StreamSession:
         base = self._setup.base

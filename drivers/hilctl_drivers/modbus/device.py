@@ -114,18 +114,8 @@ class ModbusDac(DacDevice):
 
     def _output(self) -> float | None:
         assert self._pair is not None
-        return self._command(self._pair.writer.held(self._setup.output))
-
-    def _command(self, output: float | None) -> float | None:
-        return None if output is None else self._setup.chain.command(output)
-
-    def _look(self) -> tuple[float, float | None]:
-        """Return displacement and output of a device that is not open; sends no step."""
-        self._pair = pair = _Pair(self._setup, self._connect(self._setup.writer))
-        pair.open()
-        data = pair.reader.read_bytes(self._setup.input)
-        output = self._command(self._guard.look(pair.writer))
-        return self._setup.chain.displacement_um(self._decode(data)), output
+        held = self._pair.writer.held(self._setup.output)
+        return None if held is None else self._setup.chain.command(held)
 
     def _exchange(
         self, first_sample: int, command: F64, displacement_um: F64, measured: F64

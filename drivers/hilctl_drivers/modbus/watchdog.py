@@ -71,22 +71,6 @@ class ModbusGuard:
         output, data = self._setup.output, self._setup.output.format.encode(value)
         self.write_through(session, lambda: session.put_out(output, data))
 
-    def look(self, session: ModbusSession) -> float | None:
-        """Return what the device puts out, in the output's unit, by reading alone.
-
-        Returns:
-            None where the output can't be read, or a trip does not show in any register.
-
-        Raises:
-            DeviceError: No answer, not a good one, or a refusal.
-        """
-        if self._has != "none" and self._has.clear:
-            if self._has.tripped == "none":
-                return None
-            if session.is_set(self._has.tripped) and self._has.on_trip != "hold":
-                return self._trip_value(session, self._has)
-        return session.held(self._setup.output)
-
     def _tripped(self, session: ModbusSession) -> bool:
         has, readback = self._has, self._setup.output.readback_register
         assert has != "none"

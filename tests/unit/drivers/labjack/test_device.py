@@ -523,16 +523,3 @@ def test_watchdog_that_is_shorter_than_the_start_is_refused(driven):
     with pytest.raises(DeviceError, match=r"must be longer, got 2: 2\.1 s passed"):
         made.hold(1.0, 1)
     assert made.clock.level == 0
-
-
-def test_looking_sends_no_step(driven):
-    """Displacement and output are read, and nothing is written."""
-    made = driven()
-    made.device.make_safe(2.0)
-    made.stall(0.1)
-    before = len(made.link.requests)
-    displacement_um, output = made.device._look()
-    made.device.close()
-    assert displacement_um > 5.0
-    assert output == pytest.approx(2.0)
-    assert {request[7] for request in made.link.requests[before:]} <= {3, 4}

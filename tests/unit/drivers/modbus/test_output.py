@@ -54,26 +54,3 @@ def test_silent_device_must_be_opened_again(driven):
     made.link.silent_until_s = 0.0
     with pytest.raises(DeviceError, match="not open"):
         made.exchange(1.0)
-
-
-@pytest.mark.parametrize(
-    ("profile", "known"), [("wago_750", True), ("beckhoff_bk9000", False), ("labjack_t7", True)]
-)
-@pytest.mark.parametrize("tripped", [True, False])
-def test_looking_sends_no_step(driven, profile, known, tripped):
-    """Displacement and output are read; a trip is not cleared, and nothing is written."""
-    made = driven(profile, watchdog={"timeout_s": 1.0})
-    made.open()
-    made.exchange(3.0)
-    if tripped:
-        made.time.sleep(1.1)
-        made.emulated.device.tick(made.time.now_ns)
-    made.device.close()
-    before = len(made.link.requests)
-    displacement_um, output = made.device._look()
-    made.device.close()
-    assert output == (pytest.approx(made.current_a, abs=1e-3) if known else None)
-    assert made.current_a == pytest.approx(0.0 if tripped else 3.0, abs=1e-3)
-    assert abs(displacement_um) < 50.0
-    assert {request[7] for request in made.link.requests[before:]} <= {3, 4}
-    assert made.emulated.device.tripped == (tripped and profile != "labjack_t7")
