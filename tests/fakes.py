@@ -332,6 +332,49 @@ class InProcessLink:
         self.is_open = False
 
 
+_READ_FUNCTIONS = (1, 2, 3, 4)
+
+
+class FaultyLink(InProcessLink):
+    """Loses requests, and delivers them later, when a test says so; over all connections.
+
+    Attributes:
+        timeout_s: Time that a lost request costs.
+        silent_until_s: Time until which no request reaches the device.
+        late_s: How late the next write is carried out; None where nothing is wrong with it.
+        late_if: Which request that is.
+    """
+
+    timeout_s = 0.1
+    silent_until_s = 0.0
+    late_s: float | None = None
+
+    def __init__(self, wire: ModbusWire, time: VirtualTime, message_s: float = 0.0) -> None:
+        super().__init__(wire, time, message_s)
+        self.late_if: Callable[[bytes], bool] = lambda request: request[7] not in _READ_FUNCTIONS
+        self._held_back: list[tuple[float, bytes]] = []
+
+    def transact(self, request: bytes | bytearray, missing: Missing, usual: int = 0) -> bytes:
+        """See :meth:`InProcessLink.transact`."""
+        self.deliver()
+        if self.late_s is not None and self.late_if(bytes(request)):
+            self._held_back.append((self._time() + self.late_s, bytes(request)))
+            self.late_s = None
+        elif self._time() >= self.silent_until_s:
+            return super().transact(request, missing, usual)
+        self._time.sleep(self.timeout_s)
+        self.close()
+        raise NoAnswerError(f"no answer within {self.timeout_s:g} s")
+
+    def deliver(self) -> None:
+        """Carry out what is due by now; nobody gets the answer."""
+        for due_s, request in self._held_back:
+            if due_s <= self._time():
+                for asked in self._wire.requests(bytearray(request)):
+                    self._wire.answer(asked, self._time.now_ns)
+        self._held_back = [each for each in self._held_back if each[0] > self._time()]
+
+
 @dataclass(frozen=True, slots=True)
 class InProcess:
     """An emulated device in the caller's process and time.
@@ -359,6 +402,7 @@ class InProcess:
         log: Path | None = None,
         message_s: float = 0.0,
         noise: bool = False,
+        current_a: float | None = 0.0,
     ) -> "InProcess":
         """Put one together, with the profile's first output and input.
 
@@ -368,6 +412,7 @@ class InProcess:
             log: File for a log of every write.
             message_s: How long a request and its reply take.
             noise: Whether the sensor has noise.
+            current_a: Current at the start; as the device powers up where None.
 
         Raises:
             InputError: It is not a Modbus profile with an output and an input.
@@ -378,7 +423,7 @@ class InProcess:
         output, sensor = next(iter(loaded.outputs)), next(iter(loaded.inputs))
         time = VirtualTime()
         rig, writes = Rig(time.now_ns, noise=noise), WriteLog(log, 0)
-        device = EmulatedModbus(loaded, rig, writes, output, sensor)
+        device = EmulatedModbus(loaded, rig, writes, output, sensor, current_a=current_a)
         attach_stream(device, rig, writes, output, sensor, noise=noise)
         return cls(device, rig, link(ModbusWire("tcp", device), time, message_s), time, writes)
 

@@ -113,6 +113,10 @@ class WatchdogOptions(Strict):
     safe_command: float = Field(
         default=0.0, description="where it puts the output, in the command's unit"
     )
+    reason: str = Field(
+        default="",
+        description="why safe_command is not the experiment's safe value, where it isn't",
+    )
 
 
 class ReaderOptions(Strict):
@@ -186,6 +190,16 @@ class DacOptions(DeviceOptions):
     def safe_command(self) -> float:
         """Where a watchdog is to put the output; 0 without one."""
         return 0.0 if self.watchdog == "none" else self.watchdog.safe_command
+
+    @property
+    def watchdog_command(self) -> float | None:
+        """Where the watchdog is to put the output; None without one."""
+        return None if self.watchdog == "none" else self.watchdog.safe_command
+
+    @property
+    def watchdog_reason(self) -> str:
+        """Why that is not the experiment's safe value; empty where nothing was said."""
+        return "" if self.watchdog == "none" else self.watchdog.reason
 
     def details(self) -> dict[str, str]:
         """Return the options as text, to keep with a recording."""

@@ -45,6 +45,9 @@ class DeviceInfo:
             time may hold it. Empty where any number may run side by side.
         simulated: Whether it drives no hardware and steps on sample count: it may run faster than
             real time, and its recordings say so.
+        watchdog_command: Where the device's own watchdog puts the output when the host falls
+            silent, in ``command_unit``; None where it has none, or is not to use it.
+        watchdog_reason: Why that is not the experiment's safe value; empty where it is.
         details: Anything worth keeping with a recording (serial numbers, physical parameters).
     """
 
@@ -63,6 +66,8 @@ class DeviceInfo:
     measures_command: bool = False
     holds: tuple[str, ...] = ()
     simulated: bool = False
+    watchdog_command: float | None = None
+    watchdog_reason: str = ""
     details: Mapping[str, str] = field(default_factory=dict)
 
 

@@ -160,6 +160,7 @@ def _device_problems(loaded: LoadedExperiment) -> list[Problem]:
         span = f"{info.command_min:g} to {info.command_max:g} {unit}"
         if low < info.command_min or high > info.command_max:
             add("limits", f"must lie within what {info.name} takes, {span}", f"{low:g} to {high:g}")
+    found += _watchdog_problems(loaded)
     if config.sample_rate_hz > info.max_rate_hz:
         rule = f"must be <= {info.max_rate_hz:g}, the fastest that {info.name} can keep"
         note = f" ({info.rate_note})" if info.rate_note else ""
@@ -183,6 +184,24 @@ def _device_problems(loaded: LoadedExperiment) -> list[Problem]:
         rule = f"must give commands in {unit}, what {info.name} is driven with"
         add("compensator.model", rule, model.input_unit)
     return found
+
+
+def _watchdog_problems(loaded: LoadedExperiment) -> list[Problem]:
+    """Hold the value at which the device's own watchdog would put the output against the run's."""
+    info, config = loaded.device.info, loaded.config
+    command, safe = info.watchdog_command, config.safe.value
+    if command is None or math.isclose(command, safe, abs_tol=1e-9):
+        return []
+    key, unit = "device.watchdog.safe_command", info.command_unit
+    low, high = config.limits.command_range
+    if not low <= command <= high:
+        rule = f"must lie within the limits, {low:g} to {high:g} {unit}"
+        return [_problem(loaded, key, rule, f"{command:g}")]
+    if info.watchdog_reason:
+        return []
+    rule = f"must be the safe value, {safe:g} {unit}"
+    hint = "or say in device.watchdog.reason why it is not"
+    return [_problem(loaded, key, rule, f"{command:g}", hint)]
 
 
 def _reference_problems(loaded: LoadedExperiment, reference: Reference) -> list[Problem]:

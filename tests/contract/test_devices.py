@@ -9,6 +9,7 @@ import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -20,10 +21,12 @@ from hilctl_drivers.emulator.options import EmulatorOptions
 from hilctl_drivers.emulator.setup import build
 from hilctl_drivers.modbus.profile import ModbusProfile
 from hilctl_drivers.profile import load_profile, shipped_profiles
-from tests.fakes import ManualClock
+from tests.fakes import ManualClock, VirtualTime
 
 RATE_HZ = 10_000.0
 SAMPLES = 20
+STEP = 0.01
+"""Of the coarsest converter, in the command's unit."""
 ELSEWHERE = {
     "serial_dac": "test_serial_devices.py",
     "modbus_stream": "test_modbus_stream.py",
@@ -49,13 +52,20 @@ class DrivenDevice:
         device: Not yet open.
         block: Samples it takes in one exchange.
         rate_hz: A sample rate that it can keep.
+        stands: Returns what stands at its output, not by its own word: the emulated device's, or
+            the simulated plant's.
         pass_time: Called before each exchange.
     """
 
     device: Device
     block: int
     rate_hz: float
+    stands: Callable[[], float]
     pass_time: Callable[[], None] = lambda: None
+    must_be_at_rest: ClassVar[bool] = False
+    """Whether opening is refused while it puts anything out."""
+    reads_back: ClassVar[bool] = True
+    """Whether it knows what it puts out."""
 
     def open(self) -> None:
         self.device.open(self.rate_hz, self.block)
@@ -72,6 +82,9 @@ class DrivenDevice:
             )
         return displacement_um, measured
 
+    def assert_stands(self, command):
+        assert self.stands() == pytest.approx(command, abs=STEP)
+
     @property
     def middle(self) -> float:
         """A command well inside the range that is not the resting one."""
@@ -81,7 +94,8 @@ class DrivenDevice:
 
 def simulated(kind: str) -> DrivenDevice:
     chosen = device_class(kind)
-    return DrivenDevice(chosen(chosen.Options()), SAMPLES, RATE_HZ)
+    device = chosen(chosen.Options())
+    return DrivenDevice(device, SAMPLES, RATE_HZ, lambda: device._last_command)
 
 
 RTU_PROFILE = """\
@@ -107,7 +121,8 @@ def modbus(words: list[str], stack: list[Callable[[], None]]) -> DrivenDevice:
     """Return a modbus_dac that is wired to an emulator of the profile, or of two."""
     clock = ManualClock()
     name, reader, line = [*words, None, None][:3]
-    emulator = build(EmulatorOptions(name, reader=reader, reader_line=line), clock)
+    options = EmulatorOptions(name, reader=reader, reader_line=line, current_a=0.0)
+    emulator = build(options, clock)
     thread = threading.Thread(target=emulator.server.run)
     thread.start()
 
@@ -120,13 +135,14 @@ def modbus(words: list[str], stack: list[Callable[[], None]]) -> DrivenDevice:
     options = _fast({**emulator.options, "timeout_s": 5.0})
     if "reader" in options:
         options["reader"] = _fast(options["reader"])
-    device = chosen(chosen.Options.model_validate(options))
+    time = VirtualTime()  # of what the device waits for alone
+    device = chosen(chosen.Options.model_validate(options), sleep=time.sleep, clock=time)
     rate_hz = min(RATE_HZ, device.info.max_rate_hz)
 
     def pass_time() -> None:
         clock.now_ns += round(1e9 / rate_hz)
 
-    return DrivenDevice(device, 1, rate_hz, pass_time)
+    return DrivenDevice(device, 1, rate_hz, lambda: emulator.device._rig.current_a, pass_time)
 
 
 def _fast(section: dict) -> dict:
@@ -289,13 +305,35 @@ def test_rate_beyond_its_limit_is_refused(driven):
 
 
 def test_make_safe_works_open_or_closed(driven):
-    """The last resort needs no open connection."""
+    """The last resort needs no open connection; what stands at the output then is the judge."""
+    safe = 0.5 * driven.middle
+    driven.device.make_safe(safe)
+    driven.assert_stands(safe)
     driven.device.make_safe(0.0)
+    driven.assert_stands(0.0)
     driven.open()
     driven.exchange(0, np.full(SAMPLES, driven.middle))
-    driven.device.make_safe(0.0)
+    assert abs(driven.stands() - safe) > STEP
+    driven.device.make_safe(safe)
+    driven.assert_stands(safe)
     driven.device.close()
+    driven.assert_stands(safe)
     driven.device.make_safe(0.0)
+    driven.assert_stands(0.0)
+
+
+def test_says_what_it_puts_out(driven):
+    """After opening it knows what stands there, or says that it does not."""
+    with pytest.raises(DeviceError):
+        driven.device.output()
+    driven.open()
+    driven.exchange(0, np.full(SAMPLES, 0.0 if driven.must_be_at_rest else driven.middle))
+    driven.device.close()
+    driven.open()
+    found = driven.device.output()
+    assert (found is not None) == driven.reads_back
+    if found is not None:
+        driven.assert_stands(found)
 
 
 def test_two_of_a_kind_agree(driven, make, case):

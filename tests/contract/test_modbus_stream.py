@@ -182,14 +182,32 @@ def test_rate_beyond_its_limit_is_refused(driven):
 
 def test_make_safe_works_open_or_closed(driven):
     """The last resort needs no open connection, and what is queued is not put out after it."""
-    driven.device.make_safe(0.0)
+    rig, safe = driven.emulated.rig, 0.5 * driven.middle
+    driven.device.make_safe(safe)
+    assert rig.current_a == pytest.approx(safe, abs=1e-6)
     driven.open()
     driven.exchange(0, np.full(6 * BLOCK, driven.middle))
-    driven.device.make_safe(0.0)
+    assert rig.current_a == pytest.approx(driven.middle, abs=1e-6)
+    driven.device.make_safe(safe)
+    assert rig.current_a == pytest.approx(safe, abs=1e-6)
     driven.emulated.time.sleep(1.0)
+    driven.emulated.device.tick(driven.emulated.time.now_ns)
     driven.device.close()
+    assert rig.current_a == pytest.approx(safe, abs=1e-6)
     driven.device.make_safe(0.0)
-    assert driven.emulated.rig.current_a == pytest.approx(0.0, abs=1e-9)
+    assert rig.current_a == pytest.approx(0.0, abs=1e-6)
+
+
+def test_says_what_it_puts_out(driven):
+    """After opening it knows what stands there."""
+    with pytest.raises(DeviceError):
+        driven.device.output()
+    driven.open()
+    driven.exchange(0, np.full(10 * BLOCK, driven.middle))
+    driven.device.close()
+    driven.open()
+    assert driven.emulated.rig.current_a == pytest.approx(driven.middle, abs=1e-6)
+    assert driven.device.output() == pytest.approx(driven.middle, abs=1e-6)
 
 
 def test_two_of_a_kind_agree(driven):

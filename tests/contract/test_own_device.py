@@ -1,6 +1,7 @@
 """A device in a package of its own: installed, listed and run, with the public names alone."""
 
 import ast
+import importlib
 import json
 import os
 import subprocess
@@ -103,3 +104,24 @@ def test_it_needs_the_public_names_only():
             elif isinstance(node, ast.Import):
                 assert not any(each.name.startswith("hilctl") for each in node.names)
     assert found == {f"hilctl.base.{name}" for name in PUBLIC}
+
+
+def test_make_safe_moves_the_spring(monkeypatch):
+    """Its sensor shows where it stands, open or closed before, and it says the same."""
+    monkeypatch.syspath_prepend(SOURCE)
+    spring = importlib.import_module("own_device.spring")
+    device = spring.Spring(spring.SpringOptions(um_per_a=20.0))
+    block, displacement_um, measured = np.full(50, 3.0), np.empty(50), np.empty(50)
+    for safe in (-1.0, 0.5):
+        device.open(1000.0, 50)
+        device.exchange(0, block, displacement_um, measured)
+        device.make_safe(safe)
+        device.close()
+        device.make_safe(safe)
+        device.open(1000.0, 50)
+        assert device.output() == safe
+        device.exchange(0, block, displacement_um, measured)
+        assert displacement_um[0] == pytest.approx(20.0 * safe)
+    device.close()
+    device.make_safe(0.0)
+    assert device.output() == 0.0

@@ -91,11 +91,15 @@ class DrivenSerial:
     command is not answered, time passes only after it has arrived: another line is no faster.
     """
 
-    def __init__(self, device, rate_hz, clock, arrived_a=None):
+    must_be_at_rest = False
+    reads_back = False
+
+    def __init__(self, device, rate_hz, clock, stands, arrived_a=None):
         self.device = device
         self.rate_hz = rate_hz
         self.block = BLOCK if device.info.latency_blocks else 1
         self._clock = clock
+        self.stands = stands
         self._arrived_a = arrived_a
         self._sent = 0
 
@@ -124,6 +128,12 @@ class DrivenSerial:
             self._sent += self.block
         answers = displacement_um[held.size :]
         return answers[: command.size], measured[: command.size]
+
+    def assert_stands(self, command):
+        """Wait for it: some commands are not answered, and another line is no faster."""
+        end_s = time.monotonic() + 5.0
+        while abs(self.stands() - command) > CHECKS.STEP:
+            assert time.monotonic() < end_s, f"{command} A does not stand"
 
     def _await(self, sent_a):
         if self._arrived_a is None:
@@ -161,7 +171,13 @@ def wired(case, tmp_path, stack):
     silent = getattr(profile.outputs[options["output"]], "reply", "") == "none"
     apart = silent and line == "own"
     rig = emulator.device._rig
-    return DrivenSerial(device, rate_hz, clock, (lambda: rig.current_a) if apart else None)
+
+    def stands():
+        return rig.current_a
+
+    made = DrivenSerial(device, rate_hz, clock, stands, stands if apart else None)
+    made.must_be_at_rest = name in MUST_BE_AT_REST
+    return made
 
 
 @pytest.fixture

@@ -39,6 +39,9 @@ def emulate(
     reader_port: Annotated[
         int, typer.Option(help="The reader's own TCP port; 0 takes a free one.")
     ] = EmulatorOptions.reader_port,
+    current_a: Annotated[
+        float | None, typer.Option(help="Current at the start, A; else as the device powers up.")
+    ] = None,
 ) -> None:
     """Serve the simulated rig as a real device would, until Ctrl-C."""
     if reader is None and sensor is not None and ":" in sensor:
@@ -56,6 +59,7 @@ def emulate(
         reader_line=cast(ReaderLine | None, reader_line),
         reader_unit_id=reader_unit_id,
         reader_port=reader_port,
+        current_a=current_a,
     )
     serve(options, lambda name, address: typer.echo(f"{name} answers at {address}"))
 

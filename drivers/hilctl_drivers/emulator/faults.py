@@ -10,6 +10,7 @@ from hilctl.base.errors import InputError
 FaultKind: TypeAlias = Literal[
     "silence",
     "delay",
+    "late",
     "exception",
     "corrupt",
     "cut",
@@ -27,13 +28,14 @@ class WireFault:
     """One fault.
 
     Attributes:
-        kind: ``silence`` ignores the request; ``delay`` answers late; ``exception`` refuses it;
-            ``corrupt`` spoils a byte of the reply; ``cut`` leaves out its end; ``duplicate`` sends
-            it twice; ``wrong_id`` answers in another's name; ``reset`` breaks the connection
-            instead; ``unplug`` is silence for good, for every connection.
+        kind: ``silence`` ignores the request; ``delay`` answers late; ``late`` carries it out late,
+            whoever was answered meanwhile; ``exception`` refuses it; ``corrupt`` spoils a byte of
+            the reply; ``cut`` leaves out its end; ``duplicate`` sends it twice; ``wrong_id``
+            answers in another's name; ``reset`` breaks the connection instead; ``unplug`` is
+            silence for good, for every connection.
         at_count: Transaction that has it, counted from 1; or None.
         at_s: Time since the start; the next transaction has it. Or None.
-        delay_s: How late, for ``delay``.
+        delay_s: How late, for ``delay`` and ``late``.
     """
 
     kind: FaultKind
@@ -43,7 +45,7 @@ class WireFault:
 
 
 def parse_fault(text: str) -> WireFault:
-    """Read ``KIND@COUNT`` or ``KIND@SECONDSs``; ``delay:SECONDS@...`` says how late.
+    """Read ``KIND@COUNT`` or ``KIND@SECONDSs``; ``delay:`` and ``late:SECONDS@...`` say how late.
 
     Raises:
         InputError: It is none of these.
@@ -54,8 +56,8 @@ def parse_fault(text: str) -> WireFault:
     kind, delay, at, seconds = found.groups()
     if kind not in KINDS:
         raise InputError(f"fault must be one of {', '.join(KINDS)}, got {kind!r}")
-    if delay is not None and kind != "delay":
-        raise InputError(f"only delay takes a time before the @, got {text!r}")
+    if delay is not None and kind not in {"delay", "late"}:
+        raise InputError(f"only delay and late take a time before the @, got {text!r}")
     late_s = float(delay) if delay else DELAY_S
     if seconds:
         return WireFault(cast("FaultKind", kind), at_s=float(at), delay_s=late_s)

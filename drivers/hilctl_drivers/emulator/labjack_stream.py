@@ -36,6 +36,7 @@ class LabJackStream:
         volts: From displacements in um to volts at the input.
         on_played: Called with the first value's number, float64[n] currents in A, and the time of
             the last.
+        standing_a: Returns the rig's current in A, from which a stream starts.
         noise: Whether the sensor has noise.
     """
 
@@ -49,6 +50,7 @@ class LabJackStream:
         current_a: Callable[[F64], F64],
         volts: Callable[[F64], F64],
         on_played: Callable[[int, F64, int], None],
+        standing_a: Callable[[], float],
         noise: bool,
     ) -> None:
         self._streaming = streaming
@@ -60,6 +62,7 @@ class LabJackStream:
         self._volts = volts
         self.fifo = SampleFifo(noise=noise, repeats=True, on_played=self._played)
         self._on_played = on_played
+        self._standing_a = standing_a
         self.input = LabJackInput(streaming)
         self._words = {address: [0, 0] for address in _plain(profile, streaming)}
         self._pending: list[F64] = []
@@ -206,6 +209,7 @@ class LabJackStream:
         ):
             raise Declined(_FAILURE_EXCEPTION)
         self.input.start(self._number(stream.BUFFER_SIZE_BYTES))
+        self.fifo.current_a = self._standing_a()
         self.fifo.set_rate(rate_hz)
         self.fifo.start(self._now_ns)
 
@@ -279,5 +283,6 @@ def attach_stream(
         current_a=lambda values: values * wiring.gain_a + wiring.offset_a,
         volts=lambda um: np.clip((um - wiring.offset_um) / wiring.sensor_um, *terminal.limits),
         on_played=played,
+        standing_a=lambda: rig.current_a,
         noise=noise,
     )

@@ -59,7 +59,7 @@ def _check_channels(profile: ModbusProfile, output: str | None, sensor: str | No
 class EmulatedModbus:
     """The device: what its registers hold, and what writing them does.
 
-    It starts with the output where the rig is at 0 A, as if its power-on value had been set so.
+    It powers up as the profile says; where that says nothing, with the rig at 0 A.
     Two devices can stand at one rig: one drives it, the other shows its displacement.
 
     Args:
@@ -69,6 +69,7 @@ class EmulatedModbus:
         output: Output that drives the rig; None where another device does.
         sensor: Input that shows the displacement; None where another device does.
         wiring: Amplifier and sensor between; spread over the channels' ranges where None.
+        current_a: Current at the start, as if its power-up value had been set so.
 
     Raises:
         InputError: It has no such output or input.
@@ -82,6 +83,7 @@ class EmulatedModbus:
         output: str | None,
         sensor: str | None,
         wiring: Wiring | None = None,
+        current_a: float | None = None,
     ) -> None:
         self.profile = profile
         self._rig = rig
@@ -102,8 +104,17 @@ class EmulatedModbus:
         self._now_ns = 0
         self.overlay: Overlay | None = None
         """Registers that do more than hold a value, before all others."""
-        if output is not None:
-            self._outputs[output].value = -self.wiring.offset_a / self.wiring.gain_a
+        self._power_up(current_a)
+
+    def _power_up(self, current_a: float | None) -> None:
+        for name, words in self._outputs.items():
+            value = self.profile.outputs[name].power_up
+            if name == self._output:
+                if value is None or current_a is not None:
+                    value = ((current_a or 0.0) - self.wiring.offset_a) / self.wiring.gain_a
+                self._rig.put_out(self.wiring.gain_a * value + self.wiring.offset_a, 0)
+            if value is not None:
+                words.value = value
 
     def tick(self, now_ns: int) -> None:
         """Let time pass; the watchdog may trip on the way."""
@@ -160,8 +171,11 @@ class EmulatedModbus:
             for (words, _), old in zip(targets, before, strict=True):
                 words.words[:] = old
             raise
+        tripped = self.tripped
         for words, _ in targets:
             self._act(words)
+        if tripped and not self.tripped:
+            self._resume()
 
     def _check(self, words: Words) -> None:
         for name, each in self._outputs.items():
@@ -179,7 +193,8 @@ class EmulatedModbus:
         if self._watchdog is not None:
             self._watchdog.written(words, self._now_ns)
         for name, each in self._outputs.items():
-            if each is words:
+            # What is cleared by a step keeps the terminals until then.
+            if each is words and not (self.tripped and self._holds_trip):
                 self._put_out(name, "write", self._now_ns)
 
     @property
@@ -187,8 +202,26 @@ class EmulatedModbus:
         """Whether the host watchdog has tripped."""
         return self._watchdog is not None and self._watchdog.tripped
 
+    @property
+    def _holds_trip(self) -> bool:
+        """Whether a trip is kept until a step clears it, and registers keep their commands."""
+        return self.profile.watchdog != "none" and bool(self.profile.watchdog.clear)
+
+    def _resume(self) -> None:
+        """Put out what the registers hold, as a device may once its trip is cleared.
+
+        No document says so of the shipped ones; those that refuse commands until then wait here for
+        the next one.
+        """
+        watchdog = self.profile.watchdog
+        if watchdog != "none" and not watchdog.refuses_while_tripped:
+            for name in self._outputs:
+                self._put_out(name, "cleared", self._now_ns)
+
     def _put_out(self, name: str, event: str, now_ns: int) -> None:
-        value = self._outputs[name].value
+        self._put_value(name, self._outputs[name].value, event, now_ns)
+
+    def _put_value(self, name: str, value: float, event: str, now_ns: int) -> None:
         more: dict[str, float] = {}
         if name == self._output:
             self._rig.put_out(self.wiring.gain_a * value + self.wiring.offset_a, now_ns)
@@ -208,8 +241,9 @@ class EmulatedModbus:
                 value = self._safe_value(name, watchdog.safe.get(name, ()))
             if value is None or watchdog.on_trip in {"hold", "unknown"}:
                 continue
-            words.value = value
-            self._put_out(name, "watchdog", due_ns)
+            if not self._holds_trip:
+                words.value = value
+            self._put_value(name, value, "watchdog", due_ns)
 
     def _safe_value(self, name: str, steps: tuple[ModbusStep, ...]) -> float | None:
         """Return what the safe-value register holds; None where it was not switched on."""

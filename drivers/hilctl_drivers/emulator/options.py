@@ -35,6 +35,8 @@ class EmulatorOptions:
         mute: Modbus functions that are never answered.
         wiring: Amplifier and sensor; spread over the channels' ranges where None.
         noise: Whether the sensor has noise.
+        current_a: Current at the start, as if the device's power-up value had been set so; as it is
+            shipped where None. Modbus only.
 
     Raises:
         InputError: ``link`` or ``reader_line`` is none of these words.
@@ -56,6 +58,7 @@ class EmulatorOptions:
     mute: frozenset[int] = frozenset()
     wiring: Wiring | None = None
     noise: bool = True
+    current_a: float | None = None
 
     def __post_init__(self) -> None:
         for name, words in (("link", LinkKind), ("reader_line", ReaderLine)):

@@ -38,6 +38,7 @@ class EmulatorServer:
         self._connections: list[Connection] = []
         self._unplugged: list[TcpConnection | socket.socket] = []
         self._late: list[tuple[int, int, Connection, EmulatedReply, WireFault | None]] = []
+        self._undone: list[tuple[int, int, Connection, bytes]] = []
         self._count = 0
         self._stopping = False
 
@@ -71,6 +72,7 @@ class EmulatorServer:
             now_ns = self._clock_ns()
             for wire in self._wires:
                 wire.tick(now_ns)
+            self._carry_out_due(now_ns)
             self._send_due(now_ns)
         self.close()
 
@@ -88,9 +90,10 @@ class EmulatorServer:
         self._selector.close()
 
     def _pause_s(self) -> float:
-        if not self._late:
+        due_ns = [each[0][0] for each in (self._late, self._undone) if each]
+        if not due_ns:
             return _TICK_S
-        return min(_TICK_S, max(0.0, (self._late[0][0] - self._clock_ns()) * 1e-9))
+        return min(_TICK_S, max(0.0, (min(due_ns) - self._clock_ns()) * 1e-9))
 
     def _serve(self, source: object, events: int) -> None:
         if source in self._listeners:
@@ -137,7 +140,7 @@ class EmulatorServer:
         fault = None
         if connection.faulty:
             fault = self._plan.next((now_ns - self._start_ns) * 1e-9)
-        if fault is not None and fault.kind in {"silence", "unplug", "reset", "exception"}:
+        if fault is not None and fault.kind in {"silence", "unplug", "reset", "exception", "late"}:
             self._keep_back(fault, connection, request)
             return
         answer = connection.wire.answer(request, now_ns)
@@ -152,8 +155,12 @@ class EmulatorServer:
             self._reply(connection, answer, fault, now_ns)
 
     def _keep_back(self, fault: WireFault, connection: Connection, request: bytes) -> None:
-        """Do what a fault says that keeps the request from the device."""
-        if fault.kind == "unplug":
+        """Do what a fault says that keeps the request from the device, for good or for now."""
+        if fault.kind == "late":
+            self._count += 1
+            due_ns = self._clock_ns() + round(fault.delay_s * 1e9)
+            heapq.heappush(self._undone, (due_ns, self._count, connection, request))
+        elif fault.kind == "unplug":
             self._unplug()
         elif fault.kind == "reset":
             self._drop(connection, reset=True)
@@ -178,6 +185,14 @@ class EmulatorServer:
             self._selector.unregister(listener)
         self._unplugged += self._listeners
         self._listeners.clear()
+
+    def _carry_out_due(self, now_ns: int) -> None:
+        """Carry out what was put off, though its host may have gone since."""
+        while self._undone and self._undone[0][0] <= now_ns:
+            _, _, connection, request = heapq.heappop(self._undone)
+            answer = connection.wire.answer(request, now_ns)
+            if answer is not None and connection in self._connections:
+                self._reply(connection, answer, None, now_ns)
 
     def _send_due(self, now_ns: int) -> None:
         while self._late and self._late[0][0] <= now_ns:

@@ -122,8 +122,9 @@ def _plan(options: EmulatorOptions) -> "_Plan":
         if not isinstance(reader, ModbusProfile):
             raise InputError(f"{options.reader}: only Modbus profiles read for {profile.title}")
         return _ModbusPlan(options, profile, reader)
-    if (options.link, options.reader_unit_id, options.reader_port) != (None, None, 0):
-        rule = "link and the reader's unit and port are for Modbus profiles"
+    given = (options.link, options.reader_unit_id, options.reader_port, options.current_a)
+    if given != (None, None, 0, None):
+        rule = "link, current and the reader's unit and port are for Modbus profiles"
         raise InputError(f"{rule}, {options.profile} has a line of its own")
     if isinstance(profile, FrameProfile):
         if reader is not profile:
@@ -209,11 +210,12 @@ class _ModbusPlan(_Plan):
 
     def devices(self, rig: Rig, log: WriteLog) -> tuple[AnyDevice, AnyDevice, list[Port]]:
         profile, output, sensor, wiring = self._profile, self._output, self._sensor, self._wiring
+        start_a = self._options.current_a
         if self._reader is profile:
-            device = reader = EmulatedModbus(profile, rig, log, output, sensor, wiring)
+            device = reader = EmulatedModbus(profile, rig, log, output, sensor, wiring, start_a)
             attach_stream(device, rig, log, output, sensor, noise=self._options.noise)
         else:
-            device = EmulatedModbus(profile, rig, log, output, None, wiring)
+            device = EmulatedModbus(profile, rig, log, output, None, wiring, start_a)
             reader = EmulatedModbus(self._reader, rig, log, None, sensor, wiring)
         unit, reader_unit = profile.unit_id, self.reader_unit_id
         assert reader_unit is not None

@@ -1,9 +1,10 @@
 """LabJack T-series: several registers a message, and streaming from its own buffer.
 
-profile.py  what a profile says of streaming
-frames.py   Modbus function 76
-stream.py   registers and messages of a stream; timing.py  how long they take
-setup.py    an experiment's options, held against the profile
-session.py  one stream
-device.py   the device
+profile.py     what a profile says of streaming
+frames.py      Modbus function 76
+stream.py      registers and messages of a stream; timing.py  how long they take
+setup.py       an experiment's options, held against the profile
+session.py     one stream
+last_write.py  the write that makes the output safe
+device.py      the device
 """

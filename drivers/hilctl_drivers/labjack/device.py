@@ -17,9 +17,11 @@ from hilctl.base.device import DeviceOptions
 from hilctl.base.errors import DeviceError
 from hilctl_drivers.device import DacDevice
 from hilctl_drivers.labjack.frames import ModbusFeedback
+from hilctl_drivers.labjack.last_write import StreamLastWrite
 from hilctl_drivers.labjack.session import StreamSession
-from hilctl_drivers.labjack.setup import Connect, ModbusStreamOptions, StreamSetup
+from hilctl_drivers.labjack.setup import ModbusStreamOptions, StreamSetup
 from hilctl_drivers.labjack.stream import InputCalibration
+from hilctl_drivers.modbus.last_write import Connect
 from hilctl_drivers.modbus.session import ModbusSession
 from hilctl_drivers.modbus.setup import ModbusPeer
 from hilctl_drivers.modbus.watchdog import ModbusGuard
@@ -65,6 +67,11 @@ class ModbusStream(DacDevice):
         self._stream: StreamSession | None = None
         self._calibration: InputCalibration | None = None
         self._next_sample = 0
+        self._armed_s = 0.0
+        self._peer = writer
+        self._last_write = StreamLastWrite(setup.base, connect, sleep, clock)
+        # Until it was open here: another process may have sent it a message.
+        self._under_way = True
 
     @property
     def stream(self) -> StreamSession | None:
@@ -87,8 +94,9 @@ class ModbusStream(DacDevice):
         setup, base = self._setup, self._setup.base
         self._session = session = self._connect(base.writer)
         session.link.open()
+        self._peer = base.writer.reached(session.link)
         session.check_selftest()
-        self._guard.clear_trip(session)
+        self._guard.end_trip(session)
         stream = self._stream_on(session)
         stream.stop()  # whoever started it: no other setting is taken while it runs
         session.run(base.writer.profile.init)
@@ -101,6 +109,13 @@ class ModbusStream(DacDevice):
         self._guard.arm(session, sample_rate_hz / block)
         self._stream = stream
         self._next_sample = 0
+        self._armed_s = self._clock()
+        self._under_way = False
+
+    def _output(self) -> float | None:
+        assert self._session is not None
+        held = self._session.held(self._setup.base.output)
+        return None if held is None else self._setup.base.chain.command(held)
 
     def _stream_on(self, session: ModbusSession) -> StreamSession:
         base = self._setup.base
@@ -124,13 +139,17 @@ class ModbusStream(DacDevice):
         if first_sample != self._next_sample:
             rule = f"samples must follow one another, {self._next_sample} is next"
             raise DeviceError(f"{rule}, got {first_sample}: open again to start at 0")
+        if first_sample == 0:
+            self._guard.check_fed(self._clock() - self._armed_s)
         gain, offset, um_per_unit, offset_um = self._factors
         # Queued before the readings are waited for: meanwhile the device must not run dry.
+        self._under_way = True
         stream.feed((command - offset) / gain)
         self._next_sample += command.size
         readings = self._readings(stream, command.size)
         if self._guard.feed_every and self._session is not None:
             self._guard.feed(self._session)
+        self._under_way = False
         if readings is not None:
             np.multiply(readings, um_per_unit, out=displacement_um)
             displacement_um += offset_um
@@ -149,13 +168,9 @@ class ModbusStream(DacDevice):
     def _put_out(self, command: float) -> None:
         """Stop the stream and put the output at ``command``; what is queued is dropped."""
         self._release()
-        base = self._setup.base
-        self._session = session = self._connect(base.writer)
-        session.link.open()
-        self._guard.clear_trip(session)
-        # A stream that runs would write over the safe value with its next scan.
-        self._stream_on(session).stop()
-        session.write_bytes(base.output, base.output.format.encode(base.chain.output(command)))
+        value = self._setup.base.chain.output(command)
+        self._last_write.put_out(self._peer, value, under_way=self._under_way)
+        self._under_way = False
 
     def _close(self) -> None:
         session, stream = self._session, self._stream

@@ -1,20 +1,14 @@
 """What an experiment says of a device that streams over Modbus, held against its profile."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TypeAlias
 
 from hilctl.base.device import DeviceInfo
 from hilctl.base.errors import DeviceError, InputError
 from hilctl_drivers.labjack.profile import LabJackStreaming
 from hilctl_drivers.labjack.timing import stream_time
-from hilctl_drivers.modbus.session import ModbusSession
-from hilctl_drivers.modbus.setup import ModbusOptions, ModbusPeer, ModbusSetup
+from hilctl_drivers.modbus.setup import ModbusOptions, ModbusSetup
 from hilctl_drivers.wire.timing import RateLimit
 from hilctl_drivers.wiring import FifoBlocks
-
-Connect: TypeAlias = Callable[[ModbusPeer], ModbusSession]
-"""Makes a session on a new link."""
 
 
 class ModbusStreamOptions(ModbusOptions):

@@ -6,6 +6,7 @@ read and then a write; the read may go to another device. Nothing is sent twice,
 the last reply has come.
 """
 
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from typing import ClassVar, TypeAlias
@@ -14,14 +15,10 @@ from hilctl.base.arrays import F64
 from hilctl.base.device import DeviceOptions
 from hilctl.base.errors import DeviceError
 from hilctl_drivers.device import DacDevice
-from hilctl_drivers.modbus.pdu import (
-    feedback_pdu,
-    read_pdu,
-    write_pdu,
-    write_read_pdu,
-    write_single_pdu,
-)
-from hilctl_drivers.modbus.setup import ModbusOptions, ModbusSetup
+from hilctl_drivers.modbus.last_write import Connect, ModbusLastWrite
+from hilctl_drivers.modbus.pdu import feedback_pdu, read_pdu, write_read_pdu
+from hilctl_drivers.modbus.session import ModbusSession
+from hilctl_drivers.modbus.setup import ModbusOptions, ModbusPeer, ModbusSetup
 from hilctl_drivers.modbus.watchdog import ModbusGuard
 from hilctl_drivers.wire.errors import Refused
 from hilctl_drivers.wire.links import NoAnswerError, naming
@@ -39,8 +36,20 @@ class ModbusDac(DacDevice):
 
     Options: ClassVar[type[DeviceOptions]] = ModbusOptions
 
-    def __init__(self, options: ModbusOptions) -> None:
+    def __init__(
+        self,
+        options: ModbusOptions,
+        connect: Connect = ModbusPeer.session,
+        sleep: Callable[[float], None] = time.sleep,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
         """Describe the device; nothing is sent before :meth:`open`.
+
+        Args:
+            options: What the experiment says of it.
+            connect: Makes a session on a new link to the device that has the output.
+            sleep: Waits that many s.
+            clock: Monotonic time in s.
 
         Raises:
             InputError: The profile can't be used, or options don't go with it.
@@ -53,6 +62,10 @@ class ModbusDac(DacDevice):
             options.output,
         )
         self._setup = setup
+        self._connect = connect
+        self._peer = setup.writer
+        self._clock = clock
+        self._last_write = ModbusLastWrite(setup, connect, sleep, clock)
         self._factors = setup.chain.factors
         self._encode = setup.output.format.encode
         self._decode = setup.input.format.decode
@@ -60,6 +73,8 @@ class ModbusDac(DacDevice):
         self._pair: _Pair | None = None
         self._swap: Swap = _not_open
         self._feeds = False
+        # Until it was open here: another process may have sent it a command.
+        self._under_way = True
         self.one_transaction = False
         """Whether a tick is one transaction; known once it is open."""
 
@@ -71,35 +86,54 @@ class ModbusDac(DacDevice):
         """
         del block
         # Kept before it is opened: after a step that fails, _release must find it.
-        self._pair = pair = _Pair(self._setup)
+        self._pair = pair = _Pair(self._setup, self._connect(self._setup.writer))
         pair.open()
+        self._peer = self._setup.writer.reached(pair.writer.link)
         # A device that has tripped refuses the steps that follow.
-        self._guard.clear_trip(pair.writer)
+        self._guard.end_trip(pair.writer)
         pair.set_up()
-        self._swap, self.one_transaction = pair.find_swap()
+        swap, self.one_transaction = pair.find_swap()
         rates = self._setup.rates(self.one_transaction)
         how = "one transaction" if self.one_transaction else "a read and a write"
         replace(rates, note=f"{how} a sample; {rates.note}").check(sample_rate_hz)
         # Armed last: the steps above may take longer than its time-out.
         self._guard.arm(pair.writer, sample_rate_hz)
         self._feeds = self._guard.feed_every > 0
+        self._swap = self._first_of(swap, self._clock())
+        self._under_way = False
+
+    def _first_of(self, swap: Swap, armed_s: float) -> Swap:
+        """Return a swap that is preceded, the first time, by a look at the watchdog's time."""
+
+        def first(data: bytes) -> bytes:
+            self._guard.check_fed(self._clock() - armed_s)
+            self._swap = swap
+            return swap(data)
+
+        return first
+
+    def _output(self) -> float | None:
+        assert self._pair is not None
+        held = self._pair.writer.held(self._setup.output)
+        return None if held is None else self._setup.chain.command(held)
 
     def _exchange(
         self, first_sample: int, command: F64, displacement_um: F64, measured: F64
     ) -> None:
         gain, offset, um_per_unit, offset_um = self._factors
-        data = self._swap(self._encode((command.item() - offset) / gain))
+        request = self._encode((command.item() - offset) / gain)
+        self._under_way = True
+        data = self._swap(request)
+        self._under_way = False
         displacement_um[0] = self._decode(data) * um_per_unit + offset_um
         if self._feeds and self._pair is not None:
             self._guard.feed(self._pair.writer)
 
     def _put_out(self, command: float) -> None:
         self._release()  # many devices take one connection only
-        self._pair = pair = _Pair(self._setup)
-        # No self-test, no init steps, no reader: none of them may cost the safe value.
-        pair.writer.link.open()
-        self._guard.clear_trip(pair.writer)
-        pair.put_out(self._encode(self._setup.chain.output(command)))
+        value = self._setup.chain.output(command)
+        self._last_write.put_out(self._peer, value, under_way=self._under_way)
+        self._under_way = False
 
     def _close(self) -> None:
         if self._pair is not None:
@@ -122,11 +156,12 @@ class _Pair:
 
     Args:
         setup: What the experiment says of the device.
+        writer: Session with the device that has the output.
     """
 
-    def __init__(self, setup: ModbusSetup) -> None:
+    def __init__(self, setup: ModbusSetup, writer: ModbusSession) -> None:
         self._setup = setup
-        self.writer = setup.writer.session()
+        self.writer = writer
         self.reader = self.writer
         self._one = not setup.reads_elsewhere
         self._reader = ""
@@ -203,23 +238,10 @@ class _Pair:
             return self._one_after_the_other(), False
         return swap, True
 
-    def put_out(self, data: bytes) -> None:
-        """Write the output's register bytes.
-
-        Raises:
-            DeviceError: The device does not confirm.
-        """
-        self.writer.call(self.writer.prepare(self._write_pdu(data)))
-
-    def _write_pdu(self, data: bytes) -> bytes:
-        output = self._setup.output
-        address = self._setup.writer.address(output)
-        return (write_single_pdu if output.function == 6 else write_pdu)(address, data)
-
     def _one_after_the_other(self) -> Swap:
         setup, source = self._setup, self._setup.input
         writer, reader = self.writer, self.reader
-        write = writer.prepare(self._write_pdu(bytes(2 * setup.output.words)))
+        write = writer.prepare(writer.output_pdu(setup.output, bytes(2 * setup.output.words)))
         address = setup.reader.address(source)
         read = reader.prepare(read_pdu(source.read_function, address, source.words))
 

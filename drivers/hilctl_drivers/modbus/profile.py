@@ -59,11 +59,16 @@ class ModbusOutput(Channel):
         description="where the value can be read again: another register, same, or none where"
         " reading is refused; scale and offset are the output's",
     )
+    power_up: float | None = Field(
+        default=None, description="what it puts out after power-up, in unit; left out: not known"
+    )
 
     @model_validator(mode="after")
     def _writable(self) -> Self:
         if self.area != "holding":
             raise ValueError(f"area of an output must be holding, got {self.area}")
+        if self.power_up is not None and not self.min <= self.power_up <= self.max:
+            raise ValueError(f"power_up must be min to max, got {self.power_up:g}")
         if self.function == 6 and self.words != 1:
             raise ValueError(f"function 6 writes one register, {self.type} takes {self.words}")
         return self

@@ -14,7 +14,7 @@ from hilctl_drivers.modbus.channels import (
     TripFlag,
 )
 from hilctl_drivers.modbus.pdu import coil_pdu, read_pdu, write_pdu, write_single_pdu
-from hilctl_drivers.modbus.profile import ModbusProfile
+from hilctl_drivers.modbus.profile import ModbusOutput, ModbusProfile
 from hilctl_drivers.modbus.transactions import RtuTransaction, TcpTransaction, Transaction
 from hilctl_drivers.profile_parts import WaitStep
 from hilctl_drivers.wire.links import Link
@@ -93,6 +93,28 @@ class ModbusSession:
         else:
             pdu = write_pdu(address, data)
         self.call(self.prepare(pdu))
+
+    def put_out(self, output: ModbusOutput, data: bytes) -> None:
+        """Write an output's register bytes.
+
+        Raises:
+            DeviceError: The device does not confirm.
+        """
+        self.call(self.prepare(self.output_pdu(output, data)))
+
+    def output_pdu(self, output: ModbusOutput, data: bytes) -> bytes:
+        """Return the request that writes an output's register bytes."""
+        address = self._profile.wire_address(output)
+        return (write_single_pdu if output.function == 6 else write_pdu)(address, data)
+
+    def held(self, output: ModbusOutput) -> float | None:
+        """Return what an output's register holds, in its unit; None where it can't be read.
+
+        Raises:
+            DeviceError: No answer, not a good one, or a refusal.
+        """
+        register = output.readback_register
+        return None if register is None else register.format.decode(self.read_bytes(register))
 
     def run(self, steps: Sequence[ModbusStep]) -> None:
         """Carry out a profile's steps.

@@ -121,6 +121,10 @@ class ModbusPeer:
         assert isinstance(self.profile.link, ModbusRtuLink)
         return SerialLink(str(self.port), self.profile.link.settings, self.timeout_s)
 
+    def reached(self, link: Link) -> "ModbusPeer":
+        """Return this with the address that a link has led to: no name is looked up again."""
+        return replace(self, host=link.peer_host) if isinstance(link, TcpLink) else self
+
     def session(self, link: Link | None = None) -> ModbusSession:
         """Return a session, on a link that it shares with others or on a new one."""
         framing: Literal["tcp", "rtu"] = "tcp" if self.host else "rtu"
@@ -240,6 +244,8 @@ class ModbusSetup:
             max_rate_hz=rates.highest_hz,
             rate_note=rates.note,
             holds=tuple(dict.fromkeys((writer.holds, reader.holds))),
+            watchdog_command=options.watchdog_command,
+            watchdog_reason=options.watchdog_reason,
             details=details,
         )
 

@@ -1,9 +1,14 @@
 """The host watchdog of a Modbus device during a run: cleared, armed, fed, disarmed."""
 
-from hilctl_drivers.modbus.channels import ModbusStep
+from collections.abc import Callable
+from contextlib import suppress
+
+from hilctl.base.errors import DeviceError
+from hilctl_drivers.modbus.channels import ModbusStep, RegisterStep
 from hilctl_drivers.modbus.profile import ModbusWatchdog
 from hilctl_drivers.modbus.session import ModbusSession
 from hilctl_drivers.modbus.setup import ModbusSetup
+from hilctl_drivers.wire.errors import Refused
 from hilctl_drivers.wire.timing import check_feeds
 
 
@@ -22,17 +27,79 @@ class ModbusGuard:
         self.feed_every = 0
         """Ticks from one feeding to the next; 0 where exchanges feed it."""
 
-    def clear_trip(self, session: ModbusSession) -> None:
-        """Clear a trip of an earlier run; the output stays where the watchdog has put it.
+    def write_through(self, session: ModbusSession, put: Callable[[], None]) -> None:
+        """Write the output, also where the watchdog has tripped.
+
+        Before the trip is cleared, so that no stale command takes effect by that; and after it, for
+        a device that refuses or ignores writes until then.
+
+        Args:
+            session: The device.
+            put: Writes the output.
 
         Raises:
-            DeviceError: A step failed.
+            DeviceError: The device does not confirm.
         """
         has = self._has
         if has == "none" or not has.clear:
+            put()
             return
-        if has.tripped == "none" or session.is_set(has.tripped):
-            session.run(self._bound(has, has.clear) or has.clear)
+        with suppress(Refused):
+            put()
+            if has.tripped == "none" or not session.is_set(has.tripped):
+                return
+        self._clear(session)
+        put()
+
+    def end_trip(self, session: ModbusSession) -> None:
+        """End a trip of an earlier run, with the output where the trip has put it.
+
+        Raises:
+            DeviceError: A step failed, or nobody knows where that is.
+        """
+        if self._has == "none" or not self._has.clear or not self._tripped(session):
+            return
+        if self._has.on_trip == "hold":
+            self._clear(session)
+            return
+        value = self._trip_value(session, self._has)
+        if value is None:
+            raise DeviceError(
+                "its watchdog has tripped, and where that has put the output is not known: "
+                "'hilctl safe' puts it at the safe value and clears the trip"
+            )
+        output, data = self._setup.output, self._setup.output.format.encode(value)
+        self.write_through(session, lambda: session.put_out(output, data))
+
+    def _tripped(self, session: ModbusSession) -> bool:
+        has, readback = self._has, self._setup.output.readback_register
+        assert has != "none"
+        if has.tripped != "none":
+            return session.is_set(has.tripped)
+        if not has.refuses_while_tripped or readback is None:
+            return False
+        try:  # what it holds already moves nothing
+            session.put_out(self._setup.output, session.read_bytes(readback))
+        except Refused:
+            return True
+        return False
+
+    def _trip_value(self, session: ModbusSession, has: ModbusWatchdog) -> float | None:
+        """Return what a tripped device puts out, in the output's unit; None where not known."""
+        output = self._setup.output
+        for step in has.safe.get(self._setup.options.output, ()):
+            if isinstance(step, RegisterStep) and step.value == "safe":
+                scaled = step.model_copy(update={"scale": output.scale, "offset": output.offset})
+                return scaled.format.decode(session.read_bytes(scaled))
+        if has.on_trip in {"zero", "reset"}:
+            return 0.0
+        if self._wanted == "none" or has.on_trip != "safe":
+            return None
+        return self._setup.chain.output(self._wanted.safe_command)
+
+    def _clear(self, session: ModbusSession) -> None:
+        assert self._has != "none"
+        session.run(self._bound(self._has, self._has.clear) or self._has.clear)
 
     def arm(self, session: ModbusSession, ticks_per_s: float) -> None:
         """Set safe value and time-out and start it, where the experiment wants one.
@@ -52,6 +119,22 @@ class ModbusGuard:
         session.run(steps)
         if has.kick == "strict":
             self.feed_every = ticks
+
+    def check_fed(self, silent_s: float) -> None:
+        """Refuse a first exchange for which the armed watchdog was too short.
+
+        Args:
+            silent_s: Time since it was armed.
+
+        Raises:
+            DeviceError: It has tripped, so the output is not where the run begins.
+        """
+        if self._has == "none" or self._wanted == "none" or silent_s < self._wanted.timeout_s:
+            return
+        raise DeviceError(
+            f"watchdog.timeout_s must be longer, got {self._wanted.timeout_s:g}: {silent_s:.2g} s "
+            "passed from arming it to the first exchange, so it has tripped; nothing was sent"
+        )
 
     def disarm(self, session: ModbusSession) -> None:
         """Stop it, where the experiment wanted one.

@@ -112,5 +112,7 @@ def _info(setup: SerialSetup, wire: SerialWire) -> DeviceInfo:
         latency_blocks=options.fifo_blocks if streams else 0,
         measures_command=wire.measures,
         holds=setup.holds,
+        watchdog_command=options.watchdog_command,
+        watchdog_reason=options.watchdog_reason,
         details=details,
     )

@@ -49,6 +49,8 @@ class TcpLink:
         self._timeout_s = timeout_s
         self._clock = clock
         self._socket: socket.socket | None = None
+        self.peer_host = host
+        """Numeric address of the peer, once it was reached; the host as given before."""
 
     @property
     def name(self) -> str:
@@ -64,6 +66,14 @@ class TcpLink:
             raise LostError(f"no connection within {self._timeout_s:g} s") from None
         except OSError as error:
             raise LostError(f"can't connect: {why(error)}") from None
+        try:
+            self._set_up(made)
+        except OSError as error:  # reset since
+            made.close()
+            raise LostError(f"can't connect: {why(error)}") from None
+        self._socket = made
+
+    def _set_up(self, made: socket.socket) -> None:
         made.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         made.settimeout(None)
         # The kernel's own time-outs spare the poll() before each call that Python's would cost.
@@ -71,15 +81,19 @@ class TcpLink:
         limit = struct.pack("ll", int(seconds), max(1, int(fraction * 1e6)))
         made.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, limit)
         made.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, limit)
-        self._socket = made
+        # What is not acknowledged by then is given up, also where this process dies: else the
+        # kernel sends an old command again when the cable is back.
+        unacknowledged_ms = math.ceil(self._timeout_s * 1e3)
+        made.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, unacknowledged_ms)
+        self.peer_host = made.getpeername()[0]
 
     def transact(
         self, request: bytes | bytearray, missing: Missing, usual: int = 0
     ) -> bytes | bytearray:
         """Exchange, see :meth:`~hilctl_drivers.wire.links.Link.transact`.
 
-        After a failure the connection is closed: a late reply could only be taken for that of the
-        next request.
+        After a failure the connection is reset: a late reply could only be taken for that of the
+        next request, and a request that is not delivered yet must not be any more.
         """
         connection = self._socket
         if connection is None:
@@ -94,13 +108,13 @@ class TcpLink:
                 return reply
             return self._rest(connection, bytearray(reply), missing, deadline)
         except BlockingIOError:
-            self.close()
+            self._reset()
             raise NoAnswerError(f"no answer within {self._timeout_s:g} s") from None
         except OSError as error:
-            self.close()
+            self._reset()
             raise LostError(f"connection lost: {why(error)}") from None
         except DeviceError:
-            self.close()
+            self._reset()
             raise
 
     def _rest(
@@ -122,6 +136,11 @@ class TcpLink:
         if not data:
             raise LostError(f"connection closed by the device, {wanted} bytes before the end")
         return data
+
+    def _reset(self) -> None:
+        if self._socket is not None:
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        self.close()
 
     def close(self) -> None:
         """Close the connection."""

@@ -359,3 +359,36 @@ class TestAllAtOnce:
             "x.yaml: waveform: sine: every frequency must be below half the sample rate, 5000 Hz: "
             "6000 Hz",
         ]
+
+
+class TestWatchdog:
+    """Where the device's own watchdog would put the output."""
+
+    @pytest.mark.parametrize(
+        ("command", "reason", "safe"), [(0.0, "", 0.0), (1.5, "", 1.5), (1.5, "holds a load", 0.0)]
+    )
+    def test_safe_value_or_a_reason(self, command: float, reason: str, safe: float) -> None:
+        """It goes where the run itself would go, or somebody says why not."""
+        found = checked(
+            CURRENT, f"safe={{value: {safe}}}", watchdog_command=command, watchdog_reason=reason
+        )
+        assert found.loaded.device.info.watchdog_command == command
+
+    @pytest.mark.parametrize(
+        ("command", "reason", "rule"),
+        [
+            (
+                1.5,
+                "",
+                "must be the safe value, 0 A, got 1.5 (or say in device.watchdog.reason why it is "
+                "not)",
+            ),
+            (7.5, "holds a load", "must lie within the limits, -7 to 7 A, got 7.5"),
+        ],
+    )
+    def test_another_value_is_refused(self, command: float, reason: str, rule: str) -> None:
+        """Without a reason, and outside the limits with any."""
+        with pytest.raises(ConfigError) as caught:
+            checked(CURRENT, watchdog_command=command, watchdog_reason=reason)
+        (problem,) = caught.value.problems
+        assert str(problem).endswith(f"device.watchdog.safe_command: {rule}")

@@ -11,8 +11,8 @@ def test_texts_are_read(kind):
     """A count, a time, and how late."""
     assert parse_fault(f"{kind}@12") == WireFault(kind, at_count=12)
     assert parse_fault(f"{kind}@2.5s") == WireFault(kind, at_s=2.5)
-    if kind == "delay":
-        assert parse_fault("delay:0.3@1") == WireFault("delay", at_count=1, delay_s=0.3)
+    if kind in {"delay", "late"}:
+        assert parse_fault(f"{kind}:0.3@1") == WireFault(kind, at_count=1, delay_s=0.3)
 
 
 @pytest.mark.parametrize(
@@ -20,7 +20,7 @@ def test_texts_are_read(kind):
     [
         ("silence", "KIND@COUNT"),
         ("noise@1", "must be one of silence"),
-        ("reset:2@1", "only delay"),
+        ("reset:2@1", "only delay and late"),
         ("reset@0", "whole number from 1"),
         ("reset@1.5", "whole number from 1"),
         ("", "KIND@COUNT"),

@@ -8,8 +8,8 @@ from hilctl_drivers.emulator.rig import Rig, WriteLog
 from hilctl_drivers.profile import load_profile
 
 
-def device_of(name: str, output: str, sensor: str) -> EmulatedModbus:
-    return EmulatedModbus(load_profile(name), Rig(0), WriteLog(None, 0), output, sensor)
+def device_of(name: str, output: str, sensor: str, **more: float) -> EmulatedModbus:
+    return EmulatedModbus(load_profile(name), Rig(0), WriteLog(None, 0), output, sensor, **more)
 
 
 def test_unknown_channels_are_refused():
@@ -24,3 +24,37 @@ def test_decline_carries_the_code():
     with pytest.raises(Declined) as declined:
         device.read(["holding"], 9999, 1)
     assert declined.value.code == 2
+
+
+@pytest.mark.parametrize(
+    ("name", "output", "sensor", "more", "current_a", "value"),
+    [
+        ("labjack_t7", "DAC1", "AIN0", {}, -10.0, 0.0),
+        ("labjack_t8", "DAC0", "AIN0", {}, -9.80198, 0.0),
+        ("labjack_t7", "DAC0", "AIN0", {"current_a": 2.0}, 2.0, 3.0),
+        ("generic_float32", "OUT", "IN", {}, 0.0, 0.0),
+        ("adam_6024", "AO0", "AI0", {}, 0.0, 5.0),
+    ],
+)
+def test_powers_up_as_its_profile_says(name, output, sensor, more, current_a, value):
+    """Where that says nothing, or the power-up value was set, as if it had been set so."""
+    device = device_of(name, output, sensor, **more)
+    assert device._rig.current_a == pytest.approx(current_a, abs=5e-3)
+    assert device._outputs[output].value == pytest.approx(value, abs=2e-3)
+
+
+def test_trip_that_a_step_clears_keeps_the_command(tmp_path):
+    """The terminal is at the safe value and the register is not; a new command ends that."""
+    device = device_of("wago_750", "AO0", "AI0")
+    device.write("holding", 0, [16384])
+    device._watchdog.armed = device._watchdog.tripped = True
+    device._trip(0)
+    assert device._rig.current_a == 0.0
+    assert device._outputs["AO0"].words == [16384]
+    with pytest.raises(Declined):
+        device.write("holding", 0, [100])
+    device.write("holding", 0x1007, [1])
+    assert not device.tripped
+    assert device._rig.current_a == 0.0
+    device.write("holding", 0, [100])
+    assert device._rig.current_a == pytest.approx(100 * 10 / 32767)

@@ -16,6 +16,7 @@ from hilctl_drivers.emulator.wire import EmulatedReply
 from hilctl_drivers.modbus.pdu import (
     read_pdu,
     tcp_adu,
+    write_pdu,
 )
 from hilctl_drivers.modbus.registers import RegisterFormat
 
@@ -158,3 +159,22 @@ def test_what_the_host_does_not_read_waits_for_room(serving):
         assert select.select([server.ports[0]], [], [], 5.0)[0]
         got += os.read(server.ports[0], 65536)
     assert got == 100_000 * b"a" + 100_000 * b"b"
+
+
+def test_late_request_is_carried_out_after_its_host_has_gone(served, tmp_path):
+    """Another connection was answered meanwhile; what comes last stands."""
+    path = tmp_path / "log.jsonl"
+    faults = (parse_fault("late:0.2@1"),)
+    host, port = served("labjack_t7", log=path, faults=faults, current_a=0.0).split(":")
+    for value in (3.0, 2.0):
+        data = FLOAT32.encode(value)
+        with socket.create_connection((host, int(port)), 5.0) as link:
+            link.sendall(tcp_adu(1, 1, write_pdu(1000, data)))
+            if value == 2.0:
+                assert link.recv(100)
+    for _ in range(500):
+        written = [json.loads(line)["value"] for line in path.read_text().splitlines()]
+        if len(written) == 2:
+            break
+        threading.Event().wait(0.01)
+    assert written == [2.0, 3.0]

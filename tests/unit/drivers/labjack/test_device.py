@@ -13,7 +13,7 @@ from hilctl_drivers.labjack.device import ModbusStream
 from hilctl_drivers.labjack.setup import ModbusStreamOptions
 from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
 from hilctl_drivers.wire.links import NoAnswerError
-from tests.fakes import InProcess, InProcessLink
+from tests.fakes import FaultyLink, InProcess, InProcessLink
 
 RATE_HZ = 10_000.0
 BLOCK = 100
@@ -85,10 +85,12 @@ def driven(tmp_path):
     """Return a function that wires a streaming device to an emulated LabJack."""
     made = []
 
-    def of(link=InProcessLink, message_s=MESSAGE_S, **changes):
+    def of(link=InProcessLink, message_s=MESSAGE_S, current_a=0.0, **changes):
         chosen = options(**changes)
         log = tmp_path / f"log{len(made)}.jsonl"
-        emulated = InProcess.of(chosen.profile.name, link=link, log=log, message_s=message_s)
+        emulated = InProcess.of(
+            chosen.profile.name, link=link, log=log, message_s=message_s, current_a=current_a
+        )
         made.append(DrivenStream(emulated, log, chosen))
         return made[-1]
 
@@ -440,3 +442,84 @@ def test_make_safe_needs_no_open_connection(driven):
     made.device.make_safe(1.0)
     assert made.events()[-1]["current_a"] == pytest.approx(1.0)
     assert not made.link.is_open
+
+
+def test_says_what_it_puts_out(driven):
+    """Read back after opening: at power-up the end of the range, later where a run has left it."""
+    made = driven(current_a=None)
+    made.open()
+    assert made.device.output() == pytest.approx(-10.0)
+    assert made.events() == []
+    made.hold(2.0, 10)
+    made.device.close()
+    made.open()
+    assert made.device.output() == pytest.approx(2.0)
+    made.device.close()
+
+
+def test_stream_starts_where_the_output_stands(driven):
+    """The rig has been there all the time: its first displacement is that of the last command."""
+    made = driven()
+    made.device.make_safe(3.0)
+    made.open()
+    first = made.hold(3.0, FIFO_BLOCKS + 1)[-1]
+    assert first[0] == pytest.approx(first[-1], abs=0.5)
+    assert first[0] > 10.0
+
+
+def test_one_message_stops_the_stream_and_writes_the_safe_value(driven):
+    """The device has it as soon as a message can reach it, whatever waits in the buffer."""
+    made = driven(link=FaultyLink)
+    made.open()
+    made.hold(2.0, 10)
+    before_s, sent = made.time(), len(made.link.requests)
+    made.device.make_safe(-1.0)
+    last = made.events()[-1]
+    assert (last["event"], last["current_a"]) == ("write", pytest.approx(-1.0))
+    assert last["monotonic_ns"] * 1e-9 - before_s == pytest.approx(MESSAGE_S)
+    assert len(made.link.requests) - sent == 2  # the other one reads it back
+    assert not made.clock.running
+
+
+def test_stream_that_is_started_late_is_stopped_again(driven):
+    """The message that starts it timed out, and comes after the safe value."""
+    made = driven(link=FaultyLink)
+    made.open()
+    made.hold(4.0, FIFO_BLOCKS - 1)
+    made.link.late_if = lambda request: struct.pack(">BHB", 1, stream.ENABLE, 2) in request
+    made.link.late_s = 0.4
+    with pytest.raises(DeviceError, match="no answer"):
+        made.hold(4.0, 1)
+    made.device.make_safe(0.0)
+    made.stall(60.0)
+    made.link.deliver()
+    made.emulated.device.tick(made.time.now_ns)
+    assert max(each["current_a"] for each in made.events()) == pytest.approx(4.0)
+    assert made.emulated.rig.current_a == pytest.approx(0.0, abs=1e-9)
+    assert not made.clock.running
+
+
+@pytest.mark.parametrize("silence_s", [0.6, 3.0])
+def test_stream_that_was_silent_is_made_safe_when_it_is_back(driven, silence_s):
+    """What waits in the buffer is dropped by the first message that gets there."""
+    made = driven(link=FaultyLink)
+    made.open()
+    made.hold(2.0, 10)
+    back_s = made.time() + silence_s
+    made.link.silent_until_s = back_s
+    with pytest.raises(DeviceError):
+        made.hold(2.0, 1)
+    made.device.make_safe(0.0)
+    written = [each for each in made.events() if each["event"] == "write"]
+    assert 0.0 <= written[0]["monotonic_ns"] * 1e-9 - back_s < 0.2
+    assert made.emulated.rig.current_a == pytest.approx(0.0, abs=1e-9)
+
+
+def test_watchdog_that_is_shorter_than_the_start_is_refused(driven):
+    """It has tripped then, and the first block would start elsewhere than the run believes."""
+    made = driven(watchdog={"timeout_s": 2.0})
+    made.open()
+    made.stall(2.1)
+    with pytest.raises(DeviceError, match=r"must be longer, got 2: 2\.1 s passed"):
+        made.hold(1.0, 1)
+    assert made.clock.level == 0

@@ -1,4 +1,4 @@
-"""A device that drives and one that reads, at one rig."""
+"""Devices on emulated ones: a pair that is served at one rig, and one in this process."""
 
 import json
 import threading
@@ -6,13 +6,19 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from hilctl_drivers.emulator.options import EmulatorOptions
 from hilctl_drivers.emulator.setup import Emulator, build
 from hilctl_drivers.modbus.device import ModbusDac
 from hilctl_drivers.modbus.setup import ModbusOptions
-from tests.fakes import ManualClock
+from hilctl_drivers.profile import shipped_profiles
+from tests.fakes import FaultyLink, InProcess, ManualClock, VirtualTime
+
+MESSAGE_S = 0.001
+TIMEOUT_S = 0.1
+RATE_HZ = 100.0
 
 READER = """\
 vendor: nobody
@@ -47,7 +53,8 @@ class ServedPair:
 
     def device(self, **changes) -> ModbusDac:
         options = {**self.emulator.options, "timeout_s": 2.0, **changes}
-        return ModbusDac(ModbusOptions.model_validate(options))
+        time = VirtualTime()
+        return ModbusDac(ModbusOptions.model_validate(options), sleep=time.sleep, clock=time)
 
     def events(self) -> list[dict]:
         return [json.loads(line) for line in self.log.read_text().splitlines()]
@@ -71,6 +78,79 @@ def serve(tmp_path) -> Iterator[Callable[..., ServedPair]]:
         served.emulator.server.stop()
         thread.join()
         served.emulator.log.close()
+
+
+class DrivenModbus:
+    """A modbus_dac that is wired to an emulated device."""
+
+    def __init__(self, log, profile="generic_float32", link=FaultyLink, current_a=0.0, **changes):
+        self._log = log
+        self.emulated = InProcess.of(
+            profile, link=link, log=self._log, message_s=MESSAGE_S, current_a=current_a
+        )
+        self.link, self.time = self.emulated.link, self.emulated.time
+        wiring = self.emulated.device.wiring
+        self.peers = []
+        self._options = {
+            "profile": profile,
+            "host": "h",
+            "output": next(iter(self.emulated.device.profile.outputs)),
+            "input": next(iter(self.emulated.device.profile.inputs)),
+            "amplifier": {"gain_a_per_v": wiring.gain_a, "offset_a": wiring.offset_a},
+            "sensor": {"um_per_v": wiring.sensor_um, "offset_um": wiring.offset_um},
+            "watchdog": "none",
+            "timeout_s": TIMEOUT_S,
+            **changes,
+        }
+        self.device = self.another()
+
+    def another(self, **changes) -> ModbusDac:
+        """Return a device on the same emulated one, with other options."""
+        options = ModbusOptions.model_validate({**self._options, **changes})
+        return ModbusDac(options, self._connect, self.time.sleep, self.time)
+
+    def _connect(self, peer):
+        self.peers.append(peer)
+        return peer.session(self.link)
+
+    def open(self):
+        self.device.open(RATE_HZ, 1)
+
+    def exchange(self, value):
+        self.device.exchange(0, np.array([value]), np.empty(1), np.empty(1))
+
+    @property
+    def current_a(self):
+        """What the device puts out, with all delivered that is due."""
+        self.link.deliver()
+        return self.emulated.rig.current_a
+
+    def writes(self):
+        return [json.loads(line) for line in self._log.read_text().splitlines()]
+
+
+@pytest.fixture
+def driven(tmp_path):
+    """Return a function that wires a modbus_dac to an emulated device."""
+    made = []
+
+    def of(*words, **changes):
+        made.append(DrivenModbus(tmp_path / "writes.jsonl", *words, **changes))
+        return made[-1]
+
+    yield of
+    for each in made:
+        each.emulated.log.close()
+
+
+@pytest.fixture
+def write_only(tmp_path):
+    """Return a profile whose output can't be read back, by path."""
+    text = shipped_profiles()["generic_float32"].read_text(encoding="utf-8")
+    path = tmp_path / "write_only.yaml"
+    text = text.replace("OUT: {address: 0,", "OUT: {readback: none, address: 0,")
+    path.write_text(text, encoding="utf-8")
+    return str(path)
 
 
 @pytest.fixture

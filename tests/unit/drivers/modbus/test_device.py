@@ -17,7 +17,7 @@ from hilctl_drivers.emulator.setup import Emulator, build
 from hilctl_drivers.modbus.device import ModbusDac
 from hilctl_drivers.modbus.setup import ModbusOptions
 from hilctl_drivers.profile import load_profile, shipped_profiles
-from tests.fakes import ManualClock
+from tests.fakes import ManualClock, VirtualTime
 
 T7 = {
     "profile": "labjack_t7",
@@ -80,7 +80,8 @@ class Served:
         host, _, port = self.emulator.address.partition(":")
         where = {"host": host, "tcp_port": int(port)} if port else {"serial_port": host}
         given = {**options, "timeout_s": 5.0, **where, **changes}
-        return ModbusDac(ModbusOptions.model_validate(given))
+        time = VirtualTime()
+        return ModbusDac(ModbusOptions.model_validate(given), sleep=time.sleep, clock=time)
 
     def events(self) -> list[dict]:
         return [json.loads(line) for line in self.log.read_text().splitlines()]
@@ -93,7 +94,7 @@ def serve(tmp_path) -> Iterator[Callable[..., Served]]:
 
     def start(profile: str, **options) -> Served:
         clock, log = ManualClock(0), tmp_path / f"writes{len(started)}.jsonl"
-        emulator = build(EmulatorOptions(profile, log=log, **options), clock)
+        emulator = build(EmulatorOptions(profile, log=log, **{"current_a": 0.0, **options}), clock)
         thread = threading.Thread(target=emulator.server.run)
         thread.start()
         started.append((Served(emulator, clock, log), thread))
@@ -121,7 +122,9 @@ def exchange(device: ModbusDac, value: float) -> float:
 
 
 def made(**changes) -> ModbusDac:
-    return ModbusDac(ModbusOptions.model_validate({**T7, "host": "h", **changes}))
+    time = VirtualTime()
+    options = ModbusOptions.model_validate({**T7, "host": "h", **changes})
+    return ModbusDac(options, sleep=time.sleep, clock=time)
 
 
 class TestOptions:
@@ -218,6 +221,13 @@ class TestOptions:
         assert "FC23 at 115200 8N1" in info.rate_note
         slow = ModbusDac(ModbusOptions.model_validate({**options, "baud": 9600})).info
         assert slow.max_rate_hz == pytest.approx(29.0, abs=1.0)
+
+    def test_watchdog_is_said_before_it_is_opened(self):
+        """Where it would put the output, and why that is another value than the run's."""
+        wanted = {"timeout_s": 1.0, "safe_command": 1.5, "reason": "holds a load"}
+        info = made(watchdog=wanted).info
+        assert (info.watchdog_command, info.watchdog_reason) == (1.5, "holds a load")
+        assert made().info.watchdog_command is None
 
     def test_calibration_is_kept(self):
         """Who calibrated what goes with every recording."""

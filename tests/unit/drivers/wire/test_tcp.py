@@ -102,6 +102,42 @@ def test_tcp_silence_ends_at_the_deadline(serve, sent, words):
         link.transact(b"ask", missing)
 
 
+def test_tcp_request_that_was_not_answered_is_given_up(serve):
+    """The peer sees a reset: what it has not been given yet must not reach it later."""
+    seen, acted = [], threading.Event()
+
+    def act(connection):
+        connection.recv(100)
+        try:
+            connection.recv(100)
+        except ConnectionResetError as error:
+            seen.append(error)
+        acted.set()
+
+    link = tcp(serve(act), QUICK_S)
+    with pytest.raises(NoAnswerError):
+        link.transact(b"ask", missing)
+    assert acted.wait(PATIENT_S)
+    assert len(seen) == 1
+
+
+def test_tcp_kernel_gives_up_what_is_not_acknowledged(serve):
+    """In one time-out, also where this process dies before."""
+    link = tcp(serve(lambda connection: None), QUICK_S)
+    found = link._socket.getsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT)
+    assert found == round(QUICK_S * 1e3)
+    link.close()
+
+
+def test_tcp_address_of_the_peer_is_known_once_it_was_reached(serve):
+    """Then nobody need look a name up again."""
+    link = TcpLink("localhost", serve(lambda connection: None), PATIENT_S)
+    assert link.peer_host == "localhost"
+    link.open()
+    assert link.peer_host == "127.0.0.1"
+    link.close()
+
+
 def test_tcp_trickle_does_not_move_the_deadline():
     """A byte now and then does not keep an exchange alive: time is injected and runs out."""
     ours, theirs = socket.socketpair()
@@ -148,7 +184,9 @@ def test_tcp_frame_error_closes_the_connection(serve):
         connection.sendall(REPLY)
 
     def refuse(received):
-        raise DeviceError("not a reply")
+        if received:
+            raise DeviceError("not a reply")
+        return 1
 
     link = tcp(serve(act))
     with pytest.raises(DeviceError, match="not a reply"):

@@ -1,0 +1,28 @@
+"""The write that makes the output of a LabJack safe, streaming or not."""
+
+from hilctl_drivers.labjack.frames import ModbusFeedback, ReadFrame, WriteFrame
+from hilctl_drivers.labjack.stream import ENABLE, u32
+from hilctl_drivers.modbus.last_write import ModbusLastWrite
+from hilctl_drivers.modbus.session import ModbusSession
+from hilctl_drivers.wire.errors import Refused
+
+
+class StreamLastWrite(ModbusLastWrite):
+    """Stops the stream and writes the output in one message; what is queued is dropped."""
+
+    def _put(self, session: ModbusSession, value: float) -> None:
+        output = self._setup.output
+        feedback = ModbusFeedback(session.link, self._setup.writer.unit)
+        write = WriteFrame(self._setup.writer.address(output), output.format.encode(value))
+        # The stream first: it would write over the safe value with its next scan.
+        try:
+            feedback.call([WriteFrame(ENABLE, u32(0)), write])
+        except Refused:  # a stream that does not run can't be stopped
+            feedback.call([write])
+
+    def _holds(self, session: ModbusSession, value: float) -> bool:
+        output = self._setup.output
+        feedback = ModbusFeedback(session.link, self._setup.writer.unit)
+        target = ReadFrame(self._setup.writer.address(output), output.words)
+        running, held = feedback.call([ReadFrame(ENABLE, 2), target])
+        return running == u32(0) and self._agrees(output.format.decode(held), value)
