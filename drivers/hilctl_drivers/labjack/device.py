@@ -20,6 +20,7 @@ from hilctl_drivers.labjack.frames import ModbusFeedback
 from hilctl_drivers.labjack.session import StreamSession
 from hilctl_drivers.labjack.setup import Connect, ModbusStreamOptions, StreamSetup
 from hilctl_drivers.labjack.stream import InputCalibration
+from hilctl_drivers.modbus.look import look
 from hilctl_drivers.modbus.session import ModbusSession
 from hilctl_drivers.modbus.setup import ModbusPeer
 from hilctl_drivers.modbus.watchdog import ModbusGuard
@@ -156,6 +157,9 @@ class ModbusStream(DacDevice):
         # A stream that runs would write over the safe value with its next scan.
         self._stream_on(session).stop()
         session.write_bytes(base.output, base.output.format.encode(base.chain.output(command)))
+
+    def _look(self) -> tuple[float, float | None]:
+        return look(self._setup.base)
 
     def _close(self) -> None:
         session, stream = self._session, self._stream

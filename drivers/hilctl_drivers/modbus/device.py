@@ -14,6 +14,7 @@ from hilctl.base.arrays import F64
 from hilctl.base.device import DeviceOptions
 from hilctl.base.errors import DeviceError
 from hilctl_drivers.device import DacDevice
+from hilctl_drivers.modbus.look import look
 from hilctl_drivers.modbus.pdu import (
     feedback_pdu,
     read_pdu,
@@ -100,6 +101,9 @@ class ModbusDac(DacDevice):
         pair.writer.link.open()
         self._guard.clear_trip(pair.writer)
         pair.put_out(self._encode(self._setup.chain.output(command)))
+
+    def _look(self) -> tuple[float, float | None]:
+        return look(self._setup)
 
     def _close(self) -> None:
         if self._pair is not None:

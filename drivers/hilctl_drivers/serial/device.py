@@ -61,6 +61,15 @@ class SerialDac(DacDevice):
         self._measured = np.zeros(block)
         self._answered = -self._info.latency_blocks
 
+    def _output(self) -> float | None:
+        value = self._wire.output()
+        return None if value is None else self._chain.command(value)
+
+    def _look(self) -> tuple[float, float | None]:
+        reading, value = self._wire.look()
+        output = None if value is None else self._chain.command(value)
+        return self._chain.displacement_um(reading), output
+
     def _exchange(
         self, first_sample: int, command: F64, displacement_um: F64, measured: F64
     ) -> None:

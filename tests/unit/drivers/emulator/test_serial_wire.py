@@ -41,5 +41,5 @@ def test_frames_go_over_the_pty(tmp_path):
         finally:
             os.close(port)
     found = cobs.decode(reply[:-1])
-    assert found[:4] == b"\x94\x2a\x00\x01"
+    assert found[:4] == b"\x94\x2a\x00\x02"
     assert struct.unpack_from("<HHfff", found, 4) == (0, 1, 1000.0, -10.0, 10.0)
