@@ -12,7 +12,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from fcntl import ioctl
 from os import read, write
-from pathlib import Path
 from typing import Literal
 
 import serial
@@ -51,15 +50,6 @@ class SerialSettings:
     flow: Literal["none", "xonxoff"] = "none"
     dtr: bool | None = None
     rts: bool | None = None
-
-
-def held_port(path: str) -> str:
-    """Return a serial port as :attr:`hilctl.base.device.DeviceInfo.holds` has it.
-
-    Links such as those under ``/dev/serial/by-id`` are followed, so that two names of one port are
-    one.
-    """
-    return f"serial:{Path(path).resolve()}"
 
 
 def _open_port(path: str, settings: SerialSettings, timeout_s: float) -> serial.Serial:

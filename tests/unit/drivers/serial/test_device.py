@@ -19,6 +19,7 @@ from tests.fakes import ShiftedClock, SteppingClock, emulated
 
 DCON = (Path(__file__).parents[3] / "data" / "dcon_module.yaml").read_text()
 KINDS = ["dcon", "scpi", "cobs", "length"]
+TIMEOUT_S = 0.3  # a busy machine answers within it
 
 
 @pytest.fixture
@@ -44,7 +45,7 @@ class Rig:
         self.emulator = emulator
         self.log = log
         self.clock = clock
-        made = {**emulator.options, "timeout_s": 0.1, **options}
+        made = {**emulator.options, "timeout_s": TIMEOUT_S, **options}
         self.device = SerialDac(SerialOptions.model_validate(made))
         self.device.wire.last_write = SerialLastWrite(SteppingClock(0.2), lambda seconds: None)
         self.sample = 0
@@ -131,10 +132,10 @@ def test_bad_commands_are_refused_and_nothing_is_sent(rig, kind, bad):
 
 
 FAULTS = {
-    "silence": "no answer within 0.1 s",
-    "delay": "no answer within 0.1 s",
+    "silence": "no answer within 0.3 s",
+    "delay": "no answer within 0.3 s",
     "corrupt": "checksum of|not an answer to this|crc16_ccitt_false of .* is wrong",
-    "cut": "only . bytes, 1 short, within 0.1 s",
+    "cut": "only . bytes, 1 short, within 0.3 s",
     "duplicate": "must be one line|bytes behind",
     "wrong_id": "not an answer to this|reply 90 to message",
     "exception": "invalid command|no answer within|refused by the board",
@@ -150,7 +151,7 @@ def exchange_until_it_fails(bench, command=2.0):
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_bad_answer_is_an_error_and_the_output_can_still_be_made_safe(rig, kind, fault):
     """No wrong reading is taken; the next request is not confused by what is left on the line."""
-    bench = rig(kind, faults=[f"{fault}:0.3@30" if fault == "delay" else f"{fault}@30"])
+    bench = rig(kind, faults=[f"{fault}:0.9@30" if fault == "delay" else f"{fault}@30"])
     bench.open()
     with pytest.raises(DeviceError, match=FAULTS[fault]) as caught:
         exchange_until_it_fails(bench)
@@ -309,7 +310,7 @@ def test_making_safe_is_tried_twice(rig, kind, fault):
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_device_that_was_deaf_is_made_safe_when_it_comes_back(rig, kind):
     """Each message of some time is lost: the safe value is sent until one gets through."""
-    bench = rig(kind, faults=[f"silence@{n}" for n in range(20, 28)])
+    bench = rig(kind, faults=[f"silence@{n}" for n in range(20, 25)])
     bench.open()
     with pytest.raises(DeviceError, match="no answer"):
         exchange_until_it_fails(bench)
@@ -326,7 +327,9 @@ def test_safe_is_said_only_of_what_was_read_back(rig, kind):
     device = bench.emulator.device
     device._set = lambda name, value, reply: reply
     device._put_out = lambda *args: None
-    with pytest.raises(DeviceError, match=r"not known whether the value stands: .* 2 stands"):
+    with pytest.raises(
+        DeviceError, match=r"not known whether the value stands: .* was written, .* stands"
+    ):
         bench.device.make_safe(0.0)
 
 
