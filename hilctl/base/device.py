@@ -6,7 +6,7 @@ people's packages; :mod:`hilctl.loop.pacer` and the tests supply clocks.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Literal, Protocol, TypeAlias
+from typing import Any, ClassVar, Literal, Protocol, TypeAlias, runtime_checkable
 
 from hilctl.base.arrays import F64
 from hilctl.base.strict import Strict
@@ -145,6 +145,22 @@ class Device(Protocol):
 
     def close(self) -> None:
         """Let go of the port and leave the output as it is. Closing twice is fine."""
+        ...
+
+
+@runtime_checkable
+class ReadableDevice(Protocol):
+    """A device that can be read without being set up; devices need not be."""
+
+    def look(self) -> tuple[float, float | None]:
+        """Connect, return displacement and output as they are, and let go; nothing is changed.
+
+        Returns:
+            Displacement in um, and the output in the command's unit; None where it can't be known.
+
+        Raises:
+            DeviceError: Open; or it can't be reached, is another device, or gives no good answer.
+        """
         ...
 
 

@@ -9,7 +9,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 from rich.text import Text
 
-from hilctl.experiment.inventory import Inventory, Probed
+from hilctl.experiment.inventory import Inventory
 from hilctl.machine.diagnosis import Diagnosis, lateness_counts
 from hilctl.machine.latency import Latency
 from hilctl.machine.realtime import SetUpStep
@@ -109,13 +109,3 @@ def print_inventory(found: Inventory) -> None:
     console = Console()
     console.print(table, profiles)
     console.print(ports if found.serial_ports else "no serial port found", soft_wrap=True)
-
-
-def print_probed(answered: Probed) -> None:
-    """Print what a device said of itself."""
-    console = Console()
-    console.print(f"[green]{answered.name} answers[/]: {answered.description}", highlight=False)
-    note = f": {answered.rate_note}" if answered.rate_note else ""
-    console.print(f"at most {answered.max_rate_hz:.6g} samples a second{note}", highlight=False)
-    for key, value in answered.details.items():
-        console.print(f"  {key}: {value}", highlight=False, markup=False)
