@@ -1,7 +1,10 @@
 """Whole runs over text lines and board frames with things going wrong: one ramp, every time."""
 
+import os
 import re
 import signal
+import time
+from pathlib import Path
 
 import pytest
 
@@ -119,6 +122,24 @@ def test_pulled_adapter_takes_the_port_along(meet, kind):
         return
     trip = device.log.await_event(output, "watchdog")
     assert trip["current_a"] == pytest.approx(0.0, abs=2e-3)
+
+
+@pytest.mark.parametrize(("kind", "events"), [("dcon", 80), ("cobs", 80), ("fifo", 300)])
+def test_dead_loop_is_followed_by_a_message(meet, boards, kind, events):
+    """The supervisor's, not the watchdog's doing: no boot of the board is waited for."""
+    for name in ("cobs", "fifo"):
+        path = Path(boards[name])
+        path.write_text(path.read_text().replace("boot_wait_s: 0.0", "boot_wait_s: 2.0"))
+    device, started, output = meet(kind)
+    device.log.await_events(output, events)
+    killed_ns = time.monotonic_ns()
+    os.kill(started.loop_pid(), signal.SIGKILL)
+    printed = started.end()
+    assert printed["output_safe"] is True
+    since = [each for each in device.log.events(output) if each["monotonic_ns"] > killed_ns]
+    safe = next(each for each in since if abs(each["current_a"]) < 2e-3)
+    assert safe["event"] == ("write" if kind == "dcon" else "safe")
+    assert (safe["monotonic_ns"] - killed_ns) * 1e-9 < WATCHDOG_S
 
 
 @pytest.mark.parametrize(("kind", "events"), [("dcon", 80), ("fifo", 300)])
