@@ -45,6 +45,8 @@ class DeviceInfo:
             time may hold it. Empty where any number may run side by side.
         simulated: Whether it drives no hardware and steps on sample count: it may run faster than
             real time, and its recordings say so.
+        safe_note: What stands behind the safe value where a message with it takes longer than 0.2 s
+            to get there, in words; empty where it does not.
         details: Anything worth keeping with a recording (serial numbers, physical parameters).
     """
 
@@ -63,6 +65,7 @@ class DeviceInfo:
     measures_command: bool = False
     holds: tuple[str, ...] = ()
     simulated: bool = False
+    safe_note: str = ""
     details: Mapping[str, str] = field(default_factory=dict)
 
 

@@ -8,6 +8,8 @@ def print_probed(answered: Probed) -> None:
     print(f"{answered.name} answers: {answered.description}")
     note = f": {answered.rate_note}" if answered.rate_note else ""
     print(f"at most {answered.max_rate_hz:.6g} samples a second{note}")
+    if answered.safe_note:
+        print(f"safe value: {answered.safe_note}")
     if answered.displacement_um is not None:
         print(f"reads {answered.displacement_um:.6g} um")
     if answered.output is None:

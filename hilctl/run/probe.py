@@ -24,6 +24,7 @@ class Probed:
         description: What it is.
         max_rate_hz: Highest sample rate it can keep.
         rate_note: Why that is so.
+        safe_note: How late the safe value may get there, where that is worth a word.
         details: What it says of itself.
         displacement_um: What its sensor reads; None where that can't be had without a run.
         output: What it puts out, in ``command_unit``; None where nobody can know.
@@ -35,6 +36,7 @@ class Probed:
     description: str
     max_rate_hz: float
     rate_note: str
+    safe_note: str
     details: dict[str, str]
     displacement_um: float | None
     output: float | None
@@ -65,6 +67,7 @@ def probe(path: Path, settings: list[str]) -> Probed:
         description=info.description,
         max_rate_hz=info.max_rate_hz,
         rate_note=info.rate_note,
+        safe_note=info.safe_note,
         details=dict(info.details),
         displacement_um=displacement_um,
         output=output,

@@ -18,6 +18,9 @@ from hilctl_drivers.serial.setup import SerialOptions, SerialSetup
 from hilctl_drivers.serial.wire import SerialWire
 from hilctl_drivers.wire.timing import RateLimit
 
+_PROMPT_S = 0.2
+"""A safe value that is there within it needs no word."""
+
 
 class SerialDac(DacDevice):
     """A :class:`~hilctl.base.device.Device` on a serial line."""
@@ -121,5 +124,18 @@ def _info(setup: SerialSetup, wire: SerialWire) -> DeviceInfo:
         latency_blocks=options.fifo_blocks if streams else 0,
         measures_command=wire.measures,
         holds=setup.holds,
+        safe_note=_safe_note(setup, wire.longest_message_s),
         details=details,
     )
+
+
+def _safe_note(setup: SerialSetup, longest_s: float) -> str:
+    if longest_s <= _PROMPT_S:
+        return ""
+    timeout_s = setup.options.watchdog_timeout_s
+    behind = (
+        "no watchdog of the device stands behind it"
+        if timeout_s is None
+        else f"the device's watchdog acts after {timeout_s:g} s"
+    )
+    return f"a message takes up to {longest_s:.2g} s on this line; {behind}"

@@ -17,6 +17,8 @@ class SerialWire(ABC):
         block_max: Most samples of one exchange.
         fifo_depth: Samples that its FIFO holds; 0 where it has none.
         measures: Whether :meth:`exchange` fills ``measured``.
+        longest_message_s: Longest until the safe value is there, after an exchange that is under
+            way; 0 where that is too short to be worth a word.
         last_write: How the safe value gets there.
 
     Args:
@@ -29,6 +31,7 @@ class SerialWire(ABC):
     block_max = 1
     fifo_depth = 0
     measures = False
+    longest_message_s = 0.0
 
     def __init__(self, setup: SerialSetup) -> None:
         self._setup = setup

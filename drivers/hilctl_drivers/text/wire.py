@@ -11,7 +11,7 @@ from hilctl_drivers.text.session import AsciiSession
 from hilctl_drivers.text.timing import exchange_time, feed_time, query_time
 from hilctl_drivers.wire.errors import WatchdogTripped
 from hilctl_drivers.wire.links import naming
-from hilctl_drivers.wire.timing import RateLimit, check_feeds
+from hilctl_drivers.wire.timing import RateLimit, WireTime, check_feeds
 
 
 class AsciiWire(SerialWire):
@@ -42,10 +42,19 @@ class AsciiWire(SerialWire):
             )
         self._feed_every = 0
         self._ticks = 0
+        # Half duplex: what was asked last is answered before the safe value can go out.
+        write = exchange_time(self._profile, setup.options.output, None)
+        self.longest_message_s = self._sample_time().answered_s + write.answered_s
 
     def rates(self, block: int) -> RateLimit:
         """See :meth:`~hilctl_drivers.serial.wire.SerialWire.rates`."""
         del block
+        slowest = min((self._profile, self._reader_profile), key=lambda each: each.max_rate_hz)
+        whose = f"the profile of {slowest.title}"
+        return RateLimit.of(self._sample_time(), slowest.max_rate_hz, whose)
+
+    def _sample_time(self) -> WireTime:
+        """Return what a sample costs on the wire."""
         options, profile, reader = self._setup.options, self._profile, self._reader_profile
         if self._setup.reads_elsewhere:
             wire = exchange_time(profile, options.output, None)
@@ -59,8 +68,7 @@ class AsciiWire(SerialWire):
             wire = wire.then(query_time(profile, self._measure, self._address, what))
         if options.watchdog != "none":
             wire = wire.then(feed_time(profile))
-        slowest = min((profile, reader), key=lambda each: each.max_rate_hz)
-        return RateLimit.of(wire, slowest.max_rate_hz, f"the profile of {slowest.title}")
+        return wire
 
     def open(self, sample_rate_hz: float, block: int) -> None:
         """See :meth:`~hilctl_drivers.serial.wire.SerialWire.open`."""

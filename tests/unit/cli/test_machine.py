@@ -53,7 +53,7 @@ def test_a_device_is_probed_instead_of_listed(devices):
 
 def test_a_device_that_says_what_can_not_be_is_a_fault(monkeypatch):
     """The exit code of a fault, for people and for programs."""
-    wrong = Probed("rig", "a device", 1.0, "", {}, 2.8e20, None, "A", ("too far",))
+    wrong = Probed("rig", "a device", 1.0, "", "", {}, 2.8e20, None, "A", ("too far",))
     monkeypatch.setattr("hilctl.run.probe.probe", lambda path, settings: wrong)
     for words in ([], ["--json"]):
         ended = CliRunner().invoke(devices_app, ["probe", str(DEMO), *words])

@@ -4,8 +4,9 @@ from hilctl.cli.probe_view import print_probed
 from hilctl.run.probe import Probed
 
 PROBED = Probed(
-    "rig", "a [bold] device", 1000.0, "", {"firmware": "[1.2]"}, 2.8e20, None, "A", ("too far",)
-)
+    "rig", "a [bold] device", 1000.0, "", "a message takes up to 0.3 s", {"firmware": "[1.2]"},
+    2.8e20, None, "A", ("too far",),
+)  # fmt: skip
 
 
 def test_what_a_device_says_is_no_markup(capsys):
@@ -17,4 +18,5 @@ def test_what_a_device_says_is_no_markup(capsys):
     assert "at most 1000 samples a second\n" in shown
     assert "reads 2.8e+20 um" in shown
     assert "what it puts out is not known" in shown
+    assert "safe value: a message takes up to 0.3 s" in shown
     assert "wrong: too far" in shown

@@ -17,7 +17,7 @@ def test_the_examples_for_firmware_are_right():
     readme = Path(__file__).parents[4] / "drivers" / "README.md"
     rows = re.findall(r"\| `((?:[0-9a-f]{2} ?)+)` \| `((?:[0-9a-f]{2} ?)+)` \|", readme.read_text())
     framing = binary_framing("cobs", "crc16_ccitt_false")
-    assert len(rows) == 8
+    assert len(rows) == 10
     for payload, frame in rows:
         assert framing.encode(bytes.fromhex(payload)).hex(" ") == frame
 

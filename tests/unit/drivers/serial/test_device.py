@@ -472,3 +472,23 @@ def test_options_that_do_not_go_together_are_refused(profiles, changes, text):
     }
     with pytest.raises(InputError, match=text):
         SerialDac(SerialOptions.model_validate(options))
+
+
+def test_a_line_too_slow_for_the_safe_value_is_said():
+    """With what stands behind it; not a word on a line that is fast enough."""
+    slow = {"baud": 1200, "watchdog": {"timeout_s": 2.0}}
+    options = {
+        "profile": "icp_m7024_dcon", "serial_port": "/dev/x", "output": "AO0", "input": "AI101",
+        "reader": {"profile": "agilent_34970a", "serial_port": "/dev/y"},
+        "amplifier": {"gain_a_per_v": 1.0}, "sensor": {"um_per_v": 12.5}, "watchdog": "none",
+    }  # fmt: skip
+
+    def note(**changes):
+        device = SerialDac(SerialOptions.model_validate({**options, **changes}))
+        return device.info.safe_note
+
+    assert note() == ""
+    assert note(baud=1200) == (
+        "a message takes up to 0.26 s on this line; no watchdog of the device stands behind it"
+    )
+    assert note(**slow).endswith("the device's watchdog acts after 2 s")
