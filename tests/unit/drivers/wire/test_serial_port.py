@@ -172,3 +172,34 @@ def test_binary_lines_refuse_flow_control(name):
     rule = "flow must be none where bytes 0x11 and 0x13 are data, got xonxoff"
     with pytest.raises(InputError, match=rule):
         with_link(load_profile(name), flow="xonxoff")
+
+
+def test_levels_stay_when_the_port_is_closed(line):
+    """A board that a falling DTR resets would be deaf when the next one opens its port."""
+    link = opened(line[1])
+    assert not termios.tcgetattr(link._fd)[2] & termios.HUPCL
+    link.timeout_s = 0.2  # sets the port anew
+    assert not termios.tcgetattr(link._fd)[2] & termios.HUPCL
+    link.close()
+
+
+def test_a_value_is_sent_past_a_line_that_never_falls_silent(line):
+    """At once and whole, where an exchange would first wait for silence; that comes later."""
+    master, name = line
+    link = opened(name)
+    os.write(master, b"chatter" * 20)
+    link.send_now(b"safe\r")
+    assert os.read(master, 100) == b"safe\r"
+    assert link.is_open
+    assert not link.is_in_step
+    link.close()
+
+
+def test_opening_waits_for_a_boot_unless_it_must_not(line):
+    slept = []
+    link = SerialLink(line[1], SerialSettings(boot_s=2.0), QUICK_S, sleep=slept.append)
+    link.open(boot=False)
+    assert slept == []
+    link.open()
+    assert slept == [2.0]
+    link.close()
