@@ -75,11 +75,12 @@ def _open_port(path: str, settings: SerialSettings, timeout_s: float) -> serial.
         port.rts = settings.rts
     port.port = path
     port.open()
-    try:
-        _keep_levels(port.fileno())
-    except termios.error as error:
-        port.close()
-        raise OSError(*error.args) from None
+    if settings.boot_s > 0.0:
+        try:
+            _keep_levels(port.fileno())
+        except termios.error as error:
+            port.close()
+            raise OSError(*error.args) from None
     return port
 
 

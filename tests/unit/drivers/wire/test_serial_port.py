@@ -174,12 +174,24 @@ def test_binary_lines_refuse_flow_control(name):
         with_link(load_profile(name), flow="xonxoff")
 
 
-def test_levels_stay_when_the_port_is_closed(line):
+def test_levels_stay_when_the_port_of_a_board_that_boots_is_closed(line):
     """A board that a falling DTR resets would be deaf when the next one opens its port."""
-    link = opened(line[1])
-    assert not termios.tcgetattr(link._fd)[2] & termios.HUPCL
-    link.timeout_s = 0.2  # sets the port anew
-    assert not termios.tcgetattr(link._fd)[2] & termios.HUPCL
+
+    def falls(link):
+        return bool(termios.tcgetattr(link._fd)[2] & termios.HUPCL)
+
+    plain = opened(line[1])
+    attributes = termios.tcgetattr(plain._fd)
+    attributes[2] |= termios.HUPCL  # as ports have it, but not ptys
+    termios.tcsetattr(plain._fd, termios.TCSANOW, attributes)
+    plain.timeout_s = 0.2  # sets the port anew
+    assert falls(plain)
+    plain.close()
+    link = SerialLink(line[1], SerialSettings(boot_s=2.0), QUICK_S, sleep=lambda seconds: None)
+    link.open()
+    assert not falls(link)
+    link.timeout_s = 0.2
+    assert not falls(link)
     link.close()
 
 
