@@ -73,6 +73,26 @@ class DacDevice(ABC):
             self._release()
             raise self._error("read the output back", str(error)) from None
 
+    def look(self) -> tuple[float, float | None]:
+        """Connect, return displacement and output as they are, and let go; nothing is changed.
+
+        No step of the profile is sent, no watchdog armed, fed on purpose or cleared.
+
+        Returns:
+            Displacement in um, and the output in the command's unit; None where it can't be known.
+
+        Raises:
+            DeviceError: Open; or it can't be reached, is another device, or gives no good answer.
+        """
+        if self._block:
+            raise self._error("look", "open")
+        try:
+            return self._look()
+        except DeviceError as error:
+            raise self._error("look", str(error)) from None
+        finally:
+            self._release()
+
     def exchange(
         self, first_sample: int, command: F64, displacement_um: F64, measured: F64
     ) -> None:
@@ -152,6 +172,10 @@ class DacDevice(ABC):
     def _output(self) -> float | None:
         """Return the output of a device that is open; None where it can't be known."""
         return None
+
+    def _look(self) -> tuple[float, float | None]:
+        """Connect and read, see :meth:`look`; :meth:`_release` follows."""
+        raise DeviceError("it can't be read without being set up")
 
     @abstractmethod
     def _exchange(

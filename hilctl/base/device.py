@@ -6,7 +6,7 @@ people's packages; :mod:`hilctl.loop.pacer` and the tests supply clocks.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Literal, Protocol, TypeAlias
+from typing import Any, ClassVar, Literal, Protocol, TypeAlias, runtime_checkable
 
 from hilctl.base.arrays import F64
 from hilctl.base.strict import Strict
@@ -48,6 +48,8 @@ class DeviceInfo:
         watchdog_command: Where the device's own watchdog puts the output when the host falls
             silent, in ``command_unit``; None where it has none, or is not to use it.
         watchdog_reason: Why that is not the experiment's safe value; empty where it is.
+        safe_note: What stands behind the safe value where a message with it takes longer than 0.2 s
+            to get there, in words; empty where it does not.
         details: Anything worth keeping with a recording (serial numbers, physical parameters).
     """
 
@@ -68,6 +70,7 @@ class DeviceInfo:
     simulated: bool = False
     watchdog_command: float | None = None
     watchdog_reason: str = ""
+    safe_note: str = ""
     details: Mapping[str, str] = field(default_factory=dict)
 
 
@@ -150,6 +153,22 @@ class Device(Protocol):
 
     def close(self) -> None:
         """Let go of the port and leave the output as it is. Closing twice is fine."""
+        ...
+
+
+@runtime_checkable
+class ReadableDevice(Protocol):
+    """A device that can be read without being set up; devices need not be."""
+
+    def look(self) -> tuple[float, float | None]:
+        """Connect, return displacement and output as they are, and let go; nothing is changed.
+
+        Returns:
+            Displacement in um, and the output in the command's unit; None where it can't be known.
+
+        Raises:
+            DeviceError: Open; or it can't be reached, is another device, or gives no good answer.
+        """
         ...
 
 

@@ -75,12 +75,14 @@ def devices(context: typer.Context, as_json: AsJson = False) -> None:
 
 @devices_app.command()
 def probe(experiment: ExperimentFile, settings: Settings = None, as_json: AsJson = False) -> None:
-    """Open an experiment's device and run its self-test; the output does not move."""
-    from hilctl.cli.machine_view import print_probed
-    from hilctl.experiment.inventory import probe as open_and_close
+    """Read an experiment's device and judge what it says; only reads, so nothing moves."""
+    from hilctl.cli.probe_view import print_probed
+    from hilctl.run.probe import probe as read_device
 
-    answered = open_and_close(experiment, settings or [])
+    answered = read_device(experiment, settings or [])
     if as_json:
         print_json(answered.to_mapping())
     else:
         print_probed(answered)
+    if answered.faults:
+        raise typer.Exit(3)

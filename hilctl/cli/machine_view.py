@@ -10,7 +10,7 @@ from rich.table import Table
 from rich.text import Text
 
 from hilctl.cli.console import console
-from hilctl.experiment.inventory import Inventory, Probed
+from hilctl.experiment.inventory import Inventory
 from hilctl.machine.diagnosis import Diagnosis, lateness_counts
 from hilctl.machine.latency import Latency
 from hilctl.machine.realtime import SetUpStep
@@ -110,13 +110,3 @@ def print_inventory(found: Inventory) -> None:
     terminal = console()
     terminal.print(table, profiles)
     terminal.print(ports if found.serial_ports else "no serial port found", soft_wrap=True)
-
-
-def print_probed(answered: Probed) -> None:
-    """Print what a device said of itself."""
-    terminal = console()
-    terminal.print(Text(f"{answered.name} answers", "green") + f": {answered.description}")
-    note = f": {answered.rate_note}" if answered.rate_note else ""
-    terminal.print(f"at most {answered.max_rate_hz:.6g} samples a second{note}")
-    for key, value in answered.details.items():
-        terminal.print(f"  {key}: {value}")

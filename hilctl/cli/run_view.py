@@ -144,6 +144,8 @@ def print_forecast(checked: Checked) -> None:
         "slew": f"{forecast.slew_per_s:.4g} {unit}/s (limit {limits.slew_per_s:g})",
         "recording": f"about {forecast.recording_mb:.3g} MB",
     }
+    if note := checked.loaded.device.info.safe_note:
+        rows["safe value"] = note
     if forecast.heating_rms_a is not None:
         rows["heating"] = f"{forecast.heating_rms_a:.4g} A rms (limit {limits.rms_current_a:g})"
     for name, text in rows.items():

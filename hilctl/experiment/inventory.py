@@ -1,4 +1,4 @@
-"""Which devices there are: by name, by profile, by serial port; and whether one answers."""
+"""Which devices there are: by name, by profile, by serial port."""
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any, cast
 
 from hilctl.base.errors import InputError
-from hilctl.experiment.load import load_experiment
 from hilctl.experiment.registry import known_devices
 
 SHIPPED_PROFILES = "hilctl_drivers.profile:shipped_profiles"
@@ -67,41 +66,3 @@ def _serial_ports() -> tuple[SerialPort, ...]:
         SerialPort(by_id.get(port.device, port.device), port.description)
         for port in sorted(comports())
     )
-
-
-@dataclass(frozen=True, slots=True)
-class Probed:
-    """A device that was opened and closed again.
-
-    Attributes:
-        name: Its registry name.
-        description: What it is.
-        max_rate_hz: Highest sample rate it can keep.
-        rate_note: Why that is so.
-        details: What it says of itself.
-    """
-
-    name: str
-    description: str
-    max_rate_hz: float
-    rate_note: str
-    details: dict[str, str]
-
-    def to_mapping(self) -> dict[str, Any]:
-        """Return the fields as plain values."""
-        return asdict(self)
-
-
-def probe(path: Path, settings: list[str]) -> Probed:
-    """Open an experiment's device, which runs its self-test and moves nothing, and close it.
-
-    Raises:
-        InputError: The experiment can't be used.
-        DeviceError: The device can't be reached, or is not what it should be.
-    """
-    loaded = load_experiment(path, settings)
-    device = loaded.device
-    device.open(loaded.config.sample_rate_hz, loaded.config.block)
-    device.close()
-    info = device.info
-    return Probed(info.name, info.description, info.max_rate_hz, info.rate_note, dict(info.details))

@@ -11,6 +11,7 @@ recorder.py        into the recording; metadata.py what it says of the run
 run_folder.py      runs that are going on, and who holds a device
 requests.py        requests to a run, over control_socket.py; client.py sends them
 systemd.py         readiness and watchdog of a service
+probe.py           whether a device answers, and whether that can be true
 orphans.py         what dead runs left behind
 unpaced.py         a run of a simulated device that needs no real time
 result.py          where a run stands, and how it ended

@@ -1,8 +1,12 @@
 """Whole runs over text lines and board frames with things going wrong: one ramp, every time."""
 
+import os
 import re
 import signal
+import time
+from pathlib import Path
 
+import numpy as np
 import pytest
 
 from hilctl_drivers.profile import shipped_profiles
@@ -100,8 +104,10 @@ def test_fault_ends_the_run_safely(meet, boards, kind, fault):
     if kind == "fifo":
         started.assert_recorded(at_least=5000)
     else:
+        # The last ones are the safe value's: it is sent again where an answer was lost.
         writes = device.log.writes(output)
-        started.assert_put_out(writes, tail=0 if kind == "cobs" else 1, at_least=20)
+        moving = np.flatnonzero([abs(each["current_a"]) > 2e-3 for each in writes])
+        started.assert_put_out(writes[: moving[-1] + 1], tail=0, at_least=20)
 
 
 @pytest.mark.parametrize("kind", SETUPS)
@@ -119,6 +125,24 @@ def test_pulled_adapter_takes_the_port_along(meet, kind):
         return
     trip = device.log.await_event(output, "watchdog")
     assert trip["current_a"] == pytest.approx(0.0, abs=2e-3)
+
+
+@pytest.mark.parametrize(("kind", "events"), [("dcon", 80), ("cobs", 80), ("fifo", 300)])
+def test_dead_loop_is_followed_by_a_message(meet, boards, kind, events):
+    """The supervisor's, not the watchdog's doing: no boot of the board is waited for."""
+    for name in ("cobs", "fifo"):
+        path = Path(boards[name])
+        path.write_text(path.read_text().replace("boot_wait_s: 0.0", "boot_wait_s: 2.0"))
+    device, started, output = meet(kind)
+    device.log.await_events(output, events)
+    killed_ns = time.monotonic_ns()
+    os.kill(started.loop_pid(), signal.SIGKILL)
+    printed = started.end()
+    assert printed["output_safe"] is True
+    since = [each for each in device.log.events(output) if each["monotonic_ns"] > killed_ns]
+    safe = next(each for each in since if abs(each["current_a"]) < 2e-3)
+    assert safe["event"] == ("write" if kind == "dcon" else "safe")
+    assert (safe["monotonic_ns"] - killed_ns) * 1e-9 < WATCHDOG_S
 
 
 @pytest.mark.parametrize(("kind", "events"), [("dcon", 80), ("fifo", 300)])

@@ -24,10 +24,10 @@ import numpy as np
 import pytest
 
 from hilctl.base.errors import DeviceError
-from hilctl.experiment.inventory import probe
 from hilctl.experiment.load import LoadedExperiment, load_experiment
 from hilctl.loop.limiter import CommandLimits, Limiter
 from hilctl.loop.pacer import SystemClock
+from hilctl.run.probe import probe
 
 SHARE = 0.1
 HOLD_S = 0.3
@@ -166,10 +166,11 @@ def distance_um(first: np.ndarray, second: np.ndarray) -> float:
 
 
 def test_answers_a_probe(request):
-    """What ``hilctl devices --probe`` does works, twice in a row."""
+    """What ``hilctl devices probe`` does works, twice in a row, and finds nothing wrong."""
     path = request.config.getoption("--device")
     first, second = probe(path, []), probe(path, [])
-    assert first == second
+    assert first.details == second.details
+    assert first.faults == second.faults == ()
     assert first.max_rate_hz >= load_experiment(path).config.sample_rate_hz
 
 

@@ -1,4 +1,4 @@
-"""Messages of a microcontroller board with a DAC and an ADC, version 1.
+"""Messages of a microcontroller board with a DAC and an ADC, version 2.
 
 Each message is the payload of one binary frame, least significant byte first throughout::
 
@@ -17,6 +17,8 @@ Each message is the payload of one binary frame, least significant byte first th
                   min f32, max f32, name in ASCII
     CLOCK     15  rate_hz f32 (0: stop), prefill u16    empties the queue, counts samples from 0
            -> 95  status u8, rate_hz f32 as really set
+    STATE     16  (nothing)                changes nothing; boards of version 1 don't know it
+           -> 96  status u8, flags u8, value as it is put out, reading
 
 A value is a float32 in volts unless the profile's channel has another type. The board samples its
 input when it puts out a command, so ``first`` of a STREAM reply numbers the command that each
@@ -36,7 +38,8 @@ from enum import IntFlag
 from struct import Struct
 from typing import Final
 
-VERSION: Final = 1
+VERSIONS: Final = (1, 2)
+"""Versions that are spoken here; in 2 STATE came in."""
 REPLY_BIT: Final = 0x80
 """Set in a reply's type."""
 
@@ -46,6 +49,7 @@ WATCHDOG: Final = 0x12
 SAFE: Final = 0x13
 INFO: Final = 0x14
 CLOCK: Final = 0x15
+STATE: Final = 0x16
 
 HEAD = Struct("<BB")
 """type, seq."""
@@ -71,6 +75,8 @@ CLOCK_REQUEST = Struct("<BBfH")
 """type, seq, rate_hz, prefill."""
 CLOCK_REPLY = Struct("<BBBf")
 """type, seq, status, rate_hz."""
+STATE_REPLY = Struct("<BBBB")
+"""type, seq, status, :class:`StateFlag`; the output's value and a reading follow."""
 
 
 class Status(IntFlag):
@@ -86,6 +92,13 @@ class Status(IntFlag):
     """Refused: more samples than the FIFO has room for."""
     WRONG_FIRST = 0x10
     """Refused: ``first`` is not the next sample; a block was lost or came twice."""
+
+
+class StateFlag(IntFlag):
+    """The flags of a reply to STATE."""
+
+    TRIPPED = 0x01
+    """The watchdog has tripped, and was not cleared since."""
 
 
 def exchange_sizes(samples: int, value_bytes: int, *, stream: bool) -> tuple[int, int]:

@@ -77,7 +77,9 @@ class FrameProfile(BaseProfile):
     WIRE: ClassVar[str] = "hilctl_drivers.board.wire:board_wire"
 
     link: FramesLink
-    protocol: Literal["hilctl-1"] = Field(description="messages, as in drivers/README.md")
+    protocol: Literal["hilctl-1", "hilctl-2"] = Field(
+        description="messages, as in drivers/README.md; 2 has one that asks what is put out"
+    )
     exchange: Literal["single", "stream"] = Field(
         description="single: one sample a message; stream: blocks through a FIFO"
     )

@@ -125,6 +125,21 @@ class Readings:
     underruns: int
 
 
+@dataclass(frozen=True, slots=True)
+class BoardState:
+    """What a board puts out and reads.
+
+    Attributes:
+        tripped: Whether its watchdog has tripped, and was not cleared since.
+        output: What it puts out, in the output's unit.
+        reading: What it reads, in the input's unit.
+    """
+
+    tripped: bool
+    output: float
+    reading: float
+
+
 class BoardSession:
     """A link to one board, asked one thing at a time.
 
@@ -171,8 +186,24 @@ class BoardSession:
         """Ask what the board is."""
         fields, name = self.ask(board.INFO, b"", board.INFO_REPLY)
         _, version, depth, block_max, rate, low, high = fields
-        text = name.decode("ascii", "replace")
+        # Escaped: it goes to terminals, and a board may send anything.
+        text = ascii(name.decode("latin-1"))[1:-1]
         return BoardFacts(int(version), int(depth), int(block_max), rate, low, high, text)
+
+    def state(self) -> BoardState | None:
+        """Ask what the board puts out and reads; None where it does not know the question."""
+        try:
+            (_, flags), rest = self.ask(board.STATE, b"", board.STATE_REPLY)
+        except Refused as refused:
+            if refused.code != board.Status.BAD_MESSAGE:
+                raise
+            return None
+        size = self.outputs.size
+        if len(rest) != size + self.inputs.size:
+            raise Mismatch(f"{len(rest)} bytes behind the flags of a state")
+        output, reading = self.outputs.decode(rest[:size]), self.inputs.decode(rest[size:])
+        tripped = bool(int(flags) & board.StateFlag.TRIPPED)
+        return BoardState(tripped, float(output[0]), float(reading[0]))
 
     def exchange(self, value: F64) -> Readings:
         """Put out float64[1] and return one reading."""
@@ -210,6 +241,14 @@ class BoardSession:
     def put_out(self, value: float) -> None:
         """Put ``value`` out at once; what is queued is dropped."""
         self.ask(board.SAFE, self.outputs.encode(np.array([value])), board.STATUS_REPLY)
+
+    def safe_frame(self, value: float) -> bytes:
+        """Return the message of :meth:`put_out` as it stands on the wire, to be sent blindly."""
+        seq = self._seq = (self._seq + 1) & 0xFF
+        body = self.outputs.encode(np.array([value]))
+        frame = self._framing.encode(board.HEAD.pack(board.SAFE, seq) + body)
+        # A frame that was cut off must not become one with this.
+        return b"\0" + frame if isinstance(self._framing, CobsFraming) else frame
 
     def set_clock(self, rate_hz: float, prefill: int) -> None:
         """Empty the queue and set the sample clock, which starts with ``prefill`` samples in it.

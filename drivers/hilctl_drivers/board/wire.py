@@ -15,9 +15,9 @@ from hilctl_drivers.board.profile import FrameProfile, FrameStreaming
 from hilctl_drivers.board.session import BoardFacts, BoardSession, Readings
 from hilctl_drivers.board.timing import exchange_time, settle_s
 from hilctl_drivers.serial.setup import SerialSetup
-from hilctl_drivers.serial.wire import SerialWire, refuse
+from hilctl_drivers.serial.wire import SerialWire, check_stands, refuse
 from hilctl_drivers.wire.errors import WatchdogTripped
-from hilctl_drivers.wire.links import Link, LostError
+from hilctl_drivers.wire.serial_port import SerialLink
 from hilctl_drivers.wire.timing import RateLimit, check_feeds
 
 _FIRST_MAX = 2**32
@@ -51,7 +51,7 @@ class BoardWire(SerialWire):
         super().__init__(setup)
         refuse(setup, "reader", "measure", "unit_id")
         self._profile = profile
-        self._session = BoardSession(profile, setup.link())
+        self._session = BoardSession(profile, self._link)
         self._safe = setup.chain.output(setup.options.safe_command)
 
     def rates(self, block: int) -> RateLimit:
@@ -64,18 +64,26 @@ class BoardWire(SerialWire):
         lowest_hz = 0.0 if streaming == "none" else streaming.rate_min_hz
         return RateLimit.of(exchange_time(self._profile, block), most_hz, whose, lowest_hz)
 
-    def put_out(self, value: float) -> None:
-        """See :meth:`~hilctl_drivers.serial.wire.SerialWire.put_out`.
+    def output(self) -> float | None:
+        """See :meth:`~hilctl_drivers.serial.wire.SerialWire.output`."""
+        state = self._session.state()
+        return None if state is None else state.output
 
-        A board whose watchdog has tripped is armed, and the value sent again.
-        """
-        try:
-            self._put_out(value)
-        except LostError:
-            self._session.link.open()  # a replugged adapter is a new port
-            self._put_out(value)
-        except DeviceError:
-            self._put_out(value)  # a late or damaged answer must not cost the safe value
+    def look(self) -> tuple[float, float | None]:
+        """See :meth:`~hilctl_drivers.serial.wire.SerialWire.look`."""
+        facts = self._connect(self._setup.link())
+        state = self._session.state()
+        if state is None:
+            who = facts.name or "the board"
+            raise DeviceError(f"{who} speaks version 1 of the protocol: no message only reads")
+        return state.reading, state.output
+
+    def release(self) -> None:
+        """See :meth:`~hilctl_drivers.serial.wire.SerialWire.release`."""
+        self._link.close()
+
+    def _send(self, value: float) -> None:
+        self._link.send_now(self._session.safe_frame(value))
 
     def _put_out(self, value: float) -> None:
         try:
@@ -83,20 +91,20 @@ class BoardWire(SerialWire):
         except WatchdogTripped:
             self._arm()
             self._session.put_out(value)
+        state = self._session.state()
+        if state is not None:
+            check_stands(self._setup.output, value, state.output)
 
-    def release(self) -> None:
-        """See :meth:`~hilctl_drivers.serial.wire.SerialWire.release`."""
-        self._session.link.close()
-
-    def _connect(self, link: Link) -> BoardFacts:
+    def _connect(self, link: SerialLink) -> BoardFacts:
         """Connect and check that it is a board that this profile describes."""
-        self._session = BoardSession(self._profile, link)
+        self._link, self._session = link, BoardSession(self._profile, link)
         link.open()
         facts = self._session.facts()
-        if facts.version != board.VERSION:
+        if facts.version not in board.VERSIONS:
+            known = " or ".join(str(each) for each in board.VERSIONS)
             raise DeviceError(
                 f"{facts.name or 'the board'} speaks version {facts.version} of the protocol, "
-                f"not {board.VERSION}"
+                f"not {known}"
             )
         low, high = self._setup.output.limits
         slack = 1e-6 * (high - low)
@@ -107,8 +115,16 @@ class BoardWire(SerialWire):
             )
         return facts
 
+    def _guard(self) -> None:
+        """Set the watchdog, and end a trip of an earlier run at the safe value."""
+        state = self._session.state()
+        self._arm()
+        if state is not None and state.tripped:
+            # At once: a board that comes back to a command from before must not keep it.
+            self._session.put_out(self._safe)
+
     def _arm(self) -> None:
-        """Set the watchdog as the experiment wants it, and clear a trip of an earlier run."""
+        """Set the watchdog as the experiment wants it, which clears a trip."""
         if self._profile.watchdog != "none":
             timeout_s = self._setup.options.watchdog_timeout_s or 0.0
             self._session.set_watchdog(timeout_s, self._safe)
@@ -126,7 +142,7 @@ class BoardSingle(BoardWire):
         del block
         check_feeds(self._setup.options.watchdog_timeout_s, sample_rate_hz)
         self._connect(self._setup.link())
-        self._arm()
+        self._guard()
 
     def exchange(self, first_sample: int, output: F64, reading: F64, measured: F64) -> None:
         """See :meth:`~hilctl_drivers.serial.wire.SerialWire.exchange`."""
@@ -168,7 +184,7 @@ class BoardStream(BoardWire):
         facts = self._connect(self._setup.link(extra_s=block / sample_rate_hz))
         self._check_board(facts, sample_rate_hz, block)
         # Before the clock: from the first sample on, the board must know where to go without us.
-        self._arm()
+        self._guard()
         prefill = self._latency_blocks * block
         self._session.set_clock(sample_rate_hz, prefill)
         self._block = block

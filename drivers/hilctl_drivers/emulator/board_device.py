@@ -1,4 +1,4 @@
-"""An emulated microcontroller board: protocol 1 in front of the simulated rig."""
+"""An emulated microcontroller board: protocol 2 in front of the simulated rig."""
 
 import math
 from collections.abc import Callable
@@ -48,6 +48,7 @@ class EmulatedBoard:
         self.fifo = SampleFifo(noise=noise, repeats=False, on_played=self._played)
         self._prefill = 0
         self._readings = np.empty(0)
+        self._played_um = 0.0
         self._returned = 0
         self._timeout_ns = 0
         self._safe = 0.0
@@ -62,6 +63,14 @@ class EmulatedBoard:
             board.INFO: self._info,
             board.CLOCK: self._clock,
         }
+        self._version = int(profile.protocol.rpartition("-")[2])
+        if self._version > 1:
+            self._kinds[board.STATE] = self._state
+        low, high = self._output.limits
+        # As a board powers up, whatever that is behind its amplifier.
+        current_a = wiring.gain_a * min(max(0.0, low), high) + wiring.offset_a
+        rig.put_out(current_a, 0)
+        self.fifo.current_a = current_a
 
     def tick(self, now_ns: int) -> None:
         """Let time pass; the watchdog may trip on the way."""
@@ -185,6 +194,8 @@ class EmulatedBoard:
 
     def _stop(self) -> None:
         """Stop streaming and forget all of it; the output holds its value."""
+        if self.fifo.started:
+            self._rig.put_out(self.fifo.current_a, self._now_ns)
         self.fifo.stop()
         self.fifo.clear()
         self._readings, self._returned = np.empty(0), 0
@@ -197,7 +208,7 @@ class EmulatedBoard:
             head[0] | board.REPLY_BIT,
             head[1],
             0,
-            board.VERSION,
+            self._version,
             streaming.fifo_depth if streaming else 0,
             streaming.block_max if streaming else 1,
             self._profile.max_rate_hz,
@@ -205,6 +216,18 @@ class EmulatedBoard:
             high,
         )
         return EmulatedReply(reply + b"hilctl emulated board")
+
+    def _state(self, head: bytes, body: bytes) -> EmulatedReply:
+        if body:
+            raise _Refuse(Status.BAD_MESSAGE)
+        flags = board.StateFlag.TRIPPED if self.tripped else 0
+        output = (self.fifo.current_a - self._wiring.offset_a) / self._wiring.gain_a
+        reply = board.STATE_REPLY.pack(head[0] | board.REPLY_BIT, head[1], 0, flags)
+        read_um = self._played_um if self.fifo.started else self._rig.displacement_um
+        reading = self._terminal(np.array([read_um]))
+        return EmulatedReply(
+            reply + self._outputs.encode(np.array([output])) + self._inputs.encode(reading)
+        )
 
     def _clock(self, head: bytes, body: bytes) -> EmulatedReply:
         if len(body) != board.CLOCK_REQUEST.size - board.HEAD.size or self._streaming is None:
@@ -230,6 +253,7 @@ class EmulatedBoard:
 
     def _played(self, first: int, current_a: F64, displacement_um: F64, now_ns: int) -> None:
         self._readings = np.concatenate([self._readings, displacement_um])
+        self._played_um = float(displacement_um[-1])
         value = (float(current_a[-1]) - self._wiring.offset_a) / self._wiring.gain_a
         self._log.event(
             now_ns, "played", output=self._output_name, first=first, samples=current_a.size,

@@ -100,12 +100,18 @@ class EmulatedText:
         self._wiring = wiring
         self._output, self._sensor = output, sensor
         self._address = address
-        rest = -wiring.offset_a / wiring.gain_a
+        # As devices power up, whatever that is behind the amplifier.
         self._values = {
+            name: min(max(0.0, each.min), each.max) for name, each in profile.outputs.items()
+        }
+        self._commands = dict(self._values)
+        rest = -wiring.offset_a / wiring.gain_a
+        self._safe = {
             name: min(max(rest if name == output else 0.0, each.min), each.max)
             for name, each in profile.outputs.items()
         }
-        self._safe = dict(self._values)
+        if output is not None:
+            rig.put_out(wiring.gain_a * self._values[output] + wiring.offset_a, 0)
         self._errors: list[str] = []
         self._timeout_ns = 0
         self._received_ns = 0
@@ -177,7 +183,8 @@ class EmulatedText:
                 return self._set(name, fields["value"], reply)
             readback = output.readback
             if readback != "none" and self._matches(readback.ask, text):
-                return in_style(readback.example, readback.pattern, self._values[name])
+                said = self._values if readback.of == "output" else self._commands
+                return in_style(readback.example, readback.pattern, said[name])
         combined = self._profile.exchange
         if combined == "none":
             return None
@@ -200,6 +207,7 @@ class EmulatedText:
                 return self._profile.errors[0].example
             self._errors.append(_OUT_OF_RANGE)
             return reply
+        self._commands[name] = value
         self._put_out(name, value, "write", self._now_ns)
         return reply
 

@@ -22,6 +22,7 @@ from hilctl_drivers.labjack.session import StreamSession
 from hilctl_drivers.labjack.setup import ModbusStreamOptions, StreamSetup
 from hilctl_drivers.labjack.stream import InputCalibration
 from hilctl_drivers.modbus.last_write import Connect
+from hilctl_drivers.modbus.look import look
 from hilctl_drivers.modbus.session import ModbusSession
 from hilctl_drivers.modbus.setup import ModbusPeer
 from hilctl_drivers.modbus.watchdog import ModbusGuard
@@ -171,6 +172,9 @@ class ModbusStream(DacDevice):
         value = self._setup.base.chain.output(command)
         self._last_write.put_out(self._peer, value, under_way=self._under_way)
         self._under_way = False
+
+    def _look(self) -> tuple[float, float | None]:
+        return look(self._setup.base)
 
     def _close(self) -> None:
         session, stream = self._session, self._stream

@@ -7,6 +7,7 @@ timing.py        how long an exchange takes
 setup.py         an experiment's options, held against the profile
 watchdog.py      the module's host watchdog
 last_write.py    the write that makes the output safe
+look.py          input and output of a device that is only read
 device.py        the device, and the one that reads the sensor where it is another
 """
 

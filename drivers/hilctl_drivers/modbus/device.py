@@ -16,6 +16,7 @@ from hilctl.base.device import DeviceOptions
 from hilctl.base.errors import DeviceError
 from hilctl_drivers.device import DacDevice
 from hilctl_drivers.modbus.last_write import Connect, ModbusLastWrite
+from hilctl_drivers.modbus.look import look
 from hilctl_drivers.modbus.pdu import feedback_pdu, read_pdu, write_read_pdu
 from hilctl_drivers.modbus.session import ModbusSession
 from hilctl_drivers.modbus.setup import ModbusOptions, ModbusPeer, ModbusSetup
@@ -134,6 +135,9 @@ class ModbusDac(DacDevice):
         value = self._setup.chain.output(command)
         self._last_write.put_out(self._peer, value, under_way=self._under_way)
         self._under_way = False
+
+    def _look(self) -> tuple[float, float | None]:
+        return look(self._setup)
 
     def _close(self) -> None:
         if self._pair is not None:

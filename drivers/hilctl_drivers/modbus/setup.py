@@ -12,9 +12,10 @@ from hilctl_drivers.modbus.profile import ModbusInput, ModbusOutput, ModbusProfi
 from hilctl_drivers.modbus.session import ModbusSession
 from hilctl_drivers.modbus.timing import exchange_time, feed_time, read_time
 from hilctl_drivers.profile import NamedProfile, check_baud, with_link
+from hilctl_drivers.wire.held import held_address, held_port
 from hilctl_drivers.wire.links import Link
-from hilctl_drivers.wire.serial_port import SerialLink, held_port
-from hilctl_drivers.wire.tcp import TcpLink, held_address
+from hilctl_drivers.wire.serial_port import SerialLink
+from hilctl_drivers.wire.tcp import TcpLink
 from hilctl_drivers.wire.timing import RateLimit, WireTime
 from hilctl_drivers.wiring import (
     DacOptions,
@@ -104,8 +105,8 @@ class ModbusPeer:
         return f"{self.host}:{self.port}" if self.host else str(self.port)
 
     @property
-    def holds(self) -> str:
-        """Its place as :attr:`hilctl.base.device.DeviceInfo.holds` has it."""
+    def holds(self) -> tuple[str, ...]:
+        """Its place's names as :attr:`hilctl.base.device.DeviceInfo.holds` has it."""
         if self.host:
             return held_address(self.host, int(self.port))
         return held_port(str(self.port))
@@ -182,7 +183,7 @@ class ModbusSetup:
     @property
     def shares_link(self) -> bool:
         """Whether both devices are on one line or connection."""
-        return self.reader.holds == self.writer.holds
+        return not set(self.reader.holds).isdisjoint(self.writer.holds)
 
     @property
     def may_combine(self) -> bool:
@@ -243,7 +244,7 @@ class ModbusSetup:
             sensor_max_um=high_um,
             max_rate_hz=rates.highest_hz,
             rate_note=rates.note,
-            holds=tuple(dict.fromkeys((writer.holds, reader.holds))),
+            holds=tuple(dict.fromkeys(writer.holds + reader.holds)),
             watchdog_command=options.watchdog_command,
             watchdog_reason=options.watchdog_reason,
             details=details,
@@ -280,7 +281,7 @@ def _reader_of(options: ModbusOptions, writer: ModbusPeer) -> ModbusPeer:
     reader = ModbusPeer.of(given, profile, options.timeout_s)
     if alone:
         reader = replace(reader, profile=with_link(profile, baud=given.baud))
-        if reader.holds != writer.holds:
+        if set(reader.holds).isdisjoint(writer.holds):
             return reader
     if reader.unit == writer.unit:
         raise InputError(

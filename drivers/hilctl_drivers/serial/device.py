@@ -18,6 +18,9 @@ from hilctl_drivers.serial.setup import SerialOptions, SerialSetup
 from hilctl_drivers.serial.wire import SerialWire
 from hilctl_drivers.wire.timing import RateLimit
 
+_PROMPT_S = 0.2
+"""A safe value that is there within it needs no word."""
+
 
 class SerialDac(DacDevice):
     """A :class:`~hilctl.base.device.Device` on a serial line."""
@@ -60,6 +63,15 @@ class SerialDac(DacDevice):
         self._reading = np.zeros(block)
         self._measured = np.zeros(block)
         self._answered = -self._info.latency_blocks
+
+    def _output(self) -> float | None:
+        value = self._wire.output()
+        return None if value is None else self._chain.command(value)
+
+    def _look(self) -> tuple[float, float | None]:
+        reading, value = self._wire.look()
+        output = None if value is None else self._chain.command(value)
+        return self._chain.displacement_um(reading), output
 
     def _exchange(
         self, first_sample: int, command: F64, displacement_um: F64, measured: F64
@@ -114,5 +126,18 @@ def _info(setup: SerialSetup, wire: SerialWire) -> DeviceInfo:
         holds=setup.holds,
         watchdog_command=options.watchdog_command,
         watchdog_reason=options.watchdog_reason,
+        safe_note=_safe_note(setup, wire.longest_message_s),
         details=details,
     )
+
+
+def _safe_note(setup: SerialSetup, longest_s: float) -> str:
+    if longest_s <= _PROMPT_S:
+        return ""
+    timeout_s = setup.options.watchdog_timeout_s
+    behind = (
+        "no watchdog of the device stands behind it"
+        if timeout_s is None
+        else f"the device's watchdog acts after {timeout_s:g} s"
+    )
+    return f"a message takes up to {longest_s:.2g} s on this line; {behind}"

@@ -7,8 +7,9 @@ from pydantic import Field
 from hilctl.base.errors import InputError
 from hilctl_drivers.profile import NamedProfile, check_baud, with_link
 from hilctl_drivers.profile_parts import BaseProfile, Range
+from hilctl_drivers.wire.held import held_port
 from hilctl_drivers.wire.line_settings import SerialLineSettings
-from hilctl_drivers.wire.serial_port import SerialLink, held_port
+from hilctl_drivers.wire.serial_port import SerialLink
 from hilctl_drivers.wiring import DacOptions, FifoBlocks, SignalChain, channel, check_watchdog
 
 _LINE = ("baud", "parity", "stopbits")
@@ -82,7 +83,8 @@ class SerialSetup:
         """Its ports as :attr:`hilctl.base.device.DeviceInfo.holds` has them."""
         reader = self.options.reader
         ports = (self.options.serial_port, reader.serial_port if reader else None)
-        return tuple(dict.fromkeys(held_port(port) for port in ports if port is not None))
+        held = [name for port in ports if port is not None for name in held_port(port)]
+        return tuple(dict.fromkeys(held))
 
     def details(self) -> dict[str, str]:
         """Return what is worth keeping with a recording, as text."""

@@ -3,7 +3,9 @@
 from abc import ABC, abstractmethod
 
 from hilctl.base.arrays import F64
-from hilctl.base.errors import InputError
+from hilctl.base.errors import DeviceError, InputError
+from hilctl_drivers.profile_parts import Range
+from hilctl_drivers.serial.last_write import SerialLastWrite
 from hilctl_drivers.serial.setup import SerialSetup
 from hilctl_drivers.wire.timing import RateLimit
 
@@ -15,6 +17,9 @@ class SerialWire(ABC):
         block_max: Most samples of one exchange.
         fifo_depth: Samples that its FIFO holds; 0 where it has none.
         measures: Whether :meth:`exchange` fills ``measured``.
+        longest_message_s: Longest until the safe value is there, after an exchange that is under
+            way; 0 where that is too short to be worth a word.
+        last_write: How the safe value gets there.
 
     Args:
         setup: What the experiment says of it.
@@ -26,9 +31,12 @@ class SerialWire(ABC):
     block_max = 1
     fifo_depth = 0
     measures = False
+    longest_message_s = 0.0
 
     def __init__(self, setup: SerialSetup) -> None:
         self._setup = setup
+        self._link = setup.link()
+        self.last_write = SerialLastWrite()
 
     @abstractmethod
     def rates(self, block: int) -> RateLimit:
@@ -52,13 +60,42 @@ class SerialWire(ABC):
             DeviceError: No good answer in time.
         """
 
-    @abstractmethod
     def put_out(self, value: float) -> None:
-        """Put ``value`` out at once, by the open link or by a new one; tried twice.
+        """Put ``value`` out at once, by the open link or by a new one, until it is confirmed.
 
         Raises:
-            DeviceError: The device can't be reached or does not confirm.
+            DeviceError: It is not known whether ``value`` stands.
         """
+        self.last_write.carry_out(
+            self._link, lambda: self._send(value), lambda: self._put_out(value)
+        )
+
+    @abstractmethod
+    def output(self) -> float | None:
+        """Return what the open device puts out, in the output's unit; None where it can't tell.
+
+        Raises:
+            DeviceError: No good answer in time.
+        """
+
+    @abstractmethod
+    def look(self) -> tuple[float, float | None]:
+        """Connect and return the input's value and the output's, None where it can't be known.
+
+        Nothing is sent that changes anything: no steps of the profile, no watchdog, no clearing of
+        a trip. :meth:`release` follows.
+
+        Raises:
+            DeviceError: It can't be reached, is another device, or gives no good answer.
+        """
+
+    @abstractmethod
+    def _send(self, value: float) -> None:
+        """Send ``value`` to the output and await no answer."""
+
+    @abstractmethod
+    def _put_out(self, value: float) -> None:
+        """Put ``value`` out, and raise unless the device says that it stands."""
 
     @abstractmethod
     def close(self) -> None:
@@ -71,6 +108,22 @@ class SerialWire(ABC):
     @abstractmethod
     def release(self) -> None:
         """Let go of the port and say nothing to the device."""
+
+
+def check_stands(output: Range, wanted: float, found: float) -> None:
+    """Refuse what was read back where it is not what was written, to two steps of the output.
+
+    Args:
+        output: The output.
+        wanted: What was written, in its unit.
+        found: What was read back.
+
+    Raises:
+        DeviceError: It is another value.
+    """
+    step = 2.0 * (output.resolution or 1e-3 * (output.max - output.min))
+    if not abs(found - wanted) <= step:
+        raise DeviceError(f"{wanted:g} {output.unit} was written, {found:g} stands")
 
 
 def refuse(setup: SerialSetup, *names: str) -> None:

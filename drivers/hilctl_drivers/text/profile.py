@@ -101,12 +101,24 @@ class Query(NumberReply):
     ask: LineTemplate
 
 
+class Readback(Query):
+    """What an output is asked for."""
+
+    of: Literal["command", "output"] = Field(
+        default="command",
+        description="what it says: the last command, whatever the watchdog has put out since; or"
+        " what the output is at",
+    )
+
+
 class AsciiOutput(Range):
     """An output set by a line of text."""
 
     write: LineTemplate = Field(description="sets it, with {value} in unit")
     reply: Reply | Literal["none"] = Field(description="what a good answer looks like, or none")
-    readback: Query | Literal["none"] = Field(default="none", description="asks for what was set")
+    readback: Readback | Literal["none"] = Field(
+        default="none", description="asks for what was set, to confirm the safe value"
+    )
 
     @model_validator(mode="after")
     def _has_value(self) -> Self:
@@ -199,6 +211,8 @@ class AsciiWatchdog(Watchdog):
     def _can_be_fed(self) -> Self:
         if (self.kick == "strict") != bool(self.feed):
             raise ValueError("feed steps and kick: strict go together")
+        if self.clear and self.tripped == "none":
+            raise ValueError("clear needs tripped: a trip must be known before it is cleared")
         return self
 
 

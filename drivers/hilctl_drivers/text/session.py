@@ -59,6 +59,10 @@ class AsciiSession:
         """Return a template with its fields filled in."""
         return template.format(address=self._address, **values)
 
+    def line(self, text: str) -> bytes:
+        """Return a line as it stands on the wire."""
+        return self._lines.encode(text)
+
     def send(self, text: str) -> None:
         """Send a line that is not answered."""
         if self._expected_lines == 2:

@@ -1,17 +1,17 @@
 """A device that speaks lines of text, sample by sample; its sensor may stand behind another one."""
 
 from hilctl.base.arrays import F64
-from hilctl.base.errors import DeviceError, InputError
+from hilctl.base.errors import InputError
 from hilctl_drivers.profile_parts import Range
 from hilctl_drivers.serial.setup import SerialSetup
-from hilctl_drivers.serial.wire import SerialWire
+from hilctl_drivers.serial.wire import SerialWire, check_stands
 from hilctl_drivers.text.lines import parse_number
 from hilctl_drivers.text.profile import AsciiInput, AsciiOutput, AsciiProfile
 from hilctl_drivers.text.session import AsciiSession
 from hilctl_drivers.text.timing import exchange_time, feed_time, query_time
 from hilctl_drivers.wire.errors import WatchdogTripped
-from hilctl_drivers.wire.links import LostError, naming
-from hilctl_drivers.wire.timing import RateLimit, check_feeds
+from hilctl_drivers.wire.links import naming
+from hilctl_drivers.wire.timing import RateLimit, WireTime, check_feeds
 
 
 class AsciiWire(SerialWire):
@@ -30,7 +30,6 @@ class AsciiWire(SerialWire):
         self._address = _address(setup.options.unit_id, self._profile)
         reader = setup.options.reader
         self._reader_address = _address(reader.unit_id if reader else None, self._reader_profile)
-        self._link = setup.link()
         self._writer = AsciiSession(self._profile, self._link, self._address)
         self._reader_link = setup.reader_link(self._link)
         self._reader, self._reader_name = self._writer, ""
@@ -43,10 +42,19 @@ class AsciiWire(SerialWire):
             )
         self._feed_every = 0
         self._ticks = 0
+        # Half duplex: what was asked last is answered before the safe value can go out.
+        write = exchange_time(self._profile, setup.options.output, None)
+        self.longest_message_s = self._sample_time().answered_s + write.answered_s
 
     def rates(self, block: int) -> RateLimit:
         """See :meth:`~hilctl_drivers.serial.wire.SerialWire.rates`."""
         del block
+        slowest = min((self._profile, self._reader_profile), key=lambda each: each.max_rate_hz)
+        whose = f"the profile of {slowest.title}"
+        return RateLimit.of(self._sample_time(), slowest.max_rate_hz, whose)
+
+    def _sample_time(self) -> WireTime:
+        """Return what a sample costs on the wire."""
         options, profile, reader = self._setup.options, self._profile, self._reader_profile
         if self._setup.reads_elsewhere:
             wire = exchange_time(profile, options.output, None)
@@ -60,8 +68,7 @@ class AsciiWire(SerialWire):
             wire = wire.then(query_time(profile, self._measure, self._address, what))
         if options.watchdog != "none":
             wire = wire.then(feed_time(profile))
-        slowest = min((profile, reader), key=lambda each: each.max_rate_hz)
-        return RateLimit.of(wire, slowest.max_rate_hz, f"the profile of {slowest.title}")
+        return wire
 
     def open(self, sample_rate_hz: float, block: int) -> None:
         """See :meth:`~hilctl_drivers.serial.wire.SerialWire.open`."""
@@ -98,21 +105,29 @@ class AsciiWire(SerialWire):
             # First the reading, which must not show yet what the command does.
             found = self._read()
             self._write(value)
-        reading[0] = found * self._input.scale + self._input.offset
+        reading[0] = _value(self._input, found)
         if self._measure is not None:
-            found = self._writer.number(self._measure)
-            measured[0] = found * self._measure.scale + self._measure.offset
+            measured[0] = _value(self._measure, self._writer.number(self._measure))
         self._feed()
 
-    def put_out(self, value: float) -> None:
-        """See :meth:`~hilctl_drivers.serial.wire.SerialWire.put_out`."""
-        try:
-            self._put_out(value)
-        except LostError:
-            self._link.open()  # a replugged adapter is a new port
-            self._put_out(value)
-        except DeviceError:
-            self._put_out(value)  # a late or damaged answer must not cost the safe value
+    def output(self) -> float | None:
+        """See :meth:`~hilctl_drivers.serial.wire.SerialWire.output`."""
+        readback, watchdog = self._output.readback, self._profile.watchdog
+        if readback == "none":
+            return None
+        # A trip that nobody can ask about has perhaps put out something else than the last command.
+        if readback.of == "command" and watchdog != "none" and watchdog.tripped == "none":
+            return None
+        return self._writer.number(readback)
+
+    def look(self) -> tuple[float, float | None]:
+        """See :meth:`~hilctl_drivers.serial.wire.SerialWire.look`."""
+        self._open_links()
+        self._writer.check_selftest()
+        if self._setup.reads_elsewhere:
+            with naming(self._reader_name):
+                self._reader.check_selftest()
+        return _value(self._input, self._read()), self._measured_output()
 
     def close(self) -> None:
         """See :meth:`~hilctl_drivers.serial.wire.SerialWire.close`."""
@@ -145,33 +160,50 @@ class AsciiWire(SerialWire):
             return self._reader.number(self._input)
 
     def _write(self, value: float) -> None:
-        text = self._writer.text(self._output.write, value=value)
-        self._writer.command(text, self._output.reply)
+        self._writer.command(self._command(value), self._output.reply)
+
+    def _command(self, value: float) -> str:
+        return self._writer.text(self._output.write, value=value)
+
+    def _measured_output(self) -> float | None:
+        """Return the output as the device measures it, or as it says that it is, tripped or not."""
+        unit = self._output.unit
+        for source in self._profile.inputs.values():
+            if source.measures == "output" and source.unit == unit:
+                return _value(source, self._writer.number(source))
+        readback = self._output.readback
+        if readback != "none" and readback.of == "command" and self._writer.tripped():
+            return None
+        return self.output()
+
+    def _send(self, value: float) -> None:
+        self._link.send_now(self._writer.line(self._command(value)))
 
     def _put_out(self, value: float) -> None:
-        """Write a value and make sure that it stands, where the device can tell."""
         try:
             self._write(value)
         except WatchdogTripped:
-            self._clear_trip()
+            self._run("clear")
             self._write(value)
         # A command without a reply may have been ignored: the safe value must be seen to stand.
         readback = self._output.readback
         if readback == "none":
             self._writer.check_errors()
         else:
-            found = self._writer.number(readback)
-            step = 2.0 * (self._output.resolution or 1e-3 * (self._output.max - self._output.min))
-            if not abs(found - value) <= step:
-                raise DeviceError(f"{value:g} {self._output.unit} was written, {found:g} stands")
+            check_stands(self._output, value, self._writer.number(readback))
 
     def _clear_trip(self) -> None:
-        """Clear a trip; the output stays where the watchdog has put it."""
+        """End a trip of an earlier run, at the safe value."""
         watchdog = self._profile.watchdog
-        if watchdog == "none" or not watchdog.clear:
+        if watchdog == "none" or not self._writer.tripped():
             return
-        if watchdog.tripped == "none" or self._writer.tripped():
-            self._run("clear")
+        safe = self._setup.chain.output(self._setup.options.safe_command)
+        # Before where it is taken, and after in any case: a device that goes back to its last
+        # command when the trip ends must not put that out, or not for longer than one line takes.
+        if not watchdog.refuses_while_tripped:
+            self._write(safe)
+        self._run("clear")
+        self._put_out(safe)
 
     def _run(self, name: str) -> None:
         """Run the watchdog's steps of that name."""
@@ -194,6 +226,10 @@ class AsciiWire(SerialWire):
         self._ticks += 1
         if self._ticks % self._feed_every == 0:
             self._run("feed")
+
+
+def _value(source: AsciiInput, number: float) -> float:
+    return number * source.scale + source.offset
 
 
 def _address(wanted: int | None, profile: AsciiProfile) -> int:

@@ -1,6 +1,7 @@
 """Bytes there and back; knows no protocol.
 
 links.py          the contract; tcp.py and serial_port.py keep it
+held.py           the names by which one device is one lock
 line_settings.py  baud and parity of a line, as a profile has them
 timing.py         how long an exchange takes, and the rate that leaves
 framing.py        COBS and length frames; splitters.py cuts them out of a stream; crc.py checks

@@ -12,7 +12,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from fcntl import ioctl
 from os import read, write
-from pathlib import Path
 from typing import Literal
 
 import serial
@@ -53,15 +52,6 @@ class SerialSettings:
     rts: bool | None = None
 
 
-def held_port(path: str) -> str:
-    """Return a serial port as :attr:`hilctl.base.device.DeviceInfo.holds` has it.
-
-    Links such as those under ``/dev/serial/by-id`` are followed, so that two names of one port are
-    one.
-    """
-    return f"serial:{Path(path).resolve()}"
-
-
 def _open_port(path: str, settings: SerialSettings, timeout_s: float) -> serial.Serial:
     """Open and lock a port with all settings.
 
@@ -85,7 +75,24 @@ def _open_port(path: str, settings: SerialSettings, timeout_s: float) -> serial.
         port.rts = settings.rts
     port.port = path
     port.open()
+    if settings.boot_s > 0.0:
+        try:
+            _keep_levels(port.fileno())
+        except termios.error as error:
+            port.close()
+            raise OSError(*error.args) from None
     return port
+
+
+def _keep_levels(fd: int) -> None:
+    """Let DTR and RTS stay as they are when the port is closed, or its process killed.
+
+    A level that falls resets some boards, and so would the next one to open the port: with the
+    output at whatever the board boots with, and deaf to the safe value until it has booted.
+    """
+    attributes = termios.tcgetattr(fd)
+    attributes[2] &= ~termios.HUPCL
+    termios.tcsetattr(fd, termios.TCSANOW, attributes)
 
 
 class SerialLink:
@@ -129,10 +136,40 @@ class SerialLink:
         """The port's device file."""
         return self._path
 
-    def open(self) -> None:
+    @property
+    def boot_s(self) -> float:
+        """How long the device may need after the port is opened, s."""
+        return self._settings.boot_s
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the port is open, as far as is known."""
+        return self._port is not None
+
+    @property
+    def is_in_step(self) -> bool:
+        """Whether it is open, and no bytes of an older exchange can still come."""
+        return self._port is not None and not self._stale
+
+    @property
+    def timeout_s(self) -> float:
+        """Longest that one exchange may take, s."""
+        return self._timeout_s
+
+    @timeout_s.setter
+    def timeout_s(self, timeout_s: float) -> None:
+        self._timeout_s = timeout_s
+        self._timeout_ms = math.ceil(timeout_s * 1e3)
+        if self._port is not None:
+            self._port.write_timeout = timeout_s
+
+    def open(self, *, boot: bool = True) -> None:
         """Open and lock the port, see :meth:`~hilctl_drivers.wire.links.Link.open`.
 
         What it holds is thrown away.
+
+        Args:
+            boot: Whether to wait for a device that opening may have reset.
         """
         self.close()
         try:
@@ -147,7 +184,8 @@ class SerialLink:
         self._port, self._fd = port, port.fileno()
         self._poll = select.poll()
         self._poll.register(self._fd, select.POLLIN)
-        self._sleep(self._settings.boot_s)
+        if boot:
+            self._sleep(self._settings.boot_s)
         self._stale = True
         self._quiet_at = self._clock()
 
@@ -188,6 +226,27 @@ class SerialLink:
         if self._gap_s:
             self._quiet_at = self._clock() + self._gap_s
         return reply
+
+    def send_now(self, request: bytes | bytearray) -> None:
+        """Send ``request`` whatever is on the line, and await no answer.
+
+        The next exchange throws away what comes meanwhile.
+
+        Raises:
+            NoAnswerError: It could not be sent in time.
+            LostError: The port is not open, or broke.
+        """
+        if self._port is None:
+            raise LostError("not open")
+        self._stale = True
+        try:
+            self._port.write(request)
+        except serial.SerialTimeoutException as error:
+            # What waits there would be carried out before the next try, or hold it up for good.
+            self._port.reset_output_buffer()
+            raise self._failed(error) from None
+        except OSError as error:
+            raise self._failed(error) from None
 
     def _failed(self, error: OSError | DeviceError) -> DeviceError:
         """Return what to raise, and see to it that the next request does not suffer from it."""

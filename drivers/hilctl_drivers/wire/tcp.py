@@ -1,6 +1,5 @@
 """Bytes over TCP."""
 
-import ipaddress
 import math
 import select
 import socket
@@ -15,21 +14,6 @@ _FIRST = 256
 """Most replies are shorter; buffers up to 512 bytes come from Python's own pool, which is faster
 than the system's."""
 _CHUNK = 4096
-
-
-def held_address(host: str, port: int) -> str:
-    """Return a TCP port as :attr:`hilctl.base.device.DeviceInfo.holds` has it.
-
-    Addresses come in their shortest form. Names stay as they are, but for ``localhost``: asking
-    for them could take seconds, and :attr:`hilctl.base.device.Device.info` must not wait.
-    """
-    if host.lower() == "localhost":
-        host = "127.0.0.1"
-    try:
-        address = ipaddress.ip_address(host)
-    except ValueError:
-        return f"tcp:{host.lower()}:{port}"
-    return f"tcp:[{address}]:{port}" if address.version == 6 else f"tcp:{address}:{port}"
 
 
 class TcpLink:

@@ -8,6 +8,7 @@ from typer.testing import CliRunner
 
 from hilctl.cli.machine import devices_app, schema
 from hilctl.experiment.schema import schema_text
+from hilctl.run.probe import Probed
 
 DEMO = Path(__file__).parents[3] / "configs" / "demo.yaml"
 
@@ -48,3 +49,13 @@ def test_a_device_is_probed_instead_of_listed(devices):
     shown = devices("probe", DEMO)
     assert "simulated_terfenol answers" in shown
     assert "profiles" not in shown
+
+
+def test_a_device_that_says_what_can_not_be_is_a_fault(monkeypatch):
+    """The exit code of a fault, for people and for programs."""
+    wrong = Probed("rig", "a device", 1.0, "", "", {}, 2.8e20, None, "A", ("too far",))
+    monkeypatch.setattr("hilctl.run.probe.probe", lambda path, settings: wrong)
+    for words in ([], ["--json"]):
+        ended = CliRunner().invoke(devices_app, ["probe", str(DEMO), *words])
+        assert ended.exit_code == 3
+        assert "too far" in ended.stdout

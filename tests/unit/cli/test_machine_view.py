@@ -6,12 +6,10 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from hilctl.cli.machine_view import measuring, print_inventory, print_probed, render
-from hilctl.experiment.inventory import Inventory, Probed, SerialPort
+from hilctl.cli.machine_view import measuring, print_inventory, render
+from hilctl.experiment.inventory import Inventory, SerialPort
 from hilctl.machine.diagnosis import Diagnosis
 from hilctl.machine.latency import Latency
-
-PROBED = Probed("rig", "a [bold] device", 1000.0, "", {"firmware": "[1.2]"})
 
 
 @pytest.fixture(autouse=True)
@@ -36,14 +34,6 @@ def test_ports_are_listed_or_said_to_be_none(capsys):
     shown = capsys.readouterr().out
     assert "/dev/ttyUSB0" in shown
     assert "no serial port" not in shown
-
-
-def test_what_a_device_says_is_no_markup(capsys):
-    """Brackets of its own stay as they are."""
-    print_probed(PROBED)
-    shown = capsys.readouterr().out
-    assert "firmware: [1.2]" in shown
-    assert "at most 1000 samples a second\n" in shown
 
 
 def test_no_bar_where_output_is_for_programs(capsys):

@@ -31,6 +31,10 @@ class NotingDac(DacDevice):
     def _open(self, sample_rate_hz, block):
         self._note("open")
 
+    def _look(self):
+        self._note("look")
+        return 1.0, None
+
     def _exchange(self, first_sample, command, displacement_um, measured):
         self._note("exchange")
 
@@ -113,3 +117,17 @@ def test_closing_twice_says_goodbye_once():
     device.close()
     device.close()
     assert device.calls.count("close") == 1
+
+
+def test_looking_is_for_a_device_that_is_closed():
+    """It lets go whatever comes of it; open, it is left alone."""
+    device = NotingDac()
+    assert device.look() == (1.0, None)
+    device.broken = "look"
+    with pytest.raises(DeviceError, match=r"dac at /dev/x: no answer \(to look\)"):
+        device.look()
+    assert device.calls == ["look", "release"] * 2
+    device.open(1000.0, 1)
+    with pytest.raises(DeviceError, match="open"):
+        device.look()
+    exchange(device, 0.0)

@@ -118,3 +118,40 @@ def test_mixed_byte_orders_are_refused():
     channel = FrameChannel(type="float32", order="CDAB", unit="V", min=0.0, max=1.0)
     with pytest.raises(InputError, match="must be ABCD or DCBA in frames, got CDAB"):
         Values(channel)
+
+
+def test_a_name_brings_no_escape_characters_to_the_terminal(board):
+    """They are shown as what they are; so are bytes that are no ASCII."""
+    head = struct.pack("<BHHfff", 2, 0, 1, 1000.0, -10.0, 10.0)
+    board.link.make = answer(body=head + b"board \x1b[2J\r\n\xe9 1")
+    assert board.facts().name == r"board \x1b[2J\r\n\xe9 1"
+
+
+def test_a_state_byte_by_byte(board):
+    board.link.make = answer(body=b"\x01" + struct.pack("<ff", 0.5, -2.5))
+    found = board.state()
+    assert board.link.asked == [b"\x16\x01"]
+    assert (found.tripped, found.output, found.reading) == (True, 0.5, -2.5)
+    board.link.make = answer(body=b"\x00" + struct.pack("<f", 0.5))
+    with pytest.raises(Mismatch, match="4 bytes behind the flags of a state"):
+        board.state()
+
+
+def test_a_board_of_version_1_knows_no_state(board):
+    """Another refusal is not taken for that."""
+    board.link.make = answer(status=0x04)
+    assert board.state() is None
+    board.link.make = answer(status=0x01)
+    with pytest.raises(WatchdogTripped):
+        board.state()
+
+
+def test_a_value_that_is_sent_blindly_ends_a_frame_that_was_cut_off(board):
+    """With a 0 before it, which means nothing where no frame was begun."""
+    framing = board.link.framing
+    splitter = framing.splitter()
+    cut = framing.encode(b"\x10\x05rubbish")[:-4]
+    found = splitter.feed(cut + board.safe_frame(1.5))
+    assert [each for each in found if isinstance(each, bytes)] == [
+        b"\x13\x01" + struct.pack("<f", 1.5)
+    ]

@@ -5,6 +5,8 @@ import struct
 import numpy as np
 import pytest
 
+from hilctl_drivers.profile import shipped_profiles
+
 MS = 1_000_000
 START_NS = 10_000_000_000
 
@@ -99,3 +101,39 @@ class TestBoard:
         reply = board.ask(b"\x11\x02" + struct.pack("<IH", 100, 100) + values, after_ms=15)
         assert struct.unpack("<HH", reply[-4:]) == (100, 50)
         assert board.device.fifo.current_a == 2.0
+
+    def test_state_is_said_and_not_changed(self, emulate):
+        """Tripped or not; as a board powers up, its output is at 0 V."""
+        board = emulate("cobs_board")
+        state = b"\x16\x01"
+        assert struct.unpack("<f", board.ask(state)[4:8]) == (0.0,)
+        board.ask(b"\x12\x01" + struct.pack("<If", 50, -1.0))
+        board.ask(b"\x10\x02\x01\x00" + struct.pack("<f", 5.0))
+        reply = board.ask(state, after_ms=20)
+        assert reply[:4] == b"\x96\x01\x00\x00"
+        assert struct.unpack("<f", reply[4:8]) == (5.0,)
+        before = board.writes()
+        reply = board.ask(state, after_ms=60)
+        assert reply[2:4] == b"\x00\x01"
+        assert struct.unpack("<f", reply[4:8]) == (-1.0,)
+        assert board.ask(state)[3] == 1
+        assert len(board.writes()) == len(before) + 1  # the watchdog's own
+
+    def test_state_after_a_stream_is_where_it_stopped(self, emulate):
+        """Output and reading are those of the last value that was put out."""
+        board = emulate("cobs_board_fifo")
+        board.ask(b"\x15\x01" + struct.pack("<fH", 10_000.0, 100))
+        values = np.full(100, 4.0, dtype="<f4").tobytes()
+        for k in range(2):
+            board.ask(b"\x11\x02" + struct.pack("<IH", 100 * k, 100) + values)
+        board.ask(b"\x15\x03" + struct.pack("<fH", 0.0, 0))
+        output, reading = struct.unpack("<ff", board.ask(b"\x16\x04", after_ms=500)[4:])
+        assert output == 4.0
+        assert 1.5 < reading < 3.0
+
+    def test_a_board_of_version_1_knows_no_state(self, emulate, tmp_path):
+        text = shipped_profiles()["cobs_board"].read_text()
+        (tmp_path / "old.yaml").write_text(text.replace("hilctl-2", "hilctl-1"))
+        board = emulate(tmp_path / "old.yaml")
+        assert board.ask(b"\x16\x01") == b"\x96\x01\x04"
+        assert board.ask(b"\x14\x01")[3] == 1

@@ -17,7 +17,7 @@ def test_the_examples_for_firmware_are_right():
     readme = Path(__file__).parents[4] / "drivers" / "README.md"
     rows = re.findall(r"\| `((?:[0-9a-f]{2} ?)+)` \| `((?:[0-9a-f]{2} ?)+)` \|", readme.read_text())
     framing = binary_framing("cobs", "crc16_ccitt_false")
-    assert len(rows) == 8
+    assert len(rows) == 10
     for payload, frame in rows:
         assert framing.encode(bytes.fromhex(payload)).hex(" ") == frame
 
@@ -41,5 +41,5 @@ def test_frames_go_over_the_pty(tmp_path):
         finally:
             os.close(port)
     found = cobs.decode(reply[:-1])
-    assert found[:4] == b"\x94\x2a\x00\x01"
+    assert found[:4] == b"\x94\x2a\x00\x02"
     assert struct.unpack_from("<HHfff", found, 4) == (0, 1, 1000.0, -10.0, 10.0)

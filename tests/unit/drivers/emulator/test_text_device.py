@@ -92,7 +92,7 @@ class TestHostWatchdog:
         assert module.ask(b"#010+04.000", after_ms=499) == b">"
         assert module.ask(b"~010", after_ms=2) == b"!0104"
         assert module.ask(b"#010+01.000") == b"!"
-        assert module.ask(b"$0160") == b"!01+00.000"
+        assert module.ask(b"$0180") == b"!01+00.000"
         trip = next(w for w in module.writes() if w["event"] == "watchdog" and w["output"] == "AO0")
         assert (trip["value"], trip["monotonic_ns"]) == (0.0, START_NS + 500 * MS)
         assert module.ask(b"~011") == b"!01"

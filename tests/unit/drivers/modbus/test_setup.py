@@ -53,7 +53,8 @@ class TestPlaces:
         """On one line, through one gateway, at two addresses, and on two kinds of wire."""
         served = serve(profile, reader, **options)
         device = served.device()
-        assert len(device.info.holds) == places
+        held = [name for name in device.info.holds if not name.startswith("tty:")]
+        assert len(held) == places
         device.open(5.0, 1)
         exchange(device, 3.0)
         served.clock.pass_s(0.1)

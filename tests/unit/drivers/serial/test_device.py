@@ -13,11 +13,13 @@ from hilctl_drivers.emulator.faults import parse_fault
 from hilctl_drivers.emulator.options import EmulatorOptions
 from hilctl_drivers.profile import shipped_profiles
 from hilctl_drivers.serial.device import SerialDac
+from hilctl_drivers.serial.last_write import SerialLastWrite
 from hilctl_drivers.serial.setup import SerialOptions
-from tests.fakes import ShiftedClock, emulated
+from tests.fakes import ShiftedClock, SteppingClock, emulated
 
 DCON = (Path(__file__).parents[3] / "data" / "dcon_module.yaml").read_text()
 KINDS = ["dcon", "scpi", "cobs", "length"]
+TIMEOUT_S = 0.3  # a busy machine answers within it
 
 
 @pytest.fixture
@@ -43,8 +45,9 @@ class Rig:
         self.emulator = emulator
         self.log = log
         self.clock = clock
-        made = {**emulator.options, "timeout_s": 0.1, **options}
+        made = {**emulator.options, "timeout_s": TIMEOUT_S, **options}
         self.device = SerialDac(SerialOptions.model_validate(made))
+        self.device.wire.last_write = SerialLastWrite(SteppingClock(0.2), lambda seconds: None)
         self.sample = 0
 
     def open(self):
@@ -129,10 +132,10 @@ def test_bad_commands_are_refused_and_nothing_is_sent(rig, kind, bad):
 
 
 FAULTS = {
-    "silence": "no answer within 0.1 s",
-    "delay": "no answer within 0.1 s",
+    "silence": "no answer within 0.3 s",
+    "delay": "no answer within 0.3 s",
     "corrupt": "checksum of|not an answer to this|crc16_ccitt_false of .* is wrong",
-    "cut": "only . bytes, 1 short, within 0.1 s",
+    "cut": "only . bytes, 1 short, within 0.3 s",
     "duplicate": "must be one line|bytes behind",
     "wrong_id": "not an answer to this|reply 90 to message",
     "exception": "invalid command|no answer within|refused by the board",
@@ -148,7 +151,7 @@ def exchange_until_it_fails(bench, command=2.0):
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_bad_answer_is_an_error_and_the_output_can_still_be_made_safe(rig, kind, fault):
     """No wrong reading is taken; the next request is not confused by what is left on the line."""
-    bench = rig(kind, faults=[f"{fault}:0.3@30" if fault == "delay" else f"{fault}@30"])
+    bench = rig(kind, faults=[f"{fault}:0.9@30" if fault == "delay" else f"{fault}@30"])
     bench.open()
     with pytest.raises(DeviceError, match=FAULTS[fault]) as caught:
         exchange_until_it_fails(bench)
@@ -200,9 +203,21 @@ def test_exchanges_feed_the_watchdog_and_close_disarms_it(rig, kind):
     assert {event["event"] for event in bench.events()} == {"write"}
 
 
-def test_a_trip_of_an_earlier_run_is_cleared_at_open(rig):
-    """Opening clears it, and does not move the output."""
+@pytest.mark.parametrize("readback", ["output", "command"])
+def test_a_trip_of_an_earlier_run_ends_at_the_safe_value(rig, profiles, readback):
+    """Before anything else is put out, whatever the module would say of its last command."""
+    path = Path(profiles["dcon"])
+    path.write_text(DCON.replace("of: output", f"of: {readback}"))
     bench = rig("dcon", watchdog={"timeout_s": 0.1, "safe_command": 0.0})
+    # As where a trip keeps commands back, but does not forget the last one.
+    switch, device = bench.emulator.device._switch, bench.emulator.device
+
+    def restore(name, template, text):
+        switch(name, template, text)
+        if name == "clear":
+            device._put_out("AO0", device._commands["AO0"], "stale", device._now_ns)
+
+    device._switch = restore
     bench.device.open(60.0, 1)
     bench.exchange(3.0)
     bench.device.wire.release()
@@ -210,7 +225,9 @@ def test_a_trip_of_an_earlier_run_is_cleared_at_open(rig):
         bench.device.close()
     bench.pass_s(0.3)
     bench.device.open(60.0, 1)
-    assert (bench.events()[-1]["event"], bench.current_a()) == ("watchdog", 0.0)
+    events = [(event["event"], event["current_a"]) for event in bench.events()]
+    assert events[-3:] == [("watchdog", 0.0), ("stale", 3.0), ("write", 0.0)]
+    assert bench.device.output() == 0.0
     assert bench.exchange(1.0) < 45.0
 
 
@@ -281,13 +298,115 @@ def test_a_reader_that_fails_is_named(rig):
 @pytest.mark.parametrize("fault", ["silence", "corrupt", "duplicate", "wrong_id"])
 def test_making_safe_is_tried_twice(rig, kind, fault):
     """A bad answer to the safe value itself does not end the attempt."""
-    message = {"dcon": 13, "scpi": 12, "cobs": 8, "length": 8}[kind]
+    message = {"dcon": 13, "scpi": 12, "cobs": 9, "length": 9}[kind]
     bench = rig(kind, faults=[f"{fault}@{message}"])
     bench.open()
     for _ in range(5):
         bench.exchange(2.0)
     bench.device.make_safe(0.0)
     assert bench.current_a() == pytest.approx(0.0, abs=2e-3)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_device_that_was_deaf_is_made_safe_when_it_comes_back(rig, kind):
+    """Each message of some time is lost: the safe value is sent until one gets through."""
+    bench = rig(kind, faults=[f"silence@{n}" for n in range(20, 25)])
+    bench.open()
+    with pytest.raises(DeviceError, match="no answer"):
+        exchange_until_it_fails(bench)
+    bench.device.make_safe(-1.0)
+    assert bench.current_a() == pytest.approx(-1.0, abs=2e-3)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_safe_is_said_only_of_what_was_read_back(rig, kind):
+    """A device that acknowledges and holds another value is not taken for safe."""
+    bench = rig(kind)
+    bench.open()
+    bench.exchange(2.0)
+    device = bench.emulator.device
+    device._set = lambda name, value, reply: reply
+    device._put_out = lambda *args: None
+    with pytest.raises(
+        DeviceError, match=r"not known whether the value stands: .* was written, .* stands"
+    ):
+        bench.device.make_safe(0.0)
+
+
+def test_making_safe_waits_for_no_board_to_boot(rig):
+    """The value goes out as soon as the port is open; one that boots gets it again later."""
+    bench = rig("cobs_board")
+    slept = []
+    bench.device.wire._link._sleep = slept.append
+    bench.device.make_safe(1.0)
+    assert bench.current_a() == 1.0
+    assert slept == []
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_line_that_never_falls_silent_gets_the_safe_value(rig, kind):
+    """It is put out; that it stands can't be known as long as the answers drown."""
+    bench = rig(kind)
+    bench.open()
+    bench.exchange(2.0)
+    link = bench.device.wire._link
+    # As where somebody keeps sending: the line is never found quiet.
+    link._stale = True
+    link.drain = lambda: (_ for _ in ()).throw(DeviceError("the line does not get quiet"))
+    with pytest.raises(DeviceError, match="not known whether the value stands: the line does not"):
+        bench.device.make_safe(-1.0)
+    bench.await_current(-1.0)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_output_is_read_back(rig, kind):
+    """After power-up, and what was left by another connection."""
+    bench = rig(kind)
+    bench.open()
+    assert bench.device.output() == pytest.approx(0.0, abs=1e-3)
+    bench.exchange(3.0)
+    bench.device.close()
+    bench.open()
+    assert bench.device.output() == pytest.approx(3.0, abs=2e-3)
+
+
+def test_an_output_that_nobody_can_read_back_is_not_known(rig, profiles):
+    """No query for it; a board of version 1; a query for commands, where a trip does not show."""
+    silent = Path(profiles["dcon"])
+    start = DCON.index("    readback:")
+    silent.write_text(DCON[:start] + DCON[DCON.index("    unit: V", start) :])
+    old = Path(profiles["cobs"])
+    old.write_text(old.read_text().replace("hilctl-2", "hilctl-1"))
+    adam = rig("adam_4024_ascii", reader="agilent_34970a", own_line=True)
+    for bench in (rig("dcon"), rig("cobs"), adam):
+        bench.device.open(10.0, 1)
+        assert bench.device.output() is None
+        bench.device.make_safe(1.0)
+        assert bench.current_a() == pytest.approx(1.0, abs=2e-3)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_looking_changes_nothing(rig, kind):
+    """Displacement and output as they are; no write, no step, and a trip stays."""
+    watched = {"watchdog": {"timeout_s": 0.2}} if kind != "scpi" else {}
+    bench = rig(kind, **watched)
+    bench.open()
+    bench.exchange(3.0)
+    bench.device.wire.release()
+    bench.device._block = 0
+    bench.pass_s(0.5)
+    before = bench.events()
+    displacement_um, output = bench.device.look()
+    held = 3.0 if kind == "scpi" else 0.0  # tripped
+    assert output == pytest.approx(held, abs=2e-3)
+    assert displacement_um == pytest.approx(bench.emulator.device._rig.displacement_um, abs=0.5)
+    since = bench.events()[len(before) :]
+    assert {event["event"] for event in since} <= {"watchdog"}
+    if kind != "scpi":
+        assert bench.emulator.device.tripped
+    bench.open()
+    with pytest.raises(DeviceError, match="open"):
+        bench.device.look()
 
 
 def test_another_device_is_noticed_at_open(rig, tmp_path):
@@ -353,3 +472,23 @@ def test_options_that_do_not_go_together_are_refused(profiles, changes, text):
     }
     with pytest.raises(InputError, match=text):
         SerialDac(SerialOptions.model_validate(options))
+
+
+def test_a_line_too_slow_for_the_safe_value_is_said():
+    """With what stands behind it; not a word on a line that is fast enough."""
+    slow = {"baud": 1200, "watchdog": {"timeout_s": 2.0}}
+    options = {
+        "profile": "icp_m7024_dcon", "serial_port": "/dev/x", "output": "AO0", "input": "AI101",
+        "reader": {"profile": "agilent_34970a", "serial_port": "/dev/y"},
+        "amplifier": {"gain_a_per_v": 1.0}, "sensor": {"um_per_v": 12.5}, "watchdog": "none",
+    }  # fmt: skip
+
+    def note(**changes):
+        device = SerialDac(SerialOptions.model_validate({**options, **changes}))
+        return device.info.safe_note
+
+    assert note() == ""
+    assert note(baud=1200) == (
+        "a message takes up to 0.26 s on this line; no watchdog of the device stands behind it"
+    )
+    assert note(**slow).endswith("the device's watchdog acts after 2 s")

@@ -4,7 +4,7 @@ import pytest
 
 from hilctl.base.errors import InputError
 from hilctl_drivers.serial.setup import SerialOptions, SerialSetup
-from hilctl_drivers.wire.serial_port import held_port
+from hilctl_drivers.wire.held import held_port
 
 TWO_LINES = {
     "profile": "icp_m7024_dcon", "serial_port": "/dev/x", "output": "AO0", "input": "AI101",
@@ -21,7 +21,7 @@ def setup_of(**options):
 def test_a_board_reads_itself():
     setup = setup_of(**BOARD)
     assert not setup.reads_elsewhere
-    assert setup.holds == (held_port("/dev/x"),)
+    assert setup.holds == held_port("/dev/x")
     assert setup.title == "serial_dac cobs_board at /dev/x"
     link = setup.link()
     assert setup.reader_link(link) is link

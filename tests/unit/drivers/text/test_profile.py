@@ -63,3 +63,11 @@ def test_a_strict_watchdog_has_what_feeds_it():
     plain["watchdog"]["feed"] = ()
     with pytest.raises(ValidationError, match="feed steps and kick: strict go together"):
         AsciiProfile.model_validate(plain)
+
+
+def test_a_trip_that_nobody_can_ask_about_is_not_cleared():
+    """The safe value is put out with the trip's end, and must not be where there was none."""
+    plain = DCON.model_dump()
+    plain["watchdog"]["tripped"] = "none"
+    with pytest.raises(ValidationError, match="clear needs tripped"):
+        AsciiProfile.model_validate(plain)

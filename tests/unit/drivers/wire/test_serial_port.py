@@ -172,3 +172,46 @@ def test_binary_lines_refuse_flow_control(name):
     rule = "flow must be none where bytes 0x11 and 0x13 are data, got xonxoff"
     with pytest.raises(InputError, match=rule):
         with_link(load_profile(name), flow="xonxoff")
+
+
+def test_levels_stay_when_the_port_of_a_board_that_boots_is_closed(line):
+    """A board that a falling DTR resets would be deaf when the next one opens its port."""
+
+    def falls(link):
+        return bool(termios.tcgetattr(link._fd)[2] & termios.HUPCL)
+
+    plain = opened(line[1])
+    attributes = termios.tcgetattr(plain._fd)
+    attributes[2] |= termios.HUPCL  # as ports have it, but not ptys
+    termios.tcsetattr(plain._fd, termios.TCSANOW, attributes)
+    plain.timeout_s = 0.2  # sets the port anew
+    assert falls(plain)
+    plain.close()
+    link = SerialLink(line[1], SerialSettings(boot_s=2.0), QUICK_S, sleep=lambda seconds: None)
+    link.open()
+    assert not falls(link)
+    link.timeout_s = 0.2
+    assert not falls(link)
+    link.close()
+
+
+def test_a_value_is_sent_past_a_line_that_never_falls_silent(line):
+    """At once and whole, where an exchange would first wait for silence; that comes later."""
+    master, name = line
+    link = opened(name)
+    os.write(master, b"chatter" * 20)
+    link.send_now(b"safe\r")
+    assert os.read(master, 100) == b"safe\r"
+    assert link.is_open
+    assert not link.is_in_step
+    link.close()
+
+
+def test_opening_waits_for_a_boot_unless_it_must_not(line):
+    slept = []
+    link = SerialLink(line[1], SerialSettings(boot_s=2.0), QUICK_S, sleep=slept.append)
+    link.open(boot=False)
+    assert slept == []
+    link.open()
+    assert slept == [2.0]
+    link.close()

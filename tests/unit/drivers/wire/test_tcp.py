@@ -9,7 +9,7 @@ import pytest
 
 from hilctl.base.errors import DeviceError
 from hilctl_drivers.wire.links import LostError, NoAnswerError
-from hilctl_drivers.wire.tcp import TcpLink, held_address
+from hilctl_drivers.wire.tcp import TcpLink
 
 QUICK_S = 0.05
 PATIENT_S = 5.0
@@ -193,17 +193,3 @@ def test_tcp_frame_error_closes_the_connection(serve):
         link.transact(b"ask", refuse)
     with pytest.raises(LostError):
         link.transact(b"ask", missing)
-
-
-@pytest.mark.parametrize(
-    ("host", "held"),
-    [
-        ("10.0.0.5", "tcp:10.0.0.5:502"),
-        ("localhost", "tcp:127.0.0.1:502"),
-        ("DAC.lab", "tcp:dac.lab:502"),
-        ("fe80:0:0::0001", "tcp:[fe80::1]:502"),
-    ],
-)
-def test_addresses_have_one_name(host, held):
-    """Numbers in their shortest form; names as they are, for asking takes time."""
-    assert held_address(host, 502) == held
