@@ -256,6 +256,8 @@ def test_skipped_ticks_are_a_counted_gap():
     assert outcome.code == "completed"
     at = [head[Head.FIRST_SAMPLE] for head in rig.host.heads].index(35)
     assert rig.host.columns[at][1][0] == sine(200)[35]
+    due_ns = [1_000_000 * head[Head.FIRST_SAMPLE] for head in rig.host.heads]
+    assert [head[Head.DEADLINE_NS] for head in rig.host.heads] == due_ns
 
 
 def test_full_ring_is_a_counted_gap():
