@@ -80,7 +80,7 @@ class RunReport(Figures):
         reason: Why the run ended, or that its record is cut short.
         complete: Whether it has a record of its end and the last sample of its last segment.
         samples: Samples of the waveform.
-        ramp_samples: Samples of the ramp to the safe value.
+        ramp_samples: Samples of the ramps to the safe value, before and after it.
         recorded_samples: Both.
         dropped: Samples that were exchanged or due and are missing.
         skipped_ticks: Ticks left out because one was too late; None where the record of the end

@@ -35,7 +35,7 @@ def run_rows(report: RunReport) -> list[tuple[str, str]]:
         ("ended", f"{report.reason or MISSING}{'' if report.complete else ' (NOT complete)'}"),
         (
             "samples",
-            f"{report.samples:,} of the waveform, {report.ramp_samples:,} of the safe ramp",
+            f"{report.samples:,} of the waveform, {report.ramp_samples:,} of ramps",
         ),
         ("missing samples", f"{report.dropped:,}"),
         ("rate, length", f"{report.sample_rate_hz:g} Hz, {report.duration_s:.6g} s"),

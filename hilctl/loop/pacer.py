@@ -122,8 +122,11 @@ class Pacer:
         """Make the first tick due at ``start_ns``."""
         self._origin_ns = start_ns
 
-    def wait(self) -> int:
+    def wait(self, most: int | None = None) -> int:
         """Sleep until the next tick.
+
+        Args:
+            most: Most ticks that may be skipped; the phase slips by what is more. None for any.
 
         Returns:
             How many ticks were skipped before it.
@@ -143,6 +146,9 @@ class Pacer:
             self._origin_ns += self.late_ns
             return 0
         skipped = int(self.late_ns / self._period_ns)
+        if most is not None and skipped > most:
+            self._origin_ns += round((skipped - most) * self._period_ns)
+            skipped = most
         self.tick += skipped
         self.counters.skipped_ticks += skipped
         # The tick that runs now is a later one than that which was waited for.

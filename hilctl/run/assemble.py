@@ -35,6 +35,7 @@ def assemble(
     """
     config, info = loaded.config, loaded.device.info
     rate_hz = config.sample_rate_hz
+    policy = _late_policy(config, info) if paced else "catch_up"
     compensator = Compensator(loaded.model, rate_hz)
     compensator.warm_up()
     if state is not None:
@@ -49,7 +50,9 @@ def assemble(
         limits=config.command_limits(),
         interlocks=interlock_context(config, info),
         interlock_settings=config.limits,
-        late_policy=_late_policy(config, info) if paced else "catch_up",
+        late_policy=policy,
+        # By time, not by ticks: a device that takes its time for each would be at it for long.
+        ramp_policy=policy if not paced or info.buffered or info.latency_blocks else "skip",
         late_rules=_late_rules(config, reference.size) if paced else LateRules(),
         feedback=make_feedback(config, compensator),
         keep_all=config.recording.on_failure == "stop",

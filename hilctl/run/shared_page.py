@@ -62,6 +62,7 @@ class Field(IntEnum):
     WORST_LATE_NS = 34
     WORST_LATE_TICK = 35
     LONGEST_LATE_RUN = 36
+    WAVEFORM_AT = 37
     EVENT_HEAD = 40
     EVENT_TAIL = 41
     EVENTS_LOST = 42

@@ -111,7 +111,8 @@ class Supervisor:
             child.await_ready(lambda: self._stop_signal != 0)
             start_ns = time.monotonic_ns() + _START_DELAY_NS
             unix_ns = time.time_ns() + start_ns - time.monotonic_ns()
-            recorder.begin(unix_ns, json.loads(page.read_text(PageText.SET_UP)))
+            set_up = json.loads(page.read_text(PageText.SET_UP))
+            recorder.begin(unix_ns, set_up, page.get(Field.WAVEFORM_AT))
         except (RunError, InputError):
             child.kill()  # it waits for the start signal, so nothing has moved
             recorder.give_back()

@@ -55,6 +55,16 @@ def test_skip_leaves_out_ticks_and_keeps_the_phase():
     assert paced.counters.skipped_ticks == 3
 
 
+@pytest.mark.parametrize(("most", "skipped"), [(0, 0), (2, 2), (3, 3), (9, 3)])
+def test_what_may_not_be_skipped_slips(most, skipped):
+    """The grid moves by whole periods, so that the rest of the stall is late as ever."""
+    paced = pacer(FakeClock(5_000, {2: 3_200_000}))
+    assert [paced.wait(most) for _ in range(4)] == [0, 0, skipped, 0]
+    assert paced.deadline_ns == 10_000 + 6 * PERIOD_NS
+    assert paced.tick == 3 + skipped
+    assert paced.counters.skipped_ticks == skipped
+
+
 @pytest.mark.parametrize("late_ns", [1_000_000, 3_200_000, 250_000_000])
 def test_deadline_after_a_skip_is_that_of_the_tick_that_runs(late_ns):
     """Not that of the first one which was missed."""
