@@ -9,7 +9,6 @@ from hilctl.analysis import metrics, noise, timing
 from hilctl.analysis.figures import RunReport, SegmentReport
 from hilctl.analysis.steady import SteadyPart, error_um, steady_part, waveform_end
 from hilctl.base.arrays import F64
-from hilctl.base.errors import DataError
 from hilctl.base.samples import Flag
 from hilctl.base.segments import Segment
 from hilctl.recording.data import Recording
@@ -144,22 +143,12 @@ def _counts(recording: Recording) -> dict[str, Any]:
         "recorded_samples": samples.index.size,
         "duration_s": span / recording.sample_rate_hz,
         "dropped": recording.dropped,
-        "skipped_ticks": _counter(recording, "skipped_ticks", None),
+        "deadline_misses": timing.misses(recording),
+        "skipped_ticks": timing.counter(recording, "skipped_ticks", None),
         "limited_samples": int(np.count_nonzero(flags & limited)),
         "sensor_invalid_samples": int(np.count_nonzero(flags & Flag.SENSOR_INVALID)),
-        "late_ticks": _counter(recording, "late_ticks", timing.late_ticks(recording.ticks)),
+        "late_ticks": timing.counter(recording, "late_ticks", timing.late_ticks(recording.ticks)),
     }
-
-
-def _counter(recording: Recording, name: str, otherwise: int | None) -> int | None:
-    """Return a counter from the record of the end, or what was counted here."""
-    if name not in recording.end:
-        return otherwise
-    try:
-        return int(recording.end[name])
-    except ValueError:
-        text = f"{recording.path}: hilctl.end: {name} must be a whole number"
-        raise DataError(f"{text}, got {recording.end[name]!r}") from None
 
 
 def _extremes(recording: Recording) -> dict[str, Any]:

@@ -45,6 +45,7 @@ def run_rows(report: RunReport) -> list[tuple[str, str]]:
         ("limited samples", f"{report.limited_samples:,}"),
         ("invalid readings", f"{report.sensor_invalid_samples:,}"),
         ("ticks", f"{_count(report.late_ticks)} late, {_count(report.skipped_ticks)} skipped"),
+        *([("timing", report.deadline_misses)] if report.deadline_misses else []),
         ("lateness", _percentiles(report.lateness_us)),
         ("exchange", _percentiles(report.exchange_us)),
     ]

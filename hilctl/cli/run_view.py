@@ -103,6 +103,7 @@ def run_mapping(result: RunResult, report: RunReport | None) -> dict[str, Any]:
         "code": result.code,
         "reason": result.reason,
         "output_safe": result.safe,
+        "deadline_misses": result.deadline_misses,
     }
 
 
@@ -113,6 +114,8 @@ def print_run(result: RunResult, report: RunReport | None) -> None:
     console.print(f"[{colour}]{result.code}[/]: {result.reason}", highlight=False)
     if not result.safe:
         console.print("[bold red]The output is not known to be at its safe value.[/]")
+    if result.deadline_misses:
+        console.print(f"[bold yellow]{result.deadline_misses}[/]", highlight=False)
     if result.samples == 0:
         console.print("no sample was recorded")
     elif report is not None:

@@ -22,6 +22,21 @@ class _Timespec(ctypes.Structure):
     _fields_ = (("tv_sec", ctypes.c_long), ("tv_nsec", ctypes.c_long))
 
 
+def deadline_misses(skipped: int, due: int, max_share: float) -> str:
+    """Return ``deadline misses 944 of 3003 (31 %)`` in words; empty without any.
+
+    Args:
+        skipped: Ticks that were left out.
+        due: All ticks, with these.
+        max_share: Share of them from which on ``timing not kept`` is said too.
+    """
+    if not skipped:
+        return ""
+    share = skipped / max(due, 1)
+    text = f"deadline misses {skipped} of {due} ({100.0 * share:.2g} %)"
+    return f"{text}: timing not kept" if share > max_share else text
+
+
 class SystemClock:
     """CLOCK_MONOTONIC, with sleeps to an absolute time that don't drift."""
 

@@ -14,7 +14,7 @@ from hilctl.experiment.load import LoadedExperiment
 from hilctl.loop.loop import Loop
 from hilctl.loop.pacer import SystemClock
 from hilctl.loop.plan import Outcome
-from hilctl.machine.realtime import prepare, require, step_facts
+from hilctl.machine.realtime import prepare, refusals, require, step_facts
 from hilctl.run.assemble import assemble
 from hilctl.run.host import RingHost
 from hilctl.run.job import Job
@@ -71,7 +71,7 @@ def run_job(job: Job, ring: SampleRing, loaded: LoadedExperiment) -> Outcome:
         raise
     try:
         page.put(Field.WAVEFORM_AT, waveform_at)
-        page.write_text(PageText.SET_UP, json.dumps(step_facts(steps)))
+        page.write_text(PageText.SET_UP, json.dumps([step_facts(steps), refusals(steps)]))
         # After the text, which the supervisor reads then.
         page.put(Field.PHASE, Phase.READY)
         _await_go(page, host)

@@ -2,7 +2,7 @@
 
 import pytest
 
-from hilctl.loop.pacer import LateRules, Pacer, SystemClock
+from hilctl.loop.pacer import LateRules, Pacer, SystemClock, deadline_misses
 from tests.fakes import FakeClock
 
 PERIOD_NS = 1_000_000
@@ -115,6 +115,20 @@ class TestMisses:
         often = {20 * number: PERIOD_NS for number in range(14)}
         assert self.stalled(often)[0]
         assert self.stalled(often, grace_ticks=100)[0] == ""
+
+
+@pytest.mark.parametrize(
+    ("skipped", "due", "text"),
+    [
+        (0, 3003, ""),
+        (30, 3000, "deadline misses 30 of 3000 (1 %)"),
+        (944, 3003, "deadline misses 944 of 3003 (31 %): timing not kept"),
+        (3, 0, "deadline misses 3 of 0 (3e+02 %): timing not kept"),
+    ],
+)
+def test_misses_in_words(skipped, due, text):
+    """More than the share is said so, and the share itself is not."""
+    assert deadline_misses(skipped, due, 0.01) == text
 
 
 def test_catch_up_runs_every_tick():
