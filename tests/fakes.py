@@ -90,6 +90,7 @@ class FakeDevice:
     """Answers ten times the last command; may break at a sample."""
 
     info = FakeInfo()
+    output_at_open: float = 0.0
     break_at: int = 10**9
     nan_at: int = 10**9
     safe_works: bool = True
@@ -98,7 +99,7 @@ class FakeDevice:
     made_safe: list[float] = field(default_factory=list)
 
     def output(self):
-        return 0.0
+        return self.output_at_open
 
     def exchange(self, first_sample, command, displacement_um, measured):
         if first_sample + command.size > self.break_at:
@@ -125,6 +126,7 @@ class FakeFifoDevice:
 
     info = FakeInfo(measures_command=True)
     latency: int
+    output_at_open: float = 0.0
     break_at: int = 10**9
     nan_at: int = 10**9
     commands: list[float] = field(default_factory=list)
@@ -132,7 +134,7 @@ class FakeFifoDevice:
     exchanges: int = 0
 
     def output(self):
-        return 0.0
+        return self.output_at_open
 
     def exchange(self, first_sample, command, displacement_um, measured):
         assert first_sample == len(self.commands)

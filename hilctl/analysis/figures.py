@@ -80,7 +80,7 @@ class RunReport(Figures):
         reason: Why the run ended, or that its record is cut short.
         complete: Whether it has a record of its end and the last sample of its last segment.
         samples: Samples of the waveform.
-        ramp_samples: Samples of the ramp to the safe value.
+        ramp_samples: Samples of the ramps to the safe value, before and after it.
         recorded_samples: Both.
         dropped: Samples that were exchanged or due and are missing.
         skipped_ticks: Ticks left out because one was too late; None where the record of the end
@@ -96,6 +96,8 @@ class RunReport(Figures):
         displacement_max_um: Highest displacement measured.
         limited_samples: Samples of the waveform that the limiter changed.
         sensor_invalid_samples: Samples of the waveform whose displacement could not be trusted.
+        deadline_misses: How many ticks were skipped of all, for people, and whether the timing was
+            kept; empty where none was, or where that is not known.
         late_ticks: Ticks that woke late, as counted by the run; where its record does not say,
             those later than half a tick period. None where neither is known.
         lateness_us: ``p50``, ``p90``, ``p99``, ``p99.9`` and ``max`` of how late ticks woke; empty
@@ -116,6 +118,7 @@ class RunReport(Figures):
     recorded_samples: int
     dropped: int
     skipped_ticks: int | None
+    deadline_misses: str
     sample_rate_hz: float
     duration_s: float
     compensated: bool

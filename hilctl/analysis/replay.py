@@ -97,7 +97,8 @@ def replay(recording: Recording, model: HysteresisModel | None = None) -> Replay
         if model is None:
             _restore(recording, compensator, start)
         elif rows.start == 0:
-            compensator.begin(samples.reference_um[rows])
+            waveform = (samples.flags[rows] & Flag.RAMP.value) == 0
+            compensator.begin(samples.reference_um[rows][waveform])
         for part in _alike(samples.flags, rows):
             # Another model than the recorded one looks ahead by its own preview.
             inputs = compensator.ahead(samples.reference_um[part]) if model else recorded[part]
@@ -155,10 +156,18 @@ def _recompute(
     wanted, command, flags = out[0][rows], out[1][rows], out[2][rows]
     if samples.flags[rows.start] & Flag.RAMP.value:
         wanted[:] = limiter.limits.safe
-        limiter.ramp(command, flags)
+        limiter.ramp(command, flags, _skipped_on_ramp(samples, rows.start))
         return
     compensator.process(inputs, wanted)
     limiter.limit(wanted, command, flags)
+
+
+def _skipped_on_ramp(samples: Samples, row: int) -> int:
+    """Return how many samples of a ramp were skipped just before a row."""
+    if row == 0 or not samples.flags[row] & samples.flags[row - 1] & Flag.RAMP.value:
+        return 0
+    skipped = samples.flags[row] & Flag.AFTER_SKIPPED.value
+    return int(samples.index[row] - samples.index[row - 1]) - 1 if skipped else 0
 
 
 def _compare(

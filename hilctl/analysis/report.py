@@ -9,7 +9,6 @@ from hilctl.analysis import metrics, timing
 from hilctl.analysis.figures import RunReport, SegmentReport
 from hilctl.analysis.steady import steady_part
 from hilctl.base.arrays import F64
-from hilctl.base.errors import DataError
 from hilctl.base.samples import Flag
 from hilctl.base.segments import Segment
 from hilctl.recording.data import Recording
@@ -125,26 +124,15 @@ def _extremes(column: F64) -> tuple[float | None, float | None]:
 
 
 def _timing(recording: Recording) -> dict[str, Any]:
-    skipped, late = _counter(recording, "skipped_ticks"), _counter(recording, "late_ticks")
     ticks = recording.ticks
     return {
-        "skipped_ticks": skipped,
-        "late_ticks": timing.late_ticks(ticks) if late is None else late,
+        "deadline_misses": timing.misses(recording),
+        "skipped_ticks": timing.counter(recording, "skipped_ticks", None),
+        "late_ticks": timing.counter(recording, "late_ticks", timing.late_ticks(ticks)),
         "lateness_us": timing.percentiles_us(ticks.late_ns),
         "lateness_by_minute": timing.by_minute(ticks),
         "exchange_us": timing.percentiles_us(ticks.exchange_ns),
     }
-
-
-def _counter(recording: Recording, name: str) -> int | None:
-    """Return a counter from the record of the end; None where it has none."""
-    if name not in recording.end:
-        return None
-    try:
-        return int(recording.end[name])
-    except ValueError:
-        text = f"{recording.path}: hilctl.end: {name} must be a whole number"
-        raise DataError(f"{text}, got {recording.end[name]!r}") from None
 
 
 def worst_segment(segments: Sequence[SegmentReport]) -> int:

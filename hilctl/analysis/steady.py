@@ -39,7 +39,7 @@ class SteadyPart:
 
 
 def waveform_end(samples: Samples) -> int:
-    """Return the index after the last sample that is not of the safe ramp; 0 without any."""
+    """Return the index after the last sample that is not of a ramp; 0 without any."""
     waveform = samples.index[(samples.flags & Flag.RAMP) == 0]
     return int(waveform[-1]) + 1 if waveform.size else 0
 

@@ -37,7 +37,7 @@ def run_rows(report: RunReport) -> list[tuple[str, str]]:
         ("ended", f"{reason}{'' if report.complete else ' (NOT complete)'}"),
         (
             "samples",
-            f"{report.samples:,} of the waveform, {report.ramp_samples:,} of the safe ramp",
+            f"{report.samples:,} of the waveform, {report.ramp_samples:,} of ramps",
         ),
         ("missing samples", f"{report.dropped:,}"),
         ("rate, length", f"{report.sample_rate_hz:g} Hz, {report.duration_s:.6g} s"),
@@ -47,6 +47,7 @@ def run_rows(report: RunReport) -> list[tuple[str, str]]:
         ("limited samples", f"{report.limited_samples:,}"),
         ("invalid readings", f"{report.sensor_invalid_samples:,}"),
         ("ticks", f"{_count(report.late_ticks)} late, {_count(report.skipped_ticks)} skipped"),
+        *([("timing", report.deadline_misses)] if report.deadline_misses else []),
         ("lateness", _percentiles(report.lateness_us)),
         ("exchange", _percentiles(report.exchange_us)),
     ]

@@ -1,9 +1,12 @@
-"""How well the loop kept its time: pure functions of tick arrays."""
+"""How well the loop kept its time."""
 
 import numpy as np
 
 from hilctl.base.arrays import I64
-from hilctl.recording.data import Ticks
+from hilctl.base.errors import DataError
+from hilctl.experiment.parts import Timing
+from hilctl.loop.pacer import deadline_misses
+from hilctl.recording.data import Recording, Ticks
 
 MOST_ROWS = 1440
 """Most stretches that lateness is given for: a day has as many minutes."""
@@ -50,6 +53,38 @@ def tick_period_ns(ticks: Ticks) -> float | None:
     if ticks.deadline_ns.size < 2:
         return None
     return float(np.median(np.diff(ticks.deadline_ns)))
+
+
+def misses(recording: Recording) -> str:
+    """Return how many ticks a run has skipped, for people; empty where none or not known.
+
+    Raises:
+        DataError: A number that the recording says of it is none.
+    """
+    skipped = counter(recording, "skipped_ticks", None) or 0
+    usual = Timing().max_missed_share
+    text = recording.run.get("max_missed_share", repr(usual))
+    try:
+        max_share = float(text)
+    except ValueError:
+        rule = "hilctl.run: max_missed_share must be a number"
+        raise DataError(f"{recording.path}: {rule}, got {text!r}") from None
+    return deadline_misses(skipped, recording.ticks.late_ns.size + skipped, max_share)
+
+
+def counter(recording: Recording, name: str, otherwise: int | None) -> int | None:
+    """Return a counter from the record of the end, or what was counted otherwise.
+
+    Raises:
+        DataError: It is not a whole number.
+    """
+    if name not in recording.end:
+        return otherwise
+    try:
+        return int(recording.end[name])
+    except ValueError:
+        text = f"{recording.path}: hilctl.end: {name} must be a whole number"
+        raise DataError(f"{text}, got {recording.end[name]!r}") from None
 
 
 def late_ticks(ticks: Ticks) -> int | None:

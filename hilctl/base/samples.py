@@ -256,7 +256,7 @@ class Flag(IntFlag):
     INVALID = 4
     """The wanted command was not finite; the last command was held."""
     RAMP = 8
-    """The safe ramp, which has no reference."""
+    """A ramp to the safe value, before the waveform or after it, which has no reference."""
     SENSOR_INVALID = 16
     """The displacement was not finite, outside the stroke limits or at an end of the sensor."""
     UNANSWERED = 32

@@ -104,6 +104,7 @@ def run_mapping(result: RunResult, report: RunReport | None) -> dict[str, Any]:
         "code": result.code,
         "reason": result.reason,
         "output_safe": result.safe,
+        "deadline_misses": result.deadline_misses,
     }
 
 
@@ -114,6 +115,8 @@ def print_run(result: RunResult, report: RunReport | None) -> None:
     terminal.print(Text(result.code, colour) + f": {result.reason}")
     if not result.safe:
         terminal.print("The output is not known to be at its safe value.", style="bold red")
+    if result.deadline_misses:
+        terminal.print(result.deadline_misses, style="bold yellow")
     if result.samples == 0:
         terminal.print("no sample was recorded")
     elif report is not None:

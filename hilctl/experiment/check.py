@@ -160,6 +160,9 @@ def _device_problems(loaded: LoadedExperiment) -> list[Problem]:
         span = f"{info.command_min:g} to {info.command_max:g} {unit}"
         if low < info.command_min or high > info.command_max:
             add("limits", f"must lie within what {info.name} takes, {span}", f"{low:g} to {high:g}")
+        at_start = config.safe.at_start
+        if at_start is not None and not info.command_min <= at_start <= info.command_max:
+            add("safe.at_start", f"must lie within what {info.name} takes, {span}", f"{at_start:g}")
     found += _watchdog_problems(loaded)
     if config.sample_rate_hz > info.max_rate_hz:
         rule = f"must be <= {info.max_rate_hz:g}, the fastest that {info.name} can keep"

@@ -29,10 +29,14 @@ class Safe(Strict):
     Attributes:
         value: Command of the safe state, in the device's unit.
         ramp_s: Time that the ramp takes from the largest command allowed.
+        at_start: Command at which the output stands before the run, in the device's unit, for a
+            device that can't tell: the run ramps from there to the safe value before its waveform.
+            Nothing is asked for where the device knows.
     """
 
     value: float = 0.0
     ramp_s: Annotated[float, Field(gt=0.0, le=3600.0)] = 0.2
+    at_start: float | None = None
 
 
 class CompensatorConfig(Strict):

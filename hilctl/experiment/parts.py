@@ -60,6 +60,11 @@ class Timing(Strict):
         max_consecutive_late: So many late ticks one after the other end the run; 0 for any number.
             Left out, as many as come in two seconds: this machine can't keep the rate.
         grace_s: Time after the start in which late ticks count, but don't end the run.
+        on_misses: What a run does that skips too many ticks: ``fault``, its safe ramp, or ``warn``,
+            which is said once it has ended. The command stands still in a skipped tick and jumps
+            after it, so that such a run does not put out the waveform that was checked.
+        max_missed_share: Share of ticks that may be skipped, over ten seconds or the whole waveform
+            where that is shorter; only as many as five stalls or more make end a run.
     """
 
     late_policy: Literal["skip", "catch_up", "slip"] = "skip"
@@ -67,6 +72,8 @@ class Timing(Strict):
     max_late_s: Annotated[float, Field(gt=0.0)] = 1.0
     max_consecutive_late: Annotated[int, Field(ge=0)] | None = None
     grace_s: Annotated[float, Field(ge=0.0)] = 0.0
+    on_misses: Literal["warn", "fault"] = "fault"
+    max_missed_share: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.01
 
 
 class RecordingConfig(Strict):

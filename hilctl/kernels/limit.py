@@ -22,8 +22,9 @@ def limit_block(
 ) -> int:
     """Bring wanted commands within a range and a largest change from sample to sample.
 
-    A wanted value that is not finite is replaced by the last command. ``previous`` must lie within
-    [low, high]; then every result does, and no step is larger than ``max_step``.
+    A wanted value that is not finite is replaced by the last command. No step is larger than
+    ``max_step``. Where ``previous`` lies within [low, high] every result does; where it does not,
+    the results come in by whole steps.
 
     Args:
         wanted: float64[n], what the compensator asks for.

@@ -47,7 +47,12 @@ class Host(Protocol):
         ...
 
     def heartbeat(self, next_sample: int, late_ticks: int) -> str:
-        """Write the heartbeat, once a tick; return why the run should end, or an empty text."""
+        """Write the heartbeat, once a tick; return why the run should end, or an empty text.
+
+        Args:
+            next_sample: Index in the waveform of the sample to come; 0 before it begins.
+            late_ticks: Ticks that woke late so far.
+        """
         ...
 
     def closing(self) -> None:

@@ -70,7 +70,7 @@ class InterlockSettings(Strict):
     rms_current_a: Annotated[_Positive | None, Needs("A", "thermal_time_constant_s")] = Field(
         default=None,
         description="largest running rms of the coil current, commanded or measured, A; every run"
-        " starts with the coil at the heat of the safe value",
+        " starts with the coil at the heat of the safe value, or of the output that it finds",
     )
     thermal_time_constant_s: Annotated[_Positive | None, Needs("A", "rms_current_a")] = Field(
         default=None, description="time constant of the coil's heating, s"
@@ -152,6 +152,12 @@ class Interlocks:
         self._memory[kernels.COMMAND] = context.safe
         self._memory[kernels.HEAT] = context.safe**2
         self._next_sample = 0
+
+    def begin_at(self, command: float) -> None:
+        """Begin with the output at ``command``; its coil is as hot as that keeps it, at least."""
+        memory = self._memory
+        memory[kernels.COMMAND] = command
+        memory[kernels.HEAT] = max(memory[kernels.HEAT], command**2)
 
     def check(
         self,

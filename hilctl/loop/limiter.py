@@ -3,6 +3,7 @@
 Pure: (wanted, previous, limits, time step) to (command, flags). The loop and the replay share it.
 """
 
+import math
 from dataclasses import dataclass
 
 from hilctl.base.arrays import F64, U32
@@ -44,6 +45,7 @@ class CommandLimits:
             )
 
 
+_LARGEST_STRIDE = 0.25  # of the way from the far limit to the safe value
 _RANGE_LIMITED = int(Flag.RANGE_LIMITED)
 _SLEW_LIMITED = int(Flag.SLEW_LIMITED)
 _INVALID = int(Flag.INVALID)
@@ -51,6 +53,9 @@ _INVALID = int(Flag.INVALID)
 
 class Limiter:
     """Holds commands to their limits and remembers the last one.
+
+    The last command may be set, to where the output is. From outside the limits, commands then come
+    in by no more than a step each.
 
     Args:
         limits: What commands are held to.
@@ -62,6 +67,8 @@ class Limiter:
         self.last = limits.safe
         self._step = limits.slew_per_s * dt_s
         self._ramp_step = limits.ramp_per_s * dt_s
+        furthest = max(limits.high - limits.safe, limits.safe - limits.low)
+        self._stride = max(self._ramp_step, _LARGEST_STRIDE * furthest)
 
     def limit(self, wanted: F64, command: F64, flags: U32) -> int:
         """Fill ``command`` (float64[n]) with what may be put out; add to ``flags`` (uint32[n]).
@@ -71,8 +78,27 @@ class Limiter:
         """
         return self._apply(wanted, self._step, command, flags)
 
-    def ramp(self, command: F64, flags: U32) -> bool:
+    @property
+    def at_rest(self) -> bool:
+        """Whether the last command is so near to the safe value that a step of the ramp is more."""
+        return abs(self.last - self.limits.safe) <= self._ramp_step
+
+    @property
+    def ramp_samples(self) -> int:
+        """Samples that the ramp takes from the last command; 0 where that is at rest."""
+        steps = abs(self.last - self.limits.safe) / self._ramp_step
+        return 0 if self.at_rest else math.ceil(round(steps, 6))
+
+    def ramp(self, command: F64, flags: U32, skipped: int = 0) -> bool:
         """Fill ``command`` with the next stretch of the way to the safe value.
+
+        The way goes by time: where samples of it were skipped, the first step is as many times
+        larger, up to a quarter of the way from the far limit.
+
+        Args:
+            command: float64[n], filled.
+            flags: uint32[n], added to.
+            skipped: Samples of the ramp that were skipped just before.
 
         Returns:
             Whether the safe value is reached at the end of it.
@@ -81,7 +107,10 @@ class Limiter:
         scratch = flags.copy()
         wanted = command.copy()
         wanted[:] = self.limits.safe
-        self._apply(wanted, self._ramp_step, command, scratch)
+        late = 1 if skipped else 0
+        stride = min((1 + skipped) * self._ramp_step, self._stride)
+        self._apply(wanted[:late], stride, command[:late], scratch[:late])
+        self._apply(wanted[late:], self._ramp_step, command[late:], scratch[late:])
         return self.last == self.limits.safe
 
     def _apply(self, wanted: F64, max_step: float, command: F64, flags: U32) -> int:

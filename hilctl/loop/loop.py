@@ -1,6 +1,7 @@
 """The fixed-rate loop, and nothing else.
 
-Reference block, compensator, limiter, device, ring: once a tick, until the waveform ends, a stop is
+Where the output is not at its safe value, a ramp takes it there before the waveform begins. Then:
+reference block, compensator, limiter, device, ring: once a tick, until the waveform ends, a stop is
 asked for, or something goes wrong. All of these end by the same safe ramp: to the safe value within
 the ramp's slew, recorded as before.
 
@@ -35,6 +36,7 @@ _SKIPPED = int(Flag.AFTER_SKIPPED)
 
 
 class _Phase(Enum):
+    STARTING = "ramps to the safe value, from where the output was"
     FOLLOWING = "follows the reference"
     LEAVING = "ramps to the safe value"
     HOLDING = "holds the safe value until the last answer has come"
@@ -66,6 +68,9 @@ class Loop:
         self._start_ns = 0
         self._next_sample = 0
         self._ended_at = 0
+        self._waveform_at = 0
+        self._end = plan.reference.size
+        self._on_ramp = False
         self._missing = 0
         self._dropped = 0
         self._code: Code = "completed"
@@ -77,6 +82,26 @@ class Loop:
         """Exact counters of late ticks."""
         return self._pacer.counters
 
+    def begin_at(self, output: float) -> int:
+        """Begin where the output is, before :meth:`run`.
+
+        Args:
+            output: Command at which it stands, in the device's unit; may lie outside the limits.
+
+        Returns:
+            Samples of the ramp from there to the safe value, whole blocks, which come before the
+            waveform; 0 where it stands there, to within one step of the ramp.
+        """
+        self._limiter.last = output
+        self._interlocks.begin_at(output)
+        block = self._plan.block
+        self._waveform_at = -(-self._limiter.ramp_samples // block) * block
+        self._end = self._waveform_at + self._plan.reference.size
+        if self._waveform_at:
+            self._phase = _Phase.STARTING
+            self._pacer.policy = self._plan.ramp_policy
+        return self._waveform_at
+
     def run(self, start_ns: int) -> Outcome:
         """Run until the end, ramp to the safe value, and say how it went.
 
@@ -85,6 +110,11 @@ class Loop:
         """
         self._start_ns = start_ns
         self._pacer.begin(start_ns)
+        if self._phase is _Phase.STARTING:
+            output, samples = self._limiter.last, self._waveform_at
+            text = f"output was at {output:g}: ramp to {self._limiter.limits.safe:g} first"
+            values = {"output": output, "samples": float(samples)}
+            self._host.record_event(Event(0, "info", "start_ramp", text, values))
         try:
             while not self._tick():
                 pass
@@ -106,6 +136,8 @@ class Loop:
             sample = block.head[_FIRST_SAMPLE] + first_invalid
             reason = f"wanted command is not a finite number at sample {sample}"
             self._leave("fault", "invalid_command", reason)
+        if self._phase is _Phase.STARTING and self._next_sample >= self._waveform_at:
+            self._begin_waveform()
         return done
 
     def _hold(self) -> None:
@@ -118,7 +150,10 @@ class Loop:
     def _next_block(self, *, due: bool = True) -> Block:
         """Wait for the tick; return its block with the head filled in."""
         pacer, block_samples = self._pacer, self._plan.block
-        skipped = pacer.wait() * block_samples
+        most = None
+        if self._phase is _Phase.STARTING:  # its last tick is not skipped: the waveform waits
+            most = (self._waveform_at - self._next_sample) // block_samples - 1
+        skipped = pacer.wait(most) * block_samples
         # Before the block is claimed: its number and the state kept with it are those after it.
         if skipped:
             self._pass_over(skipped)
@@ -141,7 +176,8 @@ class Loop:
         self._next_sample += skipped
         if self._phase is not _Phase.FOLLOWING:
             return
-        passed = plan.input_um[start : self._next_sample].copy()
+        at = self._waveform_at
+        passed = plan.input_um[start - at : self._next_sample - at].copy()
         factors = self._tuner.advance(passed.size)
         if factors is not None:
             tune(factors, passed, passed)
@@ -151,18 +187,27 @@ class Loop:
 
     def _supervise(self) -> None:
         """Write the heartbeat, and follow what is requested of the run."""
-        stop = self._host.heartbeat(self._next_sample, self._pacer.counters.late_ticks)
+        position = max(self._next_sample - self._waveform_at, 0)
+        stop = self._host.heartbeat(position, self._pacer.counters.late_ticks)
         # The end of the waveform first: a stop or a late tick after it changes nothing any more.
-        if self._next_sample >= self._plan.reference.size:
+        if self._next_sample >= self._end:
             self._leave("completed", "completed", "waveform completed")
-        if self._phase is not _Phase.FOLLOWING:
+        if self._phase is _Phase.LEAVING:
             return
         if late := self._pacer.too_late():
             self._leave("fault", "late", late)
         elif stop:
             self._leave("stopped", "stopped", stop)
-        elif tuning := self._host.tuning():
+        elif self._phase is _Phase.FOLLOWING and (tuning := self._host.tuning()):
             self._tune(tuning)
+
+    def _begin_waveform(self) -> None:
+        """Follow the reference from now on, unless skipped ticks have left the output elsewhere."""
+        self._phase = _Phase.FOLLOWING
+        self._pacer.policy = self._plan.late_policy
+        if not self._limiter.at_rest:
+            reason = "the ramp to the safe value before the waveform was late: timing not kept"
+            self._leave("fault", "late", reason)
 
     def _tune(self, tuning: Tuning) -> None:
         self._tuner.move(tuning)
@@ -176,8 +221,9 @@ class Loop:
 
         Leaving twice is ignored, but for a fault of the waveform that shows after its end.
         """
-        if self._phase is _Phase.FOLLOWING:
+        if self._phase in {_Phase.STARTING, _Phase.FOLLOWING}:
             self._phase = _Phase.LEAVING
+            self._pacer.policy = self._plan.ramp_policy
         elif self._code != "completed" or code != "fault":
             return
         self._code, self._reason = code, reason
@@ -199,8 +245,9 @@ class Loop:
         if block.skipped:
             block.flags |= _SKIPPED
         block.following = self._phase is _Phase.FOLLOWING
-        left = plan.reference.size - self._next_sample
+        left = self._end - self._next_sample
         n = min(left, plan.block) if block.following else 0
+        on_ramp, self._on_ramp = self._on_ramp, n < plan.block
         if n == plan.block:
             reference, input_um = block.reference, block.input_um
             wish = self._follow(
@@ -213,7 +260,9 @@ class Loop:
             first_invalid = self._follow(block, *parts, block.command[:n], block.flags[:n])
         block.reference[n:] = block.input_um[n:] = np.nan
         block.wanted[n:] = self._limiter.limits.safe
-        return self._limiter.ramp(block.command[n:], block.flags[n:]), first_invalid
+        skipped = block.skipped if on_ramp else 0
+        there = self._limiter.ramp(block.command[n:], block.flags[n:], skipped)
+        return there and self._phase is _Phase.LEAVING, first_invalid
 
     def _follow(
         self,
@@ -226,7 +275,8 @@ class Loop:
     ) -> int:
         """Fill what comes of the reference; return the first wish that is not finite, or -1."""
         plan = self._plan
-        start, stop = self._next_sample, self._next_sample + wanted.size
+        start = self._next_sample - self._waveform_at
+        stop = start + wanted.size
         factors = self._tuner.advance(wanted.size)
         if factors is None:
             reference[:] = plan.reference[start:stop]

@@ -5,6 +5,7 @@ import errno
 import math
 import os
 import time
+from collections import deque
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
@@ -13,11 +14,27 @@ from hilctl.base.device import Clock
 LatePolicy: TypeAlias = Literal["skip", "catch_up", "slip", "follow"]
 
 _FOLLOW = 1.0 / 64.0
+_FEWEST_STALLS = 5  # one stall, however long, may be an accident; what goes on stalling is none
 _TIMER_ABSTIME = 1
 
 
 class _Timespec(ctypes.Structure):
     _fields_ = (("tv_sec", ctypes.c_long), ("tv_nsec", ctypes.c_long))
+
+
+def deadline_misses(skipped: int, due: int, max_share: float) -> str:
+    """Return ``deadline misses 944 of 3003 (31 %)`` in words; empty without any.
+
+    Args:
+        skipped: Ticks that were left out.
+        due: All ticks, with these.
+        max_share: Share of them from which on ``timing not kept`` is said too.
+    """
+    if not skipped:
+        return ""
+    share = skipped / max(due, 1)
+    text = f"deadline misses {skipped} of {due} ({100.0 * share:.2g} %)"
+    return f"{text}: timing not kept" if share > max_share else text
 
 
 class SystemClock:
@@ -70,12 +87,17 @@ class LateRules:
         max_late_ns: Lateness that ends the run.
         max_consecutive_late: Late ticks, one after the other, that end the run; 0 for any number.
         grace_ticks: Ticks at the start that no lateness ends the run in.
+        missed_window: Last ticks that misses are counted in.
+        max_missed: Skipped ticks in that window that are let pass; more of them end the run once
+            they come from five stalls or more.
     """
 
     late_after_ns: float = math.inf
     max_late_ns: float = math.inf
     max_consecutive_late: int = 0
     grace_ticks: int = 0
+    missed_window: int = 1
+    max_missed: float = math.inf
 
 
 class Pacer:
@@ -84,9 +106,10 @@ class Pacer:
     Args:
         clock: Time.
         period_ns: Time from one tick to the next; it need not be a whole number of ns.
-        policy: What happens when a tick wakes a whole period late or more. ``follow`` is for
-            devices whose exchange waits for their own clock: there is no other wait, and the
-            deadlines follow that clock, so that a late tick is one that came later than usual.
+        policy: What happens when a tick wakes a whole period late or more; may be changed between
+            ticks. ``follow`` is for devices whose exchange waits for their own clock: there is no
+            other wait, and the deadlines follow that clock, so that a late tick is one that came
+            later than usual.
         rules: What counts as late.
     """
 
@@ -95,43 +118,57 @@ class Pacer:
     ) -> None:
         self._clock = clock
         self._period_ns = period_ns
-        self._policy = policy
+        self.policy = policy
         self._rules = rules
         self._origin_ns = 0
+        self._stalls: deque[tuple[int, int]] = deque()
+        self._missed = 0
+        self._not_kept = ""
         self.late_run = 0
         """Late ticks one after the other, up to this one."""
         self.tick = -1
         self.deadline_ns = 0
+        """When the tick under way was due, by the clock."""
         self.late_ns = 0
+        """How late the last wait ended; after a skip, behind the first tick that was missed."""
         self.counters = Lateness()
 
     def begin(self, start_ns: int) -> None:
         """Make the first tick due at ``start_ns``."""
         self._origin_ns = start_ns
 
-    def wait(self) -> int:
+    def wait(self, most: int | None = None) -> int:
         """Sleep until the next tick.
+
+        Args:
+            most: Most ticks that may be skipped; the phase slips by what is more. None for any.
 
         Returns:
             How many ticks were skipped before it.
         """
         self.tick += 1
         self.deadline_ns = self._origin_ns + round(self.tick * self._period_ns)
-        if self._policy == "follow" and self.tick:
+        if self.policy == "follow" and self.tick:
             self._follow()
             return 0
         self._clock.sleep_until_ns(self.deadline_ns)
         now_ns = self._clock.now_ns()
         self.late_ns = now_ns - self.deadline_ns
         self._count()
-        if self.late_ns < self._period_ns or self._policy in {"catch_up", "follow"}:
+        if self.late_ns < self._period_ns or self.policy in {"catch_up", "follow"}:
             return 0
-        if self._policy == "slip":
+        if self.policy == "slip":
             self._origin_ns += self.late_ns
             return 0
         skipped = int(self.late_ns / self._period_ns)
+        if most is not None and skipped > most:
+            self._origin_ns += round((skipped - most) * self._period_ns)
+            skipped = most
         self.tick += skipped
         self.counters.skipped_ticks += skipped
+        # The tick that runs now is a later one than that which was waited for.
+        self.deadline_ns = self._origin_ns + round(self.tick * self._period_ns)
+        self._note_stall(skipped)
         return skipped
 
     def too_late(self) -> str:
@@ -143,7 +180,21 @@ class Pacer:
             return f"tick {self.tick} woke {self.late_ns * 1e-9:.3f} s late, more than the limit"
         if 0 < rules.max_consecutive_late <= self.late_run:
             return f"{self.late_run} ticks in a row woke late, up to tick {self.tick}"
-        return ""
+        return self._not_kept
+
+    def _note_stall(self, skipped: int) -> None:
+        """Count skipped ticks, and judge those of the last ticks together."""
+        rules = self._rules
+        if self.tick < rules.grace_ticks:
+            return
+        self._stalls.append((self.tick, skipped))
+        self._missed += skipped
+        while self._stalls[0][0] <= self.tick - rules.missed_window:
+            self._missed -= self._stalls.popleft()[1]
+        if len(self._stalls) >= _FEWEST_STALLS and self._missed > rules.max_missed:
+            share = f"{self._missed} deadline misses up to tick {self.tick}"
+            allowed = f"more than {rules.max_missed:.4g} in {rules.missed_window} ticks"
+            self._not_kept = f"timing not kept: {share}, {allowed}"
 
     def _follow(self) -> None:
         """Take this moment as the tick: at once where it is early, slowly where it is late."""

@@ -48,6 +48,7 @@ class Plan:
         interlocks: What the interlocks need to know of the rig.
         interlock_settings: What they are set to.
         late_policy: What happens when a tick wakes late.
+        ramp_policy: The same on the ramps before and after the waveform.
         late_rules: From when a tick counts as late, and when lateness ends the run.
         feedback: Corrects the compensator's input; None where nothing does.
         keep_all: Whether a block that finds no room in the ring ends the run.
@@ -63,6 +64,7 @@ class Plan:
     interlocks: InterlockContext
     interlock_settings: InterlockSettings = field(default_factory=InterlockSettings)
     late_policy: LatePolicy = "skip"
+    ramp_policy: LatePolicy = "skip"
     late_rules: LateRules = field(default_factory=LateRules)
     feedback: Feedback | None = None
     keep_all: bool = True

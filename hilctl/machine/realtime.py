@@ -202,9 +202,7 @@ def require(steps: Sequence[SetUpStep]) -> None:
     Raises:
         InputError: A required step was refused; the text has the remedies.
     """
-    missing = [step for step in steps if step.name in REQUIRED and step.outcome != "done"]
-    if missing:
-        lines = [f"{step.name}: {step.detail}: {step.remedy}" for step in missing]
+    if lines := refusals(steps):
         raise InputError(
             "real time is required and can't be had; nothing has moved\n" + "\n".join(lines)
         )
@@ -213,6 +211,15 @@ def require(steps: Sequence[SetUpStep]) -> None:
 def step_facts(steps: Sequence[SetUpStep]) -> dict[str, str]:
     """Return the steps for a recording's metadata: ``rt.fifo`` and so on, to text."""
     return {f"rt.{step.name}": f"{step.outcome}: {step.detail}" for step in steps}
+
+
+def refusals(steps: Sequence[SetUpStep]) -> list[str]:
+    """Return which steps that real time needs were refused, each with what to do about it."""
+    return [
+        f"{step.name}: {step.detail}: {step.remedy}"
+        for step in steps
+        if step.name in REQUIRED and step.outcome != "done"
+    ]
 
 
 def be_ordinary(system: System = _THIS_PROCESS) -> bool:

@@ -18,7 +18,7 @@ class Ticks:
     Attributes:
         first_sample: int64[m], index of the tick's first sample.
         deadline_ns: int64[m], when the tick was due, since the start of the run.
-        late_ns: int64[m], how much later the loop woke.
+        late_ns: int64[m], how much later the loop woke; after a skip, than the first tick missed.
         exchange_ns: int64[m], how long the exchange with the device took.
     """
 

@@ -6,6 +6,7 @@ assemble.py        from a checked experiment to the plan of its loop
 supervisor.py      starts the loop's process, records, makes the rig safe
 child.py           the supervisor's hold on that process; hang_watch.py  whether it hangs
 loop_process.py    the loop's process; host.py  its side of the shared memory
+starting.py        where the output is before a run
 ring.py            sample blocks in shared memory, behind shared_page.py
 recorder.py        into the recording; metadata.py what it says of the run
 run_folder.py      runs that are going on, and who holds a device

@@ -13,6 +13,7 @@ from hilctl.loop.pacer import LatePolicy, LateRules
 from hilctl.loop.plan import Plan
 
 _ALWAYS_LATE_S = 2.0
+_MISSED_WINDOW_S = 10.0
 
 
 def assemble(
@@ -34,6 +35,7 @@ def assemble(
     """
     config, info = loaded.config, loaded.device.info
     rate_hz = config.sample_rate_hz
+    policy = _late_policy(config, info) if paced else "catch_up"
     compensator = Compensator(loaded.model, rate_hz)
     compensator.warm_up()
     if state is not None:
@@ -48,8 +50,10 @@ def assemble(
         limits=config.command_limits(),
         interlocks=interlock_context(config, info),
         interlock_settings=config.limits,
-        late_policy=_late_policy(config, info) if paced else "catch_up",
-        late_rules=_late_rules(config) if paced else LateRules(),
+        late_policy=policy,
+        # By time, not by ticks: a device that takes its time for each would be at it for long.
+        ramp_policy=policy if not paced or info.buffered or info.latency_blocks else "skip",
+        late_rules=_late_rules(config, reference.size) if paced else LateRules(),
         feedback=make_feedback(config, compensator),
         keep_all=config.recording.on_failure == "stop",
     )
@@ -61,11 +65,14 @@ def _late_policy(config: Experiment, info: DeviceInfo) -> LatePolicy:
     return "catch_up" if info.buffered else config.timing.late_policy
 
 
-def _late_rules(config: Experiment) -> LateRules:
+def _late_rules(config: Experiment, samples: int) -> LateRules:
     timing, late = config.timing, config.timing.max_consecutive_late
+    window = min(round(_MISSED_WINDOW_S / config.tick_s), math.ceil(samples / config.block))
     return LateRules(
         late_after_ns=timing.late_after * config.tick_s * 1e9,
         max_late_ns=timing.max_late_s * 1e9,
         max_consecutive_late=math.ceil(_ALWAYS_LATE_S / config.tick_s) if late is None else late,
         grace_ticks=int(timing.grace_s / config.tick_s),
+        missed_window=max(1, window),
+        max_missed=timing.max_missed_share * window if timing.on_misses == "fault" else math.inf,
     )

@@ -14,12 +14,13 @@ from hilctl.experiment.load import LoadedExperiment
 from hilctl.loop.loop import Loop
 from hilctl.loop.pacer import SystemClock
 from hilctl.loop.plan import Outcome
-from hilctl.machine.realtime import prepare, require, step_facts
+from hilctl.machine.realtime import prepare, refusals, require, step_facts
 from hilctl.run.assemble import assemble
 from hilctl.run.host import RingHost
 from hilctl.run.job import Job
 from hilctl.run.ring import SampleRing
 from hilctl.run.shared_page import Field, PageText, Phase, SharedPage
+from hilctl.run.starting import starting_output
 
 
 def main() -> int:
@@ -31,7 +32,7 @@ def main() -> int:
     page = ring.page
     try:
         outcome = run_job(job, ring, job.load())
-    except InputError as error:  # before the device was opened
+    except InputError as error:  # before anything has moved
         return _failed(page, str(error), Phase.REFUSED)
     except HilctlError as error:
         return _failed(page, str(error))
@@ -64,7 +65,13 @@ def run_job(job: Job, ring: SampleRing, loaded: LoadedExperiment) -> Outcome:
         require(steps)
     device.open(config.sample_rate_hz, config.block)
     try:
-        page.write_text(PageText.SET_UP, json.dumps(step_facts(steps)))
+        waveform_at = loop.begin_at(starting_output(device, config.safe.at_start))
+    except BaseException:
+        device.close()  # and no safe value: what starts elsewhere is not to step there
+        raise
+    try:
+        page.put(Field.WAVEFORM_AT, waveform_at)
+        page.write_text(PageText.SET_UP, json.dumps([step_facts(steps), refusals(steps)]))
         # After the text, which the supervisor reads then.
         page.put(Field.PHASE, Phase.READY)
         _await_go(page, host)

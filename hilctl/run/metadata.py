@@ -60,6 +60,7 @@ def run_facts(checked: "Checked", started: str, model_yaml: str) -> dict[str, st
         "model_sha256": _sha256(model_yaml) if model_yaml else "",
         "limits": config.limits.model_dump_json(exclude_none=True),
         "safe_value": repr(config.safe.value),
+        "max_missed_share": repr(config.timing.max_missed_share),
         "units": json.dumps({"t_rel": "s"} | {each.name: each.unit for each in recorded}),
     }
     facts |= machine_facts(config.realtime, Path(config.recording.folder))

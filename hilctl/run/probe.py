@@ -60,7 +60,7 @@ def probe(path: Path, settings: list[str]) -> Probed:
     """
     loaded = load_experiment(path, settings)
     info = loaded.device.info
-    with held_devices(info.holds, "hilctl devices probe"):
+    with held_devices(info.holds):
         displacement_um, output = _read(loaded, loaded.device)
     return Probed(
         name=info.name,

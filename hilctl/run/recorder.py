@@ -59,13 +59,14 @@ class Recorder:
     def _unwritable(self, error: OSError) -> InputError:
         return InputError(f"{self.path}: can't be written: {error.strerror}")
 
-    def begin(self, start_unix_ns: int, set_up: Mapping[str, str]) -> None:
+    def begin(self, start_unix_ns: int, set_up: Mapping[str, str], waveform_at: int = 0) -> None:
         """Write what is known before the first sample.
 
         Args:
             start_unix_ns: When it is due.
             set_up: How the loop's process was set up, see
                 :func:`hilctl.machine.realtime.step_facts`.
+            waveform_at: Index of the first sample of the waveform; a ramp comes before it.
 
         Raises:
             InputError: The file can't be written.
@@ -73,7 +74,7 @@ class Recorder:
         self._unix_ns = steady_unix_ns()
         try:
             # Before the file is opened for writing: that empties one which stood there.
-            facts = self._facts(start_unix_ns, set_up)
+            facts = self._facts(start_unix_ns, set_up, waveform_at)
             self._writer = RecordingWriter(self._file.begin(), facts)
         except OSError as error:
             raise self._unwritable(error) from None
@@ -149,13 +150,13 @@ class Recorder:
         except OSError as error:
             self.error = f"{self.path}: can't be written: {error.strerror}"
 
-    def _facts(self, start_unix_ns: int, set_up: Mapping[str, str]) -> RunFacts:
+    def _facts(self, start_unix_ns: int, set_up: Mapping[str, str], waveform_at: int) -> RunFacts:
         loaded = self._checked.loaded
         config, info = loaded.config, loaded.device.info
         model_yaml = dump_model(loaded.model) if loaded.model else ""
         return RunFacts(
             facts={**run_facts(self._checked, iso_time(start_unix_ns), model_yaml), **set_up},
-            segments=self._checked.reference.segments,
+            segments=tuple(each.shifted(waveform_at) for each in self._checked.reference.segments),
             experiment_yaml=loaded.yaml_text,
             model_yaml=model_yaml,
             correction_yaml=dump_correction(loaded.correction) if loaded.correction else "",

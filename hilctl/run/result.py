@@ -19,6 +19,7 @@ class RunResult:
         samples: Samples recorded.
         missing: Samples counted as dropped, skipped or lost.
         late_ticks: Ticks that woke late.
+        deadline_misses: How many were skipped of all, for people; empty where none was.
     """
 
     path: Path
@@ -29,6 +30,7 @@ class RunResult:
     samples: int
     missing: int
     late_ticks: int
+    deadline_misses: str = ""
 
 
 @dataclass(frozen=True, slots=True)

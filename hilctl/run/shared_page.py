@@ -26,7 +26,8 @@ class PageText(IntEnum):
     """Texts that the loop leaves for the supervisor, each in a place of its own."""
 
     SET_UP = 0
-    """How its process was set up: JSON of names and what became of each."""
+    """How its process was set up: JSON of names and what became of each, and of what was refused
+    that real time needs."""
     OUTCOME = 1
     """How the run ended: JSON of :class:`hilctl.loop.plan.Outcome`."""
     ERROR = 2
@@ -62,6 +63,7 @@ class Field(IntEnum):
     WORST_LATE_NS = 34
     WORST_LATE_TICK = 35
     LONGEST_LATE_RUN = 36
+    WAVEFORM_AT = 37
     EVENT_HEAD = 40
     EVENT_TAIL = 41
     EVENTS_LOST = 42

@@ -6,6 +6,7 @@ recording.
 """
 
 import json
+import logging
 import signal
 import time
 from collections.abc import Callable, Iterator
@@ -16,6 +17,7 @@ from types import FrameType
 
 from hilctl.base.errors import DeviceError, InputError, RunError
 from hilctl.experiment.check import Checked
+from hilctl.loop.pacer import deadline_misses
 from hilctl.loop.plan import Outcome
 from hilctl.machine.realtime import be_ordinary
 from hilctl.run.child import LoopChild
@@ -29,6 +31,8 @@ from hilctl.run.ring import SampleRing
 from hilctl.run.run_folder import RunFolder, held_devices, run_folder
 from hilctl.run.shared_page import Field, PageText, Stop
 from hilctl.run.systemd import Notifier
+
+_log = logging.getLogger(__name__)
 
 _POLL_S = 0.02
 _START_DELAY_NS = 50_000_000
@@ -109,7 +113,9 @@ class Supervisor:
             child.await_ready(lambda: self._stop_signal != 0)
             start_ns = time.monotonic_ns() + _START_DELAY_NS
             unix_ns = time.time_ns() + start_ns - time.monotonic_ns()
-            recorder.begin(unix_ns, json.loads(page.read_text(PageText.SET_UP)))
+            set_up, refused = json.loads(page.read_text(PageText.SET_UP))
+            self._warn(refused)
+            recorder.begin(unix_ns, set_up, page.get(Field.WAVEFORM_AT))
         except (RunError, InputError):
             child.kill()  # it waits for the start signal, so nothing has moved
             recorder.give_back()
@@ -118,6 +124,12 @@ class Supervisor:
         page.put(Field.SUPERVISOR_HEARTBEAT_NS, time.monotonic_ns())
         page.put(Field.START_NS, start_ns)
         page.put(Field.GO, 1)
+
+    def _warn(self, refused: list[str]) -> None:
+        """Say what real time was refused, where a late tick would be one of a real device."""
+        if not self._checked.loaded.device.info.simulated:
+            for line in refused:
+                _log.warning("real time refused, timing may not be kept: %s", line)
 
     @property
     def _silence_s(self) -> float:
@@ -157,6 +169,8 @@ class Supervisor:
         cut = f"; {recorder.missing} samples are lost: {recorder.error}" if recorder.error else ""
         fault = recorder.error or (outcome.code == "stopped" and not stop_signal)
         code = "fault" if fault else outcome.code
+        skipped = started.ring.page.lateness().skipped_ticks
+        due = (recorder.samples + recorder.missing) // self._config.block
         return RunResult(
             path=self._output,
             code=code,
@@ -166,6 +180,7 @@ class Supervisor:
             samples=recorder.samples,
             missing=recorder.missing,
             late_ticks=started.ring.page.get(Field.LATE_TICKS),
+            deadline_misses=deadline_misses(skipped, due, self._config.timing.max_missed_share),
         )
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from hilctl.base.device import Clock, Device
-from hilctl.base.errors import InputError
+from hilctl.base.errors import HilctlError, InputError
 from hilctl.base.events import Event
 from hilctl.base.samples import ANSWERS, Batch, Samples
 from hilctl.experiment.check import Checked
@@ -24,6 +24,7 @@ from hilctl.run.assemble import assemble
 from hilctl.run.metadata import end_facts
 from hilctl.run.recorder import Recorder
 from hilctl.run.result import RunResult
+from hilctl.run.starting import starting_output
 
 _BLOCKS_A_BATCH = 256
 
@@ -130,11 +131,6 @@ def run_unpaced(checked: Checked, output: Path, *, overwrite: bool = False) -> R
     if not info.simulated:
         raise InputError(f"{info.name}: only a simulated device can run without real time")
     recorder = Recorder(checked, output, overwrite=overwrite)
-    try:
-        recorder.begin(time.time_ns(), {"paced": "false"})
-    except InputError:
-        recorder.give_back()
-        raise
     outcome, lateness = _run(checked, recorder)
     recorder.finish(end_facts(outcome, lateness), outcome.ended_at)
     cut = f"; the recording is cut short: {recorder.error}" if recorder.error else ""
@@ -156,7 +152,14 @@ def _run(checked: Checked, recorder: Recorder) -> tuple[Outcome, Lateness]:
     host = BatchHost(
         plan, on_batch=recorder.batch, on_event=recorder.event, stop=lambda: recorder.error
     )
-    return _drive(plan, loaded.device, host)
+    try:
+        loop, waveform_at = _opened(plan, loaded.device, host, loaded.config.safe.at_start)
+        recorder.begin(time.time_ns(), {"paced": "false"}, waveform_at)
+    except HilctlError:
+        loaded.device.close()
+        recorder.give_back()
+        raise
+    return _drive(loop, loaded.device, host)
 
 
 def run_in_memory(plan: Plan, device: Device) -> tuple[Outcome, Samples]:
@@ -171,15 +174,27 @@ def run_in_memory(plan: Plan, device: Device) -> tuple[Outcome, Samples]:
     """
     parts: list[Samples] = []
     host = BatchHost(plan, on_batch=lambda batch: parts.append(batch.samples(slice(None))))
-    outcome, _ = _drive(plan, device, host)
+    loop, _ = _opened(plan, device, host, None)
+    outcome, _ = _drive(loop, device, host)
     values = np.concatenate([[*part.columns().values()] for part in parts], axis=1)
     index = np.concatenate([part.index for part in parts])
     return outcome, Samples.of(index, values, np.concatenate([part.flags for part in parts]))
 
 
-def _drive(plan: Plan, device: Device, host: BatchHost) -> tuple[Outcome, Lateness]:
+def _opened(
+    plan: Plan, device: Device, host: BatchHost, at_start: float | None
+) -> tuple[Loop, int]:
+    """Open the device; return the loop, and the samples that come before the waveform."""
     loop = Loop(plan, device, host)
     device.open(plan.sample_rate_hz, plan.block)
+    try:
+        return loop, loop.begin_at(starting_output(device, at_start))
+    except HilctlError:
+        device.close()
+        raise
+
+
+def _drive(loop: Loop, device: Device, host: BatchHost) -> tuple[Outcome, Lateness]:
     try:
         outcome = loop.run(0)
     finally:

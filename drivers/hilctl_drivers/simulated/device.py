@@ -20,6 +20,7 @@ from hilctl_drivers.simulated.plant import Plant
 
 FIFO_DEPTH = 4096
 MAX_RATE_HZ = 200e3
+_SETTLING_S = 0.1
 
 
 class SimulatedFault(Strict):
@@ -39,6 +40,11 @@ class SimulatedOptions(DeviceOptions):
     seed: int = Field(default=1, ge=0, description="seed of the sensor noise")
     noise: bool = Field(default=True, description="whether the sensor has noise")
     fault: SimulatedFault | None = Field(default=None, description="fault to inject")
+    output_at_open: float | None = Field(
+        default=0.0,
+        description="where the output stands when the device is opened, in its unit; null where the"
+        " device is not to know, and then it is 0",
+    )
 
 
 class SimulatedDevice(DacDevice):
@@ -46,10 +52,11 @@ class SimulatedDevice(DacDevice):
 
     Options: ClassVar[type[DeviceOptions]] = SimulatedOptions
 
-    def __init__(self, info: DeviceInfo, fault: SimulatedFault | None) -> None:
-        """Take what the subclass says of itself, and the fault to inject."""
+    def __init__(self, info: DeviceInfo, options: SimulatedOptions) -> None:
+        """Take what the subclass says of itself, and the options that all share."""
         super().__init__(info, info.name, "exchange a block", "the output")
-        self._fault = fault
+        self._fault = options.fault
+        self._output_at_open = options.output_at_open
         self._plant: Plant | None = None
         self._next_sample = 0
         self._last_command = 0.0
@@ -59,15 +66,17 @@ class SimulatedDevice(DacDevice):
         return FIFO_DEPTH, ""
 
     def _open(self, sample_rate_hz: float, block: int) -> None:
-        """Put the plant at rest, with 0 at the output and the sample count at 0."""
+        """Put the plant at rest where the output stands, with the sample count at 0."""
         del block
         self._plant = self._build(sample_rate_hz)
         self._next_sample = 0
-        self._last_command = 0.0
+        self._last_command = self._output_at_open or 0.0
         self._last_reading_um = 0.0
+        if self._last_command:
+            self._plant.hold(round(_SETTLING_S * sample_rate_hz), self._last_command)
 
-    def _output(self) -> float:
-        return self._last_command
+    def _output(self) -> float | None:
+        return None if self._output_at_open is None else self._last_command
 
     def _exchange(
         self, first_sample: int, command: F64, displacement_um: F64, measured: F64

@@ -169,7 +169,7 @@ class SimulatedTerfenol(SimulatedDevice):
             details=_details(asdict(self._parameters), options),
             **_COMMON,
         )
-        super().__init__(info, options.fault)
+        super().__init__(info, options)
 
     def _build(self, sample_rate_hz: float) -> Plant:
         options = self._options
@@ -201,7 +201,7 @@ class SimulatedPiezo(SimulatedDevice):
             details=_details(asdict(self._parameters), options),
             **_COMMON,
         )
-        super().__init__(info, options.fault)
+        super().__init__(info, options)
 
     def _build(self, sample_rate_hz: float) -> Plant:
         return PiezoActuator(self._parameters, sample_rate_hz, self._seed)

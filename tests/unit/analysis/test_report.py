@@ -297,6 +297,13 @@ class TestWholeRun:
         counted = summarize(replace(told, end={}))
         assert counted.late_ticks == 50
         assert counted.skipped_ticks is None
+        misses = "deadline misses 3 of 103 (2.9 %)"
+        assert summarize(told).deadline_misses == f"{misses}: timing not kept"
+        kept = replace(told, run={**told.run, "max_missed_share": "0.9"})
+        assert summarize(kept).deadline_misses == misses
+        assert counted.deadline_misses == ""
+        with pytest.raises(DataError, match=r"max_missed_share must be a number, got 'x'"):
+            summarize(replace(told, run={**told.run, "max_missed_share": "x"}))
         assert counted.lateness_us["max"] == pytest.approx(700.0)
         assert counted.exchange_us["p50"] == pytest.approx(30.0)
 

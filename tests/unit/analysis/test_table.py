@@ -33,6 +33,8 @@ def test_unknown_figures_are_dashes(report):
     assert rows["command"] == "-"
     assert rows["ticks"] == "- late, - skipped"
     assert rows["lateness"] == "-"
+    assert "timing" not in rows
+    assert dict(run_rows(replace(report, deadline_misses="3 of 5")))["timing"] == "3 of 5"
     assert (rows["device"], rows["ended"]) == ("-", "-")
     assert dict(run_rows(replace(unknown, complete=False)))["ended"] == "- (NOT complete)"
 

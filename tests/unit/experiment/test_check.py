@@ -143,6 +143,19 @@ def refusals(text: str, *settings: str, **given: Any) -> list[str]:
     return [str(replace(problem, where="x.yaml")) for problem in caught.value.problems]
 
 
+@pytest.mark.parametrize("at_start", [-8.0, 8.0])
+def test_a_start_within_the_device_s_range_is_taken(at_start: float) -> None:
+    """Outside the limits too: it is ramped in from there."""
+    assert checked(CURRENT, f"safe.at_start={at_start}").loaded.config.safe.at_start == at_start
+
+
+def test_a_start_that_the_device_can_not_hold_is_refused() -> None:
+    found = refusals(CURRENT, "safe.at_start=8.5")
+    assert len(found) == 1
+    assert "safe.at_start: must lie within what " in found[0]
+    assert found[0].endswith("-8 to 8 A, got 8.5")
+
+
 class TestReference:
     """References that go too far."""
 

@@ -159,12 +159,15 @@ class TestAccepted:
         assert config.compensator is None
         assert loaded.model is None
         assert (config.safe.value, config.safe.ramp_s) == (0.0, 0.2)
+        assert config.safe.at_start is None
         assert config.timing.model_dump() == {
             "late_policy": "skip",
             "late_after": 0.5,
             "max_late_s": 1.0,
             "max_consecutive_late": None,
             "grace_s": 0.0,
+            "on_misses": "fault",
+            "max_missed_share": 0.01,
         }
         assert config.recording.model_dump() == {
             "folder": "recordings",

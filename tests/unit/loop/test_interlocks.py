@@ -235,6 +235,13 @@ class TestDeviation:
         trip = bench.feed(1, first=1, command=-5.0, measured=-5.6)
         assert trip.reason.startswith("measured -5.6 A at sample 1, where 5 to -5 A was put out")
 
+    def test_starts_from_the_output_that_is_found(self):
+        """A measurement taken before the first command took effect is no deviation."""
+        bench = Fed(replace(STROKE, measured_deviation_a=0.1))
+        bench.interlocks.begin_at(3.0)
+        assert bench.feed(1, command=2.9, measured=3.05) is None
+        assert Fed(replace(STROKE, measured_deviation_a=0.1)).feed(1, command=2.9, measured=3.05)
+
     def test_starts_from_the_safe_value(self):
         """Before the first command the output was at the safe value."""
         limits = replace(DEVIATION, safe=-1.0, deviation_s=0.0)
@@ -293,6 +300,13 @@ class TestThermal:
         rested = replace(THERMAL, safe=-1.0)
         trip, _ = trips(rested, 100, command=3.0)
         assert trip.sample == math.ceil(0.1 * RATE_HZ * math.log(8.0 / 5.0)) - 1
+
+    def test_starts_at_the_heat_of_the_output_that_is_found(self):
+        """What stood at 3 A before the run has used up a budget of 2 A, and no less than safe."""
+        assert trips(THERMAL, 5)[0] is None
+        bench = Fed(THERMAL)
+        bench.interlocks.begin_at(3.0)
+        assert bench.feed(5).code == "thermal"
 
     def test_budget_is_the_square_of_the_rms(self):
         """A current of 3 A may flow for ever where 3 A rms are allowed, one of 3.01 A not."""

@@ -76,6 +76,66 @@ def test_ramp_ends_exactly_at_the_safe_value():
     assert len(way) == 56  # 2.5 / 0.05 = 50 samples, in blocks of 7
 
 
+class TestFromElsewhere:
+    """The last command may be set to where the output is, outside the limits too."""
+
+    @pytest.mark.parametrize("start", [-50.0, -2.001, -1.9, 0.61, 2.9, 3.1, 40.0])
+    def test_the_ramp_takes_the_samples_that_it_says(self, start):
+        """Every step goes towards the safe value by the ramp's slew, and none is larger."""
+        limiter = Limiter(LIMITS, DT_S)
+        limiter.last = start
+        samples = limiter.ramp_samples
+        command, flags = np.empty(samples), np.zeros(samples, dtype=np.uint32)
+        limiter.ramp(command, flags)
+        assert limiter.last == pytest.approx(0.5, abs=1e-9)
+        assert limiter.at_rest
+        assert np.abs(np.diff([start, *command])).max() <= LIMITS.ramp_per_s * DT_S * (1 + 1e-9)
+        assert (np.diff(np.abs([start - 0.5, *(command - 0.5)])) < 0.0).all()
+        assert samples == np.ceil(round(abs(start - 0.5) / 0.05, 6))
+
+    @pytest.mark.parametrize(("start", "samples"), [(0.5, 0), (0.549, 0), (0.451, 0), (0.551, 2)])
+    def test_what_one_step_of_it_reaches_needs_no_ramp(self, start, samples):
+        """The slew limit of the first sample counts from there all the same."""
+        limiter = Limiter(LIMITS, DT_S)
+        limiter.last = start
+        assert limiter.ramp_samples == samples
+        assert limiter.at_rest == (samples == 0)
+        assert abs(limited(limiter, [3.0])[0][0] - start) <= LIMITS.slew_per_s * DT_S * (1 + 1e-9)
+
+    @pytest.mark.parametrize("wish", [np.nan, -1e9, 0.0, 1e9])
+    @pytest.mark.parametrize("start", [-9.0, 9.0])
+    def test_no_wish_jumps_from_outside(self, start, wish):
+        """A step at a time towards the limits."""
+        limiter = Limiter(LIMITS, DT_S)
+        limiter.last = start
+        command, _ = limited(limiter, np.full(3, wish))
+        assert np.abs(np.diff([start, *command])) == pytest.approx(0.1)
+        assert (np.abs(command) < 9.0).all()
+
+
+class TestLateRamp:
+    """A ramp whose samples were skipped goes on by the time that passed."""
+
+    @pytest.mark.parametrize(
+        ("skipped", "step"), [(0, 0.05), (1, 0.1), (9, 0.5), (12, 0.625), (10**9, 0.625)]
+    )
+    def test_first_step_is_as_many_times_larger(self, skipped, step):
+        """Up to a quarter of the way from the far limit, 2.5 A."""
+        limiter = Limiter(LIMITS, DT_S)
+        limiter.last = 3.0
+        command, flags = np.empty(3), np.zeros(3, dtype=np.uint32)
+        limiter.ramp(command, flags, skipped)
+        assert (3.0 - command).tolist() == pytest.approx([step, step + 0.05, step + 0.1])
+        assert (flags == Flag.RAMP).all()
+
+    def test_a_slow_ramp_still_ends_at_the_safe_value(self):
+        limiter = Limiter(LIMITS, DT_S)
+        limiter.last, steps = -2.0, 0
+        while not limiter.ramp(np.empty(1), np.zeros(1, dtype=np.uint32), 400):
+            steps += 1
+        assert (limiter.last, steps) == (0.5, 3)
+
+
 def test_a_block_of_no_samples_changes_nothing():
     """An empty block leaves the last command as it is."""
     limiter = Limiter(LIMITS, DT_S)

@@ -40,7 +40,7 @@ class Rig:
             latency_blocks=getattr(self.device, "latency", 0),
             sample_rate_hz=RATE_HZ,
             compensator=compensator,
-            limits=LIMITS,
+            limits=options.get("limits", LIMITS),
             interlocks=InterlockContext(stroke_um=options.get("stroke_um", (-60.0, 60.0))),
             late_policy=options.get("policy", "skip"),
             late_rules=LateRules(**{**late, **options.get("late", {})}),
@@ -49,7 +49,13 @@ class Rig:
         self.loop = Loop(plan, self.device, self.host)
 
     def run(self):
+        self.waveform_at = self.loop.begin_at(self.device.output())
         return self.loop.run(1_000_000)
+
+    @property
+    def firsts(self):
+        """First sample of each recorded block."""
+        return [head[Head.FIRST_SAMPLE] for head in self.host.heads]
 
 
 def sine(n=200, amplitude=3.0):
@@ -256,6 +262,8 @@ def test_skipped_ticks_are_a_counted_gap():
     assert outcome.code == "completed"
     at = [head[Head.FIRST_SAMPLE] for head in rig.host.heads].index(35)
     assert rig.host.columns[at][1][0] == sine(200)[35]
+    due_ns = [1_000_000 * head[Head.FIRST_SAMPLE] for head in rig.host.heads]
+    assert [head[Head.DEADLINE_NS] for head in rig.host.heads] == due_ns
 
 
 def test_full_ring_is_a_counted_gap():

@@ -2,7 +2,7 @@
 
 import pytest
 
-from hilctl.loop.pacer import LateRules, Pacer, SystemClock
+from hilctl.loop.pacer import LateRules, Pacer, SystemClock, deadline_misses
 from tests.fakes import FakeClock
 
 PERIOD_NS = 1_000_000
@@ -53,6 +53,82 @@ def test_skip_leaves_out_ticks_and_keeps_the_phase():
     assert paced.tick == 6
     assert paced.deadline_ns == 10_000 + 6 * PERIOD_NS
     assert paced.counters.skipped_ticks == 3
+
+
+@pytest.mark.parametrize(("most", "skipped"), [(0, 0), (2, 2), (3, 3), (9, 3)])
+def test_what_may_not_be_skipped_slips(most, skipped):
+    """The grid moves by whole periods, so that the rest of the stall is late as ever."""
+    paced = pacer(FakeClock(5_000, {2: 3_200_000}))
+    assert [paced.wait(most) for _ in range(4)] == [0, 0, skipped, 0]
+    assert paced.deadline_ns == 10_000 + 6 * PERIOD_NS
+    assert paced.tick == 3 + skipped
+    assert paced.counters.skipped_ticks == skipped
+
+
+@pytest.mark.parametrize("late_ns", [1_000_000, 3_200_000, 250_000_000])
+def test_deadline_after_a_skip_is_that_of_the_tick_that_runs(late_ns):
+    """Not that of the first one which was missed."""
+    paced = pacer(FakeClock(5_000, {2: late_ns}))
+    for _ in range(3):
+        paced.wait()
+    assert paced.deadline_ns == 10_000 + paced.tick * PERIOD_NS
+    assert paced.late_ns == late_ns
+
+
+class TestMisses:
+    """Skipped ticks that end a run, and those that don't."""
+
+    def stalled(self, stalls_ns, ticks=400, grace_ticks=0):
+        """Run ticks, with stalls by the number of the sleep; return the first reason, its tick."""
+        rules = LateRules(grace_ticks=grace_ticks, missed_window=1000, max_missed=10.0)
+        paced = Pacer(FakeClock(0, stalls_ns), PERIOD_NS, "skip", rules)
+        paced.begin(0)
+        for _ in range(ticks):
+            paced.wait()
+            if reason := paced.too_late():
+                return reason, paced.tick
+        return "", paced.tick
+
+    def test_one_long_stall_is_let_pass(self):
+        assert self.stalled({3: 900 * PERIOD_NS})[0] == ""
+
+    def test_a_share_that_goes_on_is_not(self):
+        """Known after the fifth stall, whatever is still to come."""
+        reason, tick = self.stalled(dict.fromkeys(range(400), 125 * PERIOD_NS))
+        assert tick == 5 * 126 - 1
+        assert reason == (
+            "timing not kept: 625 deadline misses up to tick 629, more than 10 in 1000 ticks"
+        )
+
+    @pytest.mark.parametrize(("stalls", "ends"), [(10, False), (11, True)])
+    def test_the_share_is_of_the_window(self, stalls, ends):
+        """One tick more than the share of it, and not one less."""
+        single = {20 * number: PERIOD_NS for number in range(stalls)}
+        assert bool(self.stalled(single)[0]) == ends
+
+    def test_what_lies_behind_the_window_is_forgotten(self):
+        """Ten in every thousand ticks may go on for ever."""
+        seldom = {100 * number: PERIOD_NS for number in range(200)}
+        assert self.stalled(seldom, ticks=20_000)[0] == ""
+
+    def test_the_grace_at_the_start_counts_for_nothing(self):
+        often = {20 * number: PERIOD_NS for number in range(14)}
+        assert self.stalled(often)[0]
+        assert self.stalled(often, grace_ticks=100)[0] == ""
+
+
+@pytest.mark.parametrize(
+    ("skipped", "due", "text"),
+    [
+        (0, 3003, ""),
+        (30, 3000, "deadline misses 30 of 3000 (1 %)"),
+        (944, 3003, "deadline misses 944 of 3003 (31 %): timing not kept"),
+        (3, 0, "deadline misses 3 of 0 (3e+02 %): timing not kept"),
+    ],
+)
+def test_misses_in_words(skipped, due, text):
+    """More than the share is said so, and the share itself is not."""
+    assert deadline_misses(skipped, due, 0.01) == text
 
 
 def test_catch_up_runs_every_tick():

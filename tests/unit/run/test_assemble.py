@@ -43,6 +43,26 @@ def test_late_rules_are_in_the_file_s_own_ticks():
     assert asked.max_consecutive_late == 7
 
 
+@pytest.mark.parametrize(
+    ("settings", "samples", "expected"),
+    [
+        ([], 10**6, (10_000, 100.0)),
+        ([], 50 * 300, (300, 3.0)),
+        (["timing.max_missed_share=0.2"], 10**6, (10_000, 2000.0)),
+        (["timing.on_misses=warn"], 10**6, (10_000, np.inf)),
+    ],
+)
+def test_misses_are_counted_over_ten_seconds_or_the_whole_run(settings, samples, expected):
+    """A thousand ticks a second, of 50 samples each."""
+    loaded, values = loaded_of(*settings), np.zeros(samples)
+    rules = assemble(loaded, values, values, None).late_rules
+    assert (rules.missed_window, rules.max_missed) == expected
+
+
+def test_a_run_without_a_pace_misses_nothing():
+    assert planned(loaded_of(), paced=False).late_rules.max_missed == np.inf
+
+
 def test_the_compensator_starts_from_the_memory_that_was_given():
     """Warming up leaves no trace in it."""
     loaded = loaded_of(name="terfenol_sine_6a.yaml")

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from hilctl.base.errors import DeviceError, RunError
+from hilctl.base.errors import DeviceError, InputError, RunError
 from hilctl.run import loop_process
 from hilctl.run.job import Job
 from hilctl.run.ring import SampleRing
@@ -18,11 +18,14 @@ EXPERIMENT = Path(__file__).parents[3] / "configs" / "demo.yaml"
 class Closing:
     """A device that may refuse to be made safe."""
 
-    def __init__(self, info, *, reachable):
-        self.info, self._reachable, self.events = info, reachable, []
+    def __init__(self, info, *, reachable=True, output=0.0):
+        self.info, self._reachable, self._output, self.events = info, reachable, output, []
 
     def open(self, sample_rate_hz, block):
         self.events.append("open")
+
+    def output(self):
+        return self._output
 
     def make_safe(self, command):
         self.events.append("make_safe")
@@ -35,9 +38,9 @@ class Closing:
 
 @pytest.fixture
 def broken(tmp_path, monkeypatch):
-    """Run a job whose loop breaks; return its device and what was raised."""
+    """Run a job that breaks; return its device, what was raised and the page."""
 
-    def run(*, reachable):
+    def run(**device_is):
         checked = checked_experiment(EXPERIMENT, ["waveform.duration_s=1.0"])
         folder = RunFolder(tmp_path, RunCard("demo", "demo", "", 1, 0.0))
         info = checked.loaded.device.info
@@ -45,11 +48,11 @@ def broken(tmp_path, monkeypatch):
         ring.page.put(Field.GO, 1)
         job = Job.of(checked, folder, supervisor=1, silence_s=1.0)
         loaded = job.load()
-        device = Closing(info, reachable=reachable)
+        device = Closing(info, **device_is)
         object.__setattr__(loaded, "device", device)
         monkeypatch.setattr(loop_process, "prepare", lambda settings: ())
         monkeypatch.setattr("hilctl.loop.loop.Loop.run", lambda self, start_ns: 1 / 0)
-        with pytest.raises((ZeroDivisionError, RunError)) as caught:
+        with pytest.raises((ZeroDivisionError, RunError, InputError)) as caught:
             loop_process.run_job(job, ring, loaded)
         return device, caught.value, ring.page
 
@@ -70,3 +73,20 @@ def test_the_cause_is_not_lost_behind_a_device_that_can_not_be_reached(broken):
     assert device.events[-1] == "close"
     assert str(error).startswith("the loop broke: ZeroDivisionError")
     assert str(error).endswith("; the safe value could not be confirmed: no answer")
+
+
+@pytest.mark.parametrize("output", [None, 99.0])
+def test_a_start_that_is_refused_moves_nothing(broken, output):
+    """Not to the safe value either, which would be the jump that the refusal is to spare."""
+    device, error, page = broken(output=output)
+    assert device.events == ["open", "close"]
+    assert isinstance(error, InputError)
+    assert str(error).endswith("nothing has moved")
+    assert page.get(Field.PHASE) == Phase.STARTING
+
+
+@pytest.mark.parametrize(("output", "ramps"), [(0.0, False), (5.0, True)])
+def test_the_waveform_begins_after_the_ramp(broken, output, ramps):
+    """The recorder needs to know before the first sample: the page says it."""
+    _, _, page = broken(output=output)
+    assert (page.get(Field.WAVEFORM_AT) > 0) == ramps

@@ -10,14 +10,14 @@ from hilctl.run.result import RunResult
 
 RESULT = RunResult(
     path=Path("a.mcap"), code="stopped", reason="by a test", safe=False, stop_signal=15,
-    samples=90, missing=10, late_ticks=3,
+    samples=90, missing=10, late_ticks=3, deadline_misses="2 of 5",
 )  # fmt: skip
 
 
 def test_programs_get_every_figure_of_a_run_too_long_to_report():
     """All but the two that the exit code and the recording's own report tell."""
     mapping = run_mapping(RESULT, None)
-    told = {"a.mcap", "stopped", "by a test", False, 90, 10}
+    told = {"a.mcap", "stopped", "by a test", False, 90, 10, "2 of 5"}
     assert set(mapping.values()) == told
     assert len(mapping) == len(fields(RunResult)) - 2
 

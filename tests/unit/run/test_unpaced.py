@@ -7,9 +7,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from hilctl.analysis.replay import replay
+from hilctl.analysis.report import summarize
 from hilctl.base.errors import InputError
 from hilctl.base.events import Event
-from hilctl.base.samples import Head
+from hilctl.base.samples import Flag, Head
 from hilctl.recording.reader import read
 from hilctl.run.assemble import assemble
 from hilctl.run.start import checked_experiment
@@ -75,6 +77,54 @@ def test_a_whole_run_is_recorded_and_says_that_it_was_not_paced(tmp_path):
     assert (result.code, result.safe, result.missing) == ("completed", True, 0)
     assert np.array_equal(recording.samples.index, np.arange(result.samples))
     assert '"paced": "false"' in str(recording.run) or recording.run.get("paced") == "false"
+
+
+@pytest.mark.parametrize("output", [7.0, -9.5])
+def test_a_run_from_elsewhere_ramps_in_and_is_replayed(tmp_path, output):
+    """Inside the limits or not; the waveform is that of a run from the safe value."""
+    plain = read(run_unpaced(checked_experiment(UNCOMPENSATED, SHORT), tmp_path / "a.mcap").path)
+    checked = checked_experiment(UNCOMPENSATED, [*SHORT, f"device.output_at_open={output}"])
+    result = run_unpaced(checked, tmp_path / "b.mcap")
+    recording = read(result.path)
+    assert (result.code, result.missing, recording.dropped) == ("completed", 0, 0)
+    (segment,) = recording.segments
+    n = segment.start
+    assert n > 0
+    samples, limits = recording.samples, checked.loaded.config.command_limits()
+    steps = np.abs(np.diff([output, *samples.command]))
+    assert steps.max() <= limits.slew_per_s / recording.sample_rate_hz * (1 + 1e-9)
+    assert samples.command[n:].tolist() == plain.samples.command.tolist()
+    assert (samples.flags[:n] == Flag.RAMP).all()
+    assert recording.events[0].code == "start_ramp"
+    replayed = replay(recording)
+    assert (replayed.identical, replayed.samples) == (True, samples.index.size)
+    before, after = summarize(plain), summarize(recording)
+    assert after.samples == before.samples
+    assert after.complete
+    assert after.peak_hysteresis_percent == pytest.approx(before.peak_hysteresis_percent, rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        (["device.output_at_open=null"], "safe.at_start: is required"),
+        (["device.output_at_open=30.0"], "puts out 30 A"),
+    ],
+)
+def test_a_start_that_is_not_known_or_can_not_be_is_refused(tmp_path, settings, words):
+    """Nothing is exchanged and no file is left."""
+    checked = checked_experiment(UNCOMPENSATED, [*SHORT, *settings])
+    with pytest.raises(InputError, match=words):
+        run_unpaced(checked, tmp_path / "run.mcap")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_device_that_can_not_know_is_vouched_for(tmp_path):
+    settings = ["device.output_at_open=null", "safe.at_start=0.0"]
+    result = run_unpaced(
+        checked_experiment(UNCOMPENSATED, [*SHORT, *settings]), tmp_path / "r.mcap"
+    )
+    assert result.code == "completed"
 
 
 def test_real_devices_are_refused_before_a_file_is_made(tmp_path):
