@@ -60,6 +60,9 @@ class Timing(Strict):
         max_consecutive_late: So many late ticks one after the other end the run; 0 for any number.
             Left out, as many as come in two seconds: this machine can't keep the rate.
         grace_s: Time after the start in which late ticks count, but don't end the run.
+        hang_s: A loop that gives no sign for this time and two tick periods is killed, and the
+            output made safe; while it waits for the device, ``max_late_s`` more. Left out, 0.1 s;
+            for a simulated device, which has no coil to protect, ``max_late_s`` and half a second.
     """
 
     late_policy: Literal["skip", "catch_up", "slip"] = "skip"
@@ -67,6 +70,7 @@ class Timing(Strict):
     max_late_s: Annotated[float, Field(gt=0.0)] = 1.0
     max_consecutive_late: Annotated[int, Field(ge=0)] | None = None
     grace_s: Annotated[float, Field(ge=0.0)] = 0.0
+    hang_s: Annotated[float, Field(ge=0.02, le=60.0)] | None = None
 
 
 class RecordingConfig(Strict):

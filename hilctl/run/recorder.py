@@ -94,6 +94,10 @@ class Recorder:
         led_there = replace(event, before=self._tail.up_to(event.sample))
         self._write(partial(self._begun.event, led_there))
 
+    def fail(self, why: str) -> None:
+        """End the recording for a reason of its own; what comes after is counted as lost."""
+        self.error = self.error or f"{self.path}: can't be written: {why}"
+
     def flush(self) -> None:
         """Hand all that was written to the kernel."""
         self._write(self._begun.flush)

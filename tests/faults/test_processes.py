@@ -17,6 +17,7 @@ from hilctl.analysis.replay import replay
 from hilctl.recording.reader import read
 from hilctl.run.orphans import recover_orphans
 from hilctl.run.run_folder import runs
+from hilctl.run.shared_page import SIZE
 
 KILLS = Path(__file__).parents[1] / "benchmark" / "kills.py"
 EXPERIMENT = {
@@ -59,7 +60,7 @@ class Run:
             assert time.monotonic() < deadline
             time.sleep(0.02)
         children = Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children")
-        self.loop = int(children.read_text().split()[0])
+        (self.loop,) = map(int, children.read_text().split())
 
     def end(self):
         out, err = self.process.communicate(timeout=60)
@@ -154,7 +155,7 @@ def test_garbage_in_the_ring_is_survived(tmp_path, seed):
     with folder.ring.open("r+b") as ring:
         size = ring.seek(0, os.SEEK_END)
         for _ in range(30):
-            ring.seek(chance.randrange(50_000, size - 200))
+            ring.seek(chance.randrange(SIZE, size - 200))
             ring.write(chance.randbytes(200))
     time.sleep(0.5)
     run.process.send_signal(signal.SIGINT)

@@ -165,6 +165,7 @@ class TestAccepted:
             "max_late_s": 1.0,
             "max_consecutive_late": None,
             "grace_s": 0.0,
+            "hang_s": None,
         }
         assert config.recording.model_dump() == {
             "folder": "recordings",
