@@ -1,6 +1,7 @@
-"""Commands about runs: start, check, status, set, stop."""
+"""Commands about runs: start, check, status, set, stop; and the safe value without one."""
 
 import signal
+import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -138,3 +139,19 @@ def check(experiment: ExperimentFile, settings: Settings = None, as_json: AsJson
         print_json({"experiment": str(experiment), **checked.forecast.to_mapping()})
     else:
         print_forecast(checked)
+
+
+def safe(experiment: ExperimentFile, settings: Settings = None, as_json: AsJson = False) -> None:
+    """Put a device at its safe value by hand, where no run holds it."""
+    from hilctl.run.by_hand import put_safe
+
+    put = put_safe(experiment, settings or [])
+    if as_json:
+        print_json(put.to_mapping())
+    elif put.error:
+        print(f"the safe value could not be confirmed: {put.error}", file=sys.stderr)
+        print("The output is NOT known to be at its safe value: look at it.", file=sys.stderr)
+    else:
+        print(f"{put.device}: at its safe value, {put.value:g} {put.unit}, confirmed")
+    if put.error:
+        raise typer.Exit(3)

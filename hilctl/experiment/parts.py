@@ -61,7 +61,7 @@ class Timing(Strict):
             Left out, as many as come in two seconds: this machine can't keep the rate.
         grace_s: Time after the start in which late ticks count, but don't end the run.
         hang_s: A loop that gives no sign for this time and two tick periods is killed, and the
-            output made safe; while it waits for the device, ``max_late_s`` more. Left out, 0.1 s;
+            output made safe; while it waits for the device, ``max_late_s`` more. Left out, 80 ms;
             for a simulated device, which has no coil to protect, ``max_late_s`` and half a second.
     """
 

@@ -15,6 +15,7 @@ run_folder.py      runs that are going on, and who holds a device
 requests.py        requests to a run, over control_socket.py; client.py sends them
 systemd.py         readiness and watchdog of a service
 orphans.py         what dead runs left behind
+by_hand.py         a device put at its safe value with no run
 unpaced.py         a run of a simulated device that needs no real time
 result.py          where a run stands, and how it ended
 """

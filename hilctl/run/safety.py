@@ -29,7 +29,7 @@ _AGAIN_NS = 5_000_000_000
 _ACTING_NS = 60_000_000_000
 _END_S = 1.0
 _SIMULATED_MARGIN_S = 0.5
-_HANG_S = 0.1
+_HANG_S = 0.08
 
 
 def silence_limits(checked: Checked) -> SilenceLimits:

@@ -30,7 +30,7 @@ from hilctl.run.shared_page import Field, PageText
 from hilctl.run.started_run import STOPS, StartedRun
 from hilctl.run.systemd import Notifier
 
-_POLL_S = 0.02
+_POLL_S = 0.01
 _START_DELAY_NS = 50_000_000
 
 
