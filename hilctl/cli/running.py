@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from hilctl.base.errors import HilctlError
 from hilctl.cli.options import (
     AsJson,
     ExperimentFile,
@@ -44,12 +45,17 @@ def run(
         result = start_run(experiment, settings or [], output, overwrite, view.update)
         if result.stop_signal:  # impatience must not cost the result of a run that has ended
             signal.signal(result.stop_signal, signal.SIG_IGN)
-    report = report_of(result, whole=as_json)
+    report, unread = None, ""
+    try:
+        report = report_of(result, whole=as_json)
+    except HilctlError as error:  # of a run that has moved: no refusal, and no exit code of one
+        unread = f"hilctl: the recording can't be reported: {error}"
+        print(unread, file=sys.stderr)
     if as_json:
         print_json(run_mapping(result, report))
     else:
         print_run(result, report)
-    if result.code == "fault":
+    if result.code == "fault" or unread:
         raise typer.Exit(3)
     if result.stop_signal:
         raise typer.Exit(128 + result.stop_signal)

@@ -87,8 +87,10 @@ class RingRecorder:
         self._drain()
         if self.stalled_s() >= self._flush_s:
             # Room is given back only once the file has what stood there.
-            self.recorder.flush()
-            self._ring.release()
+            if self.recorder.flush():
+                self._ring.release()
+            else:
+                self._ring.take_again()
             self._released_s = time.monotonic()
 
     def _drain(self) -> None:
@@ -106,6 +108,9 @@ class RingRecorder:
         outcome, page, recorder = self._outcome, self._ring.page, self.recorder
         assert outcome is not None
         self._drain()
+        if not recorder.flush():
+            self._ring.take_again()
+            self._drain()
         while self._ring.skip_damaged():  # no more will come: take what stands behind them
             self._drain()
         if self._lost_loop:

@@ -26,12 +26,13 @@ from hilctl.run.ring import SampleRing
 from hilctl.run.ring_recorder import RingRecorder
 from hilctl.run.run_folder import RunFolder, held_devices, run_folder
 from hilctl.run.safety import Safety, guardian_of
-from hilctl.run.shared_page import Field, PageText
+from hilctl.run.shared_page import Field, PageText, SharedPage
 from hilctl.run.started_run import STOPS, StartedRun
 from hilctl.run.systemd import Notifier
 
 _POLL_S = 0.01
 _START_DELAY_NS = 50_000_000
+_START_TRIES = 3
 
 
 class Supervisor:
@@ -114,9 +115,7 @@ class Supervisor:
             # It is started after the loop, to watch its process, and ready long before it.
             while not safety.ready():
                 time.sleep(0.005)
-            start_ns = time.monotonic_ns() + _START_DELAY_NS
-            unix_ns = time.time_ns() + start_ns - time.monotonic_ns()
-            recording.recorder.begin(unix_ns, json.loads(page.read_text(PageText.SET_UP)))
+            start_ns = self._begin(recording.recorder, page)
             recording.start()
         except BaseException as error:
             child.kill()  # it waits for the start signal, so nothing has moved
@@ -131,6 +130,27 @@ class Supervisor:
         page.put(Field.START_NS, start_ns)
         page.put(Field.GO, 1)
         return safety
+
+    def _begin(self, recorder: Recorder, page: SharedPage) -> int:
+        """Write what the recording begins with; return when sample 0 is due, monotonic time in ns.
+
+        The file says when that is. On a disk so slow that the time has come before the file says
+        so, it is written anew with a later one: the first tick would be late by as much.
+        """
+        set_up = json.loads(page.read_text(PageText.SET_UP))
+        delay_ns = _START_DELAY_NS
+        for _ in range(_START_TRIES):
+            began_ns = time.monotonic_ns()
+            start_ns = began_ns + delay_ns
+            recorder.begin(time.time_ns() + delay_ns, set_up)
+            took_ns = time.monotonic_ns() - began_ns
+            if took_ns < delay_ns // 2:
+                return start_ns
+            delay_ns = _START_DELAY_NS + 3 * took_ns
+        raise RunError(
+            f"{self._output}: the disk took {took_ns * 1e-9:.3g} s for the first bytes; "
+            "nothing has moved"
+        )
 
     def _attend(self, started: StartedRun, server: ControlServer) -> None:
         """See to a run until its recording is closed, whatever goes wrong meanwhile."""
@@ -189,13 +209,14 @@ class Supervisor:
         stop_signal = self._stop_signal or (signal.SIGTERM if requests.stop else 0)
         cut = f"; {recorder.missing} samples are lost: {recorder.error}" if recorder.error else ""
         broke = f"; the supervisor broke: {started.broke}" if started.broke else ""
+        moved = "".join(f"; {note}" for note in recorder.notes)
         unasked = outcome.code == "stopped" and not stop_signal
-        fault = recorder.error or started.broke or unasked
+        fault = recorder.error or recorder.notes or started.broke or unasked
         code = "fault" if fault else outcome.code
         return RunResult(
             path=recorder.path,
             code=code,
-            reason=outcome.reason + broke + cut,
+            reason=outcome.reason + broke + moved + cut,
             safe=outcome.safe,
             stop_signal=stop_signal if code == "stopped" else 0,
             samples=recorder.samples,
