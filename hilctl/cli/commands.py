@@ -44,6 +44,10 @@ COMMANDS: dict[str, CommandEntry] = {
     "stop": CommandEntry(
         "hilctl.cli.running:stop", "End a run by its safe ramp, close, and record why."
     ),
+    "safe": CommandEntry(
+        "hilctl.cli.running:safe",
+        "Put a device at its safe value by hand, where no run holds it.",
+    ),
     "report": CommandEntry(
         "hilctl.cli.recordings:report", "Judge a recording: hysteresis, error, noise, lateness."
     ),

@@ -1,11 +1,13 @@
-"""Commands about runs: start, check, status, set, stop."""
+"""Commands about runs: start, check, status, set, stop; and the safe value without one."""
 
 import signal
+import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from hilctl.base.errors import HilctlError
 from hilctl.cli.options import (
     AsJson,
     ExperimentFile,
@@ -43,12 +45,17 @@ def run(
         result = start_run(experiment, settings or [], output, overwrite, view.update)
         if result.stop_signal:  # impatience must not cost the result of a run that has ended
             signal.signal(result.stop_signal, signal.SIG_IGN)
-    report = report_of(result, whole=as_json)
+    report, unread = None, ""
+    try:
+        report = report_of(result, whole=as_json)
+    except HilctlError as error:  # of a run that has moved: no refusal, and no exit code of one
+        unread = f"hilctl: the recording can't be reported: {error}"
+        print(unread, file=sys.stderr)
     if as_json:
         print_json(run_mapping(result, report))
     else:
         print_run(result, report)
-    if result.code == "fault":
+    if result.code == "fault" or unread:
         raise typer.Exit(3)
     if result.stop_signal:
         raise typer.Exit(128 + result.stop_signal)
@@ -138,3 +145,19 @@ def check(experiment: ExperimentFile, settings: Settings = None, as_json: AsJson
         print_json({"experiment": str(experiment), **checked.forecast.to_mapping()})
     else:
         print_forecast(checked)
+
+
+def safe(experiment: ExperimentFile, settings: Settings = None, as_json: AsJson = False) -> None:
+    """Put a device at its safe value by hand, where no run holds it."""
+    from hilctl.run.by_hand import put_safe
+
+    put = put_safe(experiment, settings or [])
+    if as_json:
+        print_json(put.to_mapping())
+    elif put.error:
+        print(f"the safe value could not be confirmed: {put.error}", file=sys.stderr)
+        print("The output is NOT known to be at its safe value: look at it.", file=sys.stderr)
+    else:
+        print(f"{put.device}: at its safe value, {put.value:g} {put.unit}, confirmed")
+    if put.error:
+        raise typer.Exit(3)

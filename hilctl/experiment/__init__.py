@@ -7,6 +7,7 @@ initial_state.py  what the run before left in the actuator
 check.py          the whole run worked out beforehand, held against device, model and limits
 forecast.py       what a run will do
 interlocks.py     interlocks and feedback.py feedback, from the file's keys
-registry.py       devices by name; inventory.py  what there is on this machine
+device.py         the device that it names; registry.py  devices by name
+inventory.py      what there is on this machine
 schema.py         the file's JSON schema
 """

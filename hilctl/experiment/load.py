@@ -11,8 +11,8 @@ from hilctl.base.files import TextFiles
 from hilctl.base.yaml.document import Document, load_document
 from hilctl.base.yaml.plain import dump
 from hilctl.experiment.correction import Correction, load_correction
+from hilctl.experiment.device import made_device
 from hilctl.experiment.file import Experiment
-from hilctl.experiment.registry import device_class, known_devices
 from hilctl.models.base import HysteresisModel
 from hilctl.models.files import load_model
 
@@ -73,7 +73,7 @@ def resolve(
         document.set(setting)
     problems: list[Problem] = []
     config = _collect(problems, lambda: document.validate(Experiment))
-    device = _collect(problems, lambda: _make_device(document, folder, files))
+    device = _collect(problems, lambda: made_device(document, folder, files))
     named = _NamedFiles(document, folder, files)
     model = _collect(problems, lambda: named.load("model", load_model))
     correction = _collect(problems, lambda: named.load("correction", load_correction))
@@ -113,30 +113,6 @@ def _collect(problems: list[Problem], load: Callable[[], T]) -> T | None:
     except ConfigError as error:
         problems.extend(error.problems)
     return None
-
-
-def _make_device(document: Document, folder: Path, files: TextFiles) -> Device | None:
-    given = document.data.get("device")
-    if not isinstance(given, dict):
-        return None
-    kind = given.get("kind")
-    where = document.where(("device", "kind"))
-    if not isinstance(kind, str):
-        rule, value = ("must be text", repr(kind)) if "kind" in given else ("is required", "")
-        hint = f"known: {', '.join(sorted(known_devices()))}"
-        raise ConfigError([Problem(where, "device.kind", rule, value, hint)])
-    try:
-        chosen = device_class(kind)
-    except InputError as error:
-        raise ConfigError([Problem(where, "device.kind", str(error))]) from None
-    context = {"folder": folder, "files": files}
-    options = document.validate(chosen.Options, at=("device",), without=("kind",), context=context)
-    try:
-        return chosen(options)
-    except ConfigError:
-        raise
-    except InputError as error:
-        raise ConfigError([Problem(document.where(("device",)), "device", str(error))]) from None
 
 
 @dataclass(frozen=True, slots=True)

@@ -65,6 +65,9 @@ class Timing(Strict):
             after it, so that such a run does not put out the waveform that was checked.
         max_missed_share: Share of ticks that may be skipped, over ten seconds or the whole waveform
             where that is shorter; only as many as five stalls or more make end a run.
+        hang_s: A loop that gives no sign for this time and two tick periods is killed, and the
+            output made safe; while it waits for the device, ``max_late_s`` more. Left out, 80 ms;
+            for a simulated device, which has no coil to protect, ``max_late_s`` and half a second.
     """
 
     late_policy: Literal["skip", "catch_up", "slip"] = "skip"
@@ -74,6 +77,7 @@ class Timing(Strict):
     grace_s: Annotated[float, Field(ge=0.0)] = 0.0
     on_misses: Literal["warn", "fault"] = "fault"
     max_missed_share: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.01
+    hang_s: Annotated[float, Field(ge=0.02, le=60.0)] | None = None
 
 
 class RecordingConfig(Strict):

@@ -137,9 +137,9 @@ class OutputFile:
         lock(self.stream, fcntl.LOCK_EX)
 
     def begin(self) -> BinaryIO:
-        """Empty the file and return it, open for writing."""
-        if not self._ours:
-            self.stream.truncate(0)
+        """Empty the file and return it, open for writing; may be called again to begin anew."""
+        self.stream.seek(0)
+        self.stream.truncate(0)
         return self.stream
 
     def give_back(self) -> None:

@@ -3,17 +3,22 @@
 start.py           from an experiment file to a finished run
 job.py             the experiment as it goes to the loop's process
 assemble.py        from a checked experiment to the plan of its loop
-supervisor.py      starts the loop's process, records, makes the rig safe
-child.py           the supervisor's hold on that process; hang_watch.py  whether it hangs
+supervisor.py      starts loop, guardian and recorder; started_run.py  sees to them to the end
+child.py           the supervisor's hold on the loop's process; hang_watch.py  whether it hangs
+guardian.py        a process that makes the output safe where the loop can't; safety.py  sees to
+                   it, and stands in for it; safe_action.py  what both do then
 loop_process.py    the loop's process; host.py  its side of the shared memory
 starting.py        where the output is before a run
 ring.py            sample blocks in shared memory, behind shared_page.py
 recorder.py        into the recording; metadata.py what it says of the run
+kept_file.py       a file that somebody takes away while it is written
+ring_recorder.py   from the ring into it, in a thread of its own; progress.py  for who looks on
 run_folder.py      runs that are going on, and who holds a device
 requests.py        requests to a run, over control_socket.py; client.py sends them
 systemd.py         readiness and watchdog of a service
 probe.py           whether a device answers, and whether that can be true
 orphans.py         what dead runs left behind
+by_hand.py         a device put at its safe value with no run
 unpaced.py         a run of a simulated device that needs no real time
 result.py          where a run stands, and how it ended
 """

@@ -10,13 +10,13 @@ from contextlib import suppress
 
 from hilctl.base.errors import InputError, RunError
 from hilctl.experiment.check import Checked
-from hilctl.loop.plan import Outcome
 from hilctl.run.job import Job
 from hilctl.run.ring import SampleRing
 from hilctl.run.run_folder import RunFolder
 from hilctl.run.shared_page import Field, PageText, Phase
 
 _READY_TIMEOUT_S = 120.0
+_DEATH_S = 0.1
 
 
 class LoopChild:
@@ -78,24 +78,29 @@ class LoopChild:
             raise RunError(f"the loop process died before the start: {self._death()}")
 
     @property
+    def pid(self) -> int:
+        """Its process number."""
+        return self._process.pid
+
+    @property
     def ended(self) -> bool:
         """Whether the process is gone."""
         return self._process.poll() is not None
 
     def kill(self) -> None:
-        """End it at once."""
+        """End it at once; one that the kernel keeps from dying is not waited for."""
         self._process.kill()
-        self._process.wait()
+        with suppress(subprocess.TimeoutExpired):
+            self._process.wait(_DEATH_S)
 
-    def outcome(self) -> Outcome | str:
-        """Return how it ended, or why it could not say so."""
-        # Before the exit code: the loop writes it last, with the device closed.
-        if (outcome := self._page.outcome()) is not None:
-            return outcome
+    def death(self) -> str:
+        """Return why it could not say how it ended."""
         if self._page.get(Field.PHASE) == Phase.FAILED:
             return self._page.read_text(PageText.ERROR)
         return f"the loop process died: {self._death()}"
 
     def _death(self) -> str:
-        code = self._process.wait()
+        code = self._process.poll()
+        if code is None:
+            return "it can't be ended: the kernel keeps it"
         return f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"

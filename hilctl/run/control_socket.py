@@ -10,8 +10,8 @@ import selectors
 import socket
 import struct
 import time
-from collections.abc import Callable, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
@@ -56,7 +56,8 @@ class ControlServer:
         # Not chmod after bind: for that moment others could connect.
         before = os.umask(0o177)
         try:
-            self._listener.bind(str(path))
+            with _short(path) as short:
+                self._listener.bind(short)
         except OSError as error:
             self._listener.close()
             raise RunError(f"{path}: can't listen: {error.strerror or error}") from None
@@ -139,6 +140,20 @@ class ControlServer:
         client.connection.close()
 
 
+@contextmanager
+def _short(path: Path) -> Iterator[str]:
+    """Give a short name of a socket: the kernel takes no more than 107 bytes.
+
+    Raises:
+        OSError: Its folder can't be opened.
+    """
+    folder = os.open(path.parent, os.O_PATH | os.O_DIRECTORY)
+    try:
+        yield f"/proc/self/fd/{folder}/{path.name}"
+    finally:
+        os.close(folder)
+
+
 def _is_ours(connection: socket.socket) -> bool:
     raw = connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i"))
     user = struct.unpack("3i", raw)[1]
@@ -163,7 +178,8 @@ def ask(path: Path, question: Mapping[str, Any], timeout_s: float = 5.0) -> dict
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
         connection.settimeout(timeout_s)
         try:
-            connection.connect(str(path))
+            with _short(path) as short:
+                connection.connect(short)
             connection.sendall(json.dumps(question).encode() + b"\n")
             raw = bytearray()
             while not raw.endswith(b"\n") and (data := connection.recv(_ANSWER_BYTES)):

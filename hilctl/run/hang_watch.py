@@ -1,9 +1,26 @@
-"""How the supervisor sees that the loop hangs: it lives, but its heartbeat stands still."""
+"""How it is seen that the loop hangs: it lives, but its heartbeat stands still."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
 
 from hilctl.run.shared_page import Field, Phase, SharedPage
 
-_POLLS = 5
+_POLLS = 3
 _CLOSING_S = 30.0
+
+
+@dataclass(frozen=True, slots=True)
+class SilenceLimits:
+    """How long the loop may be silent.
+
+    Attributes:
+        loop_s: While it runs.
+        exchange_s: What is added while it waits for the device.
+    """
+
+    loop_s: float
+    exchange_s: float
 
 
 class HangWatch:
@@ -14,13 +31,18 @@ class HangWatch:
 
     Args:
         page: Shared with the loop.
-        limit_s: Longest that it may be silent while it runs.
+        limits: Longest that it may be silent.
+        is_stopped: Whether the loop's process is stopped, as by SIGSTOP: then it waits for nothing
+            that could come, and no device's time-out is a reason to be silent.
     """
 
-    def __init__(self, page: SharedPage, limit_s: float) -> None:
+    def __init__(
+        self, page: SharedPage, limits: SilenceLimits, is_stopped: Callable[[], bool]
+    ) -> None:
         self._page = page
-        self._limit_ns = limit_s * 1e9
-        self._heartbeat_ns = 0
+        self._limits = limits
+        self._is_stopped = is_stopped
+        self._heartbeat_ns = -1
         self._seen_ns = 0
         self._polls = 0
 
@@ -30,14 +52,31 @@ class HangWatch:
         Args:
             now_ns: Monotonic time.
         """
-        heartbeat_ns = self._page.get(Field.LOOP_HEARTBEAT_NS)
-        phase = self._page.get(Field.PHASE)
+        page = self._page
+        heartbeat_ns, phase = page.get(Field.LOOP_HEARTBEAT_NS), page.get(Field.PHASE)
         watched = phase in {Phase.RUNNING, Phase.CLOSING}
-        if heartbeat_ns != self._heartbeat_ns or not watched or heartbeat_ns == 0:
+        if heartbeat_ns != self._heartbeat_ns or not watched:
             self._heartbeat_ns, self._seen_ns, self._polls = heartbeat_ns, now_ns, 0
             return False
         self._polls += 1
-        limit_ns = self._limit_ns
-        if phase == Phase.CLOSING:  # a device that is lost may use up its time-outs
-            limit_ns += _CLOSING_S * 1e9
-        return self._polls > _POLLS and now_ns - self._seen_ns > limit_ns
+        silent_s = (now_ns - self._seen_ns) * 1e-9
+        if self._polls <= _POLLS or silent_s <= self._limits.loop_s:
+            return False
+        return silent_s > self._limits.loop_s + self._wait_s(phase) or self._is_stopped()
+
+    def _wait_s(self, phase: int) -> float:
+        """Return how long the loop may be waiting for its device."""
+        # A device that is lost may use up its time-outs; and before the first tick nothing moves.
+        if phase == Phase.CLOSING or not self._page.get(Field.LOOP_HEARTBEAT_NS):
+            return _CLOSING_S
+        return self._limits.exchange_s if self._page.get(Field.EXCHANGING) else 0.0
+
+
+def is_stopped(process: int) -> bool:
+    """Return whether a process is stopped or traced; of one that is gone, False."""
+    try:
+        stat = Path(f"/proc/{process}/stat").read_bytes()
+    except OSError:
+        return False
+    # Behind the program's name, which may have spaces and brackets of its own.
+    return stat.rpartition(b")")[2].split()[0] in {b"T", b"t"}

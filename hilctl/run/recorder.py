@@ -18,6 +18,7 @@ from hilctl.experiment.correction import dump_correction
 from hilctl.models.files import dump_model
 from hilctl.recording.messages import RecordingLayout
 from hilctl.recording.writer import OutputFile, RecordingWriter, RunFacts
+from hilctl.run.kept_file import is_emptied, put_back
 from hilctl.run.metadata import run_facts
 
 _SAMPLES_BEFORE = 50
@@ -41,12 +42,15 @@ class Recorder:
     def __init__(self, checked: Checked, path: Path, *, overwrite: bool) -> None:
         self.path = path
         self.error = ""
+        self.notes: list[str] = []
+        """What was done to the file while it was written, for people."""
         self._next_sample = 0
-        self._flushed = 0
+        self._flushed = self._had_bytes = 0
         self._checked = checked
         self._writer: RecordingWriter | None = None
         self._unix_ns = steady_unix_ns()
         self._tail = Tail(_SAMPLES_BEFORE)
+        self._run: RunFacts | None = None
         try:
             self._file = OutputFile(path, overwrite=overwrite)
         except FileExistsError:
@@ -74,8 +78,8 @@ class Recorder:
         self._unix_ns = steady_unix_ns()
         try:
             # Before the file is opened for writing: that empties one which stood there.
-            facts = self._facts(start_unix_ns, set_up, waveform_at)
-            self._writer = RecordingWriter(self._file.begin(), facts)
+            self._run = self._facts(start_unix_ns, set_up, waveform_at)
+            self._writer = RecordingWriter(self._file.begin(), self._run)
         except OSError as error:
             raise self._unwritable(error) from None
 
@@ -88,6 +92,9 @@ class Recorder:
         # Before it is written: what a failing write loses is counted all the same.
         self._next_sample = int(batch.heads[-1, Head.FIRST_SAMPLE]) + batch.flags.shape[1]
         self._tail.add(batch)
+        if self._begun.samples == 0:
+            # The file says itself what is missing before its first sample.
+            batch.heads[0, Head.DROPPED_BEFORE] = batch.heads[0, Head.FIRST_SAMPLE]
         self._write(partial(self._begun.batch, batch))
 
     def event(self, event: Event) -> None:
@@ -95,12 +102,49 @@ class Recorder:
         led_there = replace(event, before=self._tail.up_to(event.sample))
         self._write(partial(self._begun.event, led_there))
 
-    def flush(self) -> None:
-        """Hand all that was written to the kernel."""
-        self._write(self._begun.flush)
-        # After the flush: should a later write fail, no more than this is sure to be in the file.
-        if not self.error:
-            self._flushed = self._begun.samples
+    def fail(self, why: str) -> None:
+        """End the recording for a reason of its own; what comes after is counted as lost."""
+        self.error = self.error or f"{self.path}: can't be written: {why}"
+
+    def flush(self) -> bool:
+        """Hand all that was written to the kernel, and see to it that the file is still there.
+
+        Returns:
+            Whether all since the flush before is in the file; False where somebody has emptied it,
+            so that the recording begins anew: then these samples are to be written once more.
+        """
+        kept = True
+        try:
+            # Before the flush: what it writes would hide that the file is shorter than it was.
+            if not self.error and is_emptied(self._file.stream, self._had_bytes):
+                kept = False
+                self._begin_anew()
+            self._write(self._begun.flush)
+            if not self.error:
+                # After the flush: should a later write fail, no more than this is sure to be there.
+                self._flushed = self._begun.samples
+                self._had_bytes = self._file.stream.tell()
+                self.path, done = put_back(self.path, self._file.stream)
+                if done:
+                    self._note("recording_moved", f"the recording {done}")
+        except OSError as error:
+            self.fail(f"somebody has taken it away: {error.strerror}")
+        return kept
+
+    def _begin_anew(self) -> None:
+        """Begin again in a file that somebody has emptied, as nothing in it can be read."""
+        assert self._run is not None
+        lost = self._flushed
+        self._writer = RecordingWriter(self._file.begin(), self._run)
+        self._tail = Tail(_SAMPLES_BEFORE)
+        self._flushed = self._had_bytes = 0
+        text = f"somebody has emptied the recording: {lost} samples that were in it are lost"
+        self._note("recording_emptied", text)
+
+    def _note(self, code: str, text: str) -> None:
+        event = Event(max(0, self._next_sample - 1), "error", code, text, time_ns=self._unix_ns())
+        self.notes.append(text)
+        self._write(partial(self._begun.event, event))
 
     def finish(self, end: Mapping[str, str], ended_at: int) -> None:
         """Write how the run ended, and close the file.
@@ -110,6 +154,7 @@ class Recorder:
             ended_at: Index after the last sample.
         """
         self._next_sample = max(self._next_sample, ended_at)
+        self.flush()  # it sees to a file that was taken away, for the last time
         now_ns = self._unix_ns()
         level = "info" if end["code"] == "completed" else "error"
         last = max(0, ended_at - 1)

@@ -1,6 +1,6 @@
 """Shared memory between the loop and the recorder: a ring of sample blocks behind a page.
 
-One producer (the loop) and one consumer (the supervisor). A block is born in its slot and stays
+One producer (the loop) and one consumer (the recorder). A block is born in its slot and stays
 there: the loop fills it, sends it to the device, and moves a first cursor over it (sent); when its
 displacements have come, a second one (head); the consumer takes it from there, and gives its room
 back (tail) only once it is safe in the recording. So a loop or a supervisor that dies leaves
@@ -32,7 +32,7 @@ from hilctl.run.shared_page import Field, SharedPage
 _LINE = 64
 # Plain numbers: looking up an enumeration's member takes longer than writing it.
 _SENT, _HEAD, _TAIL = int(Field.SENT), int(Field.HEAD), int(Field.TAIL)
-_ENDED_AT = int(Field.ENDED_AT)
+_ENDED_AT, _EXCHANGING = int(Field.ENDED_AT), int(Field.EXCHANGING)
 _SEQUENCE, _FIRST_SAMPLE = int(Head.SEQUENCE), int(Head.FIRST_SAMPLE)
 _HEAD_NUMBERS = len(Head)
 _MAGIC = 0x48494C43_52494E48
@@ -153,9 +153,12 @@ class SampleRing:
             block.head[_SEQUENCE] = -block.number - 1
             self._sent = numbers[_SENT] = block.number + 1
         numbers[_ENDED_AT] = block.head[_FIRST_SAMPLE] + self.block
+        # Last: from here on the loop may be silent for as long as the device keeps it waiting.
+        numbers[_EXCHANGING] = 1
 
     def answered(self, block: Block) -> bool:
         """Hand a block over to the consumer; False where it has no slot of its own."""
+        self._numbers[_EXCHANGING] = 0
         if block.number < 0:
             return False
         # The sequence number last: it says that all the rest is there.
@@ -184,6 +187,11 @@ class SampleRing:
             batch = batch.rows(slice(count))
         self._tail += count
         return batch
+
+    def take_again(self) -> None:
+        """Let all that was taken and not released be taken once more."""
+        self._tail = self._released
+        self.page.take_events_again()
 
     def skip_damaged(self) -> int:
         """Pass over blocks that will never come out; for when the producer has ended.

@@ -78,6 +78,11 @@ class RunFolder:
         return self.path / "input_um.npy"
 
     @property
+    def guardian_job(self) -> Path:
+        """File of what the guardian is to guard."""
+        return self.path / "guardian.json"
+
+    @property
     def socket(self) -> Path:
         """Socket that the supervisor answers at."""
         return self.path / "socket"

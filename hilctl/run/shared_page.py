@@ -1,20 +1,26 @@
-"""What loop and supervisor pass to each other in shared memory: numbers, texts and events.
+"""What loop, supervisor and guardian pass to each other in shared memory: numbers, texts, events.
 
 Each number has one writer, and is written whole. Nobody ever waits for the other.
+
+The guardian imports this: nothing of the loop may be imported here before it is needed, as it
+brings numba along.
 """
 
 import json
 from contextlib import suppress
-from dataclasses import asdict, astuple
+from dataclasses import asdict, astuple, dataclass
 from enum import IntEnum
 from mmap import mmap
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from hilctl.base.arrays import F64, I64
 from hilctl.base.events import Event
-from hilctl.loop.pacer import Lateness
-from hilctl.loop.plan import Outcome
+
+if TYPE_CHECKING:
+    from hilctl.loop.pacer import Lateness
+    from hilctl.loop.plan import Outcome
 
 _PAGE = 4096
 _TEXT_BYTES = 4096
@@ -23,7 +29,7 @@ _EVENT_SLOTS = 32
 
 
 class PageText(IntEnum):
-    """Texts that the loop leaves for the supervisor, each in a place of its own."""
+    """Texts that loop and guardian leave for the supervisor, each in a place of its own."""
 
     SET_UP = 0
     """How its process was set up: JSON of names and what became of each, and of what was refused
@@ -32,6 +38,8 @@ class PageText(IntEnum):
     """How the run ended: JSON of :class:`hilctl.loop.plan.Outcome`."""
     ERROR = 2
     """Why it could not start or go on, for people."""
+    GUARDIAN = 3
+    """What the guardian did: JSON of :class:`MadeSafe`, or why it could not start, for people."""
 
 
 _EVENTS_AT = _PAGE + len(PageText) * _TEXT_BYTES
@@ -64,6 +72,7 @@ class Field(IntEnum):
     WORST_LATE_TICK = 35
     LONGEST_LATE_RUN = 36
     WAVEFORM_AT = 37
+    EXCHANGING = 38
     EVENT_HEAD = 40
     EVENT_TAIL = 41
     EVENTS_LOST = 42
@@ -72,6 +81,8 @@ class Field(IntEnum):
     TUNE_GAIN = 50
     TUNE_OFFSET = 51
     TUNE_SAMPLES = 52
+    GUARDIAN_HEARTBEAT_NS = 56
+    GUARDIAN_PHASE = 57
 
 
 class Phase(IntEnum):
@@ -86,6 +97,34 @@ class Phase(IntEnum):
     CLOSING = 6
 
 
+class GuardianPhase(IntEnum):
+    """How far the guardian has come."""
+
+    STARTING = 0
+    WATCHING = 1
+    ACTING = 2
+    DONE = 3
+    FAILED = 4
+
+
+@dataclass(frozen=True, slots=True)
+class MadeSafe:
+    """What came of putting the output at its safe value in the place of a loop that can't.
+
+    Attributes:
+        hung: Whether the loop lived, but gave no sign of it, and was killed.
+        error: Why the safe value could not be confirmed; empty where the device confirmed it.
+    """
+
+    hung: bool
+    error: str
+
+    @property
+    def confirmed(self) -> bool:
+        """Whether the device has confirmed the safe value."""
+        return not self.error
+
+
 class Stop(IntEnum):
     """Why the supervisor has the loop stop; 0 is for no stop."""
 
@@ -94,6 +133,8 @@ class Stop(IntEnum):
     SIGHUP = 3
     RECORDER_FAILED = 4
     REQUEST = 5
+    RECORDER_STALLED = 6
+    SUPERVISOR_BROKE = 7
 
     @property
     def reason(self) -> str:
@@ -107,6 +148,8 @@ _REASONS = {
     Stop.SIGHUP: "stopped by SIGHUP: the terminal went away",
     Stop.RECORDER_FAILED: "stopped because the recording can't be written",
     Stop.REQUEST: "stopped by hilctl stop",
+    Stop.RECORDER_STALLED: "stopped because the disk keeps the recording waiting",
+    Stop.SUPERVISOR_BROKE: "stopped because the supervisor broke",
 }
 
 
@@ -159,27 +202,45 @@ class SharedPage:
         """Return the text that the other side left."""
         return self._read(_PAGE + place * _TEXT_BYTES, _TEXT_BYTES)
 
-    def lateness(self) -> Lateness:
+    def lateness(self) -> "Lateness":
         """Return the counters of late ticks that the loop left."""
+        from hilctl.loop.pacer import Lateness
+
         return Lateness(*map(self.get, _LATENESS))
 
-    def leave_lateness(self, lateness: Lateness) -> None:
+    def leave_lateness(self, lateness: "Lateness") -> None:
         """Leave the counters of late ticks for the supervisor."""
         for field, count in zip(_LATENESS, astuple(lateness), strict=True):
             self.put(field, count)
 
-    def leave_outcome(self, outcome: Outcome) -> None:
+    def leave_outcome(self, outcome: "Outcome") -> None:
         """Leave how the run ended for the supervisor."""
         self.write_text(PageText.OUTCOME, json.dumps(asdict(outcome)))
         # The text first: the phase says that it is there.
         self.put(Field.PHASE, Phase.ENDED)
 
-    def outcome(self) -> Outcome | None:
+    def outcome(self) -> "Outcome | None":
         """Return how the loop said that the run ended; None where it said nothing."""
+        from hilctl.loop.plan import Outcome
+
         if self.get(Field.PHASE) != Phase.ENDED:
             return None
         with suppress(ValueError, TypeError):  # damaged
             return Outcome(**json.loads(self.read_text(PageText.OUTCOME)))
+        return None
+
+    def leave_made_safe(self, made_safe: MadeSafe) -> None:
+        """Leave what came of making the output safe, for the supervisor or who comes after it."""
+        self.write_text(PageText.GUARDIAN, json.dumps(asdict(made_safe)))
+        # The text first: the phase says that it is there.
+        self.put(Field.GUARDIAN_PHASE, GuardianPhase.DONE)
+
+    def made_safe(self) -> MadeSafe | None:
+        """Return what came of the guardian's making the output safe; None where it did not act."""
+        if self.get(Field.GUARDIAN_PHASE) != GuardianPhase.DONE:
+            return None
+        with suppress(ValueError, TypeError):  # damaged
+            return MadeSafe(**json.loads(self.read_text(PageText.GUARDIAN)))
         return None
 
     def push_event(self, event: Event) -> None:
@@ -211,6 +272,10 @@ class SharedPage:
     def release_events(self) -> None:
         """Give the room of all events that were taken back to the loop: they are safe elsewhere."""
         self.put(Field.EVENT_TAIL, self._event_tail)
+
+    def take_events_again(self) -> None:
+        """Let all events that were taken and not released be taken once more."""
+        self._event_tail = self.get(Field.EVENT_TAIL)
 
     def _write(self, at: int, size: int, text: str) -> None:
         raw = text.encode()[: size - 8].decode(errors="ignore").encode()

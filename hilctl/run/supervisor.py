@@ -1,8 +1,7 @@
-"""The supervisor: starts the loop process, records what it exchanges, and makes the rig safe.
+"""The supervisor: starts loop, guardian and recorder, and ends the run whatever becomes of them.
 
-It holds no device while the loop lives. Should the loop process die or hang, it puts the output at
-its safe value by a connection of its own, drains the ring to the last sample, and closes the
-recording.
+All that can fail comes before the start signal: from then on the recording, the ring and the coil
+are seen to, whatever else goes wrong here.
 """
 
 import json
@@ -11,37 +10,32 @@ import signal
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import replace
 from pathlib import Path
 from types import FrameType
 
-from hilctl.base.errors import DeviceError, InputError, RunError
+from hilctl.base.errors import RunError
 from hilctl.experiment.check import Checked
 from hilctl.loop.pacer import deadline_misses
-from hilctl.loop.plan import Outcome
 from hilctl.machine.realtime import be_ordinary
 from hilctl.run.child import LoopChild
 from hilctl.run.control_socket import ControlServer
-from hilctl.run.hang_watch import HangWatch
-from hilctl.run.metadata import end_facts
+from hilctl.run.progress import ProgressThread
 from hilctl.run.recorder import Recorder
 from hilctl.run.requests import Requests
 from hilctl.run.result import Progress, RunResult
 from hilctl.run.ring import SampleRing
+from hilctl.run.ring_recorder import RingRecorder
 from hilctl.run.run_folder import RunFolder, held_devices, run_folder
-from hilctl.run.shared_page import Field, PageText, Stop
+from hilctl.run.safety import Safety, guardian_of
+from hilctl.run.shared_page import Field, PageText, SharedPage
+from hilctl.run.started_run import STOPS, StartedRun
 from hilctl.run.systemd import Notifier
 
 _log = logging.getLogger(__name__)
 
-_POLL_S = 0.02
+_POLL_S = 0.01
 _START_DELAY_NS = 50_000_000
-_HANG_MARGIN_S = 0.5
-_SIGNALS = {
-    signal.SIGINT: Stop.CTRL_C,
-    signal.SIGTERM: Stop.SIGTERM,
-    signal.SIGHUP: Stop.SIGHUP,
-}
+_START_TRIES = 3
 
 
 class Supervisor:
@@ -51,7 +45,7 @@ class Supervisor:
         checked: The experiment.
         output: File to record to.
         overwrite: Whether an existing file may be replaced.
-        on_progress: Called with each batch.
+        on_progress: Called a few times a second, in a thread of its own.
     """
 
     def __init__(
@@ -91,39 +85,92 @@ class Supervisor:
                 # Before there is a loop: a signal must stop it, not just end this process.
                 stack.enter_context(self._signals())
                 ring = self._make_ring(folder)
+                requests = Requests(self._checked, folder, ring.page, recorder)
+                server = stack.enter_context(ControlServer(folder.socket, requests.answer))
                 child = LoopChild(self._checked, folder, ring, locks + own, self._silence_s)
             except BaseException:
                 recorder.give_back()
                 raise
-            self._start(ring, child, recorder)
-            self._notifier.say("READY=1", f"STATUS=recording to {self._output}")
-            requests = Requests(self._checked, folder, ring.page, recorder)
-            started = _StartedRun(self._checked, ring, child, recorder, requests)
-            with ControlServer(folder.socket, requests.answer) as server:
-                while started.attend(self._stop_signal, self._on_progress):
-                    self._notifier.alive()
-                    server.serve(_POLL_S)
-            self._notifier.say("STOPPING=1")
-            return self._result(started.end(self._on_progress), started)
+            recording = RingRecorder(ring, recorder, config.recording.flush_s)
+            safety = self._start(folder, ring, child, recording, locks + own)
+            started = StartedRun(self._checked, ring, child, safety, recording, requests)
+            self._attend(started, server)
+            safety.close()
+            return self._result(started, requests, recorder, ring)
 
-    def _start(self, ring: SampleRing, child: LoopChild, recorder: Recorder) -> None:
-        """Wait for the loop to be ready, and give it the start signal."""
-        page = ring.page
+    def _start(
+        self,
+        folder: RunFolder,
+        ring: SampleRing,
+        child: LoopChild,
+        recording: RingRecorder,
+        locks: list[int],
+    ) -> Safety:
+        """Wait for loop and guardian to be ready, and give the start signal."""
+        page, checked = ring.page, self._checked
+        simulated = checked.loaded.device.info.simulated  # there is no coil to guard
+        safety = None
         try:
+            guardian = None if simulated else guardian_of(checked, folder, page, child.pid, locks)
+            safety = Safety(checked, page, child, guardian, recording.record_event)
             child.await_ready(lambda: self._stop_signal != 0)
-            start_ns = time.monotonic_ns() + _START_DELAY_NS
-            unix_ns = time.time_ns() + start_ns - time.monotonic_ns()
-            set_up, refused = json.loads(page.read_text(PageText.SET_UP))
-            self._warn(refused)
-            recorder.begin(unix_ns, set_up, page.get(Field.WAVEFORM_AT))
-        except (RunError, InputError):
+            # It is started after the loop, to watch its process, and ready long before it.
+            while not safety.ready():
+                time.sleep(0.005)
+            start_ns = self._begin(recording.recorder, page)
+            recording.start()
+        except BaseException as error:
             child.kill()  # it waits for the start signal, so nothing has moved
-            recorder.give_back()
+            if safety is not None:
+                safety.close()
+            recording.recorder.give_back()
+            if isinstance(error, OSError):
+                raise RunError(f"the run can't be started: {error}; nothing has moved") from error
             raise
         # GO last: the loop then reads its start time, and would take an old heartbeat for silence.
         page.put(Field.SUPERVISOR_HEARTBEAT_NS, time.monotonic_ns())
         page.put(Field.START_NS, start_ns)
         page.put(Field.GO, 1)
+        return safety
+
+    def _begin(self, recorder: Recorder, page: SharedPage) -> int:
+        """Write what the recording begins with; return when sample 0 is due, monotonic time in ns.
+
+        The file says when that is. On a disk so slow that the time has come before the file says
+        so, it is written anew with a later one: the first tick would be late by as much.
+        """
+        set_up, refused = json.loads(page.read_text(PageText.SET_UP))
+        self._warn(refused)
+        delay_ns = _START_DELAY_NS
+        for _ in range(_START_TRIES):
+            began_ns = time.monotonic_ns()
+            start_ns = began_ns + delay_ns
+            recorder.begin(time.time_ns() + delay_ns, set_up, page.get(Field.WAVEFORM_AT))
+            took_ns = time.monotonic_ns() - began_ns
+            if took_ns < delay_ns // 2:
+                return start_ns
+            delay_ns = _START_DELAY_NS + 3 * took_ns
+        raise RunError(
+            f"{self._output}: the disk took {took_ns * 1e-9:.3g} s for the first bytes; "
+            "nothing has moved"
+        )
+
+    def _attend(self, started: StartedRun, server: ControlServer) -> None:
+        """See to a run until its recording is closed, whatever goes wrong meanwhile."""
+        shown = ProgressThread(started.progress, self._on_progress, started.progress_failed)
+        try:
+            shown.start()
+            self._notifier.say("READY=1", f"STATUS=recording to {self._output}")
+            while started.attend(self._stop_signal):
+                self._notifier.alive()
+                server.serve(_POLL_S)
+            self._notifier.say("STOPPING=1")
+        except Exception as error:  # noqa: BLE001  it must not cost coil, ring or recording
+            started.break_off(error)
+            # Without whatever may have broken: no requests, no display, no service manager.
+            while started.attend(self._stop_signal):
+                time.sleep(_POLL_S)
+        shown.end()
 
     def _warn(self, refused: list[str]) -> None:
         """Say what real time was refused, where a late tick would be one of a real device."""
@@ -142,7 +189,7 @@ class Supervisor:
         def note(number: int, frame: FrameType | None) -> None:
             self._stop_signal = self._stop_signal or number
 
-        before = {number: signal.signal(number, note) for number in _SIGNALS}
+        before = {number: signal.signal(number, note) for number in STOPS}
         try:
             yield
         finally:
@@ -163,110 +210,28 @@ class Supervisor:
             hint = "less recording.ring_s needs less of it"
             raise RunError(f"{folder.ring}: no memory: {error.strerror}; {hint}") from None
 
-    def _result(self, outcome: Outcome, started: "_StartedRun") -> RunResult:
-        recorder = started.recorder
-        stop_signal = self._stop_signal or (signal.SIGTERM if started.requests.stop else 0)
+    def _result(
+        self, started: StartedRun, requests: Requests, recorder: Recorder, ring: SampleRing
+    ) -> RunResult:
+        outcome = started.outcome
+        assert outcome is not None
+        stop_signal = self._stop_signal or (signal.SIGTERM if requests.stop else 0)
         cut = f"; {recorder.missing} samples are lost: {recorder.error}" if recorder.error else ""
-        fault = recorder.error or (outcome.code == "stopped" and not stop_signal)
+        broke = f"; the supervisor broke: {started.broke}" if started.broke else ""
+        moved = "".join(f"; {note}" for note in recorder.notes)
+        unasked = outcome.code == "stopped" and not stop_signal
+        fault = recorder.error or recorder.notes or started.broke or unasked
         code = "fault" if fault else outcome.code
-        skipped = started.ring.page.lateness().skipped_ticks
+        skipped = ring.page.lateness().skipped_ticks
         due = (recorder.samples + recorder.missing) // self._config.block
         return RunResult(
-            path=self._output,
+            path=recorder.path,
             code=code,
-            reason=outcome.reason + cut,
+            reason=outcome.reason + broke + moved + cut,
             safe=outcome.safe,
             stop_signal=stop_signal if code == "stopped" else 0,
             samples=recorder.samples,
             missing=recorder.missing,
-            late_ticks=started.ring.page.get(Field.LATE_TICKS),
+            late_ticks=ring.page.get(Field.LATE_TICKS),
             deadline_misses=deadline_misses(skipped, due, self._config.timing.max_missed_share),
         )
-
-
-class _StartedRun:
-    """A run whose loop exchanges samples: its ring, its process, its recording, its requests."""
-
-    def __init__(
-        self,
-        checked: Checked,
-        ring: SampleRing,
-        child: LoopChild,
-        recorder: Recorder,
-        requests: Requests,
-    ) -> None:
-        self.ring, self.child, self.recorder, self.requests = ring, child, recorder, requests
-        self._checked = checked
-        self._config = checked.loaded.config
-        limit_s = self._config.tick_s + self._config.timing.max_late_s + _HANG_MARGIN_S
-        self._watch = HangWatch(ring.page, limit_s)
-        self._flushed = time.monotonic()
-        self._hung = False
-
-    def attend(self, stop_signal: int, on_progress: Callable[[Progress], None]) -> bool:
-        """Write the heartbeat, pass a stop on, and record; return whether the loop lives."""
-        page = self.ring.page
-        # Asked before the ring is drained: of a loop that has ended, nothing can come after that.
-        ended = self.child.ended
-        page.put(Field.SUPERVISOR_HEARTBEAT_NS, time.monotonic_ns())
-        self._pass_stop_on(stop_signal)
-        self._drain(on_progress)
-        now = time.monotonic()
-        if now - self._flushed >= self._config.recording.flush_s:
-            # Room is given back only once the file has what stood there.
-            self.recorder.flush()
-            self.ring.release()
-            self._flushed = now
-        if not ended and self._watch.hangs(time.monotonic_ns()):
-            self._hung = True
-            # Before the output is made safe: many devices take one connection only.
-            self.child.kill()
-        return not ended
-
-    def end(self, on_progress: Callable[[Progress], None]) -> Outcome:
-        """Return how the run ended, with the output safe and the recording closed."""
-        said = self.child.outcome()
-        # The coil comes before the samples: those wait in memory, and lose nothing by it.
-        outcome = said if isinstance(said, Outcome) else self._make_safe(said)
-        while self.ring.skip_damaged():  # no more will come: take what stands behind damaged blocks
-            self._drain(on_progress)
-        if outcome is not said:
-            if (batch := self.ring.unanswered(self.recorder.next_sample)) is not None:
-                self.recorder.batch(batch)
-            ended_at = max(self.recorder.next_sample, self.ring.page.get(Field.ENDED_AT))
-            outcome = replace(outcome, ended_at=ended_at)
-        page = self.ring.page
-        facts = end_facts(outcome, page.lateness(), page.get(Field.EVENTS_LOST))
-        self.recorder.finish(facts, outcome.ended_at)
-        return outcome
-
-    def _make_safe(self, death: str) -> Outcome:
-        """Put the output at its safe value in the place of a loop that can't."""
-        reason = "the loop process hung, and was killed" if self._hung else death
-        safe = True
-        try:
-            self._checked.loaded.device.make_safe(self._config.safe.value)
-        except DeviceError as error:
-            reason += f"; the safe value could not be confirmed: {error}"
-            safe = False
-        return Outcome("fault", reason, 0, safe, 0)
-
-    def _pass_stop_on(self, stop_signal: int) -> None:
-        page = self.ring.page
-        if stop_signal:
-            page.put(Field.STOP, _SIGNALS[signal.Signals(stop_signal)])
-        elif self.requests.stop:
-            page.put(Field.STOP, Stop.REQUEST)
-        elif self.recorder.error and self._config.recording.on_failure == "stop":
-            page.put(Field.STOP, Stop.RECORDER_FAILED)
-
-    def _drain(self, on_progress: Callable[[Progress], None]) -> None:
-        page, recorder = self.ring.page, self.recorder
-        while (batch := self.ring.pop()) is not None:
-            recorder.batch(batch)
-            total, late = self._checked.forecast.samples, page.get(Field.LATE_TICKS)
-            compensated = self._config.compensator is not None
-            on_progress(Progress(recorder.samples, total, late, compensated, batch))
-        # After the samples: an event is recorded with those that led to it.
-        for event in page.pop_events():
-            recorder.event(event)

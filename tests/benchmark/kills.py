@@ -1,4 +1,4 @@
-"""Kill a run's processes at random times, and judge by the emulated device's own log of writes.
+"""Kill and stop a run's processes at random times, and judge by the device's own log of writes.
 
 Run it with ``python tests/benchmark/kills.py``; see README.md beside it. The device is a plain
 Modbus TCP server without a watchdog: whatever is last written stays on the output.
@@ -13,6 +13,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,9 @@ from other_reader import NOT_INSTALLED, verdict
 from hilctl.base.samples import Flag
 from hilctl.recording.reader import read
 
-RATE_HZ = 500
+SLOW_WRITE = Path(__file__).with_name("slow_write.c")
+OBSERVED_S = 1.0
+LONGEST_S = 120.0
 RAMP_S = 0.1
 GAIN_A_PER_V = 1.0
 PROFILE = """\
@@ -45,29 +48,34 @@ watchdog: none
 """
 EXPERIMENT: dict[str, Any] = {
     "name": "kill",
-    "sample_rate_hz": RATE_HZ,
     "waveform": {
         "kind": "sine",
         "unit": "A",
         "amplitude": 4.0,
         "frequency_hz": 2.0,
-        "duration_s": 60.0,
+        "duration_s": 600.0,
         "soft_start_s": 0.1,
     },
     "compensator": "none",
     "limits": {"peak_current_a": 5.0, "slew_a_per_s": 500.0, "stroke_um": [-100.0, 100.0]},
     "safe": {"value": 0.0, "ramp_s": RAMP_S},
+    "recording": {"ring_s": 60.0, "flush_s": 0.5},
 }
+ROLES = {"loop": b"hilctl.run.loop_process", "guardian": b"hilctl.run.guardian"}
+TARGETS = ("loop", "supervisor", "guardian", "loop+supervisor", "loop+guardian")
+TARGETS += ("supervisor+guardian",)
+ATTACKS = tuple(f"{action}:{target}" for target in TARGETS for action in ("kill", "stop"))
 
 
 @dataclass
-class Kill:
-    """What one kill came to.
+class Attack:
+    """What one attack came to.
 
     Attributes:
-        victim: ``loop`` or ``supervisor``.
-        after_s: Time from the first write to the kill.
-        safe_ms: Time from the kill to the last write, which was the safe value; NaN if it was not.
+        attack: ``kill`` or ``stop``, and the processes that it hit.
+        after_s: Time from the first writes to the attack.
+        safe_ms: Longest time from the attack on that the output stood at another value than the
+            safe one with no new write: nobody had it under control. Infinite where it stayed.
         written: Writes that the device saw.
         recorded: Samples in the recording.
         lost: Writes whose command is not in the recording, in order.
@@ -75,7 +83,7 @@ class Kill:
         other_reader: Where another program's reading of the recording differs; empty where not.
     """
 
-    victim: str
+    attack: str
     after_s: float
     safe_ms: float
     written: int
@@ -90,13 +98,14 @@ class Kill:
         return self.lost == 0 and self.safe_ms <= within_ms and agree
 
 
-class KilledRuns:
+class AttackedRuns:
     """An emulated device and experiments that use it."""
 
-    def __init__(self, folder: Path, seed: int) -> None:
+    def __init__(self, folder: Path, seed: int, rate_hz: float, stall_s: float) -> None:
         self._folder = folder
         self._random = random.Random(seed)
         self._environment = {**os.environ, "HILCTL_RUNS": str(folder / "runs")}
+        self._disk = _slow_disk(folder, stall_s) if stall_s else {}
         profile = folder / "profile.yaml"
         profile.write_text(PROFILE, encoding="utf-8")
         self._log = folder / "writes.jsonl"
@@ -115,62 +124,112 @@ class KilledRuns:
             "sensor": {"um_per_v": 12.5},
             "watchdog": "none",
         }
+        changes = {"sample_rate_hz": rate_hz, "device": device}
         self._experiment = folder / "experiment.yaml"
-        self._experiment.write_text(yaml.safe_dump({**EXPERIMENT, "device": device}))
+        self._experiment.write_text(yaml.safe_dump({**EXPERIMENT, **changes}))
 
     def close(self) -> None:
         """Stop the emulator."""
         self._emulator.terminate()
         self._emulator.wait()
 
-    def _hilctl(self, words: list[str], **options: Any) -> subprocess.Popen[Any]:
+    def _hilctl(
+        self, words: list[str], environment: dict[str, str] | None = None, **options: Any
+    ) -> subprocess.Popen[Any]:
         command = [sys.executable, "-m", "hilctl.cli", *words]
-        return subprocess.Popen(command, env=self._environment, **options)
+        given = {**self._environment, **(environment or {})}
+        return subprocess.Popen(command, env=given, **options)
 
     def _writes(self, skip: int) -> list[dict[str, Any]]:
         lines = self._log.read_bytes()[skip:].split(b"\n")[:-1]
         entries = [json.loads(line) for line in lines]
         return [each for each in entries if each.get("event") == "write"]
 
-    def kill(self, victim: str, number: int) -> Kill:
-        """Run, kill at a random time, wait until all is over, and judge."""
+    def attack(self, attack: str, number: int) -> Attack:
+        """Run, attack at a random time, wait until all is over, and judge."""
+        action, _, names = attack.partition(":")
         skip = self._log.stat().st_size
-        output = self._folder / f"{victim}-{number}.mcap"
+        output = self._folder / f"{attack.replace(':', '-')}-{number}.mcap"
         words = ["run", str(self._experiment), "--output", str(output), "--json"]
         quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-        run = self._hilctl(words, **quiet)
+        run = self._hilctl(words, self._disk, **quiet)
         while len(self._writes(skip)) < 10:
             assert run.poll() is None, "the run ended by itself"
             time.sleep(0.02)
-        loop = int(Path(f"/proc/{run.pid}/task/{run.pid}/children").read_text().split()[0])
+        processes = {"supervisor": run.pid, **_children(run.pid)}
         after_s = self._random.uniform(0.05, 1.5)
         time.sleep(after_s)
-        killed_ns = time.monotonic_ns()
-        os.kill(loop if victim == "loop" else run.pid, signal.SIGKILL)
-        run.wait()
-        while Path(f"/proc/{loop}").exists():
-            time.sleep(0.005)
+        hit = [processes[name] for name in names.split("+")]
+        self._random.shuffle(hit)
+        hit_ns = time.monotonic_ns()
+        for process in hit:
+            os.kill(process, signal.SIGKILL if action == "kill" else signal.SIGSTOP)
+        time.sleep(OBSERVED_S)
+        # A supervisor that was stopped is to close its recording; a run that goes on is to end.
+        for number_ in (signal.SIGCONT, signal.SIGTERM):
+            with suppress(ProcessLookupError):
+                run.send_signal(number_)
+        run.wait(LONGEST_S)
+        _await_end([*processes.values()])
         self._hilctl(["status"], **quiet).wait()  # the next command of any kind recovers
-        return self._judge(victim, after_s, killed_ns, self._writes(skip), output)
+        return self._judge(attack, after_s, hit_ns, self._writes(skip), output)
 
     def _judge(
-        self, victim: str, after_s: float, killed_ns: int, writes: list[dict[str, Any]], path: Path
-    ) -> Kill:
-        last = writes[-1]
-        safe = last["value"] == 0.0
+        self, attack: str, after_s: float, hit_ns: int, writes: list[dict[str, Any]], path: Path
+    ) -> Attack:
         recording = read(path)
         commands = recording.samples.command.astype(np.float32)
         put_out = np.array([each["value"] for each in writes], dtype=np.float32) * GAIN_A_PER_V
-        return Kill(
-            victim=victim,
+        times_ns = np.array([each["monotonic_ns"] for each in writes])
+        return Attack(
+            attack=attack,
             after_s=after_s,
-            safe_ms=(last["monotonic_ns"] - killed_ns) * 1e-6 if safe else float("nan"),
+            safe_ms=_uncontrolled_ms(times_ns, put_out, hit_ns),
             written=put_out.size,
             recorded=commands.size,
             lost=_lost(put_out, commands, recording.samples.flags),
             reason=recording.end.get("reason", "none"),
             other_reader=verdict(path, commands.size),
         )
+
+
+def _children(supervisor: int) -> dict[str, int]:
+    """Return loop and guardian of a run by name."""
+    children = Path(f"/proc/{supervisor}/task/{supervisor}/children").read_text().split()
+    found = {}
+    for child in children:
+        words = Path(f"/proc/{child}/cmdline").read_bytes().split(b"\0")
+        found |= {name: int(child) for name, module in ROLES.items() if module in words}
+    return found
+
+
+def _await_end(processes: list[int]) -> None:
+    """Wait until all processes are gone; a guardian that was stopped beside nobody never is."""
+    deadline = time.monotonic() + LONGEST_S
+    while any(Path(f"/proc/{each}").exists() for each in processes):
+        assert time.monotonic() < deadline
+        for each in processes:
+            if Path(f"/proc/{each}").exists():
+                os.kill(each, signal.SIGCONT)
+        time.sleep(0.02)
+
+
+def _slow_disk(folder: Path, stall_s: float) -> dict[str, str]:
+    """Return what must stand in the environment of a run whose every write takes ``stall_s``."""
+    library = folder / "slow_write.so"
+    words = ["cc", "-shared", "-fPIC", "-O2", "-o", str(library), str(SLOW_WRITE), "-ldl"]
+    subprocess.run(words, check=True)
+    return {"LD_PRELOAD": str(library), "SLOW_WRITE_S": str(stall_s)}
+
+
+def _uncontrolled_ms(times_ns: np.ndarray, put_out: np.ndarray, hit_ns: int) -> float:
+    """Return the longest time from ``hit_ns`` on without a write at an output that is not safe."""
+    if put_out[-1] != 0.0:
+        return float("inf")
+    until_ns = times_ns[1:]
+    stood_ns = until_ns - np.maximum(times_ns[:-1], hit_ns)
+    unsafe = (put_out[:-1] != 0.0) & (until_ns > hit_ns)
+    return float(stood_ns[unsafe].max(initial=0) * 1e-6)
 
 
 def _lost(put_out: np.ndarray, commands: np.ndarray, flags: np.ndarray) -> int:
@@ -192,43 +251,45 @@ def _lost(put_out: np.ndarray, commands: np.ndarray, flags: np.ndarray) -> int:
 def main() -> int:
     """Run it; exit code 1 where a write was lost, safety came late, or readers differ."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--count", type=int, default=30, help="kills of each process")
-    parser.add_argument("--victims", nargs="+", default=["loop", "supervisor"])
+    parser.add_argument("--count", type=int, default=10, help="attacks of each kind")
+    parser.add_argument("--attacks", nargs="+", default=ATTACKS, metavar="kill:loop+guardian")
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--rate-hz", type=float, default=500.0)
+    parser.add_argument("--stall-s", type=float, default=0.0, help="time that a write takes")
     parser.add_argument("--within-ms", type=float, default=200.0)
-    parser.add_argument("--json", action="store_true", help="print every kill as JSON")
+    parser.add_argument("--json", action="store_true", help="print every attack as JSON")
     options = parser.parse_args()
-    kills: list[Kill] = []
+    found: list[Attack] = []
     with tempfile.TemporaryDirectory(prefix="hilctl-kills-") as folder:
-        killed = KilledRuns(Path(folder), options.seed)
+        runs = AttackedRuns(Path(folder), options.seed, options.rate_hz, options.stall_s)
         try:
-            for victim in options.victims:
+            for attack in options.attacks:
                 for number in range(options.count):
-                    kills.append(killed.kill(victim, number))
+                    found.append(runs.attack(attack, number))
                     if not options.json:
-                        print(kills[-1], flush=True)
+                        print(found[-1], flush=True)
         finally:
-            killed.close()
+            runs.close()
     if options.json:
-        print(json.dumps([asdict(kill) for kill in kills], indent=2))
+        print(json.dumps([asdict(each) for each in found], indent=2))
     else:
-        _print_summary(options.victims, kills)
-    return 0 if all(kill.is_good(options.within_ms) for kill in kills) else 1
+        _print_summary(options.attacks, found)
+    return 0 if all(each.is_good(options.within_ms) for each in found) else 1
 
 
-def _print_summary(victims: list[str], kills: list[Kill]) -> None:
-    for victim in victims:
-        chosen = [kill for kill in kills if kill.victim == victim]
-        times = np.array([kill.safe_ms for kill in chosen])
+def _print_summary(attacks: list[str], found: list[Attack]) -> None:
+    for attack in attacks:
+        chosen = [each for each in found if each.attack == attack]
+        times = np.array([each.safe_ms for each in chosen])
         print(
-            f"{victim}: {times.size} kills, safe after {np.median(times):.0f} ms median, "
-            f"{times.max():.0f} ms worst; {sum(kill.lost for kill in chosen)} writes lost of "
-            f"{sum(kill.written for kill in chosen)}; @mcap/core {_agreement(chosen)}"
+            f"{attack}: {times.size} times, {np.median(times):.0f} ms without control median, "
+            f"{times.max():.0f} ms worst; {sum(each.lost for each in chosen)} writes lost of "
+            f"{sum(each.written for each in chosen)}; @mcap/core {_agreement(chosen)}"
         )
 
 
-def _agreement(kills: list[Kill]) -> str:
-    said = {kill.other_reader for kill in kills}
+def _agreement(found: list[Attack]) -> str:
+    said = {each.other_reader for each in found}
     return "agrees" if said == {""} else " and ".join(sorted(said - {""}))
 
 

@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 import typer
 
-from hilctl.cli.running import check, run, set_, status, stop
+from hilctl.cli.running import check, run, safe, set_, status, stop
+from hilctl.run.by_hand import SafeByHand
 from hilctl.run.result import RunResult
 
 DEMO = Path(__file__).parents[3] / "configs" / "demo.yaml"
@@ -91,3 +92,23 @@ def test_set_says_what_was_taken(going, capsys):
     going.setattr("hilctl.run.client.set_run", lambda run, assignments, over_s: answer)
     set_(["gain=0.5"], over_s=1.5)
     assert capsys.readouterr().out == "sine-7: gain 0.5, offset -2, over 1.5 s\n"
+
+
+@pytest.mark.parametrize("as_json", [True, False])
+def test_an_output_that_is_not_known_to_be_safe_is_an_error(monkeypatch, capsys, as_json):
+    """Exit code 3, as after a run."""
+    put = SafeByHand("a device", 0.0, "A", "no answer")
+    monkeypatch.setattr("hilctl.run.by_hand.put_safe", lambda path, settings: put)
+    with pytest.raises(typer.Exit) as left:
+        safe(DEMO, as_json=as_json)
+    assert left.value.exit_code == 3
+    out, err = capsys.readouterr()
+    assert "no answer" in (out if as_json else err)
+    assert not as_json or json.loads(out)["output_safe"] is False
+
+
+def test_a_confirmed_safe_value_is_said(monkeypatch, capsys):
+    put = SafeByHand("a device", 0.25, "A", "")
+    monkeypatch.setattr("hilctl.run.by_hand.put_safe", lambda path, settings: put)
+    safe(DEMO)
+    assert capsys.readouterr().out == "a device: at its safe value, 0.25 A, confirmed\n"

@@ -168,6 +168,7 @@ class TestAccepted:
             "grace_s": 0.0,
             "on_misses": "fault",
             "max_missed_share": 0.01,
+            "hang_s": None,
         }
         assert config.recording.model_dump() == {
             "folder": "recordings",

@@ -1,14 +1,12 @@
 """How the loop's process ended, or why it never started."""
 
-import json
 import signal
-from dataclasses import asdict
+import subprocess
 from types import SimpleNamespace
 
 import pytest
 
 from hilctl.base.errors import InputError, RunError
-from hilctl.loop.plan import Outcome
 from hilctl.run import child as module
 from hilctl.run.child import LoopChild
 from hilctl.run.ring import SampleRing
@@ -82,11 +80,25 @@ def test_a_stop_comes_before_the_start(started):
     child.await_ready(lambda: True)
 
 
-def test_the_outcome_is_the_loop_s_own_where_it_left_one(started):
+def test_a_loop_that_died_or_broke_says_what_it_can(started):
+    """A loop that broke has left its reason; of one that was killed there is the signal."""
     child, page = started
     child._process.code = 7
-    assert child.outcome() == "the loop process died: exit code 7"
-    outcome = Outcome("stopped", "by a test", 7, True, 2)
-    page.write_text(PageText.OUTCOME, json.dumps(asdict(outcome)))
-    page.put(Field.PHASE, Phase.ENDED)
-    assert child.outcome() == outcome
+    assert child.death() == "the loop process died: exit code 7"
+    child._process.code = -signal.SIGSEGV
+    assert child.death() == "the loop process died: killed by SIGSEGV"
+    page.write_text(PageText.ERROR, "the loop broke: ZeroDivisionError")
+    page.put(Field.PHASE, Phase.FAILED)
+    assert child.death() == "the loop broke: ZeroDivisionError"
+
+
+def test_a_loop_that_the_kernel_keeps_is_not_waited_for(started):
+    """Whoever makes the output safe comes behind it."""
+    child, _ = started
+
+    def wait(timeout):
+        raise subprocess.TimeoutExpired("loop", timeout)
+
+    child._process.wait, child._process.kill = wait, lambda: None
+    child.kill()
+    assert "the kernel keeps it" in child.death()

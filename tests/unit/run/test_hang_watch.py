@@ -1,55 +1,102 @@
 """A loop that lives, and gives no sign of it."""
 
-from hilctl.run.hang_watch import HangWatch
+import os
+import subprocess
+import sys
+
+import pytest
+
+from hilctl.run.hang_watch import HangWatch, SilenceLimits, is_stopped
 from hilctl.run.ring import SampleRing
 from hilctl.run.shared_page import Field, Phase
 
-LIMIT_S = 1.0
+LIMITS = SilenceLimits(loop_s=1.0, exchange_s=2.0)
 
 
+class Watched:
+    """A page with a heartbeat, and who watches it."""
+
+    def __init__(self, folder):
+        self.page = SampleRing.create(folder / "ring", slots=4, block=1, state_size=1).page
+        self.page.put(Field.PHASE, Phase.RUNNING)
+        self.page.put(Field.LOOP_HEARTBEAT_NS, 1)
+        self.stopped = False
+        self.watch = HangWatch(self.page, LIMITS, lambda: self.stopped)
+
+    def looks(self, *times_s):
+        return [self.watch.hangs(round(time_s * 1e9)) for time_s in times_s]
+
+    def hangs_after_s(self):
+        """Look every 0.1 s; return the time of the first look that finds a hang."""
+        return next(k / 10 for k in range(1000) if self.watch.hangs(round(k * 1e8)))
+
+
+@pytest.fixture
 def watched(tmp_path):
-    page = SampleRing.create(tmp_path / "ring", slots=4, block=1, state_size=1).page
-    page.put(Field.PHASE, Phase.RUNNING)
-    page.put(Field.LOOP_HEARTBEAT_NS, 1)
-    return page, HangWatch(page, LIMIT_S)
+    return Watched(tmp_path)
 
 
-def look(watch, times_s):
-    return [watch.hangs(round(time_s * 1e9)) for time_s in times_s]
+def test_silence_beyond_the_limit_is_a_hang(watched):
+    """A heartbeat that stands still for longer than the limit is found, and not before."""
+    assert watched.looks(*[0.1 * k for k in range(13)]) == [False] * 11 + [True] * 2
 
 
-def test_silence_beyond_the_limit_is_a_hang(tmp_path):
-    """A heartbeat that stands still for longer than the limit is told, and not before."""
-    _, watch = watched(tmp_path)
-    seen = look(watch, [0.1 * k for k in range(13)])
-    assert seen == [False] * 11 + [True] * 2
-
-
-def test_heartbeat_starts_the_time_again(tmp_path):
+def test_heartbeat_starts_the_time_again(watched):
     """Any new sign of life will do."""
-    page, watch = watched(tmp_path)
-    assert not any(look(watch, [0.1 * k for k in range(10)]))
-    page.put(Field.LOOP_HEARTBEAT_NS, 2)
-    assert not any(look(watch, [0.9 + 0.1 * k for k in range(10)]))
+    assert not any(watched.looks(*[0.1 * k for k in range(10)]))
+    watched.page.put(Field.LOOP_HEARTBEAT_NS, 2)
+    assert not any(watched.looks(*[0.9 + 0.1 * k for k in range(10)]))
 
 
-def test_machine_that_stood_still_is_no_hang(tmp_path):
+def test_machine_that_stood_still_is_no_hang(watched):
     """A long pause of both processes is not held against the loop."""
-    _, watch = watched(tmp_path)
-    assert not any(look(watch, [0.0, 0.1, 30.0, 30.02]))
+    assert not any(watched.looks(0.0, 0.1, 30.0, 30.02))
 
 
-def test_loop_that_does_not_run_yet_or_any_more_does_not_hang(tmp_path):
+def test_loop_that_does_not_run_yet_or_any_more_does_not_hang(watched):
     """Opening and closing a device may take its time."""
-    page, watch = watched(tmp_path)
     for phase in (Phase.STARTING, Phase.READY, Phase.ENDED, Phase.FAILED):
-        page.put(Field.PHASE, phase)
-        assert not any(look(watch, [0.5 * k for k in range(20)]))
+        watched.page.put(Field.PHASE, phase)
+        assert not any(watched.looks(*[0.5 * k for k in range(20)]))
 
 
-def test_closing_a_device_has_more_time(tmp_path):
+def test_a_device_that_keeps_the_loop_waiting_is_no_hang_at_once(watched):
+    """An exchange may use up the device's time-out; for that long the loop is silent."""
+    watched.page.put(Field.EXCHANGING, 1)
+    assert watched.hangs_after_s() == 3.1
+
+
+@pytest.mark.parametrize("phase", [Phase.RUNNING, Phase.CLOSING])
+def test_a_loop_that_is_stopped_waits_for_no_device(watched, phase):
+    """SIGSTOP hits most loops in an exchange: its time-out is no excuse then."""
+    watched.page.put(Field.EXCHANGING, 1)
+    watched.page.put(Field.PHASE, phase)
+    watched.stopped = True
+    assert watched.hangs_after_s() == 1.1
+
+
+def test_closing_a_device_has_more_time(watched):
     """A device that is lost may use up its time-outs, but not for ever."""
-    page, watch = watched(tmp_path)
-    page.put(Field.PHASE, Phase.CLOSING)
-    assert not any(look(watch, [float(k) for k in range(31)]))
-    assert look(watch, [32.0]) == [True]
+    watched.page.put(Field.PHASE, Phase.CLOSING)
+    assert watched.hangs_after_s() == pytest.approx(31.0, abs=0.11)
+
+
+def test_a_loop_that_never_comes_to_its_first_tick_is_found(watched):
+    """Nothing has moved until then, so that it gets more time."""
+    watched.page.put(Field.LOOP_HEARTBEAT_NS, 0)
+    assert watched.hangs_after_s() == pytest.approx(31.0, abs=0.11)
+
+
+def test_the_kernel_says_whether_a_process_is_stopped():
+    """Whatever its program is called; one that is gone is not stopped."""
+    code = (
+        "import ctypes, os, signal; ctypes.CDLL(None).prctl(15, b') T ('); "
+        "os.kill(os.getpid(), signal.SIGSTOP)"
+    )
+    process = subprocess.Popen([sys.executable, "-c", code])
+    os.waitid(os.P_PID, process.pid, os.WSTOPPED)
+    assert is_stopped(process.pid)
+    assert not is_stopped(os.getpid())
+    process.kill()
+    process.wait()
+    assert not is_stopped(process.pid)

@@ -59,6 +59,8 @@ def begun(checked, monkeypatch, tmp_path):
     """Return a recorder that has begun, and the disk that it writes to."""
     file = DiskFile()
     monkeypatch.setattr(recorder, "OutputFile", lambda path, overwrite: file)
+    monkeypatch.setattr(recorder, "is_emptied", lambda stream, had_bytes: False)
+    monkeypatch.setattr(recorder, "put_back", lambda path, stream: (path, ""))
     made = Recorder(checked, tmp_path / "run.mcap", overwrite=False)
     made.begin(10**18, {})
     return made, file.stream
@@ -145,3 +147,53 @@ def test_nothing_comes_before_the_first_sample():
     tail.add(numbered(100, 1, 5))
     assert tail.up_to(99) is None
     assert tail.up_to(102).index.tolist() == [100, 101, 102]
+
+
+@pytest.mark.parametrize("taken", ["deleted", "renamed"])
+def test_a_recording_that_is_taken_away_is_whole_in_the_end(checked, tmp_path, taken):
+    """Under its name, with every sample; it says what has happened to it."""
+    made = Recorder(checked, tmp_path / "run.mcap", overwrite=False)
+    made.begin(10**18, {})
+    made.batch(batch(0, 20))
+    assert made.flush()
+    made.path.unlink() if taken == "deleted" else made.path.rename(tmp_path / "moved.mcap")
+    made.batch(batch(200, 20))
+    assert made.flush()
+    made.finish(END, 400)
+    recording = read(tmp_path / "run.mcap")
+    assert np.array_equal(recording.samples.index, np.arange(400))
+    assert [event.code for event in recording.events] == ["recording_moved", "run_ended"]
+    assert taken in made.notes[0]
+    assert (made.error, made.samples, made.missing) == ("", 400, 0)
+
+
+def test_a_recording_that_is_emptied_begins_anew(checked, tmp_path):
+    """What had been handed over is lost and counted; what comes after stands in the same file."""
+    made = Recorder(checked, tmp_path / "run.mcap", overwrite=False)
+    made.begin(10**18, {})
+    made.batch(batch(0, 20))
+    assert made.flush()
+    made.path.open("wb").close()
+    made.batch(batch(200, 20))
+    assert not made.flush()
+    made.batch(batch(200, 20))
+    assert made.flush()
+    made.finish(END, 400)
+    recording = read(tmp_path / "run.mcap")
+    assert np.array_equal(recording.samples.index, np.arange(200, 400))
+    assert recording.dropped == made.missing == 200
+    assert made.notes == [
+        "somebody has emptied the recording: 200 samples that were in it are lost"
+    ]
+
+
+def test_a_recording_that_can_not_be_put_back_is_an_error(checked, tmp_path):
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    made = Recorder(checked, folder / "run.mcap", overwrite=False)
+    made.begin(10**18, {})
+    made.path.unlink()
+    folder.rmdir()
+    made.flush()
+    made.finish(END, 0)
+    assert "somebody has taken it away: No such file or directory" in made.error

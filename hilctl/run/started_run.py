@@ -1,0 +1,125 @@
+"""A run whose loop exchanges samples, as the supervisor's main thread sees to it.
+
+That thread writes the heartbeat, passes stops on, and watches over the coil. It does no file
+input or output, and waits for nobody who does.
+"""
+
+import signal
+import time
+
+from hilctl.base.events import Event
+from hilctl.experiment.check import Checked
+from hilctl.loop.plan import Outcome
+from hilctl.run.child import LoopChild
+from hilctl.run.requests import Requests
+from hilctl.run.result import Progress
+from hilctl.run.ring import SampleRing
+from hilctl.run.ring_recorder import RingRecorder
+from hilctl.run.safety import Safety
+from hilctl.run.shared_page import Field, Stop
+
+STOPS = {
+    signal.SIGINT: Stop.CTRL_C,
+    signal.SIGTERM: Stop.SIGTERM,
+    signal.SIGHUP: Stop.SIGHUP,
+}
+
+
+class StartedRun:
+    """A run from its start signal to the closed recording.
+
+    Args:
+        checked: The experiment.
+        ring: Its ring.
+        child: Its loop.
+        safety: Who sees to a safe output.
+        recording: Takes what the loop exchanges.
+        requests: Requests to the run.
+    """
+
+    def __init__(
+        self,
+        checked: Checked,
+        ring: SampleRing,
+        child: LoopChild,
+        safety: Safety,
+        recording: RingRecorder,
+        requests: Requests,
+    ) -> None:
+        self._config, self._forecast = checked.loaded.config, checked.forecast
+        self._page, self._child = ring.page, child
+        self._safety, self._recording, self._requests = safety, recording, requests
+        self.outcome: Outcome | None = None
+        """How it ended, with the output safe as far as that can be had; None before."""
+        self.broke = ""
+        """What went wrong in the supervisor itself; empty where nothing did."""
+
+    def attend(self, stop_signal: int) -> bool:
+        """Write the heartbeat, pass stops on, see to a safe output; return whether it goes on.
+
+        Args:
+            stop_signal: Number of the signal that is to stop the run, or 0.
+        """
+        # Asked first: of a loop that has ended, nothing can come after that.
+        ended = self._child.ended
+        now_ns = time.monotonic_ns()
+        self._page.put(Field.SUPERVISOR_HEARTBEAT_NS, now_ns)
+        self._pass_stop_on(stop_signal)
+        if self.outcome is None:
+            self._safety.look(now_ns, ended=ended)
+            # The coil comes before the samples: those wait in memory, and lose nothing by it.
+            self._conclude(ended=ended)
+        return not self._recording.finished
+
+    def break_off(self, error: Exception) -> None:
+        """Have the loop stop by its safe ramp, as something is wrong with the supervisor."""
+        self.broke = self.broke or f"{type(error).__name__}: {error}"
+        text = f"the supervisor broke: {self.broke}"
+        sample = self._page.get(Field.NEXT_SAMPLE)
+        self._recording.record_event(Event(sample, "error", "supervisor_broke", text))
+
+    def progress(self) -> Progress | None:
+        """Return where it stands; None before the first sample."""
+        if (newest := self._recording.newest) is None:
+            return None
+        return Progress(
+            samples=self._recording.recorder.samples,
+            total=self._forecast.samples,
+            late_ticks=self._page.get(Field.LATE_TICKS),
+            compensated=self._config.compensator is not None,
+            batch=newest,
+        )
+
+    def progress_failed(self, text: str) -> None:
+        """Record that nobody sees the progress any more."""
+        sample = self._page.get(Field.NEXT_SAMPLE)
+        self._recording.record_event(Event(sample, "warning", "progress_failed", text))
+
+    def _conclude(self, *, ended: bool) -> None:
+        made_safe = self._safety.made_safe
+        if made_safe is not None:
+            hung = "the loop process hung, and was killed"
+            reason = hung if made_safe.hung else self._child.death()
+            if self._safety.by == "guardian" and made_safe.confirmed:
+                reason += "; the guardian put the output at its safe value"
+            if not made_safe.confirmed:
+                reason += f"; the safe value could not be confirmed: {made_safe.error}"
+            self.outcome = Outcome("fault", reason, 0, made_safe.confirmed, 0)
+        elif ended:
+            self.outcome = self._page.outcome()  # None where somebody is still to make it safe
+        if self.outcome is not None:
+            self._recording.end(self.outcome, lost_loop=made_safe is not None)
+
+    def _pass_stop_on(self, stop_signal: int) -> None:
+        page, recorder = self._page, self._recording.recorder
+        must_record = self._config.recording.on_failure == "stop"
+        if stop_signal:
+            page.put(Field.STOP, STOPS[signal.Signals(stop_signal)])
+        elif self._requests.stop:
+            page.put(Field.STOP, Stop.REQUEST)
+        elif self.broke:
+            page.put(Field.STOP, Stop.SUPERVISOR_BROKE)
+        elif recorder.error and must_record:
+            page.put(Field.STOP, Stop.RECORDER_FAILED)
+        elif must_record and self._recording.stalled_s() > self._config.recording.ring_s / 2.0:
+            page.put(Field.STOP, Stop.RECORDER_STALLED)

@@ -1,0 +1,76 @@
+"""A device put at its safe value by hand: confirmed, not confirmed, or refused."""
+
+from dataclasses import replace
+
+import pytest
+import yaml
+
+from hilctl.base.errors import ConfigError, DeviceError, InputError
+from hilctl.run.by_hand import put_safe
+from hilctl.run.run_folder import held_devices
+from hilctl_drivers.simulated.rigs import SimulatedTerfenol
+
+
+class Amplifier(SimulatedTerfenol):
+    """A device that notes what it is asked for, and has a port that one may hold."""
+
+    asked: list
+    error = ""
+
+    @property
+    def info(self):
+        return replace(super().info, holds=("tcp:10.9.8.7:502",))
+
+    def make_safe(self, command):
+        self.asked.append(command)
+        if self.error:
+            raise DeviceError(self.error)
+
+
+@pytest.fixture
+def amplifier(monkeypatch):
+    """The class of every device."""
+    monkeypatch.setattr("hilctl.experiment.device.device_class", lambda kind: Amplifier)
+    Amplifier.asked, Amplifier.error = [], ""
+    return Amplifier
+
+
+@pytest.fixture
+def experiment(tmp_path):
+    """A file whose model is gone, which is no reason to leave a coil as it is."""
+    path = tmp_path / "experiment.yaml"
+    section = {"kind": "simulated_terfenol"}
+    given = {"device": section, "safe": {"value": 0.5}, "compensator": {"model": "gone.yaml"}}
+    path.write_text(yaml.safe_dump(given), encoding="utf-8")
+    return path
+
+
+def test_the_experiment_s_safe_value_is_put_out_and_confirmed(amplifier, experiment):
+    assert put_safe(experiment, []).to_mapping()["output_safe"] is True
+    assert put_safe(experiment, ["safe.value=-1.5"]).value == -1.5
+    assert amplifier.asked == [0.5, -1.5]
+
+
+def test_an_output_that_is_not_confirmed_is_not_called_safe(amplifier, experiment):
+    amplifier.error = "no answer"
+    found = put_safe(experiment, []).to_mapping()
+    assert (found["output_safe"], found["error"]) == (False, "no answer")
+
+
+def test_a_device_that_a_run_holds_is_left_to_it(amplifier, experiment):
+    with (
+        held_devices(("tcp:10.9.8.7:502",), "run sine"),
+        pytest.raises(InputError, match="in use by run sine: wait for its end, or stop it first"),
+    ):
+        put_safe(experiment, [])
+    assert amplifier.asked == []
+
+
+@pytest.mark.parametrize(
+    ("text", "words"), [("name: x", "device"), ("device: {}\nsafe: {value: high}", "safe.value")]
+)
+def test_a_file_without_what_is_needed_is_refused(tmp_path, text, words):
+    path = tmp_path / "x.yaml"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(ConfigError, match=words):
+        put_safe(path, [])

@@ -1,0 +1,143 @@
+"""From the ring to the recording beside the supervisor: in order, and once."""
+
+import threading
+
+import pytest
+
+from hilctl.base.events import Event
+from hilctl.base.samples import Head
+from hilctl.loop.plan import Outcome
+from hilctl.run import ring_recorder as module
+from hilctl.run.ring import SampleRing
+from hilctl.run.ring_recorder import RingRecorder
+from hilctl.run.shared_page import Field
+
+ENDED = Outcome("completed", "waveform completed", 8, True, 0)
+
+
+class Recorder:
+    """Keeps what it is given; a flush waits for ``disk``."""
+
+    def __init__(self):
+        self.firsts, self.events, self.finished, self.errors = [], [], None, []
+        self.disk = threading.Event()
+        self.disk.set()
+        self.emptied = self.broken = False
+
+    @property
+    def next_sample(self):
+        return self.firsts[-1] + 1 if self.firsts else 0
+
+    def batch(self, batch):
+        if self.broken:
+            raise ZeroDivisionError("a bug")
+        self.firsts += batch.heads[:, Head.FIRST_SAMPLE].tolist()
+
+    def event(self, event):
+        self.events.append(event.code)
+
+    def flush(self):
+        assert self.disk.wait(30.0)
+        kept, self.emptied = not self.emptied, False
+        return kept
+
+    def fail(self, why):
+        self.errors.append(why)
+
+    def finish(self, facts, ended_at):
+        self.finished = (facts["reason"], ended_at)
+
+
+@pytest.fixture
+def ring(tmp_path):
+    return SampleRing.create(tmp_path / "ring", slots=8, block=1, state_size=1)
+
+
+@pytest.fixture
+def recording(ring):
+    """A recording of a ring; it is not started, so that a test says what it does when."""
+    return RingRecorder(ring, Recorder(), flush_s=0.0)
+
+
+def exchange(ring, count, *, answered=True):
+    for _ in range(count):
+        block = ring.claim()
+        block.head[Head.FIRST_SAMPLE] = block.number
+        ring.sending(block)
+        if answered:
+            ring.answered(block)
+
+
+def test_room_is_given_back_once_the_file_has_what_stood_there(ring, recording):
+    exchange(ring, 3)
+    recording._work()
+    assert recording.recorder.firsts == [0, 1, 2]
+    assert ring.page.get(Field.TAIL) == 3
+    assert recording.newest.heads[-1, Head.FIRST_SAMPLE] == 2
+
+
+def test_what_an_emptied_file_has_lost_is_written_once_more(ring, recording):
+    exchange(ring, 2)
+    recording.recorder.emptied = True
+    recording._work()
+    assert ring.page.get(Field.TAIL) == 0
+    recording._work()
+    assert recording.recorder.firsts == [0, 1, 0, 1]
+    assert ring.page.get(Field.TAIL) == 2
+
+
+def test_events_of_both_sides_come_after_the_samples(ring, recording):
+    exchange(ring, 1)
+    ring.page.push_event(Event(0, "info", "of_the_loop", ""))
+    recording.record_event(Event(0, "warning", "of_the_supervisor", ""))
+    recording._work()
+    assert recording.recorder.events == ["of_the_loop", "of_the_supervisor"]
+
+
+def test_what_a_dead_loop_had_sent_is_recorded_as_not_answered(ring, recording):
+    """And the samples behind a damaged block come out too."""
+    exchange(ring, 4)
+    exchange(ring, 2, answered=False)
+    ring._area.heads[1, Head.SEQUENCE] = 77
+    recording.end(Outcome("fault", "it died", 0, True, 0), lost_loop=True)
+    recording._finish()
+    assert recording.recorder.firsts == [0, 2, 3, 4, 5]
+    assert recording.recorder.finished == ("it died", 6)
+
+
+def test_a_loop_that_ended_by_itself_says_where(ring, recording):
+    exchange(ring, 2)
+    recording.end(ENDED, lost_loop=False)
+    recording._finish()
+    assert recording.recorder.finished == ("waveform completed", 8)
+
+
+def test_whatever_goes_wrong_in_it_is_said_and_the_end_comes_all_the_same(ring, recording):
+    exchange(ring, 2)
+    recording.recorder.broken = True
+    recording._guarded(recording._work)
+    assert recording.recorder.errors == ["ZeroDivisionError: a bug"]
+    recording.recorder.broken = False
+    recording.end(ENDED, lost_loop=False)
+    recording.start()
+    recording._thread.join(30.0)
+    assert recording.finished
+    assert recording.recorder.finished == ("waveform completed", 8)
+
+
+def test_nobody_waits_for_a_disk_that_stands_still(ring, recording, monkeypatch):
+    """The ring keeps what comes; how long it has been without room is known to the supervisor."""
+    now_s = 100.0
+    monkeypatch.setattr(module.time, "monotonic", lambda: now_s)
+    recording.recorder.disk.clear()
+    exchange(ring, 2)
+    recording.start()
+    recording.record_event(Event(0, "info", "x", ""))
+    recording.end(ENDED, lost_loop=False)
+    assert not recording.finished
+    now_s = 107.0
+    assert recording.stalled_s() == 7.0
+    assert ring.page.get(Field.TAIL) == 0
+    recording.recorder.disk.set()
+    recording._thread.join(30.0)
+    assert recording.recorder.finished == ("waveform completed", 8)

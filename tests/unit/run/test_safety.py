@@ -1,0 +1,220 @@
+"""Who makes the output safe: the guardian where it can, the supervisor where it can't."""
+
+from types import SimpleNamespace
+
+import pytest
+
+from hilctl.base.errors import RunError
+from hilctl.loop.plan import Outcome
+from hilctl.run import safety as module
+from hilctl.run.ring import SampleRing
+from hilctl.run.safety import Safety, silence_limits
+from hilctl.run.shared_page import Field, GuardianPhase, MadeSafe, Phase
+
+MS = 1_000_000
+
+
+class Guardian:
+    """A guardian whose process and signs of life the test has in its hand."""
+
+    def __init__(self, page, log):
+        self.page, self.log, self.ended, self.error = page, log, False, "no device"
+        self.phase = GuardianPhase.WATCHING
+        self.heartbeat_ns = 0
+
+    def kill(self):
+        self.log.append("guardian killed")
+        self.ended = True
+
+    def end(self):
+        self.log.append("guardian ended")
+
+
+class Run:
+    """A run's safety, with time in the test's hand."""
+
+    def __init__(self, page, monkeypatch, *, guarded=True, simulated=False):
+        self.page, self.log, self.events, self.guardians = page, [], [], []
+        self.now_ns, self.fail_start = 10**9, None
+        device = SimpleNamespace(
+            info=SimpleNamespace(simulated=simulated),
+            make_safe=lambda value: self.log.append(f"safe {value}"),
+        )
+        timing = SimpleNamespace(hang_s=None, max_late_s=1.0)
+        config = SimpleNamespace(timing=timing, tick_s=0.01, safe=SimpleNamespace(value=0.25))
+        self.checked = SimpleNamespace(loaded=SimpleNamespace(config=config, device=device))
+        child = SimpleNamespace(pid=1, kill=lambda: self.log.append("loop killed"))
+        monkeypatch.setattr(module, "is_stopped", lambda pid: False)
+        start = self.start if guarded else None
+        self.safety = Safety(self.checked, page, child, start, self.events.append)
+
+    def start(self):
+        if self.fail_start:
+            raise self.fail_start
+        self.guardians.append(Guardian(self.page, self.log))
+        return self.guardians[-1]
+
+    def look(self, *, ended=False, passed_ms=10, awake=True):
+        self.now_ns += passed_ms * MS
+        if awake and self.guardians:
+            self.guardians[-1].heartbeat_ns = self.now_ns
+        self.safety.look(self.now_ns, ended=ended)
+
+    def settle(self):
+        """Look until what has been begun is over."""
+        while self.safety.made_safe is None:
+            self.look(ended=True, awake=False)
+        return self.safety.made_safe
+
+
+@pytest.fixture
+def page(tmp_path):
+    page = SampleRing.create(tmp_path / "ring", slots=4, block=1, state_size=1).page
+    page.put(Field.PHASE, Phase.RUNNING)
+    page.put(Field.LOOP_HEARTBEAT_NS, 1)
+    return page
+
+
+@pytest.fixture
+def run(page, monkeypatch):
+    return Run(page, monkeypatch)
+
+
+def test_a_guardian_that_is_awake_does_it(run, page):
+    """The supervisor only waits for it, and touches neither loop nor device."""
+    for _ in range(5):
+        run.look(ended=True)
+    assert (run.log, run.safety.made_safe) == ([], None)
+    page.leave_made_safe(MadeSafe(hung=True, error=""))
+    run.look(ended=True)
+    assert run.safety.made_safe == MadeSafe(hung=True, error="")
+    assert run.safety.by == "guardian"
+
+
+@pytest.mark.parametrize("what", ["dead", "silent", "starting"])
+def test_where_the_guardian_can_not_the_supervisor_does(run, what):
+    """It kills the other one first: no two of them may hold the device."""
+    guardian = run.guardians[0]
+    run.look()
+    guardian.ended = what == "dead"
+    if what == "starting":
+        guardian.phase = GuardianPhase.STARTING
+    run.look(ended=True, passed_ms=60, awake=what != "silent")
+    assert run.settle() == MadeSafe(hung=False, error="")
+    assert run.log == ["guardian killed", "loop killed", "safe 0.25"]
+    assert run.safety.by == "supervisor"
+
+
+def test_a_guardian_that_was_just_done_when_it_was_killed_is_believed(run, page):
+    """Nothing is sent twice."""
+    guardian = run.guardians[0]
+    guardian.kill = lambda: page.leave_made_safe(MadeSafe(hung=False, error=""))
+    run.look(ended=True, passed_ms=60, awake=False)
+    assert run.safety.by == "guardian"
+    assert "safe 0.25" not in run.log
+
+
+def test_a_guardian_that_works_for_ever_is_not_waited_for(run):
+    run.guardians[0].phase = GuardianPhase.ACTING
+    run.look(ended=True)
+    run.look(ended=True, passed_ms=59_000)
+    assert run.log == []
+    run.look(ended=True, passed_ms=2_000)
+    assert run.settle().confirmed
+    assert run.log[0] == "guardian killed"
+
+
+def test_a_simulated_device_has_no_guardian(page, monkeypatch):
+    run = Run(page, monkeypatch, guarded=False, simulated=True)
+    assert run.safety.ready()
+    run.look(ended=True)
+    assert run.settle().confirmed
+    assert run.log == ["loop killed", "safe 0.25"]
+
+
+def test_a_loop_that_said_how_it_ended_is_left_alone(run, page):
+    page.leave_outcome(Outcome("completed", "waveform completed", 7, True, 0))
+    for _ in range(5):
+        run.look(ended=True, awake=False, passed_ms=100)
+    assert (run.log, run.safety.made_safe) == ([], None)
+
+
+def test_a_hanging_loop_is_found_here_too(run):
+    """Where the guardian is stopped with it, nobody else does."""
+    run.look()
+    looks = 0
+    while not run.log:
+        run.look(awake=False)
+        looks += 1
+    assert run.settle() == MadeSafe(hung=True, error="")
+    assert looks * 10 == pytest.approx(100, abs=11)  # two periods of 10 ms, and 80 ms
+    assert run.log == ["guardian killed", "loop killed", "safe 0.25"]
+
+
+def heartbeat(run, page):
+    page.put(Field.LOOP_HEARTBEAT_NS, run.now_ns)
+    run.look(awake=False)
+
+
+@pytest.mark.parametrize("how", ["died", "gives no sign"])
+def test_a_lost_guardian_is_said_and_another_one_started(run, page, how):
+    run.look()
+    if how == "died":
+        run.guardians[0].ended = True
+    looks = 0
+    while len(run.guardians) == 1:
+        heartbeat(run, page)
+        looks += 1
+    assert looks == 1 if how == "died" else looks > 90
+    assert [event.code for event in run.events] == ["guardian_lost"]
+    assert how in run.events[0].text
+    assert run.log == ["guardian killed"]
+    run.look(ended=True)
+    assert run.safety.made_safe is None
+
+
+def test_one_that_never_comes_to_watch_is_not_started_without_a_pause(run, page):
+    run.look()
+    run.guardians[0].ended = True
+    for _ in range(100):
+        heartbeat(run, page)
+        for guardian in run.guardians:
+            guardian.ended = True
+    assert len(run.guardians) == 2
+    for _ in range(500):
+        heartbeat(run, page)
+    assert len(run.guardians) == 3
+
+
+def test_one_that_can_not_be_started_again_is_said(run, page):
+    run.look()
+    run.guardians[0].ended = True
+    run.fail_start = OSError(11, "Resource temporarily unavailable")
+    heartbeat(run, page)
+    assert "can't be started: Resource temporarily unavailable" in run.events[-1].text
+    run.look(ended=True, awake=False)
+    assert run.settle().confirmed
+
+
+def test_nothing_starts_before_the_guardian_watches(run):
+    guardian = run.guardians[0]
+    guardian.phase = GuardianPhase.STARTING
+    assert not run.safety.ready()
+    guardian.ended = True
+    with pytest.raises(RunError, match="the guardian could not be started: no device"):
+        run.safety.ready()
+    guardian.phase = GuardianPhase.WATCHING
+    assert run.safety.ready()
+    run.safety.close()
+    assert run.log == ["guardian ended"]
+
+
+@pytest.mark.parametrize(
+    ("given", "simulated", "loop_s"), [(None, False, 0.1), (None, True, 1.52), (0.5, True, 0.52)]
+)
+def test_how_long_a_loop_may_be_silent(page, monkeypatch, given, simulated, loop_s):
+    """Two periods, and what the experiment says; simulated coils can wait."""
+    run = Run(page, monkeypatch, guarded=False, simulated=simulated)
+    run.checked.loaded.config.timing.hang_s = given
+    limits = silence_limits(run.checked)
+    assert (limits.loop_s, limits.exchange_s) == (pytest.approx(loop_s), 1.0)
