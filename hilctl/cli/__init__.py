@@ -3,9 +3,10 @@
 A command is imported when it is called, and imports its heavy parts itself, so that ``--help`` is
 quick.
 
-commands.py    which commands there are, and where each one's function is
-options.py     options that they share
-running.py     start, check, steer and stop runs; shown by run_view.py
+app.py         the application; commands.py  which commands there are, and where each one is
+options.py     options that they share; output.py  JSON, and what all of them say
+running.py     start and check runs; shown by run_view.py
+steering.py    status, set and stop, in a tenth of a second; shown by status_view.py
 recordings.py  judge, replay, export and recover them, identify models;
                identify_view.py and report_view.py
 comparing.py   models against one another; compare_view.py
@@ -20,27 +21,22 @@ can't be used, nothing has moved; 3 a run that ended by a fault; 128 + n a run s
 import logging
 import signal
 import sys
-from typing import Annotated, NoReturn
+from importlib import import_module
+from typing import Any, NoReturn
 
-import typer
-
-from hilctl import __version__
 from hilctl.base.errors import ConfigError, HilctlError, InputError
-from hilctl.cli.commands import HELP_NAMES, CommandTable
-from hilctl.cli.options import print_json
+from hilctl.cli.output import print_json
 
-__all__ = ["app", "main"]
+STEERING = ("status", "set", "stop")
+"""Commands that nobody wants to wait for: they go past the application, which takes longer to
+import than they take to run."""
 
-app = typer.Typer(
-    name="hilctl",
-    cls=CommandTable,
-    help="Real-time hysteresis compensation for smart-material actuators.",
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-    rich_markup_mode=None,  # rich takes longer to import than all of the rest
-    context_settings=HELP_NAMES,
-)
+
+def __getattr__(name: str) -> Any:
+    """Import the application when it is asked for."""
+    if name != "app":
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return import_module("hilctl.cli.app").app
 
 
 def main() -> None:
@@ -49,6 +45,12 @@ def main() -> None:
     shown.setFormatter(logging.Formatter("hilctl: %(message)s"))
     logging.getLogger("hilctl").handlers[:] = [shown]
     try:
+        if len(sys.argv) > 1 and sys.argv[1] in STEERING:
+            from hilctl.cli.steering import steer
+
+            raise SystemExit(steer(sys.argv[1], sys.argv[2:]))
+        from hilctl.cli.app import app
+
         app()
     except HilctlError as error:
         _refuse(error)
@@ -63,18 +65,3 @@ def _refuse(error: HilctlError) -> NoReturn:
     for line in str(error).splitlines():
         print(f"hilctl: {line}", file=sys.stderr)
     raise SystemExit(2 if isinstance(error, InputError) else 3)
-
-
-def _version(wanted: bool) -> None:
-    if wanted:
-        print(f"hilctl {__version__}")
-        raise typer.Exit
-
-
-@app.callback()
-def _root(
-    version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
-    ] = False,
-) -> None:
-    del version

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from hilctl.base.errors import InputError
-from hilctl.cli.options import AsJson, Overwrite, Settings, finish_orphans, print_json
+from hilctl.cli.options import AsJson, Overwrite, Settings
+from hilctl.cli.output import finish_orphans, print_json
 
 if TYPE_CHECKING:
     from hilctl.comparison.compare import Comparison

@@ -1,4 +1,4 @@
-"""Runs for people, in a terminal: progress, forecast, how each stands and how it ended."""
+"""Runs for people, in a terminal: progress, forecast, and how it ended."""
 
 import time
 from types import TracebackType
@@ -6,7 +6,6 @@ from typing import Any, Self
 
 import numpy as np
 from rich.console import Console
-from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
@@ -149,33 +148,3 @@ def print_forecast(checked: Checked) -> None:
     console = Console()
     console.print(table)
     console.print("[green]may start[/]")
-
-
-def print_status(found: list[dict[str, Any]]) -> None:
-    """Print which runs are going on, a block of lines each."""
-    console = Console()
-    if not found:
-        console.print("no run is going on")
-    for run in found:
-        console.print(f"[bold]{escape(run['name'])}[/]  {run['state']}", highlight=False)
-        for name, text in _status_lines(run).items():
-            # A path is left whole, wherever the line ends, so that it can be copied.
-            line = f"  {name:10} {text}"
-            console.print(line, highlight=False, markup=False, soft_wrap=True)
-
-
-def _status_lines(run: dict[str, Any]) -> dict[str, str]:
-    """Return what there is to say of a run, by name; little where nobody answers for it."""
-    lines = {}
-    if total := run.get("total_samples", 0):
-        at_s, total_s = run["sample"] / run["sample_rate_hz"], total / run["sample_rate_hz"]
-        lines["at"] = f"{at_s:.1f} of {total_s:.1f} s"
-        lines["samples"] = (
-            f"{run['recorded_samples']:,} recorded, {run['missing_samples']:,} missing"
-        )
-        lines["late ticks"] = f"{run['late_ticks']:,}"
-        lines["reference"] = f"gain {run['gain']:g}, offset {run['offset']:g}"
-    lines["recording"] = run["recording"]
-    if trouble := run.get("recording_error") or run.get("error"):
-        lines["trouble"] = trouble
-    return lines

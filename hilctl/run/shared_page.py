@@ -70,6 +70,8 @@ class Field(IntEnum):
     TUNE_GAIN = 50
     TUNE_OFFSET = 51
     TUNE_SAMPLES = 52
+    TUNE_BEGINS_AT = 53
+    TUNE_TAKEN_AT = 54
 
 
 class Phase(IntEnum):

@@ -18,6 +18,7 @@ from hilctl.base.errors import DeviceError, InputError, RunError
 from hilctl.experiment.check import Checked
 from hilctl.loop.plan import Outcome
 from hilctl.machine.realtime import be_ordinary
+from hilctl.run.change_worker import ChangeWorker
 from hilctl.run.child import LoopChild
 from hilctl.run.control_socket import ControlServer
 from hilctl.run.hang_watch import HangWatch
@@ -28,6 +29,7 @@ from hilctl.run.result import Progress, RunResult
 from hilctl.run.ring import SampleRing
 from hilctl.run.run_folder import RunFolder, held_devices, run_folder
 from hilctl.run.shared_page import Field, PageText, Stop
+from hilctl.run.stopping import STOP_SIGNAL
 from hilctl.run.systemd import Notifier
 
 _POLL_S = 0.02
@@ -37,6 +39,7 @@ _SIGNALS = {
     signal.SIGINT: Stop.CTRL_C,
     signal.SIGTERM: Stop.SIGTERM,
     signal.SIGHUP: Stop.SIGHUP,
+    STOP_SIGNAL: Stop.REQUEST,
 }
 
 
@@ -77,6 +80,11 @@ class Supervisor:
         be_ordinary()
         config = self._config
         with ExitStack() as stack:
+            # Before anything is held or started: a fork has all that its maker has.
+            worker = stack.enter_context(ChangeWorker(self._checked))
+            # Before there is a loop: a signal must stop it, not just end this process. And to the
+            # last: whoever finds the run's folder may send one.
+            stack.enter_context(self._signals())
             # The device before the recording: a run that is refused must not touch a file.
             locks = stack.enter_context(held_devices(self._checked.loaded.device.info.holds))
             recorder = Recorder(self._checked, self._output, overwrite=self._overwrite)
@@ -84,8 +92,6 @@ class Supervisor:
                 folder, own = stack.enter_context(
                     run_folder(config.name, self._output, time.time())
                 )
-                # Before there is a loop: a signal must stop it, not just end this process.
-                stack.enter_context(self._signals())
                 ring = self._make_ring(folder)
                 child = LoopChild(self._checked, folder, ring, locks + own, self._silence_s)
             except BaseException:
@@ -93,11 +99,12 @@ class Supervisor:
                 raise
             self._start(ring, child, recorder)
             self._notifier.say("READY=1", f"STATUS=recording to {self._output}")
-            requests = Requests(self._checked, folder, ring.page, recorder)
-            started = _StartedRun(self._checked, ring, child, recorder, requests)
+            requests = Requests(self._checked, folder, ring.page, recorder, worker)
+            started = _StartedRun(self._checked, ring, child, recorder)
             with ControlServer(folder.socket, requests.answer) as server:
                 while started.attend(self._stop_signal, self._on_progress):
                     self._notifier.alive()
+                    requests.attend()
                     server.serve(_POLL_S)
             self._notifier.say("STOPPING=1")
             return self._result(started.end(self._on_progress), started)
@@ -130,6 +137,8 @@ class Supervisor:
         def note(number: int, frame: FrameType | None) -> None:
             self._stop_signal = self._stop_signal or number
 
+        # Never the default, which would end a process that is asked to stop a moment too late.
+        signal.signal(STOP_SIGNAL, signal.SIG_IGN)
         before = {number: signal.signal(number, note) for number in _SIGNALS}
         try:
             yield
@@ -153,7 +162,8 @@ class Supervisor:
 
     def _result(self, outcome: Outcome, started: "_StartedRun") -> RunResult:
         recorder = started.recorder
-        stop_signal = self._stop_signal or (signal.SIGTERM if started.requests.stop else 0)
+        requested = self._stop_signal == STOP_SIGNAL
+        stop_signal = signal.SIGTERM if requested else self._stop_signal
         cut = f"; {recorder.missing} samples are lost: {recorder.error}" if recorder.error else ""
         fault = recorder.error or (outcome.code == "stopped" and not stop_signal)
         code = "fault" if fault else outcome.code
@@ -170,7 +180,7 @@ class Supervisor:
 
 
 class _StartedRun:
-    """A run whose loop exchanges samples: its ring, its process, its recording, its requests."""
+    """A run whose loop exchanges samples: its ring, its process, its recording."""
 
     def __init__(
         self,
@@ -178,9 +188,8 @@ class _StartedRun:
         ring: SampleRing,
         child: LoopChild,
         recorder: Recorder,
-        requests: Requests,
     ) -> None:
-        self.ring, self.child, self.recorder, self.requests = ring, child, recorder, requests
+        self.ring, self.child, self.recorder = ring, child, recorder
         self._checked = checked
         self._config = checked.loaded.config
         limit_s = self._config.tick_s + self._config.timing.max_late_s + _HANG_MARGIN_S
@@ -240,8 +249,6 @@ class _StartedRun:
         page = self.ring.page
         if stop_signal:
             page.put(Field.STOP, _SIGNALS[signal.Signals(stop_signal)])
-        elif self.requests.stop:
-            page.put(Field.STOP, Stop.REQUEST)
         elif self.recorder.error and self._config.recording.on_failure == "stop":
             page.put(Field.STOP, Stop.RECORDER_FAILED)
 

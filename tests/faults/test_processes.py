@@ -17,6 +17,7 @@ from hilctl.analysis.replay import replay
 from hilctl.recording.reader import read
 from hilctl.run.orphans import recover_orphans
 from hilctl.run.run_folder import runs
+from tests.fakes import loop_of
 
 KILLS = Path(__file__).parents[1] / "benchmark" / "kills.py"
 EXPERIMENT = {
@@ -58,8 +59,7 @@ class Run:
             assert self.process.poll() is None, self.process.communicate()
             assert time.monotonic() < deadline
             time.sleep(0.02)
-        children = Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children")
-        self.loop = int(children.read_text().split()[0])
+        self.loop = loop_of(self.process.pid)
 
     def end(self):
         out, err = self.process.communicate(timeout=60)
