@@ -444,3 +444,12 @@ def emulated(
         emulator.server.stop()
         thread.join()
         emulator.log.close()
+
+
+def loop_of(supervisor: int) -> int:
+    """Find a run's loop process among the children of its supervisor."""
+    children = Path(f"/proc/{supervisor}/task/{supervisor}/children")
+    for child in children.read_text().split():
+        if b"hilctl.run.loop_process" in Path(f"/proc/{child}/cmdline").read_bytes():
+            return int(child)
+    raise AssertionError("the run has no loop process")

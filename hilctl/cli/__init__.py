@@ -3,9 +3,10 @@
 A command is imported when it is called, and imports its heavy parts itself, so that ``--help`` is
 quick.
 
-commands.py    which commands there are, and where each one's function is
-options.py     options that they share
-running.py     start, check, steer and stop runs; shown by run_view.py
+app.py         the application; commands.py  which commands there are, and where each one is
+options.py     options that they share; output.py  JSON, and what all of them say
+running.py     start and check runs; shown by run_view.py
+steering.py    status, set and stop, in a tenth of a second; shown by status_view.py
 recordings.py  judge, replay, export and recover them, identify models;
                identify_view.py and report_view.py
 comparing.py   models against one another; compare_view.py
@@ -15,35 +16,30 @@ console.py     the console that tables go to, and what replay prints; progress.p
 streams.py     standard output and error, which all text passes: no control character goes through
 
 Exit codes: 0 done; 1 a replay that differs, or a rate that this machine does not keep; 2 the input
-can't be used, nothing has moved; 3 a run that ended by a fault, or a
-device that answers what can't be; 128 + n a run stopped by signal n.
+can't be used, nothing has moved; 3 a run that ended by a fault, or a device that answers what can't
+be; 128 + n a run stopped by signal n.
 """
 
 import logging
 import signal
 import sys
-from typing import Annotated, NoReturn
+from importlib import import_module
+from typing import Any, NoReturn
 
-import typer
-
-from hilctl import __version__
 from hilctl.base.errors import ConfigError, HilctlError, InputError, RunError
-from hilctl.cli.commands import HELP_NAMES, CommandTable
-from hilctl.cli.options import print_json
+from hilctl.cli.output import print_json
 from hilctl.cli.streams import plain_streams
 
-__all__ = ["app", "main"]
+STEERING = ("status", "set", "stop")
+"""Commands that nobody wants to wait for: they go past the application, which takes longer to
+import than they take to run."""
 
-app = typer.Typer(
-    name="hilctl",
-    cls=CommandTable,
-    help="Real-time hysteresis compensation for smart-material actuators.",
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-    rich_markup_mode=None,  # rich takes longer to import than all of the rest
-    context_settings=HELP_NAMES,
-)
+
+def __getattr__(name: str) -> Any:
+    """Import the application when it is asked for."""
+    if name != "app":
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return import_module("hilctl.cli.app").app
 
 
 def main() -> None:
@@ -53,13 +49,23 @@ def main() -> None:
         shown.setFormatter(logging.Formatter("hilctl: %(message)s"))
         logging.getLogger("hilctl").handlers[:] = [shown]
         try:
-            app()
+            _command()
         except HilctlError as error:
             _refuse(error)
         except KeyboardInterrupt:
             raise SystemExit(128 + signal.SIGINT) from None
         except (OSError, MemoryError, ImportError) as error:
             _refuse(RunError(_machine_refused(error)))
+
+
+def _command() -> None:
+    if len(sys.argv) > 1 and sys.argv[1] in STEERING:
+        from hilctl.cli.steering import steer
+
+        raise SystemExit(steer(sys.argv[1], sys.argv[2:]))
+    from hilctl.cli.app import app
+
+    app()
 
 
 def _machine_refused(error: OSError | MemoryError | ImportError) -> str:
@@ -79,18 +85,3 @@ def _refuse(error: HilctlError) -> NoReturn:
     for line in str(error).splitlines():
         print(f"hilctl: {line}", file=sys.stderr)
     raise SystemExit(2 if isinstance(error, InputError) else 3)
-
-
-def _version(wanted: bool) -> None:
-    if wanted:
-        print(f"hilctl {__version__}")
-        raise typer.Exit
-
-
-@app.callback()
-def _root(
-    version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
-    ] = False,
-) -> None:
-    del version

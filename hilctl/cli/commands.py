@@ -11,6 +11,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from hilctl.base.errors import InputError
+from hilctl.cli import STEERING
 
 
 class CommandEntry(NamedTuple):
@@ -35,14 +36,14 @@ COMMANDS: dict[str, CommandEntry] = {
         "Check an experiment and say what it would do; nothing moves.",
     ),
     "status": CommandEntry(
-        "hilctl.cli.running:status", "Say which runs are going on, and where each stands."
+        "hilctl.cli.steering:status", "Say which runs are going on, and where each stands."
     ),
     "set": CommandEntry(
-        "hilctl.cli.running:set_",
+        "hilctl.cli.steering:set_",
         "Move the reference of a run without a bump: gain * reference + offset.",
     ),
     "stop": CommandEntry(
-        "hilctl.cli.running:stop", "End a run by its safe ramp, close, and record why."
+        "hilctl.cli.steering:stop", "End a run by its safe ramp, close, and record why."
     ),
     "safe": CommandEntry(
         "hilctl.cli.running:safe",
@@ -114,6 +115,21 @@ class CommandTable(TyperGroup):
         return name, line and load(line.name or ""), rest
 
 
+class _Steering(TyperCommand):
+    """A command that reads its own arguments, for whoever comes by the application all the same."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Leave them to it."""
+        ctx.args = args
+        return args
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run it."""
+        from hilctl.cli.steering import steer
+
+        raise typer.Exit(steer(str(self.name), ctx.args))
+
+
 def load(name: str) -> Any:
     """Return a command of the table, ready to be called.
 
@@ -125,6 +141,8 @@ def load(name: str) -> Any:
         found = getattr(import_module(module_name), attribute)
     except (ImportError, AttributeError) as error:
         raise InputError(f"{name} can't be loaded: {error}") from error
+    if name in STEERING:
+        return _Steering(name, help=found.__doc__)
     if isinstance(found, typer.Typer):
         group = typer.main.get_group(found)
         group.name = name

@@ -9,14 +9,8 @@ import typer
 
 from hilctl.base.errors import InputError
 from hilctl.base.files import check_writable
-from hilctl.cli.options import (
-    AsJson,
-    ExperimentFile,
-    Overwrite,
-    Settings,
-    finish_orphans,
-    print_json,
-)
+from hilctl.cli.options import AsJson, ExperimentFile, Overwrite, Settings
+from hilctl.cli.output import finish_orphans, print_json
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

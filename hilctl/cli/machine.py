@@ -6,7 +6,8 @@ from typing import Annotated
 import typer
 
 from hilctl.base.files import write_text
-from hilctl.cli.options import AsJson, ExperimentFile, Settings, print_json
+from hilctl.cli.options import AsJson, ExperimentFile, Settings
+from hilctl.cli.output import print_json
 
 devices_app = typer.Typer(rich_markup_mode=None)
 

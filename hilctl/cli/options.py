@@ -1,9 +1,7 @@
-"""What the commands share: common options, and printing for programs."""
+"""Options that the commands share."""
 
-import json
-import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -17,19 +15,3 @@ Settings = Annotated[
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object for programs.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace the file if it exists.")]
-
-
-def print_json(value: dict[str, Any]) -> None:
-    """Print one JSON object."""
-    print(json.dumps(value, indent=2, allow_nan=False))
-
-
-def finish_orphans() -> None:
-    """Recover what runs whose processes have died left in memory, and say so."""
-    from hilctl.run.orphans import recover_orphans
-
-    for orphan in recover_orphans():
-        print(f"hilctl: {orphan.name} had died: {orphan.text}", file=sys.stderr)
-        kept = f"its samples are kept in {orphan.kept}; the next command tries again"
-        done = f"recovered into {orphan.recording}"
-        print(f"hilctl: {kept if orphan.kept else done}", file=sys.stderr)

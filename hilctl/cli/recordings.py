@@ -7,13 +7,8 @@ from typing import Annotated
 import typer
 
 from hilctl.cli.comparing import check_page
-from hilctl.cli.options import (
-    AsJson,
-    Overwrite,
-    RecordingFile,
-    finish_orphans,
-    print_json,
-)
+from hilctl.cli.options import AsJson, Overwrite, RecordingFile
+from hilctl.cli.output import finish_orphans, print_json
 
 IdentifyInput = Annotated[list[Path], typer.Argument(help="Recordings (MCAP) or text tables.")]
 TableUnit = Annotated[str | None, typer.Option(help="Unit of a table's command, A or V.")]

@@ -1,4 +1,4 @@
-"""Runs for people, in a terminal: progress, forecast, how each stands and how it ended."""
+"""Runs for people, in a terminal: progress, forecast, and how it ended."""
 
 import shlex
 import time
@@ -156,33 +156,3 @@ def print_forecast(checked: Checked) -> None:
     terminal = console()
     terminal.print(table)
     terminal.print("may start", style="green")
-
-
-def print_status(found: list[dict[str, Any]]) -> None:
-    """Print which runs are going on, a block of lines each."""
-    terminal = console()
-    if not found:
-        terminal.print("no run is going on")
-    for run in found:
-        terminal.print(Text(run["name"], "bold") + f"  {run['state']}")
-        for name, text in _status_lines(run).items():
-            # A path is left whole, wherever the line ends, so that it can be copied.
-            line = f"  {name:10} {text}"
-            terminal.print(line, soft_wrap=True)
-
-
-def _status_lines(run: dict[str, Any]) -> dict[str, str]:
-    """Return what there is to say of a run, by name; little where nobody answers for it."""
-    lines = {}
-    if total := run.get("total_samples", 0):
-        at_s, total_s = run["sample"] / run["sample_rate_hz"], total / run["sample_rate_hz"]
-        lines["at"] = f"{at_s:.1f} of {total_s:.1f} s"
-        lines["samples"] = (
-            f"{run['recorded_samples']:,} recorded, {run['missing_samples']:,} missing"
-        )
-        lines["late ticks"] = f"{run['late_ticks']:,}"
-        lines["reference"] = f"gain {run['gain']:g}, offset {run['offset']:g}"
-    lines["recording"] = run["recording"]
-    if trouble := run.get("recording_error") or run.get("error"):
-        lines["trouble"] = trouble
-    return lines

@@ -1,4 +1,4 @@
-"""Commands about runs: start, check, status, set, stop; and the safe value without one."""
+"""Commands about runs: start, check, safe; steering.py has those about runs that are going on."""
 
 import signal
 import sys
@@ -8,14 +8,8 @@ from typing import Annotated
 import typer
 
 from hilctl.base.errors import HilctlError
-from hilctl.cli.options import (
-    AsJson,
-    ExperimentFile,
-    Overwrite,
-    Settings,
-    finish_orphans,
-    print_json,
-)
+from hilctl.cli.options import AsJson, ExperimentFile, Overwrite, Settings
+from hilctl.cli.output import finish_orphans, print_json
 
 
 def run(
@@ -64,7 +58,7 @@ def run(
 def _detach(
     experiment: Path, output: Path | None, settings: list[str], *, overwrite: bool, as_json: bool
 ) -> None:
-    from hilctl.run.client import start_detached
+    from hilctl.run.detached import start_detached
     from hilctl.run.run_folder import facts_of
 
     flags = ["--overwrite"] if overwrite else []
@@ -74,65 +68,6 @@ def _detach(
     else:
         print(f"{started.run.card.name} runs; recording: {started.run.card.recording}")
         print("  hilctl status    hilctl set gain=0.5 --over 2    hilctl stop")
-
-
-def status(as_json: AsJson = False) -> None:
-    """Say which runs are going on, and where each stands."""
-    from hilctl.cli.run_view import print_status
-    from hilctl.run.client import status_of
-    from hilctl.run.run_folder import runs
-
-    finish_orphans()
-    found = [status_of(each) for each in runs()]
-    if as_json:
-        print_json({"runs": found})
-    else:
-        print_status(found)
-
-
-RunName = Annotated[
-    str | None, typer.Option("--run", help="Name of the run; only needed where there are several.")
-]
-
-
-def stop(
-    name: RunName = None,
-    wait_s: Annotated[float, typer.Option("--wait", help="Longest wait for its end, s.")] = 60.0,
-    as_json: AsJson = False,
-) -> None:
-    """End a run by its safe ramp, close, and record why."""
-    from hilctl.run.client import find_run, stop_run
-
-    chosen = find_run(name)
-    answer = stop_run(chosen, wait_s)
-    if as_json:
-        print_json(answer)
-    elif answer["ended"]:
-        print(f"{chosen.card.name} has ended; recording: {chosen.card.recording}")
-    else:
-        print(f"{chosen.card.name} was told to stop, and is still going after {wait_s:g} s")
-    if not answer["ended"]:
-        raise typer.Exit(3)
-
-
-def set_(
-    assignments: Annotated[
-        list[str], typer.Argument(help="gain=NUMBER, offset=NUMBER.", metavar="KEY=VALUE...")
-    ],
-    over_s: Annotated[float, typer.Option("--over", help="Time that the change takes, s.")] = 1.0,
-    name: RunName = None,
-    as_json: AsJson = False,
-) -> None:
-    """Move the reference of a run without a bump: gain * reference + offset."""
-    from hilctl.run.client import find_run, set_run
-
-    chosen = find_run(name)
-    answer = set_run(chosen, assignments, over_s)
-    if as_json:
-        print_json(answer)
-    else:
-        values = f"gain {answer['gain']:g}, offset {answer['offset']:g}"
-        print(f"{chosen.card.name}: {values}, over {over_s:g} s")
 
 
 def check(experiment: ExperimentFile, settings: Settings = None, as_json: AsJson = False) -> None:

@@ -7,8 +7,6 @@ by the same compensator that will run, and held against the limits.
 import math
 from dataclasses import dataclass
 
-import numpy as np
-
 from hilctl.base.arrays import F64
 from hilctl.base.errors import ConfigError, DataError, InputError, ModelError, Problem
 from hilctl.experiment.feedback import feedback_problems
@@ -63,7 +61,8 @@ def check(loaded: LoadedExperiment) -> Checked:
     except InputError as error:
         problems.append(_problem(loaded, "waveform", str(error)))
         raise ConfigError(problems) from None
-    problems += _reference_problems(loaded, reference)
+    low, high = float(reference.values.min()), float(reference.values.max())
+    problems += reference_problems(loaded, reference.unit, low, high)
     values = _corrected(loaded, reference, problems)
     try:
         before = _state_before(loaded, problems)
@@ -76,7 +75,7 @@ def check(loaded: LoadedExperiment) -> Checked:
     except ModelError as error:
         problems.append(_problem(loaded, "compensator.model", str(error)))
         raise ConfigError(problems) from None
-    problems += _command_problems(loaded, forecast)
+    problems += command_problems(loaded, forecast)
     if problems:
         raise ConfigError(problems)
     return Checked(loaded, reference, forecast, begun)
@@ -102,41 +101,6 @@ def _state_before(loaded: LoadedExperiment, problems: list[Problem]) -> InitialS
     except DataError as error:
         problems.append(_problem(loaded, "compensator.initial_state", str(error)))
         return None
-
-
-def check_tuned(
-    checked: Checked, now: tuple[float, float], wanted: tuple[float, float], samples: int
-) -> None:
-    """Work out what a running reference would do with another gain and offset.
-
-    Args:
-        checked: The experiment that runs.
-        now: Gain and offset of the reference at this moment.
-        wanted: Gain and offset that it is to have.
-        samples: Samples that the change takes.
-
-    Raises:
-        ConfigError: It would leave device, model or limits; the error says by how much.
-    """
-    loaded, plain = checked.loaded, checked.reference
-    change = abs(wanted[0] - now[0]) * np.abs(plain.values).max() + abs(wanted[1] - now[1])
-    values = _led_in(plain.values * wanted[0] + wanted[1], samples)
-    input_um = _led_in(checked.begun.input_um * wanted[0] + wanted[1], samples)
-    tuned = Reference(values, plain.unit, plain.sample_rate_hz, plain.segments)
-    problems = _reference_problems(loaded, tuned)
-    problems += _command_problems(loaded, forecast_of(loaded, tuned, input_um))
-    if loaded.model is None:
-        fastest = change / samples * plain.sample_rate_hz + checked.forecast.slew_per_s
-        if fastest > loaded.config.limits.slew_per_s:
-            rule = f"the change must take longer: at most {loaded.config.limits.slew_per_s:g}/s"
-            problems.append(_problem(loaded, "limits", rule, f"{fastest:.4g}/s"))
-    if problems:
-        raise ConfigError(problems)
-
-
-def _led_in(values: F64, samples: int) -> F64:
-    """Return values with that many samples before them, from 0 to the first."""
-    return np.concatenate((np.linspace(0.0, values[0], samples + 1)[:-1], values))
 
 
 def _problem(
@@ -207,10 +171,12 @@ def _watchdog_problems(loaded: LoadedExperiment) -> list[Problem]:
     return [_problem(loaded, key, rule, f"{command:g}", hint)]
 
 
-def _reference_problems(loaded: LoadedExperiment, reference: Reference) -> list[Problem]:
-    if reference.unit != "um":
+def reference_problems(
+    loaded: LoadedExperiment, unit: str, low: float, high: float
+) -> list[Problem]:
+    """Return why a reference from ``low`` to ``high``, in ``unit``, can't be followed."""
+    if unit != "um":
         return []
-    low, high = float(reference.values.min()), float(reference.values.max())
     spans = {"limits.stroke_um": loaded.config.limits.stroke_um}
     if loaded.model is not None and loaded.model.output_range_um is not None:
         spans["the range that compensator.model was found on"] = loaded.model.output_range_um
@@ -225,7 +191,8 @@ def _reference_problems(loaded: LoadedExperiment, reference: Reference) -> list[
     return found
 
 
-def _command_problems(loaded: LoadedExperiment, forecast: Forecast) -> list[Problem]:
+def command_problems(loaded: LoadedExperiment, forecast: Forecast) -> list[Problem]:
+    """Return which limits the commands of a forecast would leave, and by how much."""
     limits = loaded.config.limits
     low, high = limits.command_range
     unit = limits.unit

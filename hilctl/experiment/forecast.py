@@ -80,22 +80,14 @@ def forecast_of(
     compensator = Compensator(loaded.model, config.sample_rate_hz)
     if state is not None:
         compensator.restore(state)
-    heat = _Heat(config)
-    last = config.safe.value
-    low, high, step = last, last, 0.0
+    figures = CommandFigures(config, config.safe.value, config.safe.value**2)
     values = reference.values
     wanted = np.empty(min(_CHUNK, input_um.size))
     for start in range(0, input_um.size, _CHUNK):
         part = input_um[start : start + _CHUNK]
         out = wanted[: part.size]
         compensator.process(part, out)
-        with np.errstate(over="ignore", invalid="ignore"):  # what comes of it is refused
-            steps = np.abs(np.diff(out, prepend=last))
-        low = float(np.minimum(low, out.min()))  # keeps a NaN, where min() would lose it
-        high = float(np.maximum(high, out.max()))
-        step = float(np.maximum(step, steps.max()))
-        last = float(out[-1])
-        heat.add(out)
+        figures.add(out)
     byte_count = _BYTES_A_SAMPLE + (0.0 if input_um is reference.values else _BYTES_OF_INPUT)
     return Forecast(
         samples=values.size,
@@ -103,26 +95,75 @@ def forecast_of(
         reference_min=float(values.min()),
         reference_max=float(values.max()),
         command_unit=loaded.device.info.command_unit,
-        command_min=low,
-        command_max=high,
-        slew_per_s=step * config.sample_rate_hz,
-        heating_rms_a=heat.rms_a,
-        budget_used_s=heat.used_s,
+        command_min=figures.low,
+        command_max=figures.high,
+        slew_per_s=figures.slew_per_s,
+        heating_rms_a=figures.heat.rms_a,
+        budget_used_s=figures.heat.used_s,
         recording_mb=values.size * byte_count / 1e6,
         highest_rate_hz=loaded.device.info.max_rate_hz,
         rate_note=loaded.device.info.rate_note,
     )
 
 
-class _Heat:
-    """Follows the thermal budget of the coil through the commands of a run."""
+class CommandFigures:
+    """What limits are held against, gathered from commands that follow one another.
 
-    def __init__(self, config: Experiment) -> None:
+    Args:
+        config: The experiment.
+        last: Command before the first of them; None where there is none to step from.
+        heat_a2: Running mean square of the coil current before them, in A^2.
+
+    Attributes:
+        low: Lowest command.
+        high: Highest command.
+        last: Command before the next ones; None where they are not to be held against one.
+        heat: The thermal budget.
+    """
+
+    def __init__(self, config: Experiment, last: float | None, heat_a2: float) -> None:
+        self.last = last
+        self.low = math.inf if last is None else last
+        self.high = -math.inf if last is None else last
+        self.heat = CoilHeat(config, heat_a2)
+        self._rate_hz = config.sample_rate_hz
+        self._step = 0.0
+
+    def add(self, command: F64) -> None:
+        """Go on with the next commands: float64[n], n > 0."""
+        before = command[0] if self.last is None else self.last
+        with np.errstate(over="ignore", invalid="ignore"):  # what comes of it is refused
+            steps = np.abs(np.diff(command, prepend=before))
+        self.low = float(np.minimum(self.low, command.min()))  # keeps a NaN, where min() would not
+        self.high = float(np.maximum(self.high, command.max()))
+        self._step = float(np.maximum(self._step, steps.max()))
+        self.last = float(command[-1])
+        self.heat.add(command)
+
+    @property
+    def slew_per_s(self) -> float:
+        """Fastest change."""
+        return self._step * self._rate_hz
+
+
+class CoilHeat:
+    """Follows the thermal budget of the coil through the commands of a run.
+
+    Args:
+        config: The experiment.
+        heat_a2: Running mean square of the current before them, in A^2.
+
+    Attributes:
+        highest_a2: Highest running mean square so far, in A^2.
+        used_s: Time of the commands after which the budget is overdrawn; None where it is kept.
+    """
+
+    def __init__(self, config: Experiment, heat_a2: float) -> None:
         limits = config.limits
         self._rate_hz = config.sample_rate_hz
-        self._rms_a = limits.rms_current_a or math.inf
+        self._budget_a2 = (limits.rms_current_a or math.inf) ** 2
         self._tau_s = limits.thermal_time_constant_s
-        self._heat = self._highest = config.safe.value**2
+        self._heat = self.highest_a2 = heat_a2
         self._samples = 0
         self.used_s: float | None = None
 
@@ -132,13 +173,34 @@ class _Heat:
             return
         heat = np.empty(command.size)
         self._heat = heat_block(command, warming(self._tau_s, self._rate_hz), self._heat, heat)
-        over = np.flatnonzero(heat > self._rms_a**2)
+        over = np.flatnonzero(heat > self._budget_a2)
         if self.used_s is None and over.size:
             self.used_s = (self._samples + int(over[0])) / self._rate_hz
-        self._highest = max(self._highest, float(heat.max()))
+        self.highest_a2 = max(self.highest_a2, float(heat.max()))
         self._samples += command.size
+
+    def repeat(self, cycle: F64, times: int) -> None:
+        """Go on with a cycle (float64[n], in A) again and again."""
+        if self._tau_s is None or times < 1:
+            return
+        before = self._heat
+        self.add(cycle)
+        # A cycle maps the heat before it to kept * heat + a constant: the rest is a geometric row.
+        kept = math.exp(-cycle.size / (self._tau_s * self._rate_hz))
+        final = before + (self._heat - before) / (1.0 - kept)
+        self._heat = final + (before - final) * kept ** (times - 1)
+        self._samples += (times - 2) * cycle.size
+        self.add(
+            cycle
+        )  # from cycle to cycle it rises or falls: the highest is in the first or last
+
+    def expect(self, heat_a2: float) -> None:
+        """Take a heat that was not worked out command by command for what is to come."""
+        self.highest_a2 = max(self.highest_a2, heat_a2)
+        if self.used_s is None and heat_a2 > self._budget_a2:
+            self.used_s = self._samples / self._rate_hz
 
     @property
     def rms_a(self) -> float | None:
         """Highest running rms of the current so far, in A; None without a thermal budget."""
-        return None if self._tau_s is None else math.sqrt(self._highest)
+        return None if self._tau_s is None else math.sqrt(self.highest_a2)

@@ -16,11 +16,14 @@ class Tuning:
         gain: Factor of the reference.
         offset: Added to it, in the waveform's unit.
         samples: Samples that the change takes.
+        begins_at: Sample that it begins at, so that it can be worked out before; at the next block
+            where that one has gone by.
     """
 
     gain: float
     offset: float
     samples: int
+    begins_at: int = 0
 
 
 class Host(Protocol):
@@ -60,7 +63,7 @@ class Host(Protocol):
         ...
 
     def tuning(self) -> Tuning | None:
-        """Return a change of the reference that has come since the last call."""
+        """Return a change of the reference that begins now: each one once."""
         ...
 
     def record_event(self, event: Event) -> None:

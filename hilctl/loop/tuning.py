@@ -30,7 +30,17 @@ class Tuner:
     def move(self, wanted: Tuning) -> None:
         """Begin a change, from wherever it stands now."""
         self._from, self._to, self._done = (self.gain, self.offset), wanted, 0
-        if wanted.samples <= 0:
+        self.pass_over(0)
+
+    def pass_over(self, samples: int) -> None:
+        """Let samples go by, whose gain and offset nobody needs."""
+        self._done += samples
+        wanted, (gain, offset) = self._to, self._from
+        if self.moving:
+            part = self._done / wanted.samples
+            self.gain = gain + (wanted.gain - gain) * part
+            self.offset = offset + (wanted.offset - offset) * part
+        else:
             self.gain, self.offset = wanted.gain, wanted.offset
         self._idle = not self.moving and self.gain == 1.0 and self.offset == 0.0
 
@@ -45,12 +55,7 @@ class Tuner:
         part = steps / wanted.samples
         gains = gain + (wanted.gain - gain) * part
         offsets = offset + (wanted.offset - offset) * part
-        self._done += samples
-        if self.moving:
-            self.gain, self.offset = float(gains[-1]), float(offsets[-1])
-        else:
-            self.gain, self.offset = wanted.gain, wanted.offset
-            self._idle = self.gain == 1.0 and self.offset == 0.0
+        self.pass_over(samples)
         return gains, offsets
 
 

@@ -1,6 +1,7 @@
 """Two processes round one loop: shared memory, recording, requests, recovery.
 
 start.py           from an experiment file to a finished run
+architecture.py    processors that a run may be on
 job.py             the experiment as it goes to the loop's process
 assemble.py        from a checked experiment to the plan of its loop
 supervisor.py      starts loop, guardian and recorder; started_run.py  sees to them to the end
@@ -14,7 +15,9 @@ recorder.py        into the recording; metadata.py what it says of the run
 kept_file.py       a file that somebody takes away while it is written
 ring_recorder.py   from the ring into it, in a thread of its own; progress.py  for who looks on
 run_folder.py      runs that are going on, and who holds a device
-requests.py        requests to a run, over control_socket.py; client.py sends them
+requests.py        requests to a run, over control_socket.py; stopping.py a signal to stop;
+                   client.py sends them, detached.py starts runs in the background
+changes.py         gain and offset on their way to the loop; change_worker.py works them out
 systemd.py         readiness and watchdog of a service
 probe.py           whether a device answers, and whether that can be true
 orphans.py         what dead runs left behind

@@ -1,6 +1,5 @@
 """A device put at its safe value by hand, with no run."""
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -62,7 +61,6 @@ def put_safe(path: Path, settings: Sequence[str]) -> SafeByHand:
     if device is None:
         raise ConfigError([Problem(str(path), "device", "is required, with a key kind")])
     info = device.info
-    user = f"hilctl safe (process {os.getpid()})"
     # Not past a run that holds it: its loop would write over the safe value a tick later.
     with held_devices(info.holds):
         try:

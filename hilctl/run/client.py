@@ -1,95 +1,23 @@
-"""Runs in the background: start one, find it, send it a request, stop it."""
+"""Runs in the background, from outside: find one, send it a request, stop it.
 
-import os
-import subprocess
-import sys
+It imports nothing heavy: a stop must not wait for a compiler.
+"""
+
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from hilctl.base.errors import InputError, RunError
 from hilctl.run.control_socket import ask
 from hilctl.run.run_folder import RunFolder, facts_of, runs
-from hilctl.run.start import checked_experiment, output_of
+from hilctl.run.stopping import request_stop
 
-_POLL_S = 0.05
-_START_S = 180.0
-
-
-@dataclass(frozen=True, slots=True)
-class Detached:
-    """A run that goes on by itself.
-
-    Attributes:
-        run: Its folder.
-        log: What it prints.
-    """
-
-    run: RunFolder
-    log: Path
+_POLL_S = 0.02
 
 
-def start_detached(
-    experiment: Path, settings: Sequence[str], output: Path | None, flags: Sequence[str]
-) -> Detached:
-    """Start a run in the background, and come back once it runs.
-
-    Args:
-        experiment: Experiment file.
-        settings: ``key=value`` texts over it.
-        output: Recording to write; a name in the experiment's folder where None.
-        flags: Further arguments of ``hilctl run``.
-
-    Raises:
-        InputError: It can't be used; nothing has moved.
-        RunError: It ended before it ran; the text is what it said.
-    """
-    checked = checked_experiment(experiment, settings)
-    output = output_of(checked, output)
-    log = free_log(output)
-    command = [sys.executable, "-P", "-m", "hilctl.cli", "run", str(experiment), *flags]
-    command += ["--output", str(output)]
-    command += [word for setting in settings for word in ("--set", setting)]
-    try:
-        with log.open("xb") as stream:
-            process = subprocess.Popen(
-                command,
-                stdin=subprocess.DEVNULL,
-                stdout=stream,
-                stderr=stream,
-                start_new_session=True,  # neither Ctrl-C nor the terminal's end are meant for it
-            )
-    except OSError as error:
-        raise InputError(f"{log}: can't be written: {error.strerror}") from None
-    return Detached(_await_running(process, log), log)
-
-
-def free_log(output: Path) -> Path:
-    """Return the log of a run into ``output``: beside it, and no file that is there already."""
-    log, number = output.with_suffix(".log"), 2
-    while os.path.lexists(log):  # a link that leads nowhere is there too
-        log = output.with_suffix(f".{number}.log")
-        number += 1
-    return log
-
-
-def _await_running(process: "subprocess.Popen[bytes]", log: Path) -> RunFolder:
-    deadline = time.monotonic() + _START_S
-    while process.poll() is None:
-        for run in runs():
-            if run.card.supervisor == process.pid and run.socket.exists():
-                return run
-        if time.monotonic() > deadline:
-            process.terminate()
-            raise RunError(f"the run did not start within {_START_S:g} s: see {log}")
-        time.sleep(_POLL_S)
-    said = log.read_text(encoding="utf-8", errors="replace").strip()
-    if process.returncode == 0:
-        raise RunError(f"the run was over at once: see {log}")
-    text = said.replace("hilctl: ", "") or f"the run ended with exit code {process.returncode}"
-    raise InputError(text) if process.returncode == 2 else RunError(text)
+def going_on() -> list[RunFolder]:
+    """Return the runs of this user whose supervisor lives, the oldest first."""
+    return [run for run in runs() if run.supervised]
 
 
 def find_run(name: str | None) -> RunFolder:
@@ -101,7 +29,7 @@ def find_run(name: str | None) -> RunFolder:
     Raises:
         InputError: There is none, or more than one.
     """
-    going = [run for run in runs() if run.supervised]
+    going = going_on()
     chosen = [run for run in going if run.card.name.startswith(name or "")]
     exact = [run for run in chosen if run.card.name == name]
     if len(exact or chosen) == 1:
@@ -124,24 +52,40 @@ def status_of(run: RunFolder) -> dict[str, Any]:
     return {**facts_of(run), "state": state}
 
 
-def stop_run(run: RunFolder, wait_s: float) -> dict[str, Any]:
-    """Request a run to end by its safe ramp.
+def stop_runs(
+    chosen: Sequence[RunFolder],
+    wait_s: float,
+    clock: Callable[[], float] = time.monotonic,
+    sleep: Callable[[float], None] = time.sleep,
+) -> list[dict[str, Any]]:
+    """Request runs to end by their safe ramps, all of them before any is waited for.
 
     Args:
-        run: The run.
-        wait_s: How long to wait for its end.
+        chosen: The runs.
+        wait_s: How long to wait for the end of all.
+        clock: Monotonic time in s.
+        sleep: Lets that many s pass.
 
     Returns:
-        Its last status, with ``ended``: whether it is over.
-
-    Raises:
-        RunError: It does not answer.
+        Of each run what it says of itself, with ``ended``: whether it is over, and ``error``: why
+        it could not be requested, or an empty text.
     """
-    answer = ask(run.socket, {"command": "stop"})
-    deadline = time.monotonic() + wait_s
-    while (going := run.alive) and time.monotonic() < deadline:
-        time.sleep(_POLL_S)
-    return {**answer, "ended": not going}
+    refused = [_refusal(run) for run in chosen]
+    deadline = clock() + wait_s
+    while any(run.alive for run in chosen) and clock() < deadline:
+        sleep(_POLL_S)
+    return [
+        {**facts_of(run), "ended": not run.alive, "error": error}
+        for run, error in zip(chosen, refused, strict=True)
+    ]
+
+
+def _refusal(run: RunFolder) -> str:
+    try:
+        # Without a supervisor its loop ramps down by itself.
+        return "" if request_stop(run) or not run.alive else "its supervisor is gone"
+    except RunError as error:
+        return str(error)
 
 
 def set_run(run: RunFolder, assignments: Sequence[str], over_s: float) -> dict[str, Any]:

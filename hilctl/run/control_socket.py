@@ -1,10 +1,12 @@
 """The control socket of a run: one question a connection, one answer, both one line of JSON.
 
 It is served between two looks at the ring, without waiting for anybody: a client that is slow,
-silent or too long is cut off.
+silent or too long is cut off, and where there are too many, the one that has been silent longest.
+What takes time to answer is answered later, while others are served.
 """
 
 import json
+import math
 import os
 import selectors
 import socket
@@ -15,17 +17,28 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Protocol, Self
 
 from hilctl.base.errors import InputError, RunError
 
 MAX_BYTES = 4096
 """Longest question."""
-_MAX_CLIENTS = 8
-_CLIENT_S = 1.0
+_MAX_CLIENTS = 64
+_BACKLOG = 256
+_SILENT_S = 0.5
+_LATER_S = 0.005
 _ANSWER_BYTES = 65536
 
-Answer = Callable[[bytes], Mapping[str, Any]]
+
+class LaterAnswer(Protocol):
+    """An answer that takes its time."""
+
+    def answer(self) -> Mapping[str, Any] | None:
+        """Return it; None where it is not there yet. An InputError becomes an answer in words."""
+        ...
+
+
+Answer = Callable[[bytes], Mapping[str, Any] | LaterAnswer]
 """Question in, answer out; an InputError becomes an answer in words."""
 
 
@@ -34,6 +47,7 @@ class _Client:
     connection: socket.socket
     until: float
     question: bytearray = field(default_factory=bytearray)
+    later: LaterAnswer | None = None
 
 
 class ControlServer:
@@ -63,7 +77,7 @@ class ControlServer:
             raise RunError(f"{path}: can't listen: {error.strerror or error}") from None
         finally:
             os.umask(before)
-        self._listener.listen(_MAX_CLIENTS)
+        self._listener.listen(_BACKLOG)
         self._listener.setblocking(False)
         self._selector.register(self._listener, selectors.EVENT_READ)
 
@@ -85,12 +99,16 @@ class ControlServer:
         """Wait for something to do, at most that long, and do it."""
         until = self._clock() + timeout_s
         while True:
-            left_s = until - self._clock()
-            for key, _ in self._selector.select(max(0.0, left_s)):
+            later = [each for each in self._clients.values() if each.later is not None]
+            left_s = max(0.0, until - self._clock())
+            for key, _ in self._selector.select(min(left_s, _LATER_S) if later else left_s):
                 if key.fileobj is self._listener:
                     self._accept()
-                else:
-                    self._read(self._clients[key.fd])
+                # One that was read may have made room for another of the same descriptor.
+                elif (client := self._clients.get(key.fd)) is not None:
+                    self._read(client)
+            for client in later:
+                self._answer_later(client)
             now = self._clock()
             for client in [each for each in self._clients.values() if now > each.until]:
                 self._drop(client)
@@ -98,19 +116,33 @@ class ControlServer:
                 return
 
     def _accept(self) -> None:
-        with suppress(OSError):  # it went away again, or there are no descriptors left
-            connection, _ = self._listener.accept()
-            if len(self._clients) >= _MAX_CLIENTS or not _is_ours(connection):
-                connection.close()
-                return
-            connection.setblocking(False)
-            client = _Client(connection, self._clock() + _CLIENT_S)
-            self._clients[connection.fileno()] = client
-            self._selector.register(connection, selectors.EVENT_READ)
+        try:
+            # All of them, up to what there is room for: a crowd must not fill the queue.
+            for _ in range(_MAX_CLIENTS):
+                self._welcome(self._listener.accept()[0])
+        except BlockingIOError:
+            return
+        except OSError:  # there are no descriptors left: some come back
+            self._drop_longest_silent()
+
+    def _welcome(self, connection: socket.socket) -> None:
+        if not _is_ours(connection):
+            connection.close()
+            return
+        if len(self._clients) >= _MAX_CLIENTS:
+            self._drop_longest_silent()
+        connection.setblocking(False)
+        client = _Client(connection, self._clock() + _SILENT_S)
+        self._clients[connection.fileno()] = client
+        self._selector.register(connection, selectors.EVENT_READ)
+        # At once: what has been asked already can't be pushed out by those who come next.
+        self._read(client)
 
     def _read(self, client: _Client) -> None:
         try:
             data = client.connection.recv(MAX_BYTES)
+        except BlockingIOError:
+            return
         except OSError:
             self._drop(client)
             return
@@ -119,24 +151,47 @@ class ControlServer:
         if len(line) > MAX_BYTES:
             self._reply(client, {"ok": False, "error": f"longer than {MAX_BYTES} bytes"})
         elif end or (line and not data):
-            self._reply(client, self._answered(bytes(line)))
+            self._question(client, bytes(line))
         elif not data:
             self._drop(client)
 
-    def _answered(self, line: bytes) -> Mapping[str, Any]:
+    def _question(self, client: _Client, line: bytes) -> None:
         try:
-            return {"ok": True, **self._answer(line)}
+            answer = self._answer(line)
         except InputError as error:
-            return {"ok": False, "error": str(error)}
+            self._reply(client, {"ok": False, "error": str(error)})
+            return
+        if isinstance(answer, Mapping):
+            self._reply(client, {"ok": True, **answer})
+            return
+        # It has nothing more to say: that it has closed its side must not keep this one busy.
+        self._selector.unregister(client.connection)
+        client.later, client.until = answer, math.inf
+
+    def _answer_later(self, client: _Client) -> None:
+        assert client.later is not None
+        try:
+            answer = client.later.answer()
+        except InputError as error:
+            self._reply(client, {"ok": False, "error": str(error)})
+            return
+        if answer is not None:
+            self._reply(client, {"ok": True, **answer})
 
     def _reply(self, client: _Client, answer: Mapping[str, Any]) -> None:
         with suppress(OSError):  # it did not wait, or can't take it: its loss
             client.connection.send(json.dumps(answer).encode() + b"\n")
         self._drop(client)
 
+    def _drop_longest_silent(self) -> None:
+        silent = (each for each in self._clients.values() if each.later is None)
+        if (longest := next(silent, None)) is not None:
+            self._drop(longest)
+
     def _drop(self, client: _Client) -> None:
         del self._clients[client.connection.fileno()]
-        self._selector.unregister(client.connection)
+        if client.later is None:
+            self._selector.unregister(client.connection)
         client.connection.close()
 
 

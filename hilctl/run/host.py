@@ -12,6 +12,7 @@ _HEARTBEAT_NS, _NEXT_SAMPLE = int(Field.LOOP_HEARTBEAT_NS), int(Field.NEXT_SAMPL
 _LATE_TICKS, _STOP = int(Field.LATE_TICKS), int(Field.STOP)
 _SUPERVISOR_HEARTBEAT_NS = int(Field.SUPERVISOR_HEARTBEAT_NS)
 _TUNE_WANTED, _TUNE_TAKEN = int(Field.TUNE_WANTED), int(Field.TUNE_TAKEN)
+_TUNE_BEGINS_AT, _TUNE_TAKEN_AT = int(Field.TUNE_BEGINS_AT), int(Field.TUNE_TAKEN_AT)
 
 
 class RingHost:
@@ -54,13 +55,14 @@ class RingHost:
         self._numbers[Field.PHASE] = Phase.CLOSING
 
     def tuning(self) -> Tuning | None:
-        """Return a change of the reference that is wanted and new."""
+        """Return a change of the reference that is wanted, new, and due to begin."""
         numbers, page = self._numbers, self._page
-        wanted = numbers[_TUNE_WANTED]
-        if wanted == numbers[_TUNE_TAKEN]:
+        wanted, now = numbers[_TUNE_WANTED], numbers[_NEXT_SAMPLE]
+        if wanted == numbers[_TUNE_TAKEN] or now < numbers[_TUNE_BEGINS_AT]:
             return None
         gain, offset = page.get_float(Field.TUNE_GAIN), page.get_float(Field.TUNE_OFFSET)
-        tuning = Tuning(gain, offset, page.get(Field.TUNE_SAMPLES))
+        tuning = Tuning(gain, offset, page.get(Field.TUNE_SAMPLES), page.get(Field.TUNE_BEGINS_AT))
+        numbers[_TUNE_TAKEN_AT] = now
         # Taken only once it has been read: the supervisor may write the next one from here on.
         numbers[_TUNE_TAKEN] = wanted
         return tuning

@@ -83,6 +83,8 @@ class Field(IntEnum):
     TUNE_SAMPLES = 52
     GUARDIAN_HEARTBEAT_NS = 56
     GUARDIAN_PHASE = 57
+    TUNE_BEGINS_AT = 53
+    TUNE_TAKEN_AT = 54
 
 
 class Phase(IntEnum):

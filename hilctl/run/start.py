@@ -8,6 +8,7 @@ from pathlib import Path
 from hilctl.base.errors import InputError
 from hilctl.experiment.check import Checked, check
 from hilctl.experiment.load import load_experiment
+from hilctl.run.architecture import require_ordered_memory
 from hilctl.run.result import Progress, RunResult
 from hilctl.run.supervisor import Supervisor
 
@@ -16,8 +17,9 @@ def checked_experiment(path: Path, settings: Sequence[str]) -> Checked:
     """Load an experiment and hold it against device, model and limits.
 
     Raises:
-        InputError: It can't be used; all problems are listed.
+        InputError: It can't be used, all problems are listed; or this machine can't run any.
     """
+    require_ordered_memory()
     return check(load_experiment(path, settings))
 
 

@@ -11,17 +11,18 @@ from hilctl.base.events import Event
 from hilctl.experiment.check import Checked
 from hilctl.loop.plan import Outcome
 from hilctl.run.child import LoopChild
-from hilctl.run.requests import Requests
 from hilctl.run.result import Progress
 from hilctl.run.ring import SampleRing
 from hilctl.run.ring_recorder import RingRecorder
 from hilctl.run.safety import Safety
 from hilctl.run.shared_page import Field, Stop
+from hilctl.run.stopping import STOP_SIGNAL
 
 STOPS = {
     signal.SIGINT: Stop.CTRL_C,
     signal.SIGTERM: Stop.SIGTERM,
     signal.SIGHUP: Stop.SIGHUP,
+    STOP_SIGNAL: Stop.REQUEST,
 }
 
 
@@ -34,7 +35,6 @@ class StartedRun:
         child: Its loop.
         safety: Who sees to a safe output.
         recording: Takes what the loop exchanges.
-        requests: Requests to the run.
     """
 
     def __init__(
@@ -44,11 +44,10 @@ class StartedRun:
         child: LoopChild,
         safety: Safety,
         recording: RingRecorder,
-        requests: Requests,
     ) -> None:
         self._config, self._forecast = checked.loaded.config, checked.forecast
         self._page, self._child = ring.page, child
-        self._safety, self._recording, self._requests = safety, recording, requests
+        self._safety, self._recording = safety, recording
         self.outcome: Outcome | None = None
         """How it ended, with the output safe as far as that can be had; None before."""
         self.broke = ""
@@ -115,8 +114,6 @@ class StartedRun:
         must_record = self._config.recording.on_failure == "stop"
         if stop_signal:
             page.put(Field.STOP, STOPS[signal.Signals(stop_signal)])
-        elif self._requests.stop:
-            page.put(Field.STOP, Stop.REQUEST)
         elif self.broke:
             page.put(Field.STOP, Stop.SUPERVISOR_BROKE)
         elif recorder.error and must_record:

@@ -17,6 +17,7 @@ from hilctl.base.errors import RunError
 from hilctl.experiment.check import Checked
 from hilctl.loop.pacer import deadline_misses
 from hilctl.machine.realtime import be_ordinary
+from hilctl.run.change_worker import ChangeWorker
 from hilctl.run.child import LoopChild
 from hilctl.run.control_socket import ControlServer
 from hilctl.run.progress import ProgressThread
@@ -29,6 +30,7 @@ from hilctl.run.run_folder import RunFolder, held_devices, run_folder
 from hilctl.run.safety import Safety, guardian_of
 from hilctl.run.shared_page import Field, PageText, SharedPage
 from hilctl.run.started_run import STOPS, StartedRun
+from hilctl.run.stopping import STOP_SIGNAL
 from hilctl.run.systemd import Notifier
 
 _log = logging.getLogger(__name__)
@@ -75,6 +77,11 @@ class Supervisor:
         be_ordinary()
         config = self._config
         with ExitStack() as stack:
+            # Before anything is held or started: a fork has all that its maker has.
+            worker = stack.enter_context(ChangeWorker(self._checked))
+            # Before there is a loop: a signal must stop it, not just end this process. And to the
+            # last: whoever finds the run's folder may send one.
+            stack.enter_context(self._signals())
             # The device before the recording: a run that is refused must not touch a file.
             locks = stack.enter_context(held_devices(self._checked.loaded.device.info.holds))
             recorder = Recorder(self._checked, self._output, overwrite=self._overwrite)
@@ -82,10 +89,8 @@ class Supervisor:
                 folder, own = stack.enter_context(
                     run_folder(config.name, self._output, time.time())
                 )
-                # Before there is a loop: a signal must stop it, not just end this process.
-                stack.enter_context(self._signals())
                 ring = self._make_ring(folder)
-                requests = Requests(self._checked, folder, ring.page, recorder)
+                requests = Requests(self._checked, folder, ring.page, recorder, worker)
                 server = stack.enter_context(ControlServer(folder.socket, requests.answer))
                 child = LoopChild(self._checked, folder, ring, locks + own, self._silence_s)
             except BaseException:
@@ -93,10 +98,10 @@ class Supervisor:
                 raise
             recording = RingRecorder(ring, recorder, config.recording.flush_s)
             safety = self._start(folder, ring, child, recording, locks + own)
-            started = StartedRun(self._checked, ring, child, safety, recording, requests)
-            self._attend(started, server)
+            started = StartedRun(self._checked, ring, child, safety, recording)
+            self._attend(started, server, requests)
             safety.close()
-            return self._result(started, requests, recorder, ring)
+            return self._result(started, recorder, ring)
 
     def _start(
         self,
@@ -155,7 +160,7 @@ class Supervisor:
             "nothing has moved"
         )
 
-    def _attend(self, started: StartedRun, server: ControlServer) -> None:
+    def _attend(self, started: StartedRun, server: ControlServer, requests: Requests) -> None:
         """See to a run until its recording is closed, whatever goes wrong meanwhile."""
         shown = ProgressThread(started.progress, self._on_progress, started.progress_failed)
         try:
@@ -163,6 +168,7 @@ class Supervisor:
             self._notifier.say("READY=1", f"STATUS=recording to {self._output}")
             while started.attend(self._stop_signal):
                 self._notifier.alive()
+                requests.attend()
                 server.serve(_POLL_S)
             self._notifier.say("STOPPING=1")
         except Exception as error:  # noqa: BLE001  it must not cost coil, ring or recording
@@ -189,6 +195,8 @@ class Supervisor:
         def note(number: int, frame: FrameType | None) -> None:
             self._stop_signal = self._stop_signal or number
 
+        # Never the default, which would end a process that is asked to stop a moment too late.
+        signal.signal(STOP_SIGNAL, signal.SIG_IGN)
         before = {number: signal.signal(number, note) for number in STOPS}
         try:
             yield
@@ -210,12 +218,11 @@ class Supervisor:
             hint = "less recording.ring_s needs less of it"
             raise RunError(f"{folder.ring}: no memory: {error.strerror}; {hint}") from None
 
-    def _result(
-        self, started: StartedRun, requests: Requests, recorder: Recorder, ring: SampleRing
-    ) -> RunResult:
+    def _result(self, started: StartedRun, recorder: Recorder, ring: SampleRing) -> RunResult:
         outcome = started.outcome
         assert outcome is not None
-        stop_signal = self._stop_signal or (signal.SIGTERM if requests.stop else 0)
+        requested = self._stop_signal == STOP_SIGNAL
+        stop_signal = signal.SIGTERM if requested else self._stop_signal
         cut = f"; {recorder.missing} samples are lost: {recorder.error}" if recorder.error else ""
         broke = f"; the supervisor broke: {started.broke}" if started.broke else ""
         moved = "".join(f"; {note}" for note in recorder.notes)

@@ -24,10 +24,12 @@ def rss_kib(pid: int) -> int:
     return 0
 
 
-def child_of(pid: int) -> int | None:
-    """Return a process's first child."""
-    children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
-    return int(children[0]) if children else None
+def loop_of(pid: int) -> int | None:
+    """Return a run's loop process; None where it has ended."""
+    for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split():
+        if b"hilctl.run.loop_process" in Path(f"/proc/{child}/cmdline").read_bytes():
+            return int(child)
+    return None
 
 
 def watch(run: subprocess.Popen[bytes], path: Path) -> dict[str, list[tuple[float, int]]]:
@@ -39,7 +41,7 @@ def watch(run: subprocess.Popen[bytes], path: Path) -> dict[str, list[tuple[floa
         if not path.exists() or path.stat().st_size < 100_000:
             continue
         begun = begun or time.monotonic()
-        loop = child_of(run.pid)
+        loop = loop_of(run.pid)
         if loop is None:  # it has ended; what comes now is the report
             return seen
         at = time.monotonic() - begun

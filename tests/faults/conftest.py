@@ -17,6 +17,7 @@ import yaml
 
 from hilctl.analysis.replay import replay
 from hilctl.recording.reader import read
+from tests.fakes import loop_of
 
 PROFILES = Path(__file__).parents[1] / "data"
 EXPERIMENT = {
@@ -84,11 +85,7 @@ class Run:
 
     def loop_pid(self) -> int:
         """Find the loop process among the run's children."""
-        children = Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children")
-        for child in children.read_text().split():
-            if b"hilctl.run.loop_process" in Path(f"/proc/{child}/cmdline").read_bytes():
-                return int(child)
-        raise AssertionError("the run has no loop process")
+        return loop_of(self.process.pid)
 
     def kill_all(self, number: int) -> None:
         """Send a signal to supervisor and loop at once."""

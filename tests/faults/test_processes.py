@@ -18,6 +18,7 @@ from hilctl.recording.reader import read
 from hilctl.run.orphans import recover_orphans
 from hilctl.run.run_folder import runs
 from hilctl.run.shared_page import SIZE
+from tests.fakes import loop_of
 
 KILLS = Path(__file__).parents[1] / "benchmark" / "kills.py"
 EXPERIMENT = {
@@ -59,8 +60,7 @@ class Run:
             assert self.process.poll() is None, self.process.communicate()
             assert time.monotonic() < deadline
             time.sleep(0.02)
-        children = Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children")
-        (self.loop,) = map(int, children.read_text().split())
+        self.loop = loop_of(self.process.pid)
 
     def end(self):
         out, err = self.process.communicate(timeout=60)

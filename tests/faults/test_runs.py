@@ -19,6 +19,7 @@ from hilctl.run.orphans import recover_orphans
 from hilctl.run.run_folder import base_folder
 from hilctl.run.start import checked_experiment
 from hilctl.run.supervisor import Supervisor
+from tests.fakes import loop_of
 
 MODELS = Path(__file__).parents[2] / "configs" / "models"
 
@@ -76,9 +77,8 @@ class Run:
             time.sleep(0.02)
 
     def loop_pid(self) -> int:
-        """Find the loop process, the run's only child."""
-        children = Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children")
-        return int(children.read_text().split()[0])
+        """Find the loop process among the run's children."""
+        return loop_of(self.process.pid)
 
     def end(self) -> tuple[int, dict]:
         """Wait for the end; return the exit code and the JSON it printed."""

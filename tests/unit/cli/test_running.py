@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import typer
 
-from hilctl.cli.running import check, run, safe, set_, status, stop
+from hilctl.cli.running import check, run, safe
 from hilctl.run.by_hand import SafeByHand
 from hilctl.run.result import RunResult
 
@@ -58,40 +58,6 @@ def test_check_moves_nothing_and_says_what_would(capsys):
     printed = json.loads(capsys.readouterr().out)
     assert printed["experiment"] == str(DEMO)
     assert printed["samples"] == 50_000
-
-
-def test_no_run_is_an_empty_list(capsys):
-    status(as_json=True)
-    assert json.loads(capsys.readouterr().out) == {"runs": []}
-
-
-@pytest.fixture
-def going(monkeypatch):
-    """A run that answers as told."""
-
-    class Card:
-        name, recording = "sine-7", "a.mcap"
-
-    class Going:
-        card = Card
-
-    monkeypatch.setattr("hilctl.run.client.find_run", lambda name: Going)
-    return monkeypatch
-
-
-def test_a_run_that_does_not_end_in_time_is_a_failure(going, capsys):
-    going.setattr("hilctl.run.client.stop_run", lambda run, wait_s: {"ended": False})
-    with pytest.raises(typer.Exit) as left:
-        stop(wait_s=2.0)
-    assert left.value.exit_code == 3
-    assert "sine-7 was told to stop, and is still going after 2 s" in capsys.readouterr().out
-
-
-def test_set_says_what_was_taken(going, capsys):
-    answer = {"gain": 0.5, "offset": -2.0, "over_s": 1.5}
-    going.setattr("hilctl.run.client.set_run", lambda run, assignments, over_s: answer)
-    set_(["gain=0.5"], over_s=1.5)
-    assert capsys.readouterr().out == "sine-7: gain 0.5, offset -2, over 1.5 s\n"
 
 
 @pytest.mark.parametrize("as_json", [True, False])

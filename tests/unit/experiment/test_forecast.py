@@ -11,7 +11,7 @@ from hilctl.base.arrays import F64
 from hilctl.base.device import DeviceInfo, DeviceOptions
 from hilctl.base.errors import ConfigError
 from hilctl.base.yaml.document import Document
-from hilctl.experiment.check import Checked, check, check_tuned
+from hilctl.experiment.check import Checked, check
 from hilctl.experiment.load import LoadedExperiment, resolve
 from hilctl.models.base import HysteresisModel
 from hilctl.models.staged import FieldLag, StagedModel
@@ -178,15 +178,6 @@ class TestForecast:
         assert plain.begun.state is None
         assert plain.begun.input_um is plain.reference.values
         assert result.forecast.recording_mb > plain.forecast.recording_mb
-
-    def test_tuned_run_that_looks_ahead_is_worked_out_on_what_is_fed(self) -> None:
-        """A gain is refused by the current it would take with all of the compensator in it."""
-        model = StagedModel.around(terfenol_rdpi(), lag=FieldLag(tau_s=2e-3))
-        result = checked(DISPLACEMENT, model=model)
-        highest = result.forecast.command_max
-        check_tuned(result, (1.0, 0.0), (0.99 * 7.0 / highest, 0.0), 1000)
-        with pytest.raises(ConfigError, match="must stay within -7 to 7 A"):
-            check_tuned(result, (1.0, 0.0), (1.2 * 7.0 / highest, 0.0), 1000)
 
     def test_run_before_that_can_t_be_read_is_refused(self) -> None:
         """A recording that is not there is named with its key."""

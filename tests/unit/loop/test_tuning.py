@@ -77,3 +77,24 @@ def test_two_arrays_are_moved_alike():
     tune(factors, np.zeros(10), b)
     assert a - b == pytest.approx(1.0 + np.arange(1, 11) / 10)
     assert tuner.advance(1) == (2.0, 1.0)
+
+
+@given(st.integers(0, 80), st.integers(1, 60))
+def test_samples_that_go_by_count(passed, samples):
+    """Gain and offset are then as if each sample had been looked at, to the bit."""
+    looked, gone_by = Tuner(), Tuner()
+    for tuner in (looked, gone_by):
+        tuner.move(Tuning(0.3, -2.0, samples))
+    if passed:
+        looked.advance(passed)
+    gone_by.pass_over(passed)
+    assert (looked.gain, looked.offset, looked.moving) == (
+        gone_by.gain,
+        gone_by.offset,
+        gone_by.moving,
+    )
+    gain, offset = looked.gain, looked.offset
+    if passed:
+        gains, offsets = (np.broadcast_to(each, 1) for each in looked.advance(1))
+        assert gains[0] <= gain
+        assert offsets[0] <= offset

@@ -6,7 +6,8 @@ import pytest
 
 from hilctl.base.errors import InputError, RunError
 from hilctl.run import client
-from hilctl.run.client import find_run, free_log, set_run, status_of, stop_run
+from hilctl.run.client import find_run, going_on, set_run, status_of, stop_runs
+from tests.fakes import SteppingClock
 
 
 def run(name, *, supervised=True, alive=True):
@@ -68,10 +69,39 @@ def test_status_is_given_of_runs_that_do_not_answer(answers, monkeypatch):
     assert status_of(run("a")) == {"name": "a", "state": "not answering", "error": "no answer"}
 
 
-def test_stop_says_whether_the_run_has_ended(answers):
-    assert stop_run(run("a", alive=False), 0.0)["ended"] is True
-    assert stop_run(run("a"), 0.0)["ended"] is False
-    assert answers == [("a.sock", {"command": "stop"})] * 2
+def test_all_runs_are_requested_to_stop_before_one_is_waited_for(answers, monkeypatch):
+    """Each says whether it has ended within the time for all, and what kept it from being asked."""
+    done, clock = [], SteppingClock()
+    chosen = [run("a"), run("b"), run("c"), run("d", alive=False)]
+
+    def request(each):
+        done.append(each.card.name)
+        if each.card.name == "c":
+            raise RunError("c: can't be stopped: no right")
+        return each.card.name != "b"
+
+    def sleep(seconds):
+        done.append("sleep")
+        clock.now += seconds
+        chosen[0].alive = False
+
+    monkeypatch.setattr(client, "request_stop", request)
+    stopped = stop_runs(chosen, 0.05, clock, sleep)
+    assert done[:5] == ["a", "b", "c", "d", "sleep"]
+    assert 2 <= done.count("sleep") <= 3
+    assert [(each["name"], each["ended"], each["error"]) for each in stopped] == [
+        ("a", True, ""),
+        ("b", False, "its supervisor is gone"),
+        ("c", False, "c: can't be stopped: no right"),
+        ("d", True, ""),
+    ]
+    assert answers == []
+
+
+def test_only_runs_with_a_supervisor_are_going_on(monkeypatch):
+    found = [run("a"), run("b", supervised=False)]
+    monkeypatch.setattr(client, "runs", lambda: found)
+    assert going_on() == found[:1]
 
 
 def test_set_sends_numbers(answers):
@@ -92,12 +122,3 @@ def test_what_is_no_setting_is_not_sent(answers, text, said):
     with pytest.raises(InputError, match=said):
         set_run(run("a"), ["offset=1", text], 1.0)
     assert answers == []
-
-
-def test_no_log_takes_the_place_of_another_file(tmp_path):
-    """Neither one of another run, nor a user's own, nor a link that leads nowhere."""
-    output = tmp_path / "run.mcap"
-    assert free_log(output) == tmp_path / "run.log"
-    (tmp_path / "run.log").write_text("mine")
-    (tmp_path / "run.2.log").symlink_to(tmp_path / "nowhere")
-    assert free_log(output) == tmp_path / "run.3.log"

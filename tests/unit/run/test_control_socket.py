@@ -1,9 +1,11 @@
 """The control socket: who may ask, and what becomes of bad questions."""
 
+import errno
 import json
 import socket
 import stat
 import threading
+from typing import ClassVar
 
 import pytest
 from hypothesis import given, settings
@@ -14,9 +16,26 @@ from hilctl.run.control_socket import MAX_BYTES, ControlServer, ask
 from tests.fakes import SteppingClock
 
 
+class Later:
+    """An answer that comes when the test has set it."""
+
+    made: ClassVar[list] = []
+
+    def __init__(self):
+        self.found = None
+        self.made.append(self)
+
+    def answer(self):
+        if isinstance(self.found, Exception):
+            raise self.found
+        return self.found
+
+
 def echo(line):
     if line == b"refuse":
         raise InputError("not today")
+    if line.startswith(b"later"):
+        return Later()
     return {"heard": line.decode(errors="replace")}
 
 
@@ -77,31 +96,150 @@ def test_endless_question_is_cut_off(server, tmp_path):
 
 
 def test_silent_client_is_dropped(tmp_path):
-    """Who connects and says nothing holds nobody up, and is sent away after a second."""
+    """Who connects and says nothing holds nobody up, and is sent away after half a second."""
     clock = SteppingClock()
     with ControlServer(tmp_path / "socket", echo, clock) as server, connect(tmp_path) as client:
         server.serve(0.0)
-        clock.now = 0.9
+        clock.now = 0.4
         server.serve(0.0)
         client.setblocking(False)
         with pytest.raises(BlockingIOError):
             client.recv(10)
-        clock.now = 1.1
+        clock.now = 0.6
         server.serve(0.0)
         assert client.recv(10) == b""
 
 
-def test_crowd_is_sent_away(server, tmp_path):
-    """More clients than there is room for are refused, and the ones there are still served."""
-    crowd = [connect(tmp_path) for _ in range(9)]
-    for _ in range(12):
-        server.serve(0.0)
-    crowd[0].sendall(b"hello\n")
+def closed(client):
+    """Return whether the server has closed a connection, without waiting."""
+    client.setblocking(False)
+    try:
+        return client.recv(10) == b""
+    except BlockingIOError:
+        return False
+
+
+def test_the_longest_silent_make_room_for_who_has_something_to_ask(server, tmp_path):
+    """However many say nothing, a question is answered at once."""
+    crowd = [connect(tmp_path) for _ in range(80)]
     server.serve(0.0)
-    assert json.loads(crowd[0].recv(1000))["ok"]
-    assert crowd[8].recv(10) == b""
+    server.serve(0.0)
+    with connect(tmp_path) as client:
+        client.sendall(b"hello\n")
+        server.serve(0.0)
+        assert json.loads(client.recv(1000))["ok"]
+    gone = [closed(each) for each in crowd]
+    assert gone == sorted(gone, reverse=True)
+    assert gone.count(True) == 80 - 63
+    crowd[-1].setblocking(True)
+    crowd[-1].sendall(b"hello\n")
+    server.serve(0.0)
+    assert json.loads(crowd[-1].recv(1000))["ok"]
     for client in crowd:
         client.close()
+
+
+def test_a_crowd_is_taken_in_one_go(server, tmp_path):
+    """The queue of those who wait to be let in never fills while it is served."""
+    for _ in range(4):
+        crowd = [connect(tmp_path) for _ in range(60)]
+        server.serve(0.0)
+        for client in crowd:
+            client.close()
+    server.serve(0.0)
+    assert json.loads(exchange(server, tmp_path, b"hello\n"))["ok"]
+
+
+def test_a_question_that_was_sent_at_once_is_not_pushed_out(server, tmp_path):
+    """Whoever comes after it in the same moment does not take its place."""
+    with connect(tmp_path) as client:
+        client.sendall(b"hello\n")
+        crowd = [connect(tmp_path) for _ in range(100)]
+        for _ in range(3):
+            server.serve(0.0)
+        assert json.loads(client.recv(1000))["ok"]
+        for each in crowd:
+            each.close()
+
+
+def test_without_descriptors_the_longest_silent_goes(server, tmp_path, monkeypatch):
+    """Else the one who asks would wait for as long as the others stay."""
+    silent, other = connect(tmp_path), connect(tmp_path)
+    server.serve(0.0)
+
+    def full(self):
+        raise OSError(errno.EMFILE, "Too many open files")
+
+    monkeypatch.setattr(socket.socket, "accept", full)
+    waiting = connect(tmp_path)
+    server.serve(0.0)
+    assert closed(silent)
+    assert not closed(other)
+    for each in (silent, other, waiting):
+        each.close()
+
+
+def test_what_takes_time_is_answered_later_while_others_are_served(server, tmp_path):
+    """Neither silence nor a closed sending side ends the wait, and nobody takes its place."""
+    with connect(tmp_path) as first, connect(tmp_path) as second:
+        first.sendall(b"later\n")
+        first.shutdown(socket.SHUT_WR)
+        second.sendall(b"later\n")
+        server.serve(0.0)
+        server._clock.now += 100.0
+        crowd = [connect(tmp_path) for _ in range(80)]
+        server.serve(0.0)
+        server.serve(0.0)
+        assert json.loads(exchange(server, tmp_path, b"hello\n"))["ok"]
+        Later.made[-2].found, Later.made[-1].found = {"n": 1}, InputError("no")
+        server.serve(0.0)
+        assert json.loads(first.recv(1000)) == {"ok": True, "n": 1}
+        assert json.loads(second.recv(1000)) == {"ok": False, "error": "no"}
+        assert (first.recv(10), second.recv(10)) == (b"", b"")
+        for each in crowd:
+            each.close()
+
+
+def test_who_has_left_before_the_answer_is_no_error(server, tmp_path):
+    with connect(tmp_path) as client:
+        client.sendall(b"later\n")
+        server.serve(0.0)
+    Later.made[-1].found = {"n": 1}
+    server.serve(0.0)
+    assert json.loads(exchange(server, tmp_path, b"hello\n"))["ok"]
+
+
+def test_a_later_answer_is_looked_for_within_the_wait(tmp_path):
+    """Not only when the wait is over."""
+    clock = SteppingClock()
+    with ControlServer(tmp_path / "socket", echo, clock) as server, connect(tmp_path) as client:
+        client.sendall(b"later\n")
+        server.serve(0.0)
+        waits = []
+        select = server._selector.select
+
+        def shown(timeout):
+            waits.append(timeout)
+            clock.now += timeout
+            return select(0.0)
+
+        server._selector.select = shown
+        server.serve(0.02)
+        assert max(waits) <= 0.005
+        Later.made[-1].found = {}
+        server.serve(0.0)
+        server.serve(0.02)
+        assert max(waits) == pytest.approx(0.02)
+
+
+def test_another_user_is_sent_away(server, tmp_path, monkeypatch):
+    monkeypatch.setattr("os.getuid", lambda: 4242)
+    monkeypatch.setattr("hilctl.run.control_socket._is_ours", lambda connection: False)
+    with connect(tmp_path) as client:
+        client.sendall(b"hello\n")
+        server.serve(0.0)
+        with pytest.raises(ConnectionResetError):
+            client.recv(10)
 
 
 @settings(max_examples=200)

@@ -62,6 +62,21 @@ def test_a_tuning_is_taken_once(host, ring):
         assert page.get(Field.TUNE_TAKEN) == number
 
 
+def test_a_tuning_waits_for_its_sample(host, ring):
+    """It was worked out from there on; where a tick was skipped it begins at the next one."""
+    page = ring.page
+    page.put_float(Field.TUNE_GAIN, 0.5)
+    page.put(Field.TUNE_SAMPLES, 40)
+    page.put(Field.TUNE_BEGINS_AT, 60)
+    page.put(Field.TUNE_WANTED, 1)
+    host.heartbeat(59, 0)
+    assert host.tuning() is None
+    assert page.get(Field.TUNE_TAKEN) == 0
+    host.heartbeat(61, 0)
+    assert host.tuning() == Tuning(0.5, 0.0, 40, 60)
+    assert (page.get(Field.TUNE_TAKEN), page.get(Field.TUNE_TAKEN_AT)) == (1, 61)
+
+
 def test_closing_is_shown_before_the_device_takes_its_time(host, ring, clock):
     host.closing()
     assert ring.page.get(Field.PHASE) == Phase.CLOSING

@@ -2,10 +2,11 @@
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
-from hilctl.cli.options import finish_orphans, print_json
+from hilctl.cli.output import finish_orphans, print_json
 from hilctl.run.orphans import Orphan
 
 
@@ -20,6 +21,10 @@ def test_orphans_are_told_on_standard_error(monkeypatch, capsys):
     """A program that reads standard output is not disturbed."""
     found = [Orphan("sine-7", Path("a.mcap"), safe=False, text="supervisor and loop died")]
     monkeypatch.setattr("hilctl.run.orphans.recover_orphans", lambda: found)
+    finish_orphans()
+    assert capsys.readouterr().err == ""  # nobody has died
+    dead = SimpleNamespace(alive=False)
+    monkeypatch.setattr("hilctl.run.run_folder.runs", lambda: [dead])
     finish_orphans()
     shown = capsys.readouterr()
     assert shown.out == ""

@@ -1,8 +1,8 @@
-"""What status prints of runs."""
+"""What status, set and stop print of runs."""
 
 import pytest
 
-from hilctl.cli.run_view import print_status
+from hilctl.cli.status_view import print_change, print_status, print_stopped
 
 PATH = "/home/somebody/a/folder/with/a/long/name/recordings/2026-11-21_terfenol_sine_6a.mcap"
 RUNNING = {
@@ -68,3 +68,37 @@ def test_trouble_is_told(shown):
 def test_no_run_is_told(shown):
     """Silence could be taken for an error."""
     assert shown() == ["no run is going on"]
+
+
+@pytest.mark.parametrize(
+    ("to_the_end", "rest"),
+    [
+        (True, "within the limits, to the end of the run"),
+        (False, "within the limits; the rest was tried only where the reference goes furthest"),
+    ],
+)
+def test_a_change_says_how_far_it_was_worked_out(capsys, to_the_end, rest):
+    answer = {"gain": 0.5, "offset": -2.0, "over_s": 1.5, "checked_s": 12.345}
+    print_change("sine-7", {**answer, "checked_to_the_end": to_the_end})
+    assert capsys.readouterr().out.splitlines() == [
+        "sine-7: gain 0.5, offset -2, over 1.5 s",
+        f"  every command of the next 12.3 s is {rest}",
+    ]
+
+
+def test_each_stopped_run_has_a_line(capsys):
+    print_stopped(
+        [
+            {"name": "a", "recording": "a.mcap", "ended": True, "error": ""},
+            {"name": "b", "recording": "b.mcap", "ended": False, "error": ""},
+            {"name": "c", "recording": "c.mcap", "ended": False, "error": "no right"},
+        ],
+        2.0,
+    )
+    print_stopped([], 2.0)
+    assert capsys.readouterr().out.splitlines() == [
+        "a has ended; recording: a.mcap",
+        "b is still going after 2 s: it was requested to stop",
+        "c is still going after 2 s: no right",
+        "no run is going on",
+    ]

@@ -1,0 +1,293 @@
+"""A change of gain or offset, worked out from where the run stands before the loop is given it.
+
+The rest of a run may be hours long, and who asks for a change waits. So commands are worked out by
+the compensator that runs, from the present sample and its memory on, through the ramp of the change
+and for as long as there is time:
+
+- What repeats is passed over once two cycles after each other came out the same: the memory is
+  then that of the cycle, and the ones that follow are like it.
+- Where the time is up, the places of the rest are tried where the input is highest, lowest and
+  fastest, as gain and offset move no such place.
+
+What was worked out is said in the answer, and the limiter is the last word in any case.
+"""
+
+from collections.abc import Callable, Sequence
+from copy import copy
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hilctl.base.arrays import F64, I64
+from hilctl.base.errors import ConfigError
+from hilctl.base.segments import Segment
+from hilctl.experiment.check import Checked, command_problems, reference_problems
+from hilctl.experiment.forecast import CommandFigures, Forecast
+from hilctl.loop.compensator import Compensator
+from hilctl.loop.host import Tuning
+from hilctl.loop.tuning import Tuner, tune
+
+_CHUNK = 4096
+_PEAK_BLOCK = 65536
+_MOST_PERIODS = 32
+_SAME = 1e-3
+"""Two cycles are the same where they differ by less than this part of their span."""
+_WINDOW = 512
+"""Samples that are worked out on either side of one place."""
+
+
+@dataclass(frozen=True, slots=True)
+class RunPosition:
+    """Where a run stands.
+
+    Attributes:
+        sample: Next sample.
+        state: float64[state_size], the compensator's memory before it; None at its start.
+        tuner: Gain and offset there, and the change under way; not moved here.
+        heat_a2: Highest running mean square of the coil current that it can have come to, in A^2.
+    """
+
+    sample: int
+    state: F64 | None
+    tuner: Tuner
+    heat_a2: float
+
+
+@dataclass(frozen=True, slots=True)
+class TunedForecast:
+    """What a run would do with another gain and offset, within its limits.
+
+    Attributes:
+        tuning: The change.
+        checked_s: Time of the run, from where it stands, of which every command is known.
+        to_the_end: Whether that is all of it; else the rest was tried where it goes furthest.
+        heat_a2: Highest running mean square of the coil current, in A^2.
+    """
+
+    tuning: Tuning
+    checked_s: float
+    to_the_end: bool
+    heat_a2: float
+
+
+class InputPeaks:
+    """Where the compensator's input is highest, lowest and fastest, from any sample on.
+
+    Args:
+        input_um: float64[n].
+    """
+
+    def __init__(self, input_um: F64) -> None:
+        self._input_um = input_um
+        starts = range(0, input_um.size, _PEAK_BLOCK)
+        found = [_peaks(input_um[start : start + _PEAK_BLOCK + 1]) for start in starts]
+        self._places: I64 = np.array(found) + np.array(starts)[:, None]
+
+    def after(self, sample: int) -> list[int]:
+        """Return the three places at or after ``sample``, to within a block of samples."""
+        first = min(sample // _PEAK_BLOCK, len(self._places) - 1)
+        high, low, fast = self._places[first:].T
+        values = self._input_um
+        steps = np.abs(values[np.minimum(fast + 1, values.size - 1)] - values[fast])
+        chosen = (high[values[high].argmax()], low[values[low].argmin()], fast[steps.argmax()])
+        return [max(sample, int(place)) for place in chosen]
+
+
+def _peaks(values: F64) -> tuple[int, int, int]:
+    steps = np.abs(np.diff(values))
+    return int(values.argmax()), int(values.argmin()), int(steps.argmax()) if steps.size else 0
+
+
+def tuned_forecast(
+    checked: Checked,
+    peaks: InputPeaks,
+    position: RunPosition,
+    tuning: Tuning,
+    in_time: Callable[[], bool],
+) -> TunedForecast:
+    """Work out what a running reference would do with another gain and offset.
+
+    Args:
+        checked: The experiment that runs.
+        peaks: Of its compensator's input.
+        position: Where it stands.
+        tuning: The change; it begins at a block's first sample.
+        in_time: Whether there is time left.
+
+    Raises:
+        ConfigError: It would leave model or limits; the error says by how much.
+    """
+    walk = _Walk(checked, position, tuning)
+    to_the_end = _follow(walk, in_time)
+    known = walk.sample
+    if not to_the_end:
+        ends = [tuning.begins_at, tuning.begins_at + tuning.samples]
+        walk.try_around([*ends, *peaks.after(known)])
+    problems = command_problems(checked.loaded, walk.forecast())
+    # What the run had before the change has been approved: the new gain and offset alone count.
+    values = checked.reference.values[position.sample :]
+    ends_um = [float(end) * tuning.gain + tuning.offset for end in (values.min(), values.max())]
+    low, high = sorted(ends_um)
+    problems += reference_problems(checked.loaded, checked.reference.unit, low, high)
+    if problems:
+        raise ConfigError(problems)
+    seconds = (known - position.sample) / checked.loaded.config.sample_rate_hz
+    return TunedForecast(tuning, seconds, to_the_end, walk.figures.heat.highest_a2)
+
+
+def _follow(walk: "_Walk", in_time: Callable[[], bool]) -> bool:
+    """Work out all there is; return False where the time was up before the end."""
+    if not walk.on_to(walk.settled, in_time):
+        return False
+    for segment in walk.reference.segments:
+        if segment.stop <= walk.sample:
+            continue
+        periods = _whole_periods(segment.period)
+        if periods and not _pass_over_cycles(walk, segment, periods, in_time):
+            return False
+        if not walk.on_to(segment.stop, in_time):
+            return False
+    return True
+
+
+def _whole_periods(period: float) -> int:
+    """Return how many periods come nearest to whole samples; 0 where nothing repeats."""
+    if period <= 0.0:
+        return 0
+    return min(range(1, _MOST_PERIODS + 1), key=lambda n: (round(_off(n * period), 6), n))
+
+
+def _off(samples: float) -> float:
+    return abs(samples - round(samples))
+
+
+def _pass_over_cycles(
+    walk: "_Walk", segment: Segment, periods: int, in_time: Callable[[], bool]
+) -> bool:
+    """Go on until the steady part repeats, and to its last cycles; False where time was up."""
+    length = periods * segment.period
+    cycle = round(length)
+    before: F64 | None = None
+    if not walk.on_to(segment.steady_start, in_time):
+        return False
+    while walk.sample + 2 * cycle <= segment.steady_stop:
+        commands: list[F64] = []
+        if not walk.on_to(walk.sample + cycle, in_time, commands.append):
+            return False
+        now = np.concatenate(commands)
+        if before is not None and np.abs(now - before).max() <= _SAME * np.ptp(now):
+            # One more to come back into step, and one that is judged, as it ends what repeats.
+            times = int((segment.steady_stop - walk.sample) / length) - 2
+            if times > 0:
+                walk.repeat(now, times, round(times * length))
+            return True
+        before = now
+    return True
+
+
+class _Walk:
+    """Goes through the rest of a run, as its loop would."""
+
+    def __init__(self, checked: Checked, position: RunPosition, tuning: Tuning) -> None:
+        loaded, self.reference = checked.loaded, checked.reference
+        self.sample = position.sample
+        self.settled = tuning.begins_at + tuning.samples
+        self._checked, self._tuning = checked, tuning
+        self._input_um = checked.begun.input_um
+        self._compensator = Compensator(loaded.model, loaded.config.sample_rate_hz)
+        state = checked.begun.state if position.state is None else position.state
+        if state is not None:
+            self._compensator.restore(state)
+        self._tuner = copy(position.tuner)
+        # From nowhere: the first command makes no step.
+        self.figures = CommandFigures(loaded.config, None, position.heat_a2)
+
+    def on_to(
+        self, stop: int, in_time: Callable[[], bool], take: Callable[[F64], None] | None = None
+    ) -> bool:
+        """Work out the commands up to ``stop``; return False where the time was up before."""
+        stop = min(stop, self._input_um.size)
+        while self.sample < stop:
+            if not in_time():
+                return False
+            commands = self._commands(min(stop, self.sample + _CHUNK))
+            self.figures.add(commands)
+            if take is not None:
+                take(commands)
+        return True
+
+    def repeat(self, cycle: F64, times: int, samples: int) -> None:
+        """Pass over cycles that are like ``cycle`` (float64[n]); they take ``samples`` in all."""
+        self.figures.heat.repeat(cycle, times)
+        self._jump(self.sample + samples)
+        # Where no whole number of samples is a cycle, this is not quite where a cycle begins: what
+        # comes of that half a sample is not held against the change.
+        self._unjudged(cycle.size)
+
+    def try_around(self, places: Sequence[int]) -> None:
+        """Work out what surrounds some samples, each from the memory as it is now."""
+        begins, state, tuner = self.sample, self._compensator.state(), copy(self._tuner)
+        for place in places:
+            self.sample, self._tuner = begins, copy(tuner)
+            self._compensator.restore(state)
+            if (start := place - 3 * _WINDOW) > begins:
+                self._jump(start)
+                # The jump is not the run's: it must have died out before anything is judged.
+                self._unjudged(2 * _WINDOW)
+            else:
+                self.figures.last = None
+            self.on_to(max(begins, place) + _WINDOW, lambda: True)
+        self.figures.heat.expect(self._later_heat_a2())
+
+    def forecast(self) -> Forecast:
+        """Return what the run as it was checked would do, with the figures found here."""
+        figures = self.figures
+        return replace(
+            self._checked.forecast,
+            command_min=figures.low,
+            command_max=figures.high,
+            slew_per_s=figures.slew_per_s,
+            heating_rms_a=figures.heat.rms_a,
+            budget_used_s=figures.heat.used_s,
+        )
+
+    def _later_heat_a2(self) -> float:
+        """Return the heat of the run as it was checked, as much more as the commands are larger."""
+        before, now = self._checked.forecast, self.figures
+        largest = max(abs(now.low), abs(now.high))
+        largest_before = max(abs(before.command_min), abs(before.command_max))
+        heat = before.heating_rms_a or 0.0
+        part = heat / largest_before if largest_before else 1.0
+        return (part * largest) ** 2
+
+    def _unjudged(self, samples: int) -> None:
+        stop = min(self.sample + samples, self._input_um.size)
+        while self.sample < stop:
+            self.figures.last = float(self._commands(min(stop, self.sample + _CHUNK))[-1])
+
+    def _jump(self, sample: int) -> None:
+        begins_at = self._tuning.begins_at
+        if self.sample <= begins_at < sample:
+            self._tuner.pass_over(begins_at - self.sample)
+            self._tuner.move(self._tuning)
+            self.sample = begins_at
+        self._tuner.pass_over(sample - self.sample)
+        self.sample = sample
+
+    def _commands(self, stop: int) -> F64:
+        """Work out commands up to ``stop``, or up to where the change begins."""
+        begins_at = self._tuning.begins_at
+        if self.sample == begins_at:
+            self._tuner.move(self._tuning)
+        elif self.sample < begins_at:
+            stop = min(stop, begins_at)
+        values = self._input_um[self.sample : stop]
+        factors = self._tuner.advance(values.size)
+        if factors is not None:
+            values = values.copy()
+            with np.errstate(over="ignore", invalid="ignore"):  # what comes of it is refused
+                tune(factors, values, values)
+        commands = np.empty(values.size)
+        self._compensator.process(values, commands)
+        self.sample = stop
+        return commands

@@ -1,0 +1,110 @@
+"""Commands about runs that are going on: exit codes, what programs read, and what they import."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+from hilctl.base.errors import InputError
+from hilctl.cli import STEERING
+from hilctl.cli.commands import load
+from hilctl.cli.steering import steer
+
+HEAVY = ("typer", "pydantic", "numpy", "numba", "scipy", "rich", "mcap", "yaml")
+
+
+@pytest.fixture
+def going(monkeypatch):
+    """A run that answers as told."""
+
+    class Card:
+        name, recording = "sine-7", "a.mcap"
+
+    class Going:
+        card = Card
+
+    monkeypatch.setattr("hilctl.cli.steering.find_run", lambda name: Going)
+    return monkeypatch
+
+
+def stopped(*, ended, name="sine-7"):
+    return {"name": name, "recording": "a.mcap", "ended": ended, "error": ""}
+
+
+def test_no_run_is_an_empty_list(capsys):
+    assert steer("status", ["--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == {"runs": []}
+
+
+def test_a_run_that_does_not_end_in_time_is_a_failure(going, capsys):
+    going.setattr("hilctl.cli.steering.stop_runs", lambda runs, wait_s: [stopped(ended=False)])
+    assert steer("stop", ["--wait", "2"]) == 3
+    assert "sine-7 is still going after 2 s" in capsys.readouterr().out
+
+
+def test_all_runs_are_stopped_and_each_is_told(going, capsys):
+    """One that goes on is a failure; none at all is not."""
+    chosen = []
+
+    def stop_runs(runs, wait_s):
+        chosen.append((runs, wait_s))
+        return [stopped(ended=name == "a", name=name) for name in runs]
+
+    going.setattr("hilctl.cli.steering.stop_runs", stop_runs)
+    going.setattr("hilctl.cli.steering.going_on", lambda: ["a", "b"])
+    assert steer("stop", ["--all", "--json"]) == 3
+    assert [each["ended"] for each in json.loads(capsys.readouterr().out)["runs"]] == [True, False]
+    going.setattr("hilctl.cli.steering.going_on", list)
+    assert steer("stop", ["--all"]) == 0
+    assert chosen == [(["a", "b"], 60.0), ([], 60.0)]
+    with pytest.raises(InputError, match="--all and --run"):
+        steer("stop", ["--all", "--run", "a"])
+
+
+def test_set_says_what_was_taken(going, capsys):
+    answer = {"gain": 0.5, "offset": -2.0, "over_s": 1.5, "checked_s": 3.0}
+    answer["checked_to_the_end"] = True
+    asked = []
+
+    def set_run(run, assignments, over_s):
+        asked.append((assignments, over_s))
+        return answer
+
+    going.setattr("hilctl.cli.steering.set_run", set_run)
+    assert steer("set", ["gain=0.5", "offset=-2", "--over", "1.5"]) == 0
+    assert "sine-7: gain 0.5, offset -2, over 1.5 s" in capsys.readouterr().out
+    assert asked == [(["gain=0.5", "offset=-2"], 1.5)]
+
+
+@pytest.mark.parametrize(
+    "words", [["status"], ["stop", "--all"], ["set", "gain=1"], ["stop", "-h"]]
+)
+def test_nobody_waits_for_an_import(words):
+    """The whole command, as a user calls it, imports the standard library alone."""
+    code = """
+import sys
+from hilctl.cli import main
+heavy, sys.argv[1:] = sys.argv[1].split(","), sys.argv[2:]
+try:
+    main()
+finally:
+    print([each for each in heavy if each in sys.modules])
+"""
+    command = [sys.executable, "-c", code, ",".join(HEAVY), *words]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert "Traceback" not in ended.stderr
+    assert ended.stdout.splitlines()[-1] == "[]"
+
+
+@pytest.mark.parametrize("name", STEERING)
+def test_the_application_has_the_same_commands(name, capsys):
+    """For whoever calls them there: their own help and refusals, not the application's."""
+    command = load(name)
+    with pytest.raises(SystemExit) as left:
+        command(["--help"], standalone_mode=False)
+    assert left.value.code == 0
+    assert command.help in capsys.readouterr().out
+    with pytest.raises(SystemExit) as left:
+        command(["--absent"], standalone_mode=False)
+    assert left.value.code == 2
