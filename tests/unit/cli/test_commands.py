@@ -45,10 +45,8 @@ finally:
 """
     ended = in_a_process(code, *words)
     loaded = ended.stdout.splitlines()[-1]
-    assert (
-        loaded
-        == "loaded: ['hilctl.cli.output', 'hilctl.cli.streams', 'hilctl.cli.commands', 'hilctl.cli.app']"
-    )
+    modules = [f"hilctl.cli.{name}" for name in ("output", "streams", "commands", "app")]
+    assert loaded == f"loaded: {modules}"
     assert ended.returncode == (2 if words == ["stauts"] else 0)
 
 
