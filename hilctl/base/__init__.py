@@ -8,6 +8,7 @@ files.py     texts, each read once; files written whole or not at all
 samples.py   a sample's columns and flags, and blocks of samples
 events.py    what a run records beside its samples
 segments.py  which samples of a run are judged
+printable.py texts from files as people may be shown them
 text_table.py  columns of CSV and its relatives, mistakes with their line
 yaml/        plain YAML in, with the line of every value and all problems at once
 
