@@ -5,6 +5,7 @@ import html
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+import numpy as np
 from matplotlib.figure import Figure
 
 from hilctl.analysis import canvas, loops, plots, table
@@ -67,6 +68,7 @@ def write_page(text: str, path: Path) -> None:
     write_text(path, text, overwrite=True)
 
 
+@np.errstate(over="ignore", invalid="ignore")  # of readings near the end of all numbers
 def page(recording: Recording, report: RunReport) -> str:
     """Return the page of a run as HTML."""
     title = _text(report.name or "run")

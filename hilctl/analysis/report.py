@@ -24,6 +24,7 @@ _WORST = (
 )
 
 
+@np.errstate(over="ignore", invalid="ignore")  # of readings near the end of all numbers
 def summarize(recording: Recording) -> RunReport:
     """Work out all figures that a recording allows; one cut short gives those of what it holds.
 

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -101,7 +101,7 @@ def recover_recording(
     try:
         with path.open("rb") as stream:
             lock(stream, fcntl.LOCK_SH)
-            survey = Survey(stream)
+            survey = _survey(path, stream)
             more = list(_not_in_file(extra, survey.next_sample))
             events = [event for event in events if _is_one(event)]
             if survey.salvage.sound and not more:
@@ -130,6 +130,13 @@ def recover_recording(
         missing_samples=saved.missing,
         damages=tuple(survey.salvage.damages),
     )
+
+
+def _survey(path: Path, stream: BinaryIO) -> Survey:
+    try:
+        return Survey(stream)
+    except DataError as error:
+        raise DataError(f"{path}: {error}") from None
 
 
 def _is_one(event: Event) -> bool:

@@ -150,11 +150,11 @@ def test_folder_that_is_not_there_is_an_input_error(recording: Recording, tmp_pa
         write_html(recording, summarize(recording), path)
 
 
-def test_what_steers_a_browser_or_a_plot_is_written_out(make_recording) -> None:
+def test_what_steers_a_browser_or_a_plot_is_written_out(recording: Recording) -> None:
     """Names from a file may hold anything; a formula, a page of text or an escape among it."""
-    named = make_recording()
     label = "$\\frac{$ \x1b[31m \u202e" + "x" * 100_000
-    segment = replace(named.segments[0], label=label)
-    text = page(changed := replace(named, segments=(segment,)), summarize(changed))
+    named = tuple(replace(segment, label=label) for segment in recording.segments)
+    changed = replace(recording, segments=named)
+    text = page(changed, summarize(changed))
     assert "\x1b" not in text
     assert "\u202e" not in text
