@@ -72,3 +72,27 @@ def test_a_clock_that_stands_ends_the_wait(rig):
     with pytest.raises(DeviceError):
         session.take(400)
     assert made.time() < 60.0
+
+
+def test_values_can_be_queued_for_another_start_after_a_stop(rig):
+    """No readings are fetched from a stream that stands."""
+    _, session = rig
+    session.feed(np.full(200, 2.0))
+    session.start()
+    session.stop()
+    assert not session.running
+    session.prepare(RATE_HZ, DAC0, AIN0)
+    session.feed(np.full(30, 2.0))
+    session.start()
+    assert session.take(10).size == 10
+
+
+@pytest.mark.parametrize("more", [-20, 20])
+def test_count_of_the_device_must_be_ours(rig, more):
+    """Whether it left values out or repeated some."""
+    made, session = rig
+    session.feed(np.full(200, 2.0))
+    session.start()
+    made.device.overlay.fifo.level += more
+    with pytest.raises(DeviceError, match="by its scans it must be"):
+        session.take(10)

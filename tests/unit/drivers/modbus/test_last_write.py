@@ -103,26 +103,32 @@ def test_slow_time_out_does_not_keep_a_silent_peer(driven):
 
 
 class Rewriting(FaultyLink):
-    """Another host that writes the output after each message, until a time."""
+    """Another host that writes the output now and then, until a time."""
 
     until_s = 0.0
+    every_s = 0.0
+    written_s = 0.0
 
     def transact(self, request, missing, usual=0):
         reply = super().transact(request, missing, usual)
-        if self._time() < self.until_s:
-            words = [0x40A0, 0]  # 5 V
-            self._wire._devices[1].write("holding", 0, words)
+        if self._time() < self.until_s and self._time() - self.written_s >= self.every_s:
+            self.written_s = self._time()
+            self._wire._devices[1].write("holding", 0, [0x40A0, 0])  # 5 V
         return reply
 
 
-@pytest.mark.parametrize(("for_s", "holds"), [(1.0, True), (1e6, False)])
-def test_safe_means_that_it_holds(driven, for_s, holds):
+@pytest.mark.parametrize(("for_s", "every_s"), [(1.0, 0.0), (1e6, 0.0), (1e6, 0.9 * HOLD_S)])
+def test_safe_means_that_it_holds(driven, for_s, every_s):
     """A value that another host keeps writing over is not said to be safe."""
     made = driven(link=Rewriting)
     made.open()
     made.exchange(0.0)
-    made.link.until_s = made.time() + for_s
-    if holds:
+    made.link.late_s = 1e9
+    with pytest.raises(DeviceError):
+        made.exchange(0.0)
+    made.link.until_s, made.link.every_s = made.time() + for_s, every_s
+    made.link.written_s = made.time()
+    if for_s == 1.0:
         made.device.make_safe(0.0)
         assert made.current_a == 0.0
         return
