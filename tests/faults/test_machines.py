@@ -60,27 +60,6 @@ def test_runs_with_little(hilctl, tmp_path, shell, environment):
     assert (tmp_path / "run.mcap").stat().st_size > 1000
 
 
-def test_runs_with_nothing_writable_but_memory(hilctl, tmp_path):
-    """Neither home nor installation has room for compiled kernels."""
-    memory = tmp_path / "memory"
-    code = """
-import sys
-from pathlib import Path
-from hilctl.kernels import jit
-memory = Path(sys.argv.pop(1))
-jit.user_folders = lambda: [memory]
-import numba.core.caching as caching
-for locator in (caching.InTreeCacheLocator, caching.UserWideCacheLocator):
-    locator.get_cache_path = lambda self: "/proc/closed"
-from hilctl.cli import main
-main()
-"""
-    (tmp_path / "start.py").write_text(code)
-    ended = hilctl(f'shift 4; "{sys.executable}" -P start.py "{memory}" "$@"', NUMBA_CACHE_DIR="")
-    assert ended.returncode == 0, ended.stderr
-    assert list((memory / "kernels").rglob("*.nbc"))
-
-
 @pytest.mark.parametrize("name", ["/dev/null", "/dev/full", "/proc/x.mcap", "fifo", ".", "no/x"])
 def test_output_that_is_no_file_is_refused(hilctl, tmp_path, name):
     """In one message, and nothing stands there afterwards that did not before."""
