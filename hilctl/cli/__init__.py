@@ -54,7 +54,7 @@ def main() -> None:
             _refuse(error)
         except KeyboardInterrupt:
             raise SystemExit(128 + signal.SIGINT) from None
-        except (OSError, MemoryError, ImportError) as error:
+        except (OSError, MemoryError, ImportError, SystemError) as error:
             _refuse(RunError(_machine_refused(error)))
 
 
@@ -68,14 +68,15 @@ def _command() -> None:
     app()
 
 
-def _machine_refused(error: OSError | MemoryError | ImportError) -> str:
+def _machine_refused(error: Exception) -> str:
     """Say what this machine could not give."""
     if isinstance(error, OSError):
         where = f"{error.filename}: " if error.filename is not None else ""
         return f"{where}{error.strerror or error}"
     if isinstance(error, MemoryError):
         return f"not enough memory{f': {error}' if str(error) else ''}"
-    return f"a part of the installation can't be loaded: {error}"
+    # Both are also what is left of an import that ran out of memory.
+    return f"a part of the installation can't be loaded, for want of memory or of a file: {error}"
 
 
 def _refuse(error: HilctlError) -> NoReturn:

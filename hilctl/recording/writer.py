@@ -132,6 +132,8 @@ class OutputFile:
     def __init__(self, path: Path, *, overwrite: bool) -> None:
         self._path = path
         self._ours = not path.exists()
+        if overwrite and not self._ours and not path.is_file():
+            raise OSError(errno.EINVAL, "Not a regular file", str(path))
         # Not "wb": what stands there is emptied only once the run starts, and under the lock.
         self.stream: BinaryIO = path.open("r+b" if overwrite and not self._ours else "xb")
         lock(self.stream, fcntl.LOCK_EX)

@@ -255,7 +255,7 @@ def _holder(name: str) -> str:
     process, user, _ = _PEER.unpack(peer)
     for run in runs():
         if run.card.supervisor == process:
-            return f"run {run.card.name} (process {process}, recording {run.card.recording})"
+            return f"run {run.card.experiment} (process {process}, recording {run.card.recording})"
     try:
         return f"process {process} of {pwd.getpwuid(user).pw_name}"
     except KeyError:

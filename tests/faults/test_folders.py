@@ -20,7 +20,7 @@ def run(folder, tmp_path, *settings):
     )
 
 
-@pytest.mark.parametrize("name", ["lab #3 [x]: ü"])
+@pytest.mark.parametrize("name", ["-a: lab #3 [x] 50 % {y}\n\"ü'"])
 def test_folder_of_any_name(tmp_path, name):
     """A run is started there, and records there."""
     folder = tmp_path / name

@@ -1,9 +1,12 @@
 """What is written can be read by what it is said to be."""
 
+import os
+
 import pytest
 
 from hilctl.base.events import Event
 from hilctl.recording.reader import read
+from hilctl.recording.writer import OutputFile
 
 
 @pytest.fixture
@@ -38,3 +41,13 @@ def test_replay_can_start_first_and_after_each_gap(recorded):
     assert [start.sample for start in starts] == [0, 1900]
     assert starts[1].state.tolist() == batches[2].states[0, :-1].tolist()
     assert starts[1].previous_command == batches[2].states[0, -1]
+
+
+@pytest.mark.parametrize(
+    ("overwrite", "said"), [(True, "Not a regular file"), (False, "File exists")]
+)
+def test_a_pipe_is_no_place_for_a_recording(tmp_path, overwrite, said):
+    """Opened, it would wait for a reader for ever, or lose what is written."""
+    os.mkfifo(tmp_path / "run.mcap")
+    with pytest.raises(OSError, match=said):
+        OutputFile(tmp_path / "run.mcap", overwrite=overwrite)

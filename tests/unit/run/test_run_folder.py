@@ -178,7 +178,7 @@ def test_device_is_held_by_one_run(tmp_path):
     """The second run is refused, and reads who the first is."""
     device, other = f"{NAME}tty", f"{NAME}tcp"
     with held_devices((device,)), made(tmp_path) as (folder, _):
-        who = f"run {folder.card.name} .process {os.getpid()}, recording {tmp_path}/a.mcap"
+        who = f"run {folder.card.experiment} .process {os.getpid()}, recording {tmp_path}/a.mcap"
         with (
             pytest.raises(InputError, match=f"{device} is in use by {who}"),
             held_devices((other, device)),
