@@ -1,4 +1,4 @@
-"""Two processes round one loop: shared memory, recording, requests, recovery.
+"""Three processes round one loop: shared memory, recording, requests, recovery.
 
 start.py           from an experiment file to a finished run
 job.py             the experiment as it goes to the loop's process
