@@ -7,7 +7,7 @@ learning     corrections from run to run
 comparison   models of the literature on the same loops
 identify     measured data in, model parameters out
 analysis     figures, plots, pages, replay and export of a recording
-run          two processes round one loop: recording, requests, recovery
+run          three processes round one loop: recording, requests, recovery
 experiment   the file, what it refers to, and whether it may start; moves nothing
 machine      what this computer can do
 loop         everything that a tick executes

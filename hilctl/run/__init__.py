@@ -1,4 +1,4 @@
-"""Two processes round one loop: shared memory, recording, requests, recovery.
+"""Three processes round one loop: shared memory, recording, requests, recovery.
 
 start.py           from an experiment file to a finished run
 architecture.py    processors that a run may be on

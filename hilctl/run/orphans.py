@@ -24,7 +24,7 @@ class Orphan:
     Attributes:
         name: The run's name.
         recording: Its recording.
-        safe: Whether the loop has put the output at its safe value before it left.
+        safe: Whether loop or guardian have put the output at its safe value before they left.
         text: What became of it, for people.
         kept: Folder that still holds what could not be recovered; None where all of it was.
     """
@@ -82,6 +82,11 @@ def _left_behind(
     outcome = page.outcome() or died
     if page.get(Field.PHASE) == Phase.FAILED:
         outcome = replace(died, reason=page.read_text(PageText.ERROR))
+    if page.outcome() is None and (made_safe := page.made_safe()) is not None:
+        did = "the guardian put the output at its safe value"
+        if not made_safe.confirmed:
+            did = f"the guardian could not confirm the safe value: {made_safe.error}"
+        outcome = replace(outcome, reason=f"{outcome.reason}; {did}", safe=made_safe.confirmed)
     if page.get(Field.PHASE) != Phase.ENDED:
         last = batches[-1].heads[-1] if batches else None
         next_sample = 0 if last is None else int(last[Head.FIRST_SAMPLE]) + ring.block

@@ -88,8 +88,10 @@ class Run:
         return loop_of(self.process.pid)
 
     def kill_all(self, number: int) -> None:
-        """Send a signal to supervisor and loop at once."""
-        for pid in (self.process.pid, self.loop_pid()):
+        """Send a signal to supervisor, loop and guardian at once."""
+        children = Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children")
+        # The supervisor first: it would start another guardian.
+        for pid in (self.process.pid, *map(int, children.read_text().split())):
             os.kill(pid, number)
         self.process.communicate(timeout=60)
 

@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -15,8 +16,9 @@ import yaml
 from hilctl.analysis.replay import replay
 from hilctl.base.samples import Flag
 from hilctl.recording.reader import read
+from hilctl.run.client import status_of
 from hilctl.run.orphans import recover_orphans
-from hilctl.run.run_folder import base_folder
+from hilctl.run.run_folder import base_folder, runs
 from hilctl.run.start import checked_experiment
 from hilctl.run.supervisor import Supervisor
 from tests.fakes import loop_of
@@ -237,3 +239,96 @@ def test_model_exchanged_after_the_check_changes_nothing(tmp_path):
     result = Supervisor(checked, output, overwrite=False, on_progress=lambda _: None).run()
     assert (result.code, result.missing) == ("completed", 0)
     assert replay(read(output)).identical
+
+
+def supervised(folder, on_progress=lambda _: None, **changes):
+    """Run an experiment in this process; return how it ended, and its recording."""
+    checked = checked_experiment(experiment(folder, **changes), ())
+    output = folder / "run.mcap"
+    result = Supervisor(checked, output, overwrite=False, on_progress=on_progress).run()
+    return result, read(output)
+
+
+def test_the_longest_name_and_folder_are_no_error_after_the_start(tmp_path, monkeypatch):
+    """The kernel's limit for a socket's path is 107 bytes; requests reach this one all the same."""
+    monkeypatch.setenv("HILCTL_RUNS", str(tmp_path / ("deep" * 20)))
+    states = []
+
+    def ask_status(progress):
+        states.extend(status_of(each)["state"] for each in runs() if not states)
+
+    result, recording = supervised(tmp_path, ask_status, name="n" * 80, waveform=short(0.5))
+    assert (result.code, recording.dropped) == ("completed", 0)
+    assert set(states) <= {"running", "stopping", "closing"}
+    assert states
+
+
+def test_a_supervisor_that_breaks_ends_the_run_by_its_ramp(tmp_path, monkeypatch):
+    """Coil, ring and recording are seen to, whatever is wrong; no sample is lost."""
+    calls = []
+
+    def serve(self, timeout_s):
+        calls.append(timeout_s)
+        time.sleep(timeout_s)
+        if len(calls) == 30:
+            raise ZeroDivisionError("a bug")
+
+    monkeypatch.setattr("hilctl.run.control_socket.ControlServer.serve", serve)
+    result, recording = supervised(tmp_path)
+    assert result.reason == (
+        "stopped because the supervisor broke; the supervisor broke: ZeroDivisionError: a bug"
+    )
+    assert (result.code, result.safe, result.missing) == ("fault", True, 0)
+    assert recording.samples.index.size == result.samples > 1000
+    assert recording.samples.command[-1] == 0.0
+    assert "supervisor_broke" in [event.code for event in recording.events]
+    assert replay(recording).identical
+
+
+@pytest.mark.parametrize("how", ["raises", "stands still"])
+def test_a_display_that_fails_costs_no_run(tmp_path, how):
+    """A terminal keeps nobody waiting."""
+    released = threading.Event()
+
+    def show(progress):
+        if how == "raises":
+            raise BrokenPipeError(32, "Broken pipe")
+        released.wait(60.0)
+
+    try:
+        result, recording = supervised(tmp_path, show, waveform=short(1.0))
+    finally:
+        released.set()
+    assert (result.code, result.missing) == ("completed", 0)
+    said = [event.code for event in recording.events]
+    assert said == (["progress_failed"] if how == "raises" else []) + ["run_ended"]
+
+
+@pytest.mark.parametrize("how", ["deleted", "renamed", "emptied"])
+def test_a_recording_that_is_taken_away_is_kept(tmp_path, how):
+    """The run goes on, says so, and leaves a recording with all that can be had."""
+    done = []
+
+    def take_away(progress):
+        path = tmp_path / "run.mcap"
+        if done or path.stat().st_size < 100_000:
+            return
+        done.append(how)
+        if how == "deleted":
+            path.unlink()
+        elif how == "renamed":
+            path.rename(tmp_path / "moved.mcap")
+        else:
+            os.truncate(path, 0)
+
+    result, recording = supervised(tmp_path, take_away, waveform=short(5.0))
+    assert done
+    assert result.code == "fault"
+    assert how in result.reason
+    assert result.safe
+    index = recording.samples.index
+    assert np.array_equal(index, np.arange(index[0], index[-1] + 1))
+    assert recording.dropped == result.missing == index[0]
+    assert (index[0] > 0) == (how == "emptied")
+    assert recording.end["reason"] == "waveform completed"
+    assert replay(recording).identical

@@ -15,7 +15,6 @@ from hilctl.loop.plan import Outcome
 from hilctl.run.guardian import Guardian, GuardianJob, main
 from hilctl.run.hang_watch import SilenceLimits
 from hilctl.run.ring import SampleRing
-from hilctl.run.safe_action import SafeAction
 from hilctl.run.shared_page import Field, GuardianPhase, PageText, Phase
 
 SLEEP = [sys.executable, "-c", "import time; time.sleep(600)"]
@@ -150,13 +149,3 @@ def test_it_brings_no_numba_along():
         "sys.exit(any(name in sys.modules for name in ('numba', 'scipy', 'mcap')))"
     )
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0
-
-
-def test_an_action_takes_its_time(guarded):
-    """Whoever asks is never kept waiting."""
-    go_on = threading.Event()
-    guarded.device.make_safe = lambda value: go_on.wait(30.0)
-    action = SafeAction(guarded.device, 0.0, hung=True)
-    assert action.result() is None
-    go_on.set()
-    assert action.result(30.0).hung

@@ -12,7 +12,7 @@ from hilctl.recording.reader import read
 from hilctl.run.orphans import recover_orphans
 from hilctl.run.ring import SampleRing
 from hilctl.run.run_folder import run_folder, runs
-from hilctl.run.shared_page import Field, PageText, Phase
+from hilctl.run.shared_page import Field, MadeSafe, PageText, Phase
 
 GOLDEN = Path(__file__).parents[3] / "recordings" / "golden" / "terfenol_uncompensated.mcap"
 
@@ -59,6 +59,26 @@ def test_a_loop_that_ended_by_its_ramp_is_believed(dead):
     (orphan,) = recover_orphans()
     assert orphan.safe
     assert orphan.text.startswith("stopped because the supervisor died; output at its safe value")
+
+
+@pytest.mark.parametrize(
+    ("error", "words"), [("", "put the output at"), ("no answer", "no answer")]
+)
+def test_what_the_guardian_did_is_said(dead, error, words):
+    """Both others were dead; what it could not confirm is not called safe."""
+
+    def fill(folder):
+        page = SampleRing.create(folder.ring, slots=4, block=1, state_size=1).page
+        page.put(Field.PHASE, Phase.RUNNING)
+        page.leave_made_safe(MadeSafe(hung=False, error=error))
+
+    recording = dead(fill)
+    (orphan,) = recover_orphans()
+    assert orphan.safe == (not error)
+    assert "supervisor and loop died; the guardian" in orphan.text
+    assert words in orphan.text
+    assert ("NOT known to be safe" in orphan.text) == bool(error)
+    assert read(recording).samples.index.size > 0
 
 
 def test_a_living_run_is_left_alone(tmp_path):
