@@ -33,7 +33,8 @@ def make_feedback(config: Experiment, compensator: Compensator) -> Feedback | No
         return None
     rate_hz = config.sample_rate_hz
     due_after = round(wanted.sensor_delay_s * rate_hz) + (0 if compensator.preview else 1)
-    return Feedback(_gains(wanted, rate_hz), rate_hz, wanted.limit_um, due_after)
+    shown_after = due_after + compensator.preview + LOOP_DELAY
+    return Feedback(_gains(wanted, rate_hz), rate_hz, wanted.limit_um, due_after, shown_after)
 
 
 def feedback_problems(loaded: LoadedExperiment, preview: int) -> list[Problem]:

@@ -39,9 +39,17 @@ class Feedback:
         limit_um: Largest correction, > 0.
         due_after: Samples from a reference to the displacement that is to show it: 0 where the
             compensator looks ahead for it, 1 where it does not, and what link and sensor add.
+        shown_after: Samples from a correction to the displacement that shows all of it.
     """
 
-    def __init__(self, gains: Gains, rate_hz: float, limit_um: float, due_after: int) -> None:
+    def __init__(
+        self,
+        gains: Gains,
+        rate_hz: float,
+        limit_um: float,
+        due_after: int,
+        shown_after: int = 2,
+    ) -> None:
         if not 0.0 < limit_um < math.inf:
             raise InputError(f"limit_um must be > 0: {limit_um}")
         self._kp = gains.kp
@@ -51,6 +59,12 @@ class Feedback:
         self._integral_um = 0.0
         self.correction_um = 0.0
         """Correction of the tick under way, in um, within the limit."""
+        self._polarity = Polarity(limit_um, shown_after)
+
+    @property
+    def against(self) -> str:
+        """Why sensor and command can't be of one sign; empty as long as they may be."""
+        return self._polarity.against
 
     def follow(self, block: Block, last: Block | None) -> None:
         """Correct the input of the next sample.
@@ -80,7 +94,8 @@ class Feedback:
             limited: Whether the limiter held the last command back: then the integral may only
                 shrink.
         """
-        error_um = self._due[0] - displacement_um
+        due_um = self._due[0]
+        error_um = due_um - displacement_um
         self._due.append(reference_um)
         if not math.isfinite(error_um):
             return self.correction_um
@@ -95,6 +110,8 @@ class Feedback:
             after = before
         self._integral_um = min(limit, max(-limit, after))
         self.correction_um = min(limit, max(-limit, proportional + after))
+        if not limited:  # a command that is held back says nothing
+            self._polarity.look(self.correction_um, due_um, displacement_um)
         return self.correction_um
 
     def forget(self) -> None:
@@ -103,3 +120,56 @@ class Feedback:
         The correction and the integral stay.
         """
         self._due.extend([math.nan] * len(self._due))
+
+
+class Polarity:
+    """Whether the displacement goes the way that its input goes, or the other one.
+
+    With the sign of the sensor or of the command reversed, a correction makes the error larger that
+    it is to take away, and grows with it up to its limit. Disturbances drive it there too. What
+    tells them apart is the sum of input and displacement: it stands still where one is the other
+    reversed, and moves twice as far as the input where both go together. It is looked at from half
+    of the limit on, and once the limit is met for as long again: a disturbance goes on or stops.
+
+    Args:
+        limit_um: Largest correction.
+        shown_after: Samples from a correction to the displacement that shows all of it.
+    """
+
+    def __init__(self, limit_um: float, shown_after: int) -> None:
+        self._limit_um = limit_um
+        self._fewest = shown_after
+        self._corrections: deque[float] = deque([0.0] * shown_after, shown_after)
+        self._input_um = self._sum_um = (math.inf, -math.inf)
+        self._samples = self._judged_at = 0
+        self.against = ""
+
+    def look(self, correction_um: float, due_um: float, displacement_um: float) -> None:
+        """Take one sample: correction, the reference due and the displacement that shows it."""
+        shown_um = self._corrections[0]
+        self._corrections.append(correction_um)
+        if abs(shown_um) <= 0.5 * self._limit_um:
+            self._input_um = self._sum_um = (math.inf, -math.inf)
+            self._samples = self._judged_at = 0
+        input_um = due_um + shown_um
+        self._input_um = _spanning(self._input_um, input_um)
+        self._sum_um = _spanning(self._sum_um, input_um + displacement_um)
+        self._samples += 1
+        if not self._judged_at and abs(shown_um) >= self._limit_um:
+            self._judged_at = self._samples + max(self._samples, self._fewest)
+        if self._samples == self._judged_at:
+            self._judge()
+
+    def _judge(self) -> None:
+        fed_um = self._input_um[1] - self._input_um[0]
+        left_um = self._sum_um[1] - self._sum_um[0]
+        if left_um <= 0.5 * fed_um:
+            self.against = (
+                f"the correction grew to its limit of {self._limit_um:g} um and the error with it: "
+                f"input and displacement went opposite ways, over {fed_um:.3g} um: the sign of the "
+                "sensor or of the command is wrong"
+            )
+
+
+def _spanning(span: tuple[float, float], value: float) -> tuple[float, float]:
+    return min(span[0], value), max(span[1], value)

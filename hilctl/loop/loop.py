@@ -136,6 +136,9 @@ class Loop:
             sample = block.head[_FIRST_SAMPLE] + first_invalid
             reason = f"wanted command is not a finite number at sample {sample}"
             self._leave("fault", "invalid_command", reason)
+        feedback = self._plan.feedback
+        if feedback is not None and feedback.against:
+            self._leave("fault", "feedback_sign", feedback.against)
         if self._phase is _Phase.STARTING and self._next_sample >= self._waveform_at:
             self._begin_waveform()
         return done

@@ -80,3 +80,16 @@ def test_a_lost_sensor_ends_the_run_by_its_interlock(run):
     ramp = (samples.flags & Flag.RAMP) != 0
     assert samples.index[ramp][0] == 1501
     assert np.isfinite(samples.input_um[~ramp]).all()
+
+
+@pytest.mark.parametrize("model", [OMEGA, STAGED], ids=["omega", "staged"])
+def test_a_sensor_of_the_wrong_sign_ends_the_run(run, model):
+    """By the safe ramp, once the correction has grown to its limit; a right one does not."""
+    inverted = "device.fault={kind: sensor_inverted, at_sample: 0}"
+    result, recording = run(model, FEEDBACK, inverted)
+    assert (result.code, result.safe) == ("fault", True)
+    assert "the sign of the sensor or of the command is wrong" in result.reason
+    (event,) = (each for each in recording.events if each.level == "error" and each.before)
+    assert event.code == "feedback_sign"
+    assert event.sample < 0.5 * recording.sample_rate_hz
+    assert run(model, FEEDBACK)[0].code == "completed"

@@ -26,10 +26,13 @@ _SETTLING_S = 0.1
 class SimulatedFault(Strict):
     """A fault to inject, for trying what a run does about it. It stays once it has come."""
 
-    kind: Literal["sensor_nan", "sensor_frozen", "sensor_jump", "no_answer", "refused"] = Field(
+    kind: Literal[
+        "sensor_nan", "sensor_frozen", "sensor_jump", "sensor_inverted", "no_answer", "refused"
+    ] = Field(
         description="sensor_nan: readings are not numbers; sensor_frozen: the last good reading"
-        " is repeated; sensor_jump: readings are off by half the sensor's range; no_answer:"
-        " exchanges time out; refused: exchanges are turned down"
+        " is repeated; sensor_jump: readings are off by half the sensor's range; sensor_inverted:"
+        " readings have the other sign; no_answer: exchanges time out; refused: exchanges are"
+        " turned down"
     )
     at_sample: int = Field(ge=0, description="first sample that has the fault")
 
@@ -138,6 +141,8 @@ class SimulatedDevice(DacDevice):
             spoilt[:] = np.nan
         elif fault.kind == "sensor_frozen":
             spoilt[:] = good
+        elif fault.kind == "sensor_inverted":
+            np.negative(spoilt, out=spoilt)
         elif fault.kind == "sensor_jump":
             spoilt += 0.5 * self._info.sensor_max_um
             np.minimum(spoilt, self._info.sensor_max_um, out=spoilt)

@@ -45,12 +45,13 @@ def plant(feedback, samples=2000, *, gain=1.0, offset_um=0.0, reference=None, ho
     A displacement shows the input of the sample before; the controller sees it a sample later.
     """
     wanted = np.zeros(samples) if reference is None else reference
+    offsets = np.broadcast_to(offset_um, samples)
     errors, inputs, seen, limited = [], [0.0], math.nan, False
     for k in range(samples):
         wish = wanted[k] + feedback.correct(wanted[k], seen, limited=limited)
         put_out = min(hold_back, max(-hold_back, wish))
         limited = put_out != wish
-        seen = gain * inputs[-1] + offset_um
+        seen = gain * inputs[-1] + offsets[k]
         errors.append((wanted[k - 1] if k else 0.0) - seen)
         inputs.append(put_out)
     return np.array(errors)
@@ -138,6 +139,59 @@ class TestCorrection:
         feedback = Feedback(Gains(kp, ki), RATE_HZ, 2.0, 1)
         for reading in readings:
             assert abs(feedback.correct(0.0, reading, limited=limited)) <= 2.0
+
+
+class TestPolarity:
+    """A sensor of the wrong sign is found; what else drives the correction to its limit is not."""
+
+    STILL = np.full(2000, 4.0)
+    TIMES = np.arange(4000) / RATE_HZ
+
+    def sine(self, frequency_hz, amplitude_um=20.0):
+        return amplitude_um * np.sin(2.0 * np.pi * frequency_hz * self.TIMES)
+
+    @pytest.mark.parametrize("bandwidth_hz", [2.0, 20.0, 200.0])
+    @pytest.mark.parametrize("limit_um", [0.5, 5.0, 50.0])
+    def test_a_still_reference(self, bandwidth_hz, limit_um):
+        feedback = loop(bandwidth_hz, limit_um)
+        plant(feedback, gain=-1.0, reference=self.STILL)
+        assert abs(feedback.correction_um) == limit_um
+        assert feedback.against.startswith(f"the correction grew to its limit of {limit_um:g} um")
+
+    @pytest.mark.parametrize("frequency_hz", [1.0, 5.0, 50.0])
+    @pytest.mark.parametrize("bandwidth_hz", [2.0, 20.0, 200.0])
+    @pytest.mark.parametrize("limit_um", [0.5, 5.0, 50.0])
+    def test_a_sine(self, frequency_hz, bandwidth_hz, limit_um):
+        """Wherever in it the limit is met, as long as it is met."""
+        feedback = loop(bandwidth_hz, limit_um)
+        plant(feedback, 4000, gain=-1.0, reference=self.sine(frequency_hz))
+        assert feedback.against
+
+    @pytest.mark.parametrize("gain", [0.3, 0.7, 1.0, 1.5])
+    @pytest.mark.parametrize("frequency_hz", [1.0, 5.0, 50.0])
+    @pytest.mark.parametrize("limit_um", [0.5, 5.0])
+    def test_a_wrong_gain_of_the_right_sign_is_none(self, gain, frequency_hz, limit_um):
+        feedback = loop(100.0, limit_um)
+        plant(feedback, 4000, gain=gain, offset_um=3.0, reference=self.sine(frequency_hz))
+        assert feedback.against == ""
+
+    @pytest.mark.parametrize("bandwidth_hz", [2.0, 20.0, 200.0])
+    @pytest.mark.parametrize("drift_um_per_s", [-100.0, -10.0, 10.0, 100.0])
+    @pytest.mark.parametrize("frequency_hz", [0.0, 5.0])
+    def test_drift_beyond_the_limit_is_none(self, bandwidth_hz, drift_um_per_s, frequency_hz):
+        feedback = loop(bandwidth_hz, 2.0)
+        drift = drift_um_per_s * self.TIMES
+        plant(feedback, 4000, offset_um=drift, reference=self.sine(frequency_hz))
+        assert abs(feedback.correction_um) == 2.0
+        assert feedback.against == ""
+
+    @pytest.mark.parametrize("offset_um", [-30.0, 30.0])
+    def test_a_step_beyond_the_limit_is_none(self, offset_um):
+        feedback = loop(100.0, 2.0)
+        step = np.where(self.TIMES > 0.2, offset_um, 0.0)
+        plant(feedback, 4000, offset_um=step, reference=self.sine(5.0))
+        assert abs(feedback.correction_um) == 2.0
+        assert feedback.against == ""
 
 
 class TestFollow:
