@@ -3,7 +3,8 @@
 A command is imported when it is called, and imports its heavy parts itself, so that ``--help`` is
 quick.
 
-app.py         the application; commands.py  which commands there are, and where each one is
+application.py  what all commands hang on
+commands.py    which commands there are, and where each one's function is
 options.py     options that they share; output.py  JSON, and what all of them say
 running.py     start and check runs; shown by run_view.py
 steering.py    status, set and stop, in a tenth of a second; shown by status_view.py
@@ -39,7 +40,7 @@ def __getattr__(name: str) -> Any:
     """Import the application when it is asked for."""
     if name != "app":
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return import_module("hilctl.cli.app").app
+    return import_module("hilctl.cli.application").app
 
 
 def main() -> None:
@@ -63,7 +64,7 @@ def _command() -> None:
         from hilctl.cli.steering import steer
 
         raise SystemExit(steer(sys.argv[1], sys.argv[2:]))
-    from hilctl.cli.app import app
+    from hilctl.cli.application import app
 
     app()
 

@@ -32,7 +32,7 @@ _PEAK_BLOCK = 65536
 _MOST_PERIODS = 32
 _SAME = 1e-3
 """Two cycles are the same where they differ by less than this part of their span."""
-_WINDOW = 512
+_WINDOW = 1024
 """Samples that are worked out on either side of one place."""
 
 

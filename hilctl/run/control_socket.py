@@ -28,6 +28,7 @@ _BACKLOG = 256
 _SILENT_S = 0.5
 _LATER_S = 0.005
 _ANSWER_BYTES = 65536
+_LEAST_S = 0.01
 
 
 class LaterAnswer(Protocol):
@@ -215,13 +216,19 @@ def _is_ours(connection: socket.socket) -> bool:
     return user in {0, os.getuid()}
 
 
-def ask(path: Path, question: Mapping[str, Any], timeout_s: float = 5.0) -> dict[str, Any]:
-    """Ask a run something.
+def ask(
+    path: Path,
+    question: Mapping[str, Any],
+    timeout_s: float = 5.0,
+    clock: Callable[[], float] = time.monotonic,
+) -> dict[str, Any]:
+    """Ask a run something, again where a crowd has pushed the question out.
 
     Args:
         path: Its socket.
-        question: What to ask.
+        question: What to ask; asked twice it must be the same as once.
         timeout_s: Longest wait.
+        clock: Monotonic time in s.
 
     Returns:
         The answer.
@@ -230,18 +237,29 @@ def ask(path: Path, question: Mapping[str, Any], timeout_s: float = 5.0) -> dict
         InputError: The run refuses; the text says why.
         RunError: There is nobody, or no answer.
     """
-    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
-        connection.settimeout(timeout_s)
-        try:
-            with _short(path) as short:
-                connection.connect(short)
-            connection.sendall(json.dumps(question).encode() + b"\n")
-            raw = bytearray()
-            while not raw.endswith(b"\n") and (data := connection.recv(_ANSWER_BYTES)):
-                raw += data
-            answer = json.loads(raw)
-        except (OSError, ValueError) as error:
-            raise RunError(f"the run at {path.parent.name} does not answer: {error}") from None
+    until = clock() + timeout_s
+    raw = json.dumps(question).encode() + b"\n"
+    try:
+        while not (said := _asked_once(path, raw, max(_LEAST_S, until - clock()))):
+            if clock() >= until:
+                raise TimeoutError("timed out among a crowd")
+        answer = json.loads(said)
+    except (OSError, ValueError) as error:
+        raise RunError(f"the run at {path.parent.name} does not answer: {error}") from None
     if not isinstance(answer, dict) or not answer.pop("ok", False):
         raise InputError(str(answer.get("error", "refused")) if isinstance(answer, dict) else "?")
     return answer
+
+
+def _asked_once(path: Path, raw: bytes, timeout_s: float) -> bytes:
+    """Return what a run says to a question; nothing where it has cut the connection."""
+    said = bytearray()
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
+        connection.settimeout(timeout_s)
+        with _short(path) as short:
+            connection.connect(short)
+        with suppress(ConnectionResetError, BrokenPipeError):
+            connection.sendall(raw)
+            while not said.endswith(b"\n") and (data := connection.recv(_ANSWER_BYTES)):
+                said += data
+    return bytes(said)

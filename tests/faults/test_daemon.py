@@ -6,7 +6,10 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
@@ -193,6 +196,68 @@ def test_hundreds_of_mangled_messages_do_not_disturb_a_run(going):
     ticks = (after["sample"] - before["sample"]) / EXPERIMENT["block"]
     assert ticks > 100
     assert after["late_ticks"] - before["late_ticks"] < 0.1 * ticks
+
+
+@contextmanager
+def crowd(socket_path, size):
+    """Keep so many clients connected that say nothing, each again as soon as it is sent away."""
+    over = threading.Event()
+
+    def stay():
+        while not over.is_set():
+            with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as client:
+                client.settimeout(0.1)
+                with suppress(OSError):
+                    client.connect(str(socket_path))
+                    client.recv(1)
+
+    threads = [threading.Thread(target=stay) for _ in range(size)]
+    for thread in threads:
+        thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        for thread in threads:
+            thread.join()
+
+
+def test_a_crowd_keeps_nobody_else_out(going):
+    """Status and set are answered, and the run goes on undisturbed."""
+    (run,) = runs()
+    before = await_state("running")
+    with crowd(run.socket, 100):
+        for _ in range(5):
+            assert hilctl("status")["runs"][0]["state"] == "running"
+        assert hilctl("set", "gain=1.0", "--over", "0.1")["gain"] == 1.0
+    after = await_state("running")
+    assert after["missing_samples"] == 0
+    assert after["recorded_samples"] > before["recorded_samples"]
+
+
+def test_two_changes_at_once_are_both_made(going):
+    """The second begins once the loop has taken the first, and leads to what both asked for."""
+    commands = [["set", "gain=0.5", "--over", "0.5"], ["set", "offset=0.5", "--over", "0.1"]]
+    before = await_state("running")
+    with ThreadPoolExecutor(2) as pool:
+        first, second = pool.map(lambda words: hilctl(*words), commands)
+    assert first["begins_at_sample"] != second["begins_at_sample"]
+    last = max(first, second, key=lambda each: each["begins_at_sample"])
+    assert (last["gain"], last["offset"]) == (0.5, 0.5)
+    assert hilctl("set", "gain=1.0", "offset=0.0", "--over", "0.1")["gain"] == 1.0
+    after = await_state("running")
+    assert (after["gain"], after["offset"], after["missing_samples"]) == (1.0, 0.0, 0)
+    assert after["late_ticks"] - before["late_ticks"] < 100
+
+
+def test_a_crowd_does_not_keep_a_run_from_being_stopped(background):
+    """Its supervisor is told by a signal, which no client can take the place of."""
+    await_state("running")
+    (run,) = runs()
+    with crowd(run.socket, 200):
+        (stopped,) = hilctl("stop", "--all")["runs"]
+    assert stopped["ended"]
+    assert read(background).end["reason"] == "stopped by hilctl stop"
 
 
 def test_second_run_into_the_same_recording_is_refused(going):

@@ -10,6 +10,7 @@ WITHOUT = {
     "base/arrays": "names of array types; nothing runs",
     "base/device": "the contract of devices: tests/contract/test_devices.py holds each to it",
     "base/events": "one record of plain values; seen in run/test_shared_page.py",
+    "cli/options": "types of options; cli/test_commands.py loads every command that has them",
     "drivers/emulator/wire": "a contract and a record; drivers/emulator/test_server.py uses both",
     "loop/host": "a contract and a record; loop/test_loop.py runs the loop on a double of it",
     "loop/plan": "two records of plain values; loop/test_loop.py fills and reads all of them",

@@ -45,7 +45,7 @@ finally:
 """
     ended = in_a_process(code, *words)
     loaded = ended.stdout.splitlines()[-1]
-    modules = [f"hilctl.cli.{name}" for name in ("output", "streams", "commands", "app")]
+    modules = [f"hilctl.cli.{name}" for name in ("output", "streams", "commands", "application")]
     assert loaded == f"loaded: {modules}"
     assert ended.returncode == (2 if words == ["stauts"] else 0)
 
@@ -77,7 +77,9 @@ def hilctl(*arguments):
 
 def test_help_imports_nothing_heavy():
     """Help and a first look at the commands cost no numerics."""
-    code = "import sys, hilctl.cli.app; print([m for m in sys.argv[1:] if m in sys.modules])"
+    code = (
+        "import sys, hilctl.cli.application; print([m for m in sys.argv[1:] if m in sys.modules])"
+    )
     found = subprocess.run(
         [sys.executable, "-c", code, *HEAVY], capture_output=True, text=True, check=True
     )

@@ -168,7 +168,8 @@ def soft(waveform):
 @pytest.mark.parametrize("waveform", [SINE, CHIRP])
 @pytest.mark.parametrize("chunks", [1, 3, 10**9])
 def test_the_verdict_is_that_of_the_loop_to_come(model, waveform, chunks):
-    """Range and slew, with a compensator as without, and however little time there is."""
+    """Range and slew, with a compensator as without; where there is little time to within 8 %."""
+    off = 0.02 if chunks > 3 else 0.08
     slew = 1.2 * checked(soft(waveform), model, slew=1e6).forecast.slew_per_s
     made = checked(soft(waveform), model, slew=slew)
     position, compensator, tuner = position_at(made, 1000)
@@ -178,13 +179,15 @@ def test_the_verdict_is_that_of_the_loop_to_come(model, waveform, chunks):
         compensator.restore(state)
         out = put_out(made, compensator, copy(tuner), 1000, 40_000, [tuning])
         of_limits = np.abs(out).max() / 7.0, np.abs(np.diff(out)).max() * 10e3 / slew
-        if max(of_limits) > 1.02:
+        if max(of_limits) > 1.0 + off:
             with pytest.raises(ConfigError, match="must") as error:
                 forecast(made, position, tuning, chunks)
             rules = [each.rule for each in error.value.problems]
-            assert any("stay within -7 to 7 A" in rule for rule in rules) or of_limits[0] < 1.02
-            assert any("no faster" in rule for rule in rules) or of_limits[1] < 1.02
-        elif max(of_limits) < 0.98:
+            assert (
+                any("stay within -7 to 7 A" in rule for rule in rules) or of_limits[0] < 1.0 + off
+            )
+            assert any("no faster" in rule for rule in rules) or of_limits[1] < 1.0 + off
+        elif max(of_limits) < 1.0 - off:
             forecast(made, position, tuning, chunks)
         refused.append(max(of_limits) > 1.0)
     assert {True, False} == set(refused)

@@ -276,6 +276,36 @@ def test_ask_brings_answer_or_error(tmp_path):
         ask(path, {"say": "hello"})
 
 
+def test_a_question_that_was_pushed_out_is_asked_again(tmp_path):
+    """Until the time is up; a connection that was cut before it had an answer has done nothing."""
+    path = tmp_path / "socket"
+    seen = []
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as listener:
+        listener.bind(str(path))
+        listener.listen(20)
+
+        def serve(cuts):
+            for number in range(cuts + 1):
+                client, _ = listener.accept()
+                with client:
+                    if number % 2:
+                        seen.append(client.recv(1000))
+                    if number == cuts:
+                        client.sendall(b'{"ok": true, "n": 1}\n')
+
+        thread = threading.Thread(target=serve, args=(5,))
+        thread.start()
+        assert ask(path, {"say": "hello"}) == {"n": 1}
+        thread.join()
+        assert seen == [b'{"say": "hello"}\n'] * 3
+        thread = threading.Thread(target=serve, args=(2,))
+        thread.start()
+        with pytest.raises(RunError, match="among a crowd"):
+            ask(path, {"say": "hello"}, 5.0, SteppingClock(2.0))
+        listener.close()
+        thread.join(5)
+
+
 def test_path_that_cannot_be_listened_at_is_told(tmp_path):
     """A socket that can't be made is an error of ours."""
     with pytest.raises(RunError, match="can't listen"):

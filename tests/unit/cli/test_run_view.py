@@ -1,0 +1,36 @@
+"""How a run ended, for people and for programs."""
+
+from pathlib import Path
+
+import pytest
+
+from hilctl.cli.run_view import print_run, report_of, run_mapping
+from hilctl.run.result import RunResult
+
+ENDED = RunResult(Path("a.mcap"), "stopped", "stopped by hilctl stop", True, 15, 0, 3, 2)
+
+
+def test_a_program_reads_how_the_run_ended():
+    assert run_mapping(ENDED, None) == {
+        "recorded_samples": 0,
+        "dropped": 3,
+        "output": "a.mcap",
+        "code": "stopped",
+        "reason": "stopped by hilctl stop",
+        "output_safe": True,
+    }
+
+
+def test_no_report_is_made_of_no_sample():
+    """The file is not even opened."""
+    assert report_of(ENDED, whole=False) is None
+
+
+@pytest.mark.parametrize("safe", [True, False])
+def test_an_output_that_may_not_be_safe_is_said(capsys, safe):
+    result = RunResult(Path("a.mcap"), "fault", "lost", safe, 0, 0, 0, 0)
+    print_run(result, None)
+    shown = capsys.readouterr().out
+    assert "fault: lost" in shown
+    assert "no sample was recorded" in shown
+    assert ("not known to be at its safe value" in shown) is not safe
