@@ -37,7 +37,7 @@ class Board:
         self.emulator = emulator
         self.clock = clock
         self._log = log
-        made = {**emulator.options, "timeout_s": 0.1, "fifo_blocks": FIFO_BLOCKS, **options}
+        made = {**emulator.options, "timeout_s": 0.3, "fifo_blocks": FIFO_BLOCKS, **options}
         self.device = SerialDac(SerialOptions.model_validate(made))
         self.device.wire.last_write = SerialLastWrite(SteppingClock(0.2), lambda seconds: None)
         self.sent = 0
@@ -150,9 +150,9 @@ def test_an_underrun_is_told_with_its_length(board):
 @pytest.mark.parametrize(
     ("fault", "text"),
     [
-        ("silence", "no answer within 0.11 s"),
+        ("silence", "no answer within 0.31 s"),
         ("corrupt", "crc16_ccitt_false|not a COBS frame|behind the final"),
-        ("cut", "within 0.11 s"),
+        ("cut", "within 0.31 s"),
         ("duplicate", "bytes"),
         ("wrong_id", "reply 91 to message"),
         ("exception", "refused by the board"),
