@@ -16,6 +16,9 @@ PATIENCE_S = 3.0
 _ANSWER_S = 0.5
 """Longest wait for one answer: where the device did not get the value, it must be sent again."""
 _PAUSE_S = 0.05
+_QUIET_S = 0.02
+"""First silence that is taken for the end of late answers; doubled with each try, for an answer
+that came later than that would pass for the next one's."""
 
 
 class SerialLastWrite:
@@ -61,6 +64,7 @@ class SerialLastWrite:
         send: Callable[[], None],
         confirm: Callable[[], None],
     ) -> None:
+        quiet_s = _QUIET_S
         while True:
             try:
                 if not link.is_open:
@@ -69,9 +73,11 @@ class SerialLastWrite:
                 # and some never do.
                 if not link.is_in_step:
                     send()
+                    link.await_silence(quiet_s)
                 confirm()
                 return
             except DeviceError as error:
                 if self._clock() >= deadline_s:
                     raise DeviceError(f"not known whether the value stands: {error}") from None
+            quiet_s = min(2.0 * quiet_s, _ANSWER_S)
             self._sleep(_PAUSE_S)

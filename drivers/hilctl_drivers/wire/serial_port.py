@@ -279,14 +279,31 @@ class SerialLink:
             raise OSError(errno.EIO, os.strerror(errno.EIO))
         return data
 
-    def drain(self) -> None:
+    def await_silence(self, quiet_s: float) -> None:
+        """Throw away what comes until nothing has come for that long.
+
+        Raises:
+            LostError: The port is not open, or broke.
+            DeviceError: The line did not get quiet in time.
+        """
+        if self._port is None:
+            raise LostError("not open")
+        try:
+            self.drain(quiet_s)
+        except (OSError, DeviceError) as error:
+            raise self._failed(error) from None
+
+    def drain(self, quiet_s: float = _QUIET_S) -> None:
         """Throw away what comes until nothing has come for a while.
+
+        Args:
+            quiet_s: How long, at least; never less than the line's own gap.
 
         Raises:
             OSError: The port broke.
             DeviceError: The line did not get quiet in time.
         """
-        quiet_ms = math.ceil(1e3 * max(_QUIET_S, self._gap_s))
+        quiet_ms = math.ceil(1e3 * max(quiet_s, self._gap_s))
         deadline = self._clock() + max(self._timeout_s, 10.0 * _QUIET_S)
         while self._poll.poll(quiet_ms):
             self._read()

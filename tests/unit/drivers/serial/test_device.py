@@ -352,7 +352,11 @@ def test_a_line_that_never_falls_silent_gets_the_safe_value(rig, kind):
     link = bench.device.wire._link
     # As where somebody keeps sending: the line is never found quiet.
     link._stale = True
-    link.drain = lambda: (_ for _ in ()).throw(DeviceError("the line does not get quiet"))
+
+    def drain(quiet_s=0.0):
+        raise DeviceError("the line does not get quiet")
+
+    link.drain = drain
     with pytest.raises(DeviceError, match="not known whether the value stands: the line does not"):
         bench.device.make_safe(-1.0)
     bench.await_current(-1.0)
