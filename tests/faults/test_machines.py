@@ -8,8 +8,6 @@ import sys
 import pytest
 import yaml
 
-pytestmark = pytest.mark.rig
-
 EXPERIMENT = {
     "name": "poor",
     "device": {"kind": "simulated_terfenol"},
