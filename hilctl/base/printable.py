@@ -14,6 +14,8 @@ def printable(text: str, *, lines: bool = False) -> str:
         text: Any text.
         lines: Leave ends of lines and tabs as they are.
     """
+    if text.isprintable():  # nearly always
+        return text
     kept = "\n\t" if lines else ""
     return "".join(
         each if each.isprintable() or each in kept else each.encode("unicode_escape").decode()

@@ -9,7 +9,8 @@ from rich.segment import Segment
 from rich.text import Text
 
 from hilctl.analysis.replay import ReplayResult
-from hilctl.cli.streams import PlainStream, visible
+from hilctl.base.printable import printable
+from hilctl.cli.streams import PlainStream
 
 
 class PlainConsole(Console):
@@ -21,7 +22,11 @@ class PlainConsole(Console):
         """Return the segments of what is to be printed; those that move the cursor stay."""
         for segment in super().render(renderable, options):
             text, style, control = segment
-            yield segment if control or text.isprintable() else Segment(visible(text), style)
+            yield (
+                segment
+                if control or text.isprintable()
+                else Segment(printable(text, lines=True), style)
+            )
 
 
 def console(*, stderr: bool = False) -> Console:

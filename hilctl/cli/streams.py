@@ -13,21 +13,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from typing import TextIO
 
+from hilctl.base.printable import printable
+
 _READER_IS_GONE = {errno.EPIPE, errno.EIO}
 """A pipe closed early, a terminal hung up: whoever read has chosen to read no more."""
-
-
-def visible(text: str) -> str:
-    r"""Return a text with all that is not printable written out, an escape character as ``\x1b``.
-
-    Ends of lines and tabs stay.
-    """
-    if text.isprintable():
-        return text
-    return "".join(
-        each if each.isprintable() or each in "\n\t" else each.encode("unicode_escape").decode()
-        for each in text
-    )
 
 
 class StandardStream(io.TextIOWrapper):
@@ -84,8 +73,8 @@ class PlainStream(StandardStream):
         self.styled = StandardStream(stream)
 
     def write(self, text: str) -> int:
-        """Write a text, its control characters as :func:`visible` has them."""
-        super().write(visible(text))
+        """Write a text, its control characters as :func:`~hilctl.base.printable.printable` has them."""
+        super().write(printable(text, lines=True))
         return len(text)
 
     def leave(self) -> OSError | None:
