@@ -73,7 +73,7 @@ class PlainStream(StandardStream):
         self.styled = StandardStream(stream)
 
     def write(self, text: str) -> int:
-        """Write a text, its control characters as :func:`~hilctl.base.printable.printable` has them."""
+        """Write a text with its control characters written out."""
         super().write(printable(text, lines=True))
         return len(text)
 

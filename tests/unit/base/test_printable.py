@@ -12,7 +12,7 @@ from hilctl.base.printable import MOST_SHOWN, printable, short_name
         ("\x1b[31mred\x07", "\\x1b[31mred\\x07"),
         ("a\r\nb", "a\\r\\nb"),
         ("\u202egnp.exe", "\\u202egnp.exe"),
-        ("\x9b2J", "\\x9b2J"),
+        ("\x9b2Jc\rd\x7fe", "\\x9b2Jc\\rd\\x7fe"),
     ],
 )
 def test_what_steers_a_terminal_is_written_out(text: str, shown: str) -> None:

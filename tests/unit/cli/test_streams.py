@@ -8,20 +8,10 @@ import sys
 
 import pytest
 
-from hilctl.cli.streams import PlainStream, StandardStream, plain_streams, visible
+from hilctl.cli.streams import PlainStream, StandardStream, plain_streams
 
 HOSTILE = "a\x1b]0;title\x07b\x9b2Jc\rd\x7fe\u202ef"
 SHOWN = r"a\x1b]0;title\x07b\x9b2Jc\rd\x7fe\u202ef"
-
-
-def test_control_characters_are_written_out():
-    """Escape sequences of 7 and 8 bits, a carriage return that hides a line, turned text."""
-    assert visible(HOSTILE) == SHOWN
-
-
-@pytest.mark.parametrize("text", ["plain", "µm ü 😀", "two\nlines\tand tab\n", ""])
-def test_text_stays_as_it_is(text):
-    assert visible(text) == text
 
 
 def wrapped(target, encoding="utf-8"):
