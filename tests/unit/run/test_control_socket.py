@@ -284,26 +284,30 @@ def test_a_question_that_was_pushed_out_is_asked_again(tmp_path):
         listener.bind(str(path))
         listener.listen(20)
 
-        def serve(cuts):
-            for number in range(cuts + 1):
+        def serve(connections, last):
+            for number in range(1, connections + 1):
                 client, _ = listener.accept()
                 with client:
-                    if number % 2:
+                    if number % 2 == 0:
                         seen.append(client.recv(1000))
-                    if number == cuts:
-                        client.sendall(b'{"ok": true, "n": 1}\n')
+                    if number == connections:
+                        client.sendall(last)
 
-        thread = threading.Thread(target=serve, args=(5,))
-        thread.start()
+        def serving(connections, last=b""):
+            # A daemon: one that waits in vain must not keep the tests from ending.
+            thread = threading.Thread(target=serve, args=(connections, last), daemon=True)
+            thread.start()
+            return thread
+
+        thread = serving(6, b'{"ok": true, "n": 1}\n')
         assert ask(path, {"say": "hello"}) == {"n": 1}
-        thread.join()
+        thread.join(10)
         assert seen == [b'{"say": "hello"}\n'] * 3
-        thread = threading.Thread(target=serve, args=(2,))
-        thread.start()
+        thread = serving(2)
         with pytest.raises(RunError, match="among a crowd"):
             ask(path, {"say": "hello"}, 5.0, SteppingClock(2.0))
-        listener.close()
-        thread.join(5)
+        thread.join(10)
+        assert not thread.is_alive()
 
 
 def test_path_that_cannot_be_listened_at_is_told(tmp_path):
