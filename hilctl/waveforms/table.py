@@ -10,12 +10,11 @@ import numpy.typing as npt
 from hilctl.base.arrays import F64
 from hilctl.base.errors import InputError
 from hilctl.base.segments import SHORTEST_PERIOD
-from hilctl.base.text_table import TextTable, check_rows, column_index
+from hilctl.base.text_table import MAX_COLUMNS, TextTable, check_rows, column_index
 from hilctl.waveforms.shapes import check_length
 from hilctl.waveforms.spec import FileWaveform
 
 _RATE_TOLERANCE = 1e-6
-_MOST_COLUMNS = 10_000
 _TIME_TOLERANCE = 0.01  # largest departure of one step from the median
 
 
@@ -118,8 +117,8 @@ def _read_npy(path: Path) -> dict[str, npt.NDArray[Any]]:
     if table.size == 0:
         raise InputError(f"{path}: holds no data")
     columns = table.reshape(table.shape[0], -1).T
-    if len(columns) > _MOST_COLUMNS:
-        raise InputError(f"{path}: holds {len(columns)} columns, at most {_MOST_COLUMNS} are read")
+    if len(columns) > MAX_COLUMNS:
+        raise InputError(f"{path}: holds {len(columns)} columns, at most {MAX_COLUMNS} are read")
     return {str(number): column for number, column in enumerate(columns, start=1)}
 
 
