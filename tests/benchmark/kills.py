@@ -154,7 +154,7 @@ class AttackedRuns:
         quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
         run = self._hilctl(words, self._disk, **quiet)
         while len(self._writes(skip)) < 10:
-            assert run.poll() is None, "the run ended by itself"
+            assert run.poll() is None, f"the run ended by itself: {read(output).end}"
             time.sleep(0.02)
         processes = {"supervisor": run.pid, **_children(run.pid)}
         after_s = self._random.uniform(0.05, 1.5)

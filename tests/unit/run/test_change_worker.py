@@ -113,6 +113,14 @@ def test_a_process_answers_and_ends_with_its_supervisor(ring, checked):
         os.kill(number, 0)
 
 
+def test_a_process_whose_supervisor_is_gone_ends_by_itself(checked):
+    """However that died: the end of its side is what shows it."""
+    with ChangeWorker(checked) as worker:
+        worker._connection.close()
+        worker._process.join(20)
+        assert worker._process.exitcode == 0
+
+
 def await_result(worker):
     while (found := worker.result()) is None:
         time.sleep(0.001)

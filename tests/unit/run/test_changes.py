@@ -186,6 +186,17 @@ def test_the_end_of_the_run_refuses_all_that_wait(changes, page, worker, number,
         change(changes, gain=1.0)
 
 
+def test_the_end_of_the_run_refuses_what_is_being_worked_out(changes, page, worker):
+    """What comes of it then is put nowhere."""
+    made = change(changes, gain=0.5)
+    worker.approve(600)
+    page.put(Field.STOP, Stop.REQUEST)
+    changes.attend()
+    with pytest.raises(InputError, match="on its way"):
+        made.answer()
+    assert page.get(Field.TUNE_WANTED) == 0
+
+
 def test_a_queue_that_is_full_takes_no_more(changes):
     """The first is being worked out, sixteen wait."""
     for _ in range(17):

@@ -79,6 +79,10 @@ def test_question_and_answer_are_one_line_each(server, tmp_path):
         assert client.recv(1000) == b""
 
 
+def test_a_question_without_its_end_is_one_when_its_client_has_said_all(server, tmp_path):
+    assert json.loads(exchange(server, tmp_path, b"hello")) == {"ok": True, "heard": "hello"}
+
+
 def test_refusal_is_told_in_words(server, tmp_path):
     """What can't be followed comes back as an error text."""
     answer = json.loads(exchange(server, tmp_path, b"refuse\n"))
