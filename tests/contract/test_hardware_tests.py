@@ -18,6 +18,7 @@ from hilctl_drivers.emulator.setup import Emulator, build
 ROOT = Path(__file__).parents[2]
 GIVE_UP_S = 120.0
 PEAK_A = 6.0
+POWER_UP_A = -10.0
 TENTH_A = 0.1 * PEAK_A
 RAMP_S = 0.25
 RATE_HZ = 200.0
@@ -90,15 +91,19 @@ def test_keeps_to_a_tenth_of_the_limits(suite):
     assert done.returncode == 0, done.stdout
     assert "9 passed" in done.stdout
     currents_a = suite.currents_a()
+    assert currents_a[0] == pytest.approx(POWER_UP_A)
+    # It powers up far from the safe value, and ramps from there.
+    arrived = next(index for index, each in enumerate(currents_a) if each >= 0.0)
+    assert currents_a[: arrived + 1] == sorted(currents_a[: arrived + 1])
     assert max(currents_a) == pytest.approx(TENTH_A, rel=1e-3)
-    assert min(currents_a) == 0.0
+    assert min(currents_a[arrived:]) == 0.0
     assert currents_a[-1] == 0.0
     steps_a = sorted(abs(b - a) for a, b in itertools.pairwise(currents_a))
     assert steps_a[-1] == pytest.approx(TENTH_A, rel=1e-3)  # the one that make_safe takes
     assert steps_a[-2] <= PEAK_A / RAMP_S / RATE_HZ * 1.001
 
 
-@pytest.mark.parametrize("suite", ["exception@150"], indirect=True)
+@pytest.mark.parametrize("suite", ["exception@250"], indirect=True)
 def test_failure_ends_at_the_safe_value(suite):
     """A device that refuses in the middle of a move fails its test and is made safe."""
     done = suite.run(only="small_move")

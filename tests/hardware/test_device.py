@@ -28,6 +28,7 @@ from hilctl.experiment.load import LoadedExperiment, load_experiment
 from hilctl.loop.limiter import CommandLimits, Limiter
 from hilctl.loop.pacer import SystemClock
 from hilctl.run.probe import probe
+from hilctl.run.starting import starting_output
 
 SHARE = 0.1
 HOLD_S = 0.3
@@ -58,6 +59,7 @@ class RealDevice:
         )
         self.limiter = Limiter(gentle, 1.0 / config.sample_rate_hz)
         self.stroke_um = config.limits.stroke_um
+        self._at_start = config.safe.at_start
         self._rate_hz, self._block = config.sample_rate_hz, config.block
         self._period_ns = round(1e9 * config.block / config.sample_rate_hz)
         self._clock = SystemClock()
@@ -67,10 +69,11 @@ class RealDevice:
         self._was_open = False
 
     def open(self) -> None:
-        """Open the device; the limiter goes on from the last command."""
+        """Open the device; the limiter goes on from where its output is."""
         self.device.open(self._rate_hz, self._block)
         self._open = self._was_open = True
         self._sample = 0
+        self.limiter.last = starting_output(self.device, self._at_start)
 
     def close(self) -> None:
         """Close the device and leave the output as it is."""
@@ -177,6 +180,7 @@ def test_answers_a_probe(request):
 def test_small_move_is_seen_and_comes_back(real):
     """The displacement follows a tenth of the range beyond noise, and most of it comes back."""
     real.open()
+    real.go(real.target)  # once before: the loop closes only round where it came from last
     rest = real.go(real.safe)
     there = real.go(real.target)
     back = real.go(real.safe)
