@@ -228,6 +228,7 @@ class TestByTime:
         """On the way in and on the way out, bit for bit."""
         golden = read(GOLDEN)
         slower = golden.experiment_yaml.replace("slew_a_per_s: 20000.0", "slew_a_per_s: 2000.0")
+        slower = slower.replace("sample_rate_hz: 50000", f"sample_rate_hz: {RATE_HZ:g}")
         limits = Document("x", slower).validate(Experiment).command_limits()
         stalls = {20: 7_000_000, 60: 3_000_000, 360: 5_000_000, 380: 40_000_000}
         clock, device = FakeClock(stall_ns=stalls), FakeDevice(5.0)

@@ -18,6 +18,7 @@ def test_a_program_reads_how_the_run_ended():
         "code": "stopped",
         "reason": "stopped by hilctl stop",
         "output_safe": True,
+        "deadline_misses": "",
     }
 
 

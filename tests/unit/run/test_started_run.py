@@ -10,6 +10,7 @@ from hilctl.run import started_run as module
 from hilctl.run.ring import SampleRing
 from hilctl.run.shared_page import Field, MadeSafe, Stop
 from hilctl.run.started_run import StartedRun
+from hilctl.run.stopping import STOP_SIGNAL
 
 
 class Run:
@@ -32,16 +33,13 @@ class Run:
         self.safety = SimpleNamespace(
             made_safe=None, by="", look=lambda now_ns, *, ended: self.looks.append(ended)
         )
-        self.requests = SimpleNamespace(stop=False)
         self.config = SimpleNamespace(
             recording=SimpleNamespace(on_failure="stop", ring_s=10.0), compensator=None
         )
         checked = SimpleNamespace(
             loaded=SimpleNamespace(config=self.config), forecast=SimpleNamespace(samples=100)
         )
-        self.started = StartedRun(
-            checked, ring, self.child, self.safety, self.recording, self.requests
-        )
+        self.started = StartedRun(checked, ring, self.child, self.safety, self.recording)
 
 
 @pytest.fixture
@@ -65,7 +63,6 @@ def break_off(run):
 @pytest.mark.parametrize(
     ("cause", "stop"),
     [
-        (lambda run: setattr(run.requests, "stop", True), Stop.REQUEST),
         (lambda run: setattr(run.recording.recorder, "error", "full"), Stop.RECORDER_FAILED),
         (lambda run: setattr(run, "stalled", 5.1), Stop.RECORDER_STALLED),
         (break_off, Stop.SUPERVISOR_BROKE),
@@ -85,10 +82,11 @@ def test_a_stop_is_passed_on(run, cause, stop):
         (signal.SIGINT, Stop.CTRL_C),
         (signal.SIGTERM, Stop.SIGTERM),
         (signal.SIGHUP, Stop.SIGHUP),
+        (STOP_SIGNAL, Stop.REQUEST),
     ],
 )
 def test_a_signal_goes_before_all_else(run, number, stop):
-    run.requests.stop = True
+    break_off(run)
     run.started.attend(number)
     assert run.page.get(Field.STOP) == stop
 

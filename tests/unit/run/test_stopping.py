@@ -15,7 +15,15 @@ from hilctl.run.stopping import STOP_SIGNAL, request_stop
 @pytest.fixture
 def process():
     """A process that ends by the first signal that comes."""
-    started = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
+    # What this process ignores, its children do too, until they say otherwise.
+    code = (
+        f"import signal; signal.signal({STOP_SIGNAL}, signal.SIG_DFL); print(flush=True); input()"
+    )
+    started = subprocess.Popen(
+        [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    )
+    assert started.stdout is not None
+    started.stdout.readline()
     yield started
     started.kill()
     started.communicate()
