@@ -85,6 +85,7 @@ def suite(tmp_path, request) -> Iterator[HardwareTestRun]:
     emulator.log.close()
 
 
+@pytest.mark.slow
 def test_keeps_to_a_tenth_of_the_limits(suite):
     """All pass, no current is beyond a tenth of the peak, but for one step ramps are slow."""
     done = suite.run()
@@ -104,6 +105,7 @@ def test_keeps_to_a_tenth_of_the_limits(suite):
 
 
 @pytest.mark.parametrize("suite", ["exception@250"], indirect=True)
+@pytest.mark.slow
 def test_failure_ends_at_the_safe_value(suite):
     """A device that refuses in the middle of a move fails its test and is made safe."""
     done = suite.run(only="small_move")
@@ -114,6 +116,7 @@ def test_failure_ends_at_the_safe_value(suite):
     assert currents_a[-1] == 0.0
 
 
+@pytest.mark.slow
 def test_sensor_that_shows_nothing_is_found(suite):
     """With the sensor on another input the tests fail and say what to look at."""
     done = suite.run(sensor="AIN1", only="small_move")

@@ -73,6 +73,7 @@ def test_is_listed(installed):
     assert devices["spring"] == "own_device.spring:Spring"
 
 
+@pytest.mark.slow
 def test_is_run(installed, tmp_path):
     """A whole run in hilctl's own processes, recorded and replayed."""
     output = tmp_path / "own.mcap"
@@ -85,6 +86,7 @@ def test_is_run(installed, tmp_path):
     assert replay(recording).identical
 
 
+@pytest.mark.slow
 def test_its_options_are_checked_like_any_other(installed, tmp_path):
     """With file and line, and nothing moved."""
     done = hilctl(installed, "check", experiment(tmp_path, um_per_a=-1.0, um_per_b=2.0))

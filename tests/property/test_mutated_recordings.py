@@ -45,6 +45,7 @@ def test_mutated_recordings_are_refused_in_words(tmp_path: Path, part: int) -> N
     assert {"done", "refused"} <= set(found)
 
 
+@pytest.mark.slow
 def test_kernels_stay_within_their_arrays(request: pytest.FixtureRequest) -> None:
     """Compiled with bounds checks, in a cache of their own, they find nothing to say."""
     cache = request.config.cache.mkdir("kernels-with-bounds-checks")

@@ -22,7 +22,7 @@ def _ticks(samples: int, block: int, rate_hz: float) -> Ticks:
     return Ticks(first, deadline_ns, late_ns, np.full(first.size, 30_000, dtype=np.int64))
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def make_recording() -> MakeRecording:
     """Return a builder: displacement and what it is held against in, a whole recording out."""
 

@@ -44,7 +44,7 @@ class Page(HTMLParser):
         self.text += data
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def recording(make_recording) -> Recording:
     """Return a run of two segments whose every text wants to be markup."""
     phase = 2.0 * np.pi * np.arange(8000) / 1000
@@ -64,10 +64,15 @@ def recording(make_recording) -> Recording:
     return replace(recording, model_yaml=f"model: {NASTY}\n", path=Path(f"{NASTY}.mcap"))
 
 
-def test_fetches_nothing(recording: Recording) -> None:
+@pytest.fixture(scope="module")
+def shown(recording: Recording) -> str:
+    """Return the page of that run; to draw it takes seconds."""
+    return page(recording, summarize(recording))
+
+
+def test_fetches_nothing(shown: str) -> None:
     """All that it refers to is PNG within the page; there is no script, link or address."""
-    text = page(recording, summarize(recording))
-    seen = Page(text)
+    seen = Page(shown)
     assert len(seen.references) == 4
     for reference in seen.references:
         head, _, data = reference.partition(",")
@@ -75,21 +80,21 @@ def test_fetches_nothing(recording: Recording) -> None:
         assert base64.b64decode(data, validate=True).startswith(b"\x89PNG")
     assert not {"script", "link", "iframe", "object", "embed", "base"} & set(seen.tags)
     for address in ("http:", "https:", "url(", "@import"):
-        assert address not in text
+        assert address not in shown
 
 
-def test_texts_are_shown_as_they_are(recording: Recording) -> None:
+def test_texts_are_shown_as_they_are(shown: str) -> None:
     """Names, labels, reasons, events and YAML can't become markup, and none is lost."""
-    seen = Page(page(recording, summarize(recording)))
+    seen = Page(shown)
     assert seen.open == []
     for start in ("name ", "first ", "reason ", "code ", "event ", "name: ", "model: "):
         assert start + NASTY in seen.text
 
 
-def test_holds_figures_segments_events_and_experiment(recording: Recording) -> None:
+def test_holds_figures_segments_events_and_experiment(recording: Recording, shown: str) -> None:
     """The figures of the report are on the page, by segment too, with the YAML folded away."""
     report = summarize(recording)
-    seen = Page(page(recording, report))
+    seen = Page(shown)
     for segment in report.segments:
         assert f"{segment.peak_hysteresis_percent:.4g}" in seen.text
     assert "noise floor" in seen.text
@@ -104,6 +109,7 @@ def test_one_segment_has_no_table_of_its_own(recording: Recording) -> None:
     assert "By segment" not in page(single, summarize(single))
 
 
+@pytest.mark.slow
 def test_is_small(make_recording) -> None:
     """A minute at 50 kHz with noise makes less than a megabyte."""
     n = 3_000_000

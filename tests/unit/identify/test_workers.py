@@ -26,6 +26,7 @@ def loops(loops_of: Loops) -> list[SteadyLoop]:
 
 
 @pytest.mark.parametrize("scheduler", ["threads", "processes"])
+@pytest.mark.slow
 def test_workers_find_the_same(loops: list[SteadyLoop], scheduler: str) -> None:
     """Starts followed on other workers end at the same bits."""
     settings = FitSettings(kind="integrated", weights="free", starts=3)

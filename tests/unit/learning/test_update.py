@@ -74,7 +74,10 @@ def peaks(state: Learning) -> list[float]:
         Response(),
         Response(0.8, 5.0 / RATE_HZ),
         RESONANT,
-        Response(1.1, 3.0 / RATE_HZ, 1.0 / (2.0 * np.pi * 480.0) ** 2, 0.12),
+        pytest.param(
+            Response(1.1, 3.0 / RATE_HZ, 1.0 / (2.0 * np.pi * 480.0) ** 2, 0.12),
+            marks=pytest.mark.slow,
+        ),
     ],
     ids=["exact", "late", "resonant", "loaded"],
 )

@@ -112,6 +112,7 @@ def boundaries(sound):
     return sorted(offset for offset in offsets if offset <= last)
 
 
+@pytest.mark.slow
 def test_cut_at_every_kind_of_boundary(sound, tmp_path):
     """Between, in the frame of and inside every record: all before is saved, nothing else."""
     path = tmp_path / "run.mcap"
@@ -127,6 +128,7 @@ def test_cut_at_every_kind_of_boundary(sound, tmp_path):
     assert {sound.before(cut) for cut in boundaries(sound)} <= counts
 
 
+@pytest.mark.slow
 def test_random_cuts_garbage_and_zeros(sound, tmp_path):
     """At 200 random places, with nothing, zeros or garbage behind the cut."""
     rng = np.random.default_rng(7)

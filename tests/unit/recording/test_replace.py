@@ -240,6 +240,7 @@ def test_a_sound_file_with_all_of_the_ring_is_left_alone(torn, batches):
     assert state(torn.parent) == before
 
 
+@pytest.mark.slow
 def test_the_command(torn):
     """The command line recovers once, says what it did, and then finds nothing to do."""
 
