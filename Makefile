@@ -12,11 +12,11 @@ run: $(VENV)/.ready
 
 test: $(VENV)/.ready
 	@echo "Takes about 4 minutes of one core; whole runs have a target of their own: make test-slow."
-	$(BIN)/pytest -m "not slow"
+	$(BIN)/pytest -n auto --dist loadfile -m "not slow"
 
 test-slow: $(VENV)/.ready
 	@echo "Takes about 15 minutes: most of them real time, in which runs go on."
-	$(BIN)/pytest -m slow
+	$(BIN)/pytest -n 2 --dist loadfile -m slow
 
 lint: $(VENV)/.ready
 	$(BIN)/ruff check .
