@@ -163,6 +163,8 @@ def write_experiment(
             "stroke_um": [-75.0, 60.0],
         },
         "safe": {"value": 0.0, "ramp_s": 0.2},
+        # Misses are what is counted here, not what ends the run.
+        "timing": {"on_misses": "warn", "hang_s": 0.5},
     }
     path.write_text(yaml.safe_dump(experiment), encoding="utf-8")
 

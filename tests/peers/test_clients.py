@@ -291,7 +291,7 @@ def emulate() -> Iterator[Callable[[str], Emulated]]:
 
     def start(profile: str) -> Emulated:
         clock = ManualClock()
-        emulator = build(EmulatorOptions(profile, noise=False), clock)
+        emulator = build(EmulatorOptions(profile, noise=False, current_a=0.0), clock)
         thread = threading.Thread(target=emulator.server.run)
         thread.start()
 
