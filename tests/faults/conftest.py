@@ -66,8 +66,8 @@ class Log:
     def await_events(self, output: str, count: int) -> None:
         """Wait until so many events have come."""
         deadline = time.monotonic() + 60.0
-        while len(self.events(output)) < count:
-            assert time.monotonic() < deadline
+        while (seen := len(self.events(output))) < count:
+            assert time.monotonic() < deadline, f"{seen} of {count}"
             time.sleep(0.02)
 
 
