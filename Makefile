@@ -11,7 +11,7 @@ run: $(VENV)/.ready
 	$(BIN)/hilctl run configs/demo.yaml
 
 test: $(VENV)/.ready
-	@echo "Takes about 4 minutes of one core; whole runs have a target of their own: make test-slow."
+	@echo "Takes about 6 minutes of processor time, shared by all cores; whole runs: make test-slow."
 	$(BIN)/pytest -n auto --dist loadfile -m "not slow"
 
 test-slow: $(VENV)/.ready
