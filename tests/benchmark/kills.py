@@ -59,6 +59,7 @@ EXPERIMENT: dict[str, Any] = {
     "compensator": "none",
     "limits": {"peak_current_a": 5.0, "slew_a_per_s": 500.0, "stroke_um": [-100.0, 100.0]},
     "safe": {"value": 0.0, "ramp_s": RAMP_S},
+    "timing": {"on_misses": "warn"},  # a busy machine must not be quicker than the attack
     "recording": {"ring_s": 60.0, "flush_s": 0.5},
 }
 ROLES = {"loop": b"hilctl.run.loop_process", "guardian": b"hilctl.run.guardian"}
