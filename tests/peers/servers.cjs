@@ -33,6 +33,8 @@ function serveModbusSerial() {
 function serveJsmodbus() {
   const { ModbusTCPServer } = require("jsmodbus");
   const server = net.createServer();
+  // It leaves errors of a connection to its host: without this, one that is reset ends the process.
+  server.on("connection", (socket) => socket.on("error", () => {}));
   new ModbusTCPServer(server, { holding: Buffer.alloc(2 * REGISTERS) });
   server.listen(0, HOST, () => console.log(server.address().port));
 }

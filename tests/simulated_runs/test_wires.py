@@ -5,6 +5,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from hilctl.analysis.replay import replay
@@ -56,7 +57,8 @@ def test_compensated_run_is_complete(tmp_path, name):
     assert missing <= recording.dropped
     if name == "COBS FIFO":  # its own clock paces it, whatever this machine does meanwhile
         assert recording.dropped == 0
-    assert printed["peak_to_peak_um"] > 60.0
+    # All of it, and not of its steady cycles alone: a busy machine may leave none.
+    assert np.ptp(recording.samples.displacement_um) > 60.0
     measured = recording.samples.measured
     assert (measured.size > 0 and abs(measured - recording.samples.command).max() < 1e-3) == (
         name == "SCPI, measured"
