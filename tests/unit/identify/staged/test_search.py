@@ -9,47 +9,10 @@ import pytest
 
 from hilctl.base.errors import DataError
 from hilctl.identify.data.records import History, SteadyLoop
-from hilctl.identify.fit_data import FitData
-from hilctl.identify.fit_model import FittedModel, fit_model
-from hilctl.identify.settings import FitSettings
-from hilctl.identify.staged.fit_data import StagedFitData
-from hilctl.models.published import exponential_integrated
-from hilctl.models.staged import FieldLag, StagedModel
+from hilctl.models.staged import FieldLag
+from tests.staged import GRID, fit, truth
 
 Loops = Callable[..., list[SteadyLoop]]
-GRID = [(a, f) for a in (3.0, 6.0) for f in (2.0, 50.0, 150.0, 250.0, 400.0)]
-
-
-def truth(**stages: Any) -> StagedModel:
-    """Return a known model; its deadbands lie where identification puts them."""
-    omega = exponential_integrated(
-        alpha=0.5,
-        gamma_s=0.0,
-        a_0=3.0,
-        alpha_0=1.4,
-        beta_0=0.3,
-        g_0=1.0,
-        alpha_1=0.08,
-        beta_1=0.15,
-        d_p=6.0,
-        alpha_2=0.1,
-        beta_2=0.4,
-        d_n=6.0,
-        plays=8,
-        deadbands_a_side=5,
-    )
-    return StagedModel.around(omega, **stages)
-
-
-def fit(data: list[SteadyLoop], **choices: Any) -> FittedModel:
-    settings = FitSettings(kind="staged", plays=8, deadbands=5, starts=2, **choices)
-    return fit_model(data, settings, lambda: 0.0)
-
-
-@pytest.fixture
-def data(loops_of: Loops) -> StagedFitData:
-    loops = loops_of(truth(lag=FieldLag(tau_s=1e-4, growth_per_unit=0.3)), GRID[::3])
-    return StagedFitData(loops, FitData(loops).speeds)
 
 
 def test_peak_goal_lowers_the_peak(loops_of: Loops) -> None:
