@@ -55,10 +55,16 @@ def history_from_recording(recording: Recording) -> History:
     """Return a run's waveform as a whole, from rest, without the ramp at its end.
 
     Raises:
-        DataError: Samples are missing or have no displacement, so the hysteresis can't be followed.
+        DataError: Samples are missing or have no displacement, or the run ramped to its waveform
+            from another output, so the hysteresis can't be followed from rest.
     """
     samples = recording.samples
     rows = (samples.flags & Flag.RAMP.value) == 0
+    if samples.index.size and samples.index[0] == 0 and not rows[0]:
+        raise DataError(
+            f"{recording.path}: begins with a ramp from where the output was, so the actuator was "
+            "not at rest: leave out --whole to use its steady cycles"
+        )
     index, displacement_um = samples.index[rows], samples.displacement_um[rows]
     whole = index.size > 0 and index[0] == 0 and index[-1] == index.size - 1
     if not whole or not np.isfinite(displacement_um).all():

@@ -37,6 +37,14 @@ def test_a_history_ends_where_the_ramp_begins(recording_of):
     np.testing.assert_array_equal(history.displacement_um, 2.0 * command[:80])
 
 
+def test_a_history_that_begins_with_a_ramp_is_refused(recording_of):
+    """It did not begin at rest; no sample is missing from it."""
+    recording = recording_of(np.zeros(100), np.zeros(100), [])
+    recording.samples.flags[:20] |= Flag.RAMP.value
+    with pytest.raises(DataError, match="begins with a ramp from where the output was"):
+        history_from_recording(recording)
+
+
 @pytest.mark.parametrize("what", ["begins late", "has a gap", "has no reading"])
 def test_a_history_with_missing_samples_is_refused(recording_of, what):
     """A model's memory would be another behind the gap."""
