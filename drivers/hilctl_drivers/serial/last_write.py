@@ -64,14 +64,15 @@ class SerialLastWrite:
         send: Callable[[], None],
         confirm: Callable[[], None],
     ) -> None:
-        quiet_s = _QUIET_S
+        quiet_s, in_doubt = _QUIET_S, False
         while True:
             try:
                 if not link.is_open:
                     link.open(boot=False)
                 # The coil first: waiting for a line that is out of step to fall silent takes time,
-                # and some never do.
-                if not link.is_in_step:
+                # and some never do. After a failure the line is taken to be: the answer to one
+                # try would pass for the next one's, and each time again.
+                if in_doubt or not link.is_in_step:
                     send()
                     link.await_silence(quiet_s)
                 confirm()
@@ -79,5 +80,5 @@ class SerialLastWrite:
             except DeviceError as error:
                 if self._clock() >= deadline_s:
                     raise DeviceError(f"not known whether the value stands: {error}") from None
-            quiet_s = min(2.0 * quiet_s, _ANSWER_S)
+            quiet_s, in_doubt = min(2.0 * quiet_s, _ANSWER_S), True
             self._sleep(_PAUSE_S)
