@@ -18,6 +18,7 @@ import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Self
 
@@ -27,6 +28,7 @@ from hilctl.base.files import TextFiles
 from hilctl.base.yaml.document import Document
 from hilctl.experiment.device import made_device
 from hilctl.machine.linux import LinuxProcess
+from hilctl.machine.realtime import be_quick
 from hilctl.run.hang_watch import HangWatch, SilenceLimits, is_stopped
 from hilctl.run.safe_action import SafeAction
 from hilctl.run.shared_page import SIZE, Field, GuardianPhase, PageText, Phase, SharedPage
@@ -156,10 +158,10 @@ def main(words: list[str]) -> int:
         return 1
     "localhost".encode("idna")  # the codec, which is imported at the first connection otherwise
     process = LinuxProcess()
-    be_quick = _quick(process, job.priority)
     _stay_in_memory(process)
-    be_quick()
-    Guardian(page, device, job, int(words[1]), be_quick).watch()
+    be_quick(job.priority, process)
+    prepare = partial(be_quick, job.priority, process)
+    Guardian(page, device, job, int(words[1]), prepare).watch()
     return 0
 
 
@@ -169,16 +171,6 @@ def _page(ring: str) -> SharedPage:
         return SharedPage(mmap.mmap(descriptor, SIZE))
     finally:
         os.close(descriptor)
-
-
-def _quick(process: LinuxProcess, priority: int) -> Callable[[], None]:
-    """Return what puts the calling thread before all that is not real-time, where allowed."""
-
-    def be_quick() -> None:
-        with suppress(OSError):
-            process.set_fifo(priority)
-
-    return be_quick
 
 
 def _stay_in_memory(process: LinuxProcess) -> None:
