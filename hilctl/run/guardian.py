@@ -34,7 +34,9 @@ from hilctl.run.safe_action import SafeAction
 from hilctl.run.shared_page import SIZE, Field, GuardianPhase, PageText, Phase, SharedPage
 
 _POLL_MS = 5
-_DEATH_MS = 50
+LAST_CALL_MS = 5
+"""How long a process that was killed may be in a call that it is to end. Then it is dying: giving
+back its memory takes much longer, and only a device that takes one connection waits for that."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,8 +134,7 @@ class Guardian:
         """End the loop for good: should it go on, it would send commands from before."""
         with suppress(ProcessLookupError):
             signal.pidfd_send_signal(self._loop, signal.SIGKILL)
-        # Not for long: one that the kernel keeps from dying can't come back to its commands either.
-        self._death.poll(_DEATH_MS)
+        self._death.poll(LAST_CALL_MS)
 
     def _make_safe(self, *, hung: bool) -> None:
         page = self._page

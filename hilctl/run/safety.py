@@ -17,7 +17,7 @@ from hilctl.base.events import Event
 from hilctl.experiment.check import Checked
 from hilctl.machine.realtime import be_ordinary, be_quick
 from hilctl.run.child import LoopChild
-from hilctl.run.guardian import GuardianJob
+from hilctl.run.guardian import LAST_CALL_MS, GuardianJob
 from hilctl.run.hang_watch import HangWatch, SilenceLimits, is_stopped
 from hilctl.run.run_folder import RunFolder
 from hilctl.run.safe_action import SafeAction
@@ -109,10 +109,15 @@ class GuardianProcess:
         """Why it could not start."""
         return self._page.read_text(PageText.GUARDIAN) or "it died"
 
-    def kill(self) -> None:
-        """End it at once."""
+    def kill(self, wait_s: float | None = None) -> None:
+        """End it at once.
+
+        Args:
+            wait_s: Longest wait until it is gone; None for as long as that takes.
+        """
         self._process.kill()
-        self._process.wait()
+        with suppress(subprocess.TimeoutExpired):
+            self._process.wait(wait_s)
 
     def end(self) -> None:
         """Let it end by itself, as it does once the loop has; not for long."""
@@ -230,10 +235,11 @@ class Safety:
             be_ordinary()
 
     def _stand_in(self) -> None:
-        # Both before the device: many take one connection only, and neither may come back.
+        # Both before the device: neither may come back to it.
+        last_call_s = 1e-3 * LAST_CALL_MS
         if self._guardian is not None:
-            self._guardian.kill()
-        self._child.kill()
+            self._guardian.kill(last_call_s)
+        self._child.kill(last_call_s)
         # It may have been done in the very last moment.
         self.made_safe, self.by = self._page.made_safe(), "guardian"
         if self.made_safe is None:

@@ -15,7 +15,8 @@ PATIENCE_S = 3.0
 """How long a device that does not answer is tried, beside the time that it needs to boot."""
 _ANSWER_S = 0.5
 """Longest wait for one answer: where the device did not get the value, it must be sent again."""
-_PAUSE_S = 0.05
+_PAUSE_S = 0.01
+"""Between two tries: a port is free as soon as the process that had it has died."""
 _QUIET_S = 0.02
 """First silence that is taken for the end of late answers; doubled with each try, for an answer
 that came later than that would pass for the next one's."""

@@ -22,7 +22,7 @@ class Guardian:
         self.phase = GuardianPhase.WATCHING
         self.heartbeat_ns = 0
 
-    def kill(self):
+    def kill(self, wait_s=None):
         self.log.append("guardian killed")
         self.ended = True
 
@@ -48,7 +48,7 @@ class Run:
             realtime=SimpleNamespace(priority=80),
         )
         self.checked = SimpleNamespace(loaded=SimpleNamespace(config=config, device=device))
-        child = SimpleNamespace(pid=1, kill=lambda: self.log.append("loop killed"))
+        child = SimpleNamespace(pid=1, kill=lambda wait_s: self.log.append("loop killed"))
         monkeypatch.setattr(module, "is_stopped", lambda pid: False)
         self.priorities = []
         monkeypatch.setattr(module, "be_quick", self.priorities.append)
@@ -118,7 +118,7 @@ def test_where_the_guardian_can_not_the_supervisor_does(run, what):
 def test_a_guardian_that_was_just_done_when_it_was_killed_is_believed(run, page):
     """Nothing is sent twice."""
     guardian = run.guardians[0]
-    guardian.kill = lambda: page.leave_made_safe(MadeSafe(hung=False, error=""))
+    guardian.kill = lambda wait_s: page.leave_made_safe(MadeSafe(hung=False, error=""))
     run.look(ended=True, passed_ms=60, awake=False)
     assert run.safety.by == "guardian"
     assert "safe 0.25" not in run.log
