@@ -13,6 +13,7 @@ from hilctl_drivers.simulated.device import (
     SimulatedOptions,
 )
 from hilctl_drivers.simulated.diffusion import DiffusionParameters
+from hilctl_drivers.simulated.domains import DomainsParameters
 from hilctl_drivers.simulated.jiles_atherton import JilesAthertonParameters
 from hilctl_drivers.simulated.piezo import PiezoActuator, PiezoParameters
 from hilctl_drivers.simulated.pinned_cells import PinnedCellsParameters
@@ -20,9 +21,10 @@ from hilctl_drivers.simulated.plant import Plant
 from hilctl_drivers.simulated.rods import RodParameters
 from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
 
-Physics: TypeAlias = Literal["pinned_cells", "diffusion", "jiles_atherton"]
+Physics: TypeAlias = Literal["pinned_cells", "domains", "diffusion", "jiles_atherton"]
 PHYSICS: dict[Physics, type[RodParameters]] = {
     "pinned_cells": PinnedCellsParameters,
+    "domains": DomainsParameters,
     "diffusion": DiffusionParameters,
     "jiles_atherton": JilesAthertonParameters,
 }
@@ -61,7 +63,8 @@ class TerfenolOptions(SimulatedOptions):
     physics: Physics = Field(
         default="pinned_cells",
         description="what goes on in the rods; pinned_cells: cells with dry friction behind one lag"
-        " of the field; diffusion: the field diffuses into conducting rods, shell by shell;"
+        " of the field; domains: domains of eight orientations, averaged over their energies;"
+        " diffusion: the field diffuses into conducting rods, shell by shell;"
         " jiles_atherton: Jiles and Atherton's equations with eddy and excess loss",
     )
     load_kg: float = Field(default=0.0, ge=0.0, le=100.0, description="mass on the actuator, kg")
