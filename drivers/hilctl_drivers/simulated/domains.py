@@ -3,10 +3,10 @@
 W. D. Armstrong, "Magnetization and magnetostriction processes in Tb(0.27-0.30)Dy(0.73-0.70)
 Fe(1.9-2.0)", J. Appl. Phys. 81 (1997) 2321, and "An incremental theory of magneto-elastic
 hysteresis in pseudo-cubic ferro-magnetostrictive alloys", J. Magn. Magn. Mater. 263 (2003) 208;
-with the closed form of P. G. Evans and M. J. Dapino, "Efficient magnetic hysteresis model for field
-and stress application in magnetostrictive Galfenol", J. Appl. Phys. 107 (2010) 063906, which S.
-Chakrabarti and M. J. Dapino, "Fully coupled discrete energy-averaged model for Terfenol-D", J.
-Appl. Phys. 111 (2012) 054505, took to this alloy.
+with local minima in closed form after P. G. Evans and M. J. Dapino, "Efficient magnetic hysteresis
+model for field and stress application in magnetostrictive Galfenol", J. Appl. Phys. 107 (2010)
+063906, which S. Chakrabarti and M. J. Dapino, "Fully coupled discrete energy-averaged model for
+Terfenol-D", J. Appl. Phys. 111 (2012) 054505, took to this alloy.
 
 The rods are single crystals along u = [112]; moments lie near the eight <111> directions c. Around
 each the energy
@@ -14,10 +14,10 @@ each the energy
     G = K/2 |m - c|^2 - mu_0 M_s H m.u - sigma S(m),
     S(m) = 3/2 lambda_100 (sum u_i^2 m_i^2 - 1/3) + 3 lambda_111 sum_(i<j) u_i u_j m_i m_j
 
-is least, to first order in m - c, at an m that is linear in the field and is then made a unit
-vector. Volume fractions tend to Boltzmann's, and pinning lets a part follow only as the field
-travels, not while it would move them back (the remedy of Jiles, Thoelke and Devine, IEEE Trans.
-Magn. 28 (1992) 27):
+is least where, to first order in fields and stresses beside K, and in high fields again, m points
+along K c + mu_0 M_s H u + sigma dS/dm(c). Volume fractions tend to Boltzmann's, and pinning lets a
+part follow only as the field travels, not while it would move them back (the remedy of Jiles,
+Thoelke and Devine, IEEE Trans. Magn. 28 (1992) 27):
 
     f_an = exp(-G / Omega) / sum exp(-G / Omega)
     df_irr = mu_0 M_s |dH| (f_an - f_irr) / k_p,  f = c f_an + (1 - c) f_irr
@@ -81,10 +81,10 @@ class DomainsParameters(RodParameters):
     anisotropy_j_per_m3: float = 80e3
     strain_100: float = 90e-6
     strain_111: float = 1640e-6
-    stress_pa: float = -20e6
-    spread_j_per_m3: float = 12e3
-    pinning_j_per_m3: float = 8e3
-    reversibility: float = 0.2
+    stress_pa: float = -22e6
+    spread_j_per_m3: float = 16e3
+    pinning_j_per_m3: float = 11e3
+    reversibility: float = 0.1
     resistivity_ohm_m: float = 0.6e-6
 
     def rods(self, coil: Coil) -> Rods:
@@ -111,23 +111,20 @@ class DomainsParameters(RodParameters):
         return form
 
     def table(self) -> F64:
-        """Return float64[9, 6], what each orientation's m is at a field, before it is a unit.
+        """Return float64[11, 6], what each orientation's m is at a field, before it is a unit.
 
-        Rows: size of the kind; m.m as a polynomial in the field, from its constant; m.u as one; m.Q
-        m as one.
+        Rows: size of the kind; then polynomials in the field, from their constants: m.m, m.u, m.Q
+        m, m.c.
         """
         axis = np.array(AXIS) / np.linalg.norm(AXIS)
         form = self.strain_form()
         zeeman = VACUUM_PERMEABILITY * self.saturation_a_per_m * axis
-        inverse = np.linalg.inv(self.anisotropy_j_per_m3 * np.eye(3) - 2.0 * self.stress_pa * form)
         columns = []
         for size, direction in zip(KIND_SIZES, ORIENTATIONS, strict=True):
             easy = np.array(direction) / math.sqrt(3.0)
-            # Lagrange's factor keeps m on the plane that touches the sphere at c.
-            along = inverse @ easy / (easy @ inverse @ easy)
-            constant, slope = self.anisotropy_j_per_m3 * (inverse @ easy), inverse @ zeeman
-            constant += (1.0 - easy @ constant) * along
-            slope -= (easy @ slope) * along
+            torque = 2.0 * self.stress_pa * (form @ easy)
+            constant = easy + torque / self.anisotropy_j_per_m3
+            slope = zeeman / self.anisotropy_j_per_m3
             columns.append(
                 [
                     size,
@@ -139,6 +136,8 @@ class DomainsParameters(RodParameters):
                     constant @ form @ constant,
                     2.0 * constant @ form @ slope,
                     slope @ form @ slope,
+                    constant @ easy,
+                    slope @ easy,
                 ]
             )
         return np.ascontiguousarray(np.array(columns).T)
@@ -150,7 +149,7 @@ def equilibrium(field: float, table: F64, energies: Energies, work: F64) -> None
 
     Args:
         field: Field in the rods.
-        table: float64[9, n], see ``DomainsParameters.table``.
+        table: float64[11, n], see ``DomainsParameters.table``.
         energies: K, mu_0 M_s, sigma, Omega, k_p, c.
         work: float64[8, n], rows 0 to 5 filled: f_an (of one of the kind), m.u, m.Q m, and what
             they grow by with the field.
@@ -170,8 +169,13 @@ def equilibrium(field: float, table: F64, energies: Energies, work: F64) -> None
         along *= shrink
         form *= inverse
         form_slope = (table[7, i] + 2.0 * field * table[8, i] - form * growth) * inverse
-        energy = stiffness * (1.0 - shrink) - zeeman * field * along - stress * form
-        slope = -stiffness * shrinks - zeeman * (along + field * along_slope) - stress * form_slope
+        near = table[9, i] + field * table[10, i]
+        near_slope = table[10, i] * shrink + near * shrinks
+        near *= shrink
+        energy = -stiffness * near - zeeman * field * along - stress * form
+        slope = (
+            -stiffness * near_slope - zeeman * (along + field * along_slope) - stress * form_slope
+        )
         part = math.exp(-energy / spread)
         total += table[0, i] * part
         mean += table[0, i] * part * slope
