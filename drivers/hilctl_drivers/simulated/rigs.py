@@ -14,6 +14,7 @@ from hilctl_drivers.simulated.device import (
 )
 from hilctl_drivers.simulated.diffusion import DiffusionParameters
 from hilctl_drivers.simulated.domains import DomainsParameters
+from hilctl_drivers.simulated.extras import Creep, SecondMode, Thermal, VoltageLimit
 from hilctl_drivers.simulated.jiles_atherton import JilesAthertonParameters
 from hilctl_drivers.simulated.piezo import PiezoActuator, PiezoParameters
 from hilctl_drivers.simulated.pinned_cells import PinnedCellsParameters
@@ -89,6 +90,16 @@ class TerfenolOptions(SimulatedOptions):
         default=Variation(), description="factors on the rated actuator, for tests of robustness"
     )
     drift: Drift | None = Field(default=None, description="slow growth of the displacement")
+    creep: Creep | None = Field(default=None, description="creep of the displacement")
+    thermal: Thermal | None = Field(
+        default=None, description="growth of the displacement with the rods' temperature"
+    )
+    second_mode: SecondMode | None = Field(
+        default=None, description="a mode of the structure beside the first"
+    )
+    amplifier: VoltageLimit | None = Field(
+        default=None, description="limit of the amplifier's voltage"
+    )
 
     @model_validator(mode="after")
     def _room(self) -> Self:
@@ -108,7 +119,14 @@ class TerfenolOptions(SimulatedOptions):
 
     def parameters(self) -> TerfenolParameters:
         """Return the actuator that the options describe."""
-        parameters = self.vary.of(TerfenolParameters(rods=PHYSICS[self.physics]()))
+        rated = TerfenolParameters(
+            rods=PHYSICS[self.physics](),
+            creep=self.creep,
+            thermal=self.thermal,
+            second_mode=self.second_mode,
+            amplifier=self.amplifier,
+        )
+        parameters = self.vary.of(rated)
         if not self.noise:
             parameters = replace(parameters, sensor_noise_um=0.0)
         if not self.magnet:

@@ -13,10 +13,11 @@ import numpy as np
 from scipy.linalg import expm
 
 from hilctl.base.arrays import F64
+from hilctl_drivers.simulated.extras import Creep, SecondMode, Thermal, VoltageLimit
 from hilctl_drivers.simulated.pinned_cells import PinnedCellsParameters
 from hilctl_drivers.simulated.plant import CHUNK, Plant
 from hilctl_drivers.simulated.rods import Coil, RodParameters
-from hilctl_drivers.simulated.terfenol_kernel import amplify, respond
+from hilctl_drivers.simulated.terfenol_kernel import Amplification, amplify, creep, respond, warm
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +35,6 @@ class TerfenolParameters:
         coil_factor_per_m: Field of one ampere, k_o in H = k_o I + H_PM.
         magnet_field_a_per_m: Field of the permanent magnets, H_PM; 0 where there are none: the
             displacement is then even in the current.
-        rods: Physics of the rods.
         stiffness_n_per_m: Stiffness of the rods.
         damping_ratio: Damping of the structure, measured without a load and kept with any: the
             guides of a load add friction of their own.
@@ -45,6 +45,11 @@ class TerfenolParameters:
         drift_um: Displacement that slow growth of the rods comes to, beside all the rest.
         drift_s: Time constant of that growth.
         step_max_s: Longest internal time step.
+        rods: Physics of the rods.
+        creep: Creep of the rods.
+        thermal: Growth with their temperature.
+        second_mode: A mode of the structure beside the first.
+        amplifier: Limit of the amplifier's voltage.
     """
 
     dac_range_a: float = 10.0
@@ -62,26 +67,67 @@ class TerfenolParameters:
     drift_s: float = 1.0
     step_max_s: float = 10e-6
     rods: RodParameters = field(default_factory=PinnedCellsParameters)
+    creep: Creep | None = None
+    thermal: Thermal | None = None
+    second_mode: SecondMode | None = None
+    amplifier: VoltageLimit | None = None
 
 
 def _motion(parameters: TerfenolParameters, load_kg: float, step_s: float) -> F64:
-    """Return float64[3, 5], the exact step of structure and sensor for ``_move``.
+    """Return float64[m - 2, m], the exact step of structure and sensor for ``respond``.
 
-    The velocity is kept in um per radian of the natural frequency, so that the matrix is well
+    Velocities are kept in um per radian of their natural frequency, so that the matrix is well
     scaled.
     """
     omega = math.sqrt(parameters.stiffness_n_per_m / (parameters.moving_mass_kg + load_kg))
-    damping = 2.0 * parameters.damping_ratio
+    modes = [(omega, parameters.damping_ratio, 1.0)]
+    second = parameters.second_mode
+    if second is not None:
+        modes[0] = (omega, parameters.damping_ratio, 1.0 - second.share)
+        modes.append((2.0 * math.pi * second.frequency_hz, second.damping_ratio, second.share))
     sensor = 2.0 * math.pi * parameters.sensor_bandwidth_hz
-    # States: position, velocity, sensor output, free displacement, its change over the step.
-    rates = np.zeros((5, 5))
-    rates[0, 1] = omega
-    rates[1, :4] = (-omega, -damping * omega, 0.0, omega)
-    rates[2, :3] = (sensor, 0.0, -sensor)
-    rates[3, 4] = 1.0 / step_s
-    motion: F64 = np.ascontiguousarray(expm(rates * step_s)[:3])
-    motion[:, 3] -= motion[:, 4]
+    # States: position and velocity of each mode, sensor output, free displacement, its change over
+    # the step.
+    size = 2 * len(modes) + 3
+    rates = np.zeros((size, size))
+    for k, (natural, damping_ratio, share) in enumerate(modes):
+        rates[2 * k, 2 * k + 1] = natural
+        rates[2 * k + 1, 2 * k : 2 * k + 2] = -natural, -2.0 * damping_ratio * natural
+        rates[2 * k + 1, -2] = natural * share
+        rates[-3, 2 * k] = sensor
+    rates[-3, -3] = -sensor
+    rates[-2, -1] = 1.0 / step_s
+    motion: F64 = np.ascontiguousarray(expm(rates * step_s)[:-2])
+    motion[:, -2] -= motion[:, -1]
     return motion
+
+
+def _amplifier(parameters: TerfenolParameters, step_s: float) -> Amplification:
+    """Return the constants of ``amplify``."""
+    bandwidth = 2.0 * math.pi * parameters.amplifier_bandwidth_hz
+    decay_half, decay, most = 0.0, 0.0, math.inf
+    limit = parameters.amplifier
+    if limit is not None:
+        rate = limit.resistance_ohm / limit.inductance_h
+        decay_half, decay = math.exp(-0.5 * rate * step_s), math.exp(-rate * step_s)
+        most = limit.voltage_max_v / limit.resistance_ohm
+    return (
+        math.exp(-0.5 * bandwidth * step_s),
+        math.exp(-bandwidth * step_s),
+        decay_half,
+        decay,
+        most,
+        parameters.dac_range_a / parameters.dac_codes,
+    )
+
+
+def _creep(option: Creep | None, step_s: float) -> F64:
+    """Return float64[3, m], the elements of ``creep``."""
+    if option is None:
+        return np.zeros((3, 0))
+    times = np.array(option.time_constants_s)
+    shares = np.full(times.size, option.share / times.size)
+    return np.stack([shares, -np.expm1(-step_s / times), np.zeros(times.size)])
 
 
 class TerfenolActuator(Plant):
@@ -111,12 +157,7 @@ class TerfenolActuator(Plant):
         # The margin keeps rounding from adding a step where the period is a multiple of it.
         self._substeps = math.ceil(1.0 / (sample_rate_hz * parameters.step_max_s) - 1e-9)
         step_s = 1.0 / (sample_rate_hz * self._substeps)
-        bandwidth = 2.0 * math.pi * parameters.amplifier_bandwidth_hz
-        self._amplifier = (
-            math.exp(-0.5 * bandwidth * step_s),
-            math.exp(-bandwidth * step_s),
-            parameters.dac_range_a / parameters.dac_codes,
-        )
+        self._amplifier = _amplifier(parameters, step_s)
         bias = parameters.magnet_field_a_per_m + parameters.coil_factor_per_m * bias_a
         self._rods = parameters.rods.rods(Coil(parameters.coil_factor_per_m, bias, step_s))
         self._sensor = (
@@ -125,6 +166,18 @@ class TerfenolActuator(Plant):
         )
         self._drift = (parameters.drift_um, 1.0 / (parameters.drift_s * sample_rate_hz))
         self._samples = 0
+        self._creep = _creep(parameters.creep, step_s)
+        self._warmth = np.zeros(1)
+        self._thermal: tuple[float, float, float, float, float] | None = None
+        thermal = parameters.thermal
+        if thermal is not None:
+            self._thermal = (
+                thermal.rise_k_per_a2,
+                -math.expm1(-step_s / thermal.tau_s),
+                thermal.growth_um_per_k,
+                thermal.ambient_k,
+                bias_a,
+            )
         self._motion = _motion(parameters, load_kg, step_s)
         self._mechanics = np.zeros(self._motion.shape[1])
         self._current = np.zeros(1)
@@ -137,6 +190,8 @@ class TerfenolActuator(Plant):
     def _rest(self) -> None:
         self._current[:] = 0.0
         self._mechanics[:] = 0.0
+        self._creep[2] = 0.0
+        self._warmth[:] = 0.0
         self._rest_um = self._rods.rest()
         self._samples = 0
 
@@ -160,6 +215,10 @@ class TerfenolActuator(Plant):
         halves, free = self._halves[: 2 * steps + 1], self._free[:steps]
         amplify(command, measured, halves, self._current, self._amplifier, self._substeps)
         self._rods.follow(halves, free)
+        if self._creep.size:
+            creep(free, self._creep, self._rest_um)
+        if self._thermal is not None:  # the sensor takes no notice of it
+            warm(halves, noise_um, self._warmth, self._thermal, self._substeps)
         respond(
             free,
             noise_um,

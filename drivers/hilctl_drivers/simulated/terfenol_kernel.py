@@ -1,22 +1,44 @@
-"""Compiled steps of the simulated actuator around its rods: amplifier, structure, sensor.
+"""Compiled steps of the simulated actuator around its rods, from amplifier to sensor.
 
 numba's on-disk cache does not notice a callee that changed in another file: all that a kernel calls
 stands in its own. Displacements are in um.
 """
+
+from typing import TypeAlias
 
 import numpy as np
 
 from hilctl.base.arrays import F64
 from hilctl.kernels.jit import kernel
 
+Amplification: TypeAlias = tuple[float, float, float, float, float, float]
 
-@kernel("void(float64[::1], float64[::1], float64[::1], float64[::1], UniTuple(float64, 3), int64)")
+
+@kernel("float64(float64, float64, float64, UniTuple(float64, 2))")
+def _toward(start: float, target: float, left: float, limit: tuple[float, float]) -> float:
+    """Return the current after some time: to the target by first order, as far as voltage goes.
+
+    Args:
+        start: Current in A before.
+        target: Current in A that is wanted.
+        left: What is then left of the error, had the amplifier all voltages.
+        limit: What is then left of a current that nothing drives, and the current in A that the
+            largest voltage holds, infinite where there is no limit.
+    """
+    decay, most = limit
+    free = target + left * (start - target)
+    driven = decay * start
+    push = (1.0 - decay) * most
+    return max(driven - push, min(driven + push, free))
+
+
+@kernel("void(float64[::1], float64[::1], float64[::1], float64[::1], UniTuple(float64, 6), int64)")
 def amplify(
     command: F64,
     current_a: F64,
     halves_a: F64,
     state: F64,
-    amplifier: tuple[float, float, float],
+    amplifier: Amplification,
     substeps: int,
 ) -> None:
     """Put out commands and let the current follow.
@@ -27,11 +49,12 @@ def amplify(
         halves_a: float64[2 n substeps + 1], filled with the current at the start, then at the
             middle and the end of each step.
         state: float64[1], current in A; updated.
-        amplifier: What is left of the current's error after half a step and after a step, one DAC
+        amplifier: What is left after half a step and after a step of the current's error, then of a
+            current that nothing drives; the current in A that the largest voltage holds; one DAC
             code in A.
         substeps: Steps in a sample period.
     """
-    left_half, left, dac_code = amplifier
+    left_half, left, decay_half, decay, most, dac_code = amplifier
     current = state[0]
     halves_a[0] = current
     k = 0
@@ -40,11 +63,56 @@ def amplify(
         target = np.rint(command[j] / dac_code) * dac_code
         for _ in range(substeps):
             start = current
-            halves_a[k + 1] = target + left_half * (start - target)
-            current = target + left * (start - target)
+            halves_a[k + 1] = _toward(start, target, left_half, (decay_half, most))
+            current = _toward(start, target, left, (decay, most))
             halves_a[k + 2] = current
             k += 2
     state[0] = current
+
+
+@kernel("void(float64[::1], float64[:, ::1], float64)")
+def creep(free_um: F64, elements: F64, rest_um: float) -> None:
+    """Add what creeps to the free displacement.
+
+    Args:
+        free_um: float64[n], at the end of each step; changed.
+        elements: float64[3, m]: share, what is reached in a step, and displacement that each
+            element stands at, from rest; the last is updated.
+        rest_um: Free displacement at rest.
+    """
+    for k in range(free_um.size):
+        moved = free_um[k] - rest_um
+        for i in range(elements.shape[1]):
+            elements[2, i] += elements[1, i] * (moved - elements[2, i])
+            free_um[k] += elements[0, i] * elements[2, i]
+
+
+@kernel("void(float64[::1], float64[::1], float64[::1], UniTuple(float64, 5), int64)")
+def warm(
+    halves_a: F64,
+    growth_um: F64,
+    state: F64,
+    thermal: tuple[float, float, float, float, float],
+    substeps: int,
+) -> None:
+    """Add what the rods have grown by at the instant of each sample, and warm them.
+
+    Args:
+        halves_a: float64[2 n substeps + 1], see ``amplify``.
+        growth_um: float64[n], added to.
+        state: float64[1], rise in K by the coil; updated.
+        thermal: Steady rise in K/A^2, what of it is reached in a step, growth in um/K, temperature
+            of the room in K, bias in A.
+        substeps: Steps in a sample period.
+    """
+    rise, reached, growth, room, bias = thermal
+    warmth = state[0]
+    for j in range(growth_um.size):
+        growth_um[j] += growth * (room + warmth)
+        for k in range(j * substeps, (j + 1) * substeps):
+            current = halves_a[2 * k + 1] + bias
+            warmth += reached * (rise * current * current - warmth)
+    state[0] = warmth
 
 
 @kernel(
