@@ -176,18 +176,21 @@ def equilibrium(field: float, table: F64, energies: Energies, work: F64) -> None
         slope = (
             -stiffness * near_slope - zeeman * (along + field * along_slope) - stress * form_slope
         )
-        part = math.exp(-energy / spread)
-        total += table[0, i] * part
-        mean += table[0, i] * part * slope
-        work[0, i] = part
+        work[0, i] = energy
         work[1, i] = along
         work[2, i] = form
         work[3, i] = slope
         work[4, i] = along_slope
         work[5, i] = form_slope
-    mean /= total
+    # A loop of its own: the compiler takes four orientations at once in the others.
     for i in range(table.shape[1]):
-        work[0, i] /= total
+        work[0, i] = math.exp(-work[0, i] / spread)
+        total += table[0, i] * work[0, i]
+        mean += table[0, i] * work[0, i] * work[3, i]
+    mean /= total
+    share = 1.0 / total
+    for i in range(table.shape[1]):
+        work[0, i] *= share
         work[3, i] = work[0, i] * (mean - work[3, i]) / spread
 
 

@@ -113,6 +113,18 @@ def test_cells_hold_until_the_field_is_beyond_their_pinning() -> None:
     assert pinned.tolist() == [[5600.0, 6600.0], [5000.0, 5600.0]]
 
 
+@pytest.mark.parametrize(("frequency_hz", "closes"), [(2.0, True), (250.0, False)])
+def test_minor_loops_close_only_where_the_field_has_time(frequency_hz: float, closes: bool) -> None:
+    """Friction remembers where a slow field turned; a fast one is elsewhere in each shell."""
+    n = round(1.0 / (frequency_hz * STEP_S))
+    up = np.linspace(0.0, 10e3, 2 * n + 1)
+    dip = 10e3 - 4e3 * (1.0 - np.cos(np.pi * np.arange(1, 2 * n + 1) / n))
+    _, magnetised = shells(RATED, np.concatenate([up, dip]), 44.1e3)
+    mean = magnetised @ RATED.areas()
+    gap = abs(mean[-1] - mean[n - 1]) / np.ptp(mean[n - 1 :])
+    assert bool(gap < 0.003) == closes
+
+
 @pytest.mark.parametrize("frequency_hz", [20.0, 250.0])
 @pytest.mark.parametrize("amplitude", [2e3, 30e3])
 def test_loops_take_energy(frequency_hz: float, amplitude: float) -> None:
