@@ -33,6 +33,8 @@ ELSEWHERE = {
 }
 """Devices that meet this contract, or the part of it that streams have, in a file of their own."""
 SIMULATED = sorted(set(BUILTIN) - {"modbus_dac", *ELSEWHERE})
+PHYSICS = ("domains", "diffusion", "jiles_atherton")
+"""What simulated_terfenol is tried with beside its default."""
 MODBUS = (
     "adam_6024", "beckhoff_bk9000", "generic_float32", "icp_et7000", "labjack_t4", "labjack_t7",
     "labjack_t8", "wago_750", "rtu",
@@ -92,9 +94,9 @@ class DrivenDevice:
         return 0.5 * (info.command_max + max(0.0, info.command_min))
 
 
-def simulated(kind: str) -> DrivenDevice:
+def simulated(kind: str, words: list[str]) -> DrivenDevice:
     chosen = device_class(kind)
-    device = chosen(chosen.Options())
+    device = chosen(chosen.Options(physics=words[0]) if words else chosen.Options())
     return DrivenDevice(device, SAMPLES, RATE_HZ, lambda: device._last_command)
 
 
@@ -150,7 +152,11 @@ def _fast(section: dict) -> dict:
     return {**section, "baud": 115200} if "serial_port" in section else section
 
 
-CASES = [*SIMULATED, *(f"modbus_dac {words}" for words in MODBUS)]
+CASES = [
+    *SIMULATED,
+    *(f"simulated_terfenol {words}" for words in PHYSICS),
+    *(f"modbus_dac {words}" for words in MODBUS),
+]
 
 
 @pytest.fixture
@@ -165,7 +171,8 @@ def make(tmp_path) -> Iterator[Callable[[str], DrivenDevice]]:
             path = tmp_path / "rtu.yaml"
             path.write_text(RTU_PROFILE, encoding="utf-8")
             words = [str(path)]
-        benches.append(modbus(words, stack) if words else simulated(kind))
+        wired = kind == "modbus_dac"
+        benches.append(modbus(words, stack) if wired else simulated(kind, words))
         return benches[-1]
 
     yield of
