@@ -85,6 +85,11 @@ def judge(model: HysteresisModel, data: Records | FitData, *, creep: bool = Fals
     if creep:
         own = np.linalg.lstsq(data.creep, data.target_um - responses_um, rcond=None)[0]
         responses_um = responses_um + data.creep @ own
+    return judgement_of(data, responses_um)
+
+
+def judgement_of(data: FitData, responses_um: F64) -> Judgement:
+    """Return how far responses, float64[N], are from the records' judged samples."""
     errors_um = responses_um - data.target_um
     errors = tuple(
         _loop_error(record, responses_um[place], data.target_um[place])

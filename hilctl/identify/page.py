@@ -38,14 +38,13 @@ def identification_page(found: Identification) -> str:
         f"<h1>{html.escape(title)}</h1>",
         f"<p>{html.escape(fit.model.provenance.method)}</p>",
         *(f"<p>{html.escape(line)}</p>" for line in summary(found)),
-        "<h2>Errors</h2>",
-        grid(HEADINGS, error_rows(fit.errors), "numbers"),
-        *_drawn("Model and data", fit, found.data, unit),
     ]
-    if found.held_out is not None:
+    if (held_out := found.held_out) is not None:
         body += ["<h2>Errors on data not fitted</h2>"]
-        body += [grid(HEADINGS, error_rows(found.held_out.errors), "numbers")]
-        body += _drawn("Model and data not fitted", found.held_out, found.held_out_data, unit)
+        body += [grid(HEADINGS, error_rows(held_out.judgement.errors), "numbers")]
+        body += _drawn("Model and data not fitted", held_out.judgement, held_out.records, unit)
+    body += ["<h2>Errors on data fitted</h2>", grid(HEADINGS, error_rows(fit.errors), "numbers")]
+    body += _drawn("Model and data", fit, found.data, unit)
     body += ["<h2>Parameters</h2>", grid(("name", "value"), parameter_texts(fit), "numbers")]
     body += [f"<details><summary>Model</summary><pre>{html.escape(dump_model(fit.model))}</pre>"]
     return document(html.escape(title), [*body, "</details>"])

@@ -2,7 +2,7 @@
 
 from hilctl.identify.geometry import weight_roots
 from hilctl.identify.job import FitJob, FoundModel
-from hilctl.identify.staged.confidence import standard_errors
+from hilctl.identify.staged.confidence import at_bound, standard_errors
 from hilctl.identify.staged.fit_data import StagedFitData
 from hilctl.identify.staged.layered import Layers
 from hilctl.identify.staged.model import (
@@ -36,7 +36,8 @@ def fit_free(job: FitJob) -> FoundModel:
     known = parameters(layers, found.point, staged=False)
     errors = standard_errors(found, layers, data.places, staged=False)
     model = integrated_model(data, layers, found.point, job.data.unit)
-    return FoundModel(model, len(known) - 1, known, found.starts, errors)
+    held = at_bound(found, layers, staged=False)
+    return FoundModel(model, len(known) - 1, known, found.starts, errors, held)
 
 
 def fit_staged(job: FitJob) -> FoundModel:
@@ -61,8 +62,9 @@ def fit_staged(job: FitJob) -> FoundModel:
     known = parameters(layers, found.point, staged=True)
     errors = standard_errors(found, layers, data.places, staged=True)
     model = staged_model(data, layers, found.point, job.data.unit)
+    held = at_bound(found, layers, staged=True)
     if settings.hysteresis == "integrated":
-        return FoundModel(model, len(known) - 1, known, found.starts, errors)
+        return FoundModel(model, len(known) - 1, known, found.starts, errors, held)
     job.progress(0.9, "densities of the Preisach triangle")
     scale = weight_roots(job.data.records, settings.weight_by)
     model = with_triangle(data, model, settings.lines, scale, settings.least_slope)
@@ -70,7 +72,8 @@ def fit_staged(job: FitJob) -> FoundModel:
     errors = {name: errors[name] for name in STAGE_PARAMETERS if name in errors}
     known["output_offset_um"] = model.hysteresis.output_offset_um
     numbers = len(known) + settings.lines**2
-    return FoundModel(model, numbers, known, found.starts, errors)
+    held = tuple(name for name in held if name in known)
+    return FoundModel(model, numbers, known, found.starts, errors, held)
 
 
 def _found(job: FitJob, data: StagedFitData, layers: Layers) -> StagedEnd:

@@ -37,6 +37,7 @@ class StagedEnd:
         errors_um: float64[N], modelled less measured displacement.
         slopes: float64[N, p], their derivatives by ``point.pack()``.
         free: bool[p], parameters that are neither fixed nor held by a bound.
+        held: bool[p], parameters that a bound holds.
         scale: float64[N], square root of the weights at the end.
         starts: All starts.
     """
@@ -45,6 +46,7 @@ class StagedEnd:
     errors_um: F64
     slopes: F64
     free: np.ndarray[tuple[int], np.dtype[np.bool_]]
+    held: np.ndarray[tuple[int], np.dtype[np.bool_]]
     scale: F64
     starts: tuple[StartOutcome, ...]
 
@@ -129,7 +131,8 @@ def find_staged(
     margin = 1e-6 * (high - low)
     errors, slopes = error_and_slopes(data, layers, point)
     free = np.asarray((high > low) & (x > low + margin) & (x < high - margin))
-    return StagedEnd(point, errors, slopes, free, scale, tuple(outcomes))
+    held = np.asarray((high > low) & ~free)
+    return StagedEnd(point, errors, slopes, free, held, scale, tuple(outcomes))
 
 
 def _check(data: StagedFitData, layers: Layers) -> None:
