@@ -8,7 +8,6 @@ from hilctl.identify.staged.layered import Layers
 from hilctl.identify.staged.model import (
     STAGE_PARAMETERS,
     integrated_model,
-    loop_delay_s,
     parameters,
     staged_model,
 )
@@ -53,7 +52,7 @@ def fit_staged(job: FitJob) -> FoundModel:
         gamma=not lag,
         structure=settings.structure,
         delay=settings.delay,
-        least_delay_s=loop_delay_s(data.half_period_s, lag=lag),
+        half_period_s=data.half_period_s,
         offset=settings.offset,
         midpoint=settings.layout == "midpoint",
         least_slope=settings.least_slope,

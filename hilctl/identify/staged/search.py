@@ -13,7 +13,14 @@ from hilctl.identify.searched.search import first_least
 from hilctl.identify.staged.convex import WeightedStart, convex_start
 from hilctl.identify.staged.descend import ErrorAndSlopes, descend
 from hilctl.identify.staged.fit_data import StagedFitData
-from hilctl.identify.staged.layered import RADIAN, Layers, Point, bounds, error_and_slopes
+from hilctl.identify.staged.layered import (
+    RADIAN,
+    Layers,
+    Point,
+    bounds,
+    error_and_slopes,
+    loop_delay_s,
+)
 from hilctl.identify.workers import Map
 
 ROUNDS = 10  # steps from every start
@@ -155,11 +162,12 @@ def _grid(data: StagedFitData, layers: Layers, scale: F64) -> list[WeightedStart
     fastest = data.reach / data.top_speed
     gammas = [part * fastest for part in GAMMAS] if layers.gamma else [0.0]
     late = layers.delay or layers.structure
-    delays = [layers.least_delay_s + part * radian_s for part in (DELAYS if late else (0.0,))]
+    delays = [part * radian_s for part in (DELAYS if late else (0.0,))]
     found = []
     for spacing, lag_s, gamma_s, delay_s in product(SPACINGS, lags, gammas, delays):
         before = np.array([lag_s, 0.0, spacing * limit, gamma_s])
-        found.append(convex_start(data, layers, before, delay_s, scale))
+        late_s = delay_s + loop_delay_s(layers.half_period_s, lag_s)
+        found.append(convex_start(data, layers, before, late_s, scale))
     return found
 
 
