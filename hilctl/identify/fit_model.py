@@ -11,7 +11,7 @@ import hilctl
 from hilctl.base.device import CommandUnit
 from hilctl.identify.catalogue import CATALOGUE
 from hilctl.identify.data.records import Record, Records, SteadyLoop
-from hilctl.identify.fit_data import FitData
+from hilctl.identify.fit_data import FitData, search_data
 from hilctl.identify.found_range import identified_range
 from hilctl.identify.job import FitJob, OnProgress, StartOutcome, ignore_progress
 from hilctl.identify.judge import Judgement, judge
@@ -91,8 +91,8 @@ def fit_model(
         DataError: The data can't be used as asked, or there are none.
     """
     begin = clock()
-    data = FitData(records, unit)
-    found = CATALOGUE[settings.kind].fit(FitJob(data, settings, run, progress))
+    data, few = FitData(records, unit), search_data(records, settings.kind, unit)
+    found = CATALOGUE[settings.kind].fit(FitJob(few, settings, run, progress))
     judged = judge(found.model, data, creep=settings.creep)
     provenance = Provenance(
         source=tuple(source),

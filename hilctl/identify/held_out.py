@@ -11,7 +11,7 @@ from hilctl.base.device import CommandUnit
 from hilctl.base.errors import DataError
 from hilctl.identify.catalogue import CATALOGUE
 from hilctl.identify.data.records import History, Record, SteadyLoop
-from hilctl.identify.fit_data import FitData
+from hilctl.identify.fit_data import FitData, search_data
 from hilctl.identify.job import FitJob, OnProgress
 from hilctl.identify.judge import Judgement, judge, judgement_of
 from hilctl.identify.settings import FitSettings
@@ -122,7 +122,7 @@ def held_out_error(
 
 
 def _modelled_um(trial: _Trial) -> F64 | None:
-    data = FitData(trial.fold.fitted, trial.unit)
+    data = search_data(trial.fold.fitted, trial.settings.kind, trial.unit)
     try:
         found = CATALOGUE[trial.settings.kind].fit(FitJob(data, trial.settings))
     except DataError:  # what is left is too little for this kind of fit; all of it need not be

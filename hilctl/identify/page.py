@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import matplotlib as mpl
+import numpy as np
 from matplotlib.figure import Figure
 
 from hilctl.analysis.canvas import DISPLACEMENT, ERROR, REFERENCE, STYLE
@@ -18,6 +19,7 @@ from hilctl.models.files import dump_model
 
 COLUMNS = 3
 MOST_RECORDS = 36
+MOST_DRAWN = 20_000  # samples of a history: more have no place on a page
 
 
 def write_identification(found: Identification, path: Path) -> None:
@@ -79,10 +81,11 @@ def loops_figure(modelled_um: Sequence[F64], data: Sequence[Record], unit: str) 
             signal[-modelled.size :] for signal in (record.command, record.displacement_um)
         )
         steady = isinstance(record, SteadyLoop)
-        x = command if steady else range(command.size)
-        upper.plot(x, measured, color=REFERENCE, label="measured", linewidth=1.6)
-        upper.plot(x, modelled, color=DISPLACEMENT, label="model", linewidth=0.9)
-        lower.plot(x, modelled - measured, color=ERROR)
+        step = 1 + command.size // MOST_DRAWN
+        x = (command if steady else np.arange(command.size))[::step]
+        upper.plot(x, measured[::step], color=REFERENCE, label="measured", linewidth=1.6)
+        upper.plot(x, modelled[::step], color=DISPLACEMENT, label="model", linewidth=0.9)
+        lower.plot(x, (modelled - measured)[::step], color=ERROR)
         upper.set(title=record.label, ylabel="um")
         lower.set(xlabel=f"command, {unit}" if steady else "sample", ylabel="error, um")
         upper.set_visible(True)
