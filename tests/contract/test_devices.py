@@ -8,6 +8,7 @@ time passes by one sample an exchange, so that nothing depends on how fast this 
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import ClassVar
 
@@ -16,7 +17,7 @@ import pytest
 
 from hilctl.base.device import Device
 from hilctl.base.errors import DeviceError
-from hilctl.experiment.registry import BUILTIN, device_class
+from hilctl.experiment.registry import BUILTIN, device_class, known_devices
 from hilctl_drivers.emulator.options import EmulatorOptions
 from hilctl_drivers.emulator.setup import build
 from hilctl_drivers.modbus.profile import ModbusProfile
@@ -100,6 +101,37 @@ def simulated(kind: str, words: list[str]) -> DrivenDevice:
     return DrivenDevice(device, SAMPLES, RATE_HZ, lambda: device._last_command)
 
 
+def of_another_package(kind: str) -> DrivenDevice:
+    """Return a simulated device that is installed beside hilctl, or the example of one."""
+    chosen = EXAMPLES[kind]() if kind in EXAMPLES else device_class(kind)
+    device = chosen(chosen.Options())
+    if not device.info.simulated:
+        pytest.skip(f"{kind} drives hardware: pytest --device EXPERIMENT tests/hardware")
+    rate_hz = min(RATE_HZ, device.info.max_rate_hz)
+
+    def stands() -> float:
+        try:
+            return device.output()
+        except DeviceError:  # it is not open, and keeps its output while it is not
+            device.open(rate_hz, SAMPLES)
+            current = device.output()
+            device.close()
+            return current
+
+    return DrivenDevice(device, SAMPLES, rate_hz, stands)
+
+
+def _spring() -> type[Device]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(Path(__file__).parents[1] / "data" / "own_device")
+        found: type[Device] = import_module("own_device.spring").Spring
+    return found
+
+
+EXAMPLES = {"spring": _spring}
+OTHERS = sorted({*EXAMPLES, *known_devices()} - set(BUILTIN))
+
+
 RTU_PROFILE = """\
 vendor: nobody
 model: an analogue module on a serial line, which no shipped profile with an input is
@@ -154,6 +186,7 @@ def _fast(section: dict) -> dict:
 
 CASES = [
     *SIMULATED,
+    *OTHERS,
     *(f"simulated_terfenol {words}" for words in PHYSICS),
     *(f"modbus_dac {words}" for words in MODBUS),
 ]
@@ -171,8 +204,12 @@ def make(tmp_path) -> Iterator[Callable[[str], DrivenDevice]]:
             path = tmp_path / "rtu.yaml"
             path.write_text(RTU_PROFILE, encoding="utf-8")
             words = [str(path)]
-        wired = kind == "modbus_dac"
-        benches.append(modbus(words, stack) if wired else simulated(kind, words))
+        if kind == "modbus_dac":
+            benches.append(modbus(words, stack))
+        elif kind in OTHERS:
+            benches.append(of_another_package(kind))
+        else:
+            benches.append(simulated(kind, words))
         return benches[-1]
 
     yield of
@@ -196,7 +233,7 @@ def driven(make, case) -> DrivenDevice:
 
 def test_no_device_is_left_out():
     """Each device of the table is tried here, or in a file that is there."""
-    assert {case.split()[0] for case in CASES} | set(ELSEWHERE) == set(BUILTIN)
+    assert {case.split()[0] for case in CASES} | set(ELSEWHERE) == {*BUILTIN, *OTHERS}
     folder = Path(__file__).parent
     assert [name for name in ELSEWHERE.values() if not (folder / name).exists()] == []
 
@@ -215,7 +252,7 @@ def test_no_modbus_profile_is_left_out():
 def test_says_what_it_is_before_it_is_opened(driven):
     """Info is complete and sensible without a connection."""
     info = driven.device.info
-    assert info.name in BUILTIN
+    assert info.name in {*BUILTIN, *OTHERS}
     assert info.description
     assert info.command_unit in {"A", "V"}
     assert info.command_min < info.command_max
