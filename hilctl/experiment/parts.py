@@ -1,7 +1,7 @@
 """Common types of the experiment file, and its parts about the machine: time, recording, CPU."""
 
 import re
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, TypeAlias
 
 from pydantic import (
     AfterValidator,
@@ -108,14 +108,11 @@ class RecordingConfig(Strict):
         return self
 
 
-class FeedbackConfig(Strict):
-    """A PI controller around the compensator, for devices that exchange sample by sample.
+class _AnyFeedback(Strict):
+    """What every feedback has.
 
     Attributes:
         limit_um: Largest correction of the compensator's input, either way.
-        bandwidth_hz: Frequency up to which the error is brought down; gives the gains.
-        kp: Proportional gain, um of correction per um of error, where there is no bandwidth.
-        ki_per_s: Integral gain, per s, where there is no bandwidth.
         sensor_delay_s: Age of a displacement when it is read, as far as the model does not know it:
             the filter of the sensor, its line.
         resonance_hz: Lowest natural frequency of the actuator with its load; the feedback must stay
@@ -124,12 +121,24 @@ class FeedbackConfig(Strict):
     """
 
     limit_um: Annotated[float, Field(gt=0.0)]
-    bandwidth_hz: Annotated[float, Field(gt=0.0)] | None = None
-    kp: Annotated[float, Field(ge=0.0)] | None = None
-    ki_per_s: Annotated[float, Field(gt=0.0)] | None = None
     sensor_delay_s: Annotated[float, Field(ge=0.0)] = 0.0
     resonance_hz: Annotated[float, Field(gt=0.0)] | None = None
     damping_ratio: Annotated[float, Field(gt=0.0, le=2.0)] | None = None
+
+
+class PiFeedbackConfig(_AnyFeedback):
+    """A PI controller around the compensator, for devices that exchange sample by sample.
+
+    Attributes:
+        bandwidth_hz: Frequency up to which the error is brought down; gives the gains.
+        kp: Proportional gain, um of correction per um of error, where there is no bandwidth.
+        ki_per_s: Integral gain, per s, where there is no bandwidth.
+    """
+
+    kind: Literal["pi"] = "pi"
+    bandwidth_hz: Annotated[float, Field(gt=0.0)] | None = None
+    kp: Annotated[float, Field(ge=0.0)] | None = None
+    ki_per_s: Annotated[float, Field(gt=0.0)] | None = None
 
     @model_validator(mode="after")
     def _one_way(self) -> Self:
@@ -137,3 +146,25 @@ class FeedbackConfig(Strict):
         if by_gains == (self.bandwidth_hz is not None) or (by_gains and self.ki_per_s is None):
             raise ValueError("must have either bandwidth_hz or ki_per_s, the latter with kp or not")
         return self
+
+
+class IntegralFeedbackConfig(_AnyFeedback):
+    """An integrator of the mean error of each block, for every device: see loop/integral.py.
+
+    Attributes:
+        bandwidth_hz: Frequency below which offset, creep and drift are taken out; a disturbance
+            that comes at once fades as e^(-2 pi bandwidth t).
+    """
+
+    kind: Literal["integral"]
+    bandwidth_hz: Annotated[float, Field(gt=0.0)]
+
+
+def _pi_where_not_said(value: Any) -> Any:
+    return {"kind": "pi", **value} if isinstance(value, dict) else value
+
+
+FeedbackConfig: TypeAlias = Annotated[
+    Annotated[PiFeedbackConfig | IntegralFeedbackConfig, Field(discriminator="kind")],
+    BeforeValidator(_pi_where_not_said),
+]

@@ -64,7 +64,6 @@ class Loop:
         self._pacer = Pacer(host.clock, period_ns, plan.late_policy, plan.late_rules)
         self._tuner = Tuner()
         self._in_flight: deque[Block] = deque()
-        self._last: Block | None = None
         self._start_ns = 0
         self._next_sample = 0
         self._ended_at = 0
@@ -289,7 +288,7 @@ class Loop:
             tune(factors, plan.reference[start:stop], reference)
             tune(factors, plan.input_um[start:stop], input_um)
         if plan.feedback is not None:
-            plan.feedback.follow(block, self._last)
+            plan.feedback.follow(block, input_um)
         self._compensator.process(input_um, wanted)
         return self._limiter.limit(wanted, command, flags)
 
@@ -310,7 +309,6 @@ class Loop:
             sent.head[_FIRST_SAMPLE], sent.command, answered.displacement_um, answered.measured
         )
         sent.head[_EXCHANGE_NS] = self._clock.now_ns() - before_ns
-        self._last = sent
         if not early:
             in_flight.popleft()
             self._take(answered)
@@ -325,6 +323,9 @@ class Loop:
             block.measured,
             block.flags,
         )
+        # Before it is recorded: from then on its slot may be another block's.
+        if self._plan.feedback is not None:
+            self._plan.feedback.take(block)
         # Recorded before the run leaves for it: the event refers to samples that are there.
         self._record(block)
         if trip is not None and block.following:

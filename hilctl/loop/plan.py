@@ -5,7 +5,7 @@ from typing import Literal, TypeAlias
 
 from hilctl.base.arrays import F64
 from hilctl.loop.compensator import Compensator
-from hilctl.loop.feedback import Feedback
+from hilctl.loop.feedback import Controller
 from hilctl.loop.interlocks import InterlockContext, InterlockSettings
 from hilctl.loop.limiter import CommandLimits
 from hilctl.loop.pacer import LatePolicy, LateRules
@@ -66,5 +66,5 @@ class Plan:
     late_policy: LatePolicy = "skip"
     ramp_policy: LatePolicy = "skip"
     late_rules: LateRules = field(default_factory=LateRules)
-    feedback: Feedback | None = None
+    feedback: Controller | None = None
     keep_all: bool = True

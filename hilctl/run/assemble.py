@@ -54,7 +54,7 @@ def assemble(
         # By time, not by ticks: a device that takes its time for each would be at it for long.
         ramp_policy=policy if not paced or info.buffered or info.latency_blocks else "skip",
         late_rules=_late_rules(config, reference.size) if paced else LateRules(),
-        feedback=make_feedback(config, compensator),
+        feedback=make_feedback(config, compensator, info.latency_blocks),
         keep_all=config.recording.on_failure == "stop",
     )
 
