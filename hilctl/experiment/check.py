@@ -5,15 +5,19 @@ by the same compensator that will run, and held against the limits.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+
+import numpy as np
 
 from hilctl.base.arrays import F64
 from hilctl.base.errors import ConfigError, DataError, InputError, ModelError, Problem
+from hilctl.experiment.condition import condition_problems, conditioning_of, measures_offset
 from hilctl.experiment.feedback import feedback_problems
 from hilctl.experiment.forecast import Forecast, forecast_of
 from hilctl.experiment.initial_state import Begun, InitialState, begin, initial_state_of
 from hilctl.experiment.interlocks import interlock_problems
 from hilctl.experiment.load import LoadedExperiment
+from hilctl.loop.conditioning import Conditioning
 from hilctl.waveforms.build import Reference, build
 
 
@@ -42,7 +46,12 @@ class Checked:
     def records_input(self) -> bool:
         """Whether the compensator's input is recorded: not where it is the reference itself."""
         own = self.begun.input_um is not self.reference.values
-        return own or self.loaded.config.feedback is not None
+        config = self.loaded.config
+        return own or config.feedback is not None or measures_offset(config)
+
+    def conditioning(self) -> Conditioning | None:
+        """Return what comes before the waveform; None where nothing does."""
+        return conditioning_of(self.loaded, self.begun.stands_um)
 
 
 def check(loaded: LoadedExperiment) -> Checked:
@@ -54,7 +63,7 @@ def check(loaded: LoadedExperiment) -> Checked:
     Raises:
         ConfigError: The run must not start; all reasons are listed, each saying by how much.
     """
-    problems = _device_problems(loaded) + interlock_problems(loaded)
+    problems = _device_problems(loaded) + interlock_problems(loaded) + condition_problems(loaded)
     config = loaded.config
     try:
         reference = build(config.waveform, config.sample_rate_hz, loaded.folder)
@@ -65,13 +74,16 @@ def check(loaded: LoadedExperiment) -> Checked:
     problems += reference_problems(loaded, reference.unit, low, high)
     values = _corrected(loaded, reference, problems)
     try:
-        before = _state_before(loaded, problems)
+        conditioning = conditioning_of(loaded)
+        conditioned = np.empty(0) if conditioning is None else conditioning.command
+        before = _state_before(loaded, conditioned, problems)
         if before is not None:
-            lead_in = max(1, round(config.safe.ramp_s * config.sample_rate_hz))
-            values = before.lead_in(values, lead_in)
+            values = before.lead_in(values, config.lead_in_samples)
         begun = begin(loaded.model, config.sample_rate_hz, values, before)
+        if not measures_offset(config):
+            begun = replace(begun, stands_um=None)
         problems += feedback_problems(loaded, begun.preview)
-        forecast = forecast_of(loaded, reference, begun.input_um, begun.state)
+        forecast = forecast_of(loaded, reference, begun, conditioned)
     except ModelError as error:
         problems.append(_problem(loaded, "compensator.model", str(error)))
         raise ConfigError(problems) from None
@@ -94,10 +106,12 @@ def _corrected(loaded: LoadedExperiment, reference: Reference, problems: list[Pr
         return reference.values
 
 
-def _state_before(loaded: LoadedExperiment, problems: list[Problem]) -> InitialState | None:
-    """Return where the run before left the actuator; None where that can't be used."""
+def _state_before(
+    loaded: LoadedExperiment, conditioned: F64, problems: list[Problem]
+) -> InitialState | None:
+    """Return where the actuator stands before the waveform; None where that can't be said."""
     try:
-        return initial_state_of(loaded)
+        return initial_state_of(loaded, conditioned)
     except DataError as error:
         problems.append(_problem(loaded, "compensator.initial_state", str(error)))
         return None
@@ -224,7 +238,9 @@ def _budget_problems(loaded: LoadedExperiment, forecast: Forecast) -> list[Probl
         return []
     key, rms_a = "limits.rms_current_a", limits.rms_current_a
     rule = f"the coil must stay within {rms_a:g} A rms over {limits.thermal_time_constant_s:g} s"
-    when = f"the budget is used up after {forecast.budget_used_s:.4g} s"
+    used_s = forecast.budget_used_s
+    when = f"the budget is used up after {used_s:.4g} s"
     excess = f"{highest_a - rms_a:.3g} A too much"
-    hint = f"{excess}, and {when}: lower the waveform's amplitude, or shorten the run"
+    by = "condition" if used_s < forecast.before_s else "waveform"
+    hint = f"{excess}, and {when}: lower the {by}'s amplitude, or shorten it"
     return [_problem(loaded, key, rule, f"{highest_a:.4g} A", hint)]

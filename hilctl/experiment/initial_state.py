@@ -1,6 +1,7 @@
 """What a compensator begins with: the memory that a run before left in the actuator, or rest."""
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +26,9 @@ class Begun:
         preview: Samples by which its input runs ahead of the commands.
         state_size: Numbers in its memory.
         state: float64[state_size], its memory before the first sample; None where it is at rest.
-        run_id: The run that left this memory; empty where the actuator is at rest.
+        run_id: The run that left this memory; empty where none did.
+        stands_um: Displacement before the first sample by the model, where the sensor is held
+            against it; None where it is not.
     """
 
     input_um: F64
@@ -33,16 +36,17 @@ class Begun:
     state_size: int
     state: F64 | None = None
     run_id: str = ""
+    stands_um: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class InitialState:
-    """Where a run before left the actuator.
+    """Where a run before, or what comes before the waveform, leaves the actuator.
 
     Attributes:
         state: float64[state_size], the compensator's memory, at rest there.
         stands_um: Displacement there, by the model.
-        run_id: That run.
+        run_id: That run; empty where it is this one.
     """
 
     state: F64
@@ -62,18 +66,25 @@ class InitialState:
         return led
 
 
-def initial_state_of(loaded: LoadedExperiment) -> InitialState | None:
-    """Return where the run before left the actuator; None where the experiment names none.
+def initial_state_of(loaded: LoadedExperiment, conditioned: F64) -> InitialState | None:
+    """Return where the actuator stands before the waveform; None for an actuator at rest.
+
+    Args:
+        loaded: The experiment.
+        conditioned: float64[m], commands that come before the waveform: a cycle that makes all
+            before it forgotten, and a rest; or the rest alone; or none.
 
     Raises:
-        DataError: That run can't be used, see :func:`initial_state_after`.
+        DataError: The run before can't be used, see :func:`initial_state_after`.
         ModelError: The model has no inverse.
     """
     config, model = loaded.config, loaded.model
-    named = config.compensator.initial_state if config.compensator else None
-    if named is None or model is None:
+    if model is None or config.compensator is None:
         return None
-    return initial_state_after(loaded.folder / named, model, config.sample_rate_hz)
+    rate_hz, named = config.sample_rate_hz, config.compensator.initial_state
+    if named is not None and config.condition is None:
+        return initial_state_after(loaded.folder / named, model, rate_hz)
+    return _left_by(conditioned, model, rate_hz) if conditioned.size else None
 
 
 def begin(
@@ -104,6 +115,7 @@ def begin(
         state_size=state.size,
         state=state if before is not None or compensator.preview else None,
         run_id=before.run_id if before else "",
+        stands_um=before.stands_um if before else None,
     )
 
 
@@ -124,14 +136,21 @@ def initial_state_after(path: Path, model: HysteresisModel, sample_rate_hz: floa
     """
     recording = read(path)
     _check(recording, model, sample_rate_hz)
-    command = recording.samples.command
+    left = _left_by(recording.samples.command, model, sample_rate_hz)
+    if not math.isfinite(left.stands_um):
+        raise DataError(f"{path}: has commands that the model has no displacement for")
+    return replace(left, run_id=recording.run.get("run_id", ""))
+
+
+def _left_by(command: F64, model: HysteresisModel, sample_rate_hz: float) -> InitialState:
+    """Return where commands from rest leave the model, once it has stood still for a second."""
     still = np.full(round(_STILL_S * sample_rate_hz), command[-1])
     came = model.forward(sample_rate_hz).process(np.concatenate((command, still)))
     inverse = model.inverse(sample_rate_hz)
     if not np.isfinite(came).all():
-        raise DataError(f"{path}: has commands that the model has no displacement for")
+        return InitialState(inverse.state(), math.nan, "")
     inverse.process(came[inverse.preview :])
-    return InitialState(inverse.state(), float(came[-1]), recording.run.get("run_id", ""))
+    return InitialState(inverse.state(), float(came[-1]), "")
 
 
 def _check(recording: Recording, model: HysteresisModel, sample_rate_hz: float) -> None:

@@ -108,6 +108,33 @@ class RecordingConfig(Strict):
         return self
 
 
+REST_S = 0.1
+"""Rest before the waveform where an offset is measured and no other rest is given."""
+
+
+class Condition(Strict):
+    """A decaying cycle around the safe value before the waveform, to a repeatable state.
+
+    It goes to both sides of the safe value as far as the amplitude, and no further than the limits.
+
+    Attributes:
+        amplitude_a: Amplitude of the first cycle, for devices driven in A; as far as the limits go
+            where it is left out.
+        amplitude_v: The same for devices driven in V.
+        frequency_hz: Left out, 10 Hz, or less where slew limit or rate ask for it.
+        cycles: How many.
+        decay: Amplitude of each cycle over that of the one before; 1 for one that falls in a line.
+        rest_s: Rest at the safe value after it; over its second half the displacement is averaged.
+    """
+
+    amplitude_a: Annotated[float, Field(gt=0.0)] | None = None
+    amplitude_v: Annotated[float, Field(gt=0.0)] | None = None
+    frequency_hz: Annotated[float, Field(gt=0.0)] | None = None
+    cycles: Annotated[int, Field(ge=2, le=1000)] = 20
+    decay: Annotated[float, Field(ge=0.1, le=1.0)] = 0.8
+    rest_s: Annotated[float, Field(ge=0.0, le=60.0)] = REST_S
+
+
 class _AnyFeedback(Strict):
     """What every feedback has.
 
