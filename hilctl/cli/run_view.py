@@ -148,6 +148,8 @@ def print_forecast(checked: Checked) -> None:
         "slew": f"{forecast.slew_per_s:.4g} {unit}/s (limit {limits.slew_per_s:g})",
         "recording": f"about {forecast.recording_mb:.3g} MB",
     }
+    if forecast.begins:
+        rows["begins"] = forecast.begins
     if note := checked.loaded.device.info.safe_note:
         rows["safe value"] = note
     if forecast.heating_rms_a is not None:

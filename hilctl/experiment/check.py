@@ -6,6 +6,7 @@ by the same compensator that will run, and held against the limits.
 
 import math
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
@@ -14,7 +15,14 @@ from hilctl.base.errors import ConfigError, DataError, InputError, ModelError, P
 from hilctl.experiment.condition import condition_problems, conditioning_of, measures_offset
 from hilctl.experiment.feedback import feedback_problems
 from hilctl.experiment.forecast import Forecast, forecast_of
-from hilctl.experiment.initial_state import Begun, InitialState, begin, initial_state_of
+from hilctl.experiment.history import left_by_last_run
+from hilctl.experiment.initial_state import (
+    Begun,
+    InitialState,
+    begin,
+    initial_state_after,
+    left_by,
+)
 from hilctl.experiment.interlocks import interlock_problems
 from hilctl.experiment.load import LoadedExperiment
 from hilctl.loop.conditioning import Conditioning
@@ -54,11 +62,13 @@ class Checked:
         return conditioning_of(self.loaded, self.begun.stands_um)
 
 
-def check(loaded: LoadedExperiment) -> Checked:
+def check(loaded: LoadedExperiment, folder: Path | None = None) -> Checked:
     """Work out the whole run and hold it against device, model and limits.
 
     Args:
         loaded: The experiment.
+        folder: Folder that the run is written to, where that is not ``recording.folder``: the last
+            run of its device may have been, too.
 
     Raises:
         ConfigError: The run must not start; all reasons are listed, each saying by how much.
@@ -76,10 +86,10 @@ def check(loaded: LoadedExperiment) -> Checked:
     try:
         conditioning = conditioning_of(loaded)
         conditioned = np.empty(0) if conditioning is None else conditioning.command
-        before = _state_before(loaded, conditioned, problems)
+        before, begins = _state_before(loaded, folder, conditioned, problems)
         if before is not None:
             values = before.lead_in(values, config.lead_in_samples)
-        begun = begin(loaded.model, config.sample_rate_hz, values, before)
+        begun = begin(loaded.model, config.sample_rate_hz, values, before, begins)
         if not measures_offset(config):
             begun = replace(begun, stands_um=None)
         problems += feedback_problems(loaded, begun.preview)
@@ -107,14 +117,38 @@ def _corrected(loaded: LoadedExperiment, reference: Reference, problems: list[Pr
 
 
 def _state_before(
-    loaded: LoadedExperiment, conditioned: F64, problems: list[Problem]
-) -> InitialState | None:
-    """Return where the actuator stands before the waveform; None where that can't be said."""
-    try:
-        return initial_state_of(loaded, conditioned)
-    except DataError as error:
-        problems.append(_problem(loaded, "compensator.initial_state", str(error)))
-        return None
+    loaded: LoadedExperiment, folder: Path | None, conditioned: F64, problems: list[Problem]
+) -> tuple[InitialState | None, str]:
+    """Return where the actuator stands before the waveform, None at rest; and why, in words.
+
+    Args:
+        loaded: The experiment.
+        folder: See :func:`check`.
+        conditioned: float64[m], commands that come before the waveform: a cycle that makes all
+            before it forgotten, and a rest; or the rest alone; or none.
+        problems: Added to where that can't be said.
+
+    Raises:
+        ModelError: The model has no inverse.
+    """
+    config, model = loaded.config, loaded.model
+    if model is None or config.compensator is None:
+        return None, ""
+    rate_hz, named = config.sample_rate_hz, config.compensator.initial_state
+    before, begins = None, "at rest"
+    if config.condition is not None:
+        begins = "where its condition leaves the actuator"
+    elif named == "last":
+        before, begins = left_by_last_run(loaded, folder)
+    elif named != "rest":
+        begins = f"where {named} left the actuator"
+        try:
+            before = initial_state_after(loaded.folder / named, model, rate_hz)
+        except DataError as error:
+            problems.append(_problem(loaded, "compensator.initial_state", str(error)))
+    if before is None and conditioned.size:
+        before = left_by(conditioned, model, rate_hz)
+    return before, begins
 
 
 def _problem(
@@ -242,5 +276,5 @@ def _budget_problems(loaded: LoadedExperiment, forecast: Forecast) -> list[Probl
     when = f"the budget is used up after {used_s:.4g} s"
     excess = f"{highest_a - rms_a:.3g} A too much"
     by = "condition" if used_s < forecast.before_s else "waveform"
-    hint = f"{excess}, and {when}: lower the {by}'s amplitude, or shorten it"
+    hint = f"{excess}, and {when}: lower the {by}'s amplitude, or shorten the run"
     return [_problem(loaded, key, rule, f"{highest_a:.4g} A", hint)]

@@ -24,12 +24,8 @@ _SLEW_SHARE = 0.5  # of the slew limit, for a cycle for which no frequency is gi
 
 
 def measures_offset(config: Experiment) -> bool:
-    """Return whether a run measures its resting offset: where told to, or after a condition."""
-    compensator = config.compensator
-    if compensator is None:
-        return False
-    asked = compensator.offset
-    return config.condition is not None if asked is None else asked == "measured"
+    """Return whether a run measures its resting offset before the waveform."""
+    return config.compensator is not None and config.compensator.offset == "measured"
 
 
 def conditioning_of(

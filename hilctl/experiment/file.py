@@ -46,18 +46,20 @@ class CompensatorConfig(Strict):
         model: Model file, relative to the experiment file's folder.
         correction: File that ``hilctl learn`` has written for this waveform, relative to the same
             folder; None where nothing is added to the reference.
-        initial_state: Recording of the run before this one, relative to the same folder, so that
-            the compensator begins with what that run left in the actuator, and reaches the
-            reference from there within ``safe.ramp_s``; None for an actuator at rest.
-        offset: ``measured`` takes out what the resting sensor shows beside the model before the
-            waveform; ``identified`` leaves the model's offset as it is. Left out, it is measured
-            after a condition.
+        initial_state: What the compensator begins with, unless there is a condition: what the
+            ``last`` run of this device left in the actuator, by its newest recording in
+            ``recording.folder``; ``rest``; or a recording of the run before this one, relative to
+            the same folder as the model. The reference is reached from there within
+            ``safe.ramp_s``.
+        offset: ``identified`` takes the model's offset as it is; ``measured`` takes out what the
+            sensor shows beside the model while it rests before the waveform, for a sensor or an
+            actuator that has moved since.
     """
 
     model: str
     correction: str | None = None
-    initial_state: str | None = None
-    offset: Literal["measured", "identified"] | None = None
+    initial_state: str = "last"
+    offset: Literal["identified", "measured"] = "identified"
 
 
 class Experiment(Strict):

@@ -28,6 +28,7 @@ class Forecast:
         samples: Samples of the waveform.
         duration_s: Its length.
         before_s: Time of the conditioning before it.
+        begins: Where the compensator begins, in words; empty without one.
         reference_min: Lowest reference, in the waveform's unit.
         reference_max: Highest reference.
         command_unit: ``A`` or ``V``.
@@ -45,6 +46,7 @@ class Forecast:
     samples: int
     duration_s: float
     before_s: float
+    begins: str
     reference_min: float
     reference_max: float
     command_unit: str
@@ -99,6 +101,7 @@ def forecast_of(
         samples=values.size,
         duration_s=values.size / config.sample_rate_hz,
         before_s=conditioned.size / config.sample_rate_hz,
+        begins=begun.begins,
         reference_min=float(values.min()),
         reference_max=float(values.max()),
         command_unit=loaded.device.info.command_unit,

@@ -8,7 +8,7 @@ import numpy as np
 
 from hilctl.base.arrays import F64
 from hilctl.base.errors import DataError
-from hilctl.experiment.load import LoadedExperiment
+from hilctl.base.samples import Flag
 from hilctl.loop.compensator import Compensator
 from hilctl.models.base import HysteresisModel
 from hilctl.recording.data import Recording
@@ -26,6 +26,7 @@ class Begun:
         preview: Samples by which its input runs ahead of the commands.
         state_size: Numbers in its memory.
         state: float64[state_size], its memory before the first sample; None where it is at rest.
+        begins: Where the compensator begins, in words, and why.
         run_id: The run that left this memory; empty where none did.
         stands_um: Displacement before the first sample by the model, where the sensor is held
             against it; None where it is not.
@@ -35,6 +36,7 @@ class Begun:
     preview: int
     state_size: int
     state: F64 | None = None
+    begins: str = "at rest"
     run_id: str = ""
     stands_um: float | None = None
 
@@ -66,32 +68,12 @@ class InitialState:
         return led
 
 
-def initial_state_of(loaded: LoadedExperiment, conditioned: F64) -> InitialState | None:
-    """Return where the actuator stands before the waveform; None for an actuator at rest.
-
-    Args:
-        loaded: The experiment.
-        conditioned: float64[m], commands that come before the waveform: a cycle that makes all
-            before it forgotten, and a rest; or the rest alone; or none.
-
-    Raises:
-        DataError: The run before can't be used, see :func:`initial_state_after`.
-        ModelError: The model has no inverse.
-    """
-    config, model = loaded.config, loaded.model
-    if model is None or config.compensator is None:
-        return None
-    rate_hz, named = config.sample_rate_hz, config.compensator.initial_state
-    if named is not None and config.condition is None:
-        return initial_state_after(loaded.folder / named, model, rate_hz)
-    return _left_by(conditioned, model, rate_hz) if conditioned.size else None
-
-
 def begin(
     model: HysteresisModel | None,
     sample_rate_hz: float,
     values: F64,
     before: InitialState | None = None,
+    begins: str = "at rest",
 ) -> Begun:
     """Return what the compensator is fed, and its memory once it has begun.
 
@@ -100,6 +82,7 @@ def begin(
         sample_rate_hz: Samples a second.
         values: float64[n], the reference with what is added to it, led in from where it begins.
         before: Where the run before left the actuator; at rest where None.
+        begins: That, in words.
 
     Raises:
         ModelError: The model has no inverse.
@@ -114,6 +97,7 @@ def begin(
         preview=compensator.preview,
         state_size=state.size,
         state=state if before is not None or compensator.preview else None,
+        begins=begins,
         run_id=before.run_id if before else "",
         stands_um=before.stands_um if before else None,
     )
@@ -136,13 +120,13 @@ def initial_state_after(path: Path, model: HysteresisModel, sample_rate_hz: floa
     """
     recording = read(path)
     _check(recording, model, sample_rate_hz)
-    left = _left_by(recording.samples.command, model, sample_rate_hz)
+    left = left_by(recording.samples.command, model, sample_rate_hz)
     if not math.isfinite(left.stands_um):
         raise DataError(f"{path}: has commands that the model has no displacement for")
     return replace(left, run_id=recording.run.get("run_id", ""))
 
 
-def _left_by(command: F64, model: HysteresisModel, sample_rate_hz: float) -> InitialState:
+def left_by(command: F64, model: HysteresisModel, sample_rate_hz: float) -> InitialState:
     """Return where commands from rest leave the model, once it has stood still for a second."""
     still = np.full(round(_STILL_S * sample_rate_hz), command[-1])
     came = model.forward(sample_rate_hz).process(np.concatenate((command, still)))
@@ -163,3 +147,7 @@ def _check(recording: Recording, model: HysteresisModel, sample_rate_hz: float) 
         raise DataError(f"{path}: was recorded at {rates}")
     if index.size == 0 or recording.dropped or index[-1] + 1 != index.size or not recording.end:
         raise DataError(f"{path}: is not of a whole run: where it left the actuator is not known")
+    unanswered = np.any(recording.samples.flags & Flag.UNANSWERED.value)
+    if unanswered or recording.end.get("output_safe") == "false":
+        lost = "lost its device, or did not confirm its safe value"
+        raise DataError(f"{path}: {lost}: where it left the actuator is not known")

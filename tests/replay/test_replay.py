@@ -136,7 +136,7 @@ def test_run_with_a_condition_is_identical(tmp_path, block, output):
         "waveform.duration_s=0.5",
         "waveform.offset=0.0",
         "waveform.amplitude=20.0",
-        "compensator.model=models/terfenol_staged.yaml",
+        "compensator={model: models/terfenol_staged.yaml, offset: measured}",
     ]
     checked = checked_experiment(SINE, settings)
     recording = read(run_unpaced(checked, tmp_path / "run.mcap").path)

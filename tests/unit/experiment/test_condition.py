@@ -124,7 +124,7 @@ class TestCheck:
 
     def test_the_compensator_begins_where_the_cycle_ends(self):
         """Model and inverse stand at the same displacement, and the input is led in from there."""
-        checked = check(loaded())
+        checked = check(loaded("compensator.offset=measured"))
         conditioning, begun = checked.conditioning(), checked.begun
         assert conditioning is not None
         model = load_model(MODEL)
@@ -138,8 +138,8 @@ class TestCheck:
         assert checked.records_input
 
     def test_offset_is_measured_where_told_to(self):
-        """After a condition by default; without one by the key; never without a compensator."""
-        assert check(loaded("compensator.offset=identified")).conditioning().stands_um is None
+        """After a condition or without one; never without a compensator."""
+        assert check(loaded()).conditioning().stands_um is None
         plain = loaded("condition=null")
         assert check(plain).conditioning() is None
         measured = check(loaded("condition=null", "compensator.offset=measured"))
@@ -155,7 +155,9 @@ class TestCheck:
         assert checked.forecast.command_max == pytest.approx(6.0, rel=1e-6)
         assert checked.forecast.recording_mb > plain.forecast.recording_mb
         heat = ("limits.rms_current_a=1.0", "limits.thermal_time_constant_s=1.0")
-        with pytest.raises(ConfigError, match="lower the condition's amplitude, or shorten it"):
+        with pytest.raises(
+            ConfigError, match="lower the condition's amplitude, or shorten the run"
+        ):
             check(loaded(*heat))
 
     @pytest.mark.parametrize(
