@@ -2,7 +2,7 @@
 
 Simulated devices stand for themselves. Devices on a wire meet an emulator on loopback, one for each
 shipped profile: alone where it can drive and measure, else beside the one that it goes with. Its
-time passes by one sample an exchange, so that nothing depends on how fast this machine is.
+time passes by the exchanges, so that nothing depends on how fast this machine is.
 """
 
 import threading
@@ -26,6 +26,8 @@ from tests.fakes import ManualClock, VirtualTime
 
 RATE_HZ = 10_000.0
 SAMPLES = 20
+SETTLED_NS = 2_000_000
+"""What the emulated rig takes to settle, 0.1 ms, many times over: it computes each sample of it."""
 STEP = 0.01
 """Of the coarsest converter, in the command's unit."""
 ELSEWHERE = {
@@ -174,7 +176,7 @@ def modbus(words: list[str], stack: list[Callable[[], None]]) -> DrivenDevice:
     rate_hz = min(RATE_HZ, device.info.max_rate_hz)
 
     def pass_time() -> None:
-        clock.now_ns += round(1e9 / rate_hz)
+        clock.now_ns += min(round(1e9 / rate_hz), SETTLED_NS)
 
     return DrivenDevice(device, 1, rate_hz, lambda: emulator.device._rig.current_a, pass_time)
 
