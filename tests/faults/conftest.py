@@ -217,6 +217,7 @@ class Device:
             "tcp_port": int(port),
             "output": "DAC0",
             "input": "AIN0",
+            "timeout_s": 5.0,
             "amplifier": {"gain_a_per_v": 4.0, "offset_a": -10.0},
             "sensor": {"um_per_v": 12.5},
             "watchdog": "none",

@@ -12,7 +12,12 @@ import yaml
 
 from tests.faults.conftest import EXPERIMENT
 
-LONG = {**EXPERIMENT["waveform"], "duration_s": 3600.0}
+# No machine is too busy for it, and no second run comes after its end.
+PATIENT = {
+    "sample_rate_hz": 50,
+    "waveform": {**EXPERIMENT["waveform"], "duration_s": 3600.0},
+    "timing": {"on_misses": "warn", "max_late_s": 30.0, "hang_s": 30.0},
+}
 
 
 class Neighbour:
@@ -20,7 +25,7 @@ class Neighbour:
 
     def __init__(self, words, folder, section):
         self._words, self.folder, self.process = words, folder, None
-        text = yaml.safe_dump({**EXPERIMENT, "device": section, "waveform": LONG})
+        text = yaml.safe_dump({**EXPERIMENT, **PATIENT, "device": section})
         (folder / "theirs.yaml").write_text(text, encoding="utf-8")
 
     def start(self):
@@ -51,8 +56,8 @@ def neighbour(nobody, device):
 
 def test_the_second_user_of_a_device_is_refused(neighbour, device, run):
     """In one message, and the first one's run goes on."""
-    mine = run(device.section, waveform=LONG)
-    device.log.await_events("DAC0", 100)
+    mine = run(device.section, **PATIENT)
+    device.log.await_events("DAC0", 40)
     theirs = neighbour.start()
     out, err = theirs.communicate(timeout=240)
     assert theirs.returncode == 2, err
@@ -60,18 +65,18 @@ def test_the_second_user_of_a_device_is_refused(neighbour, device, run):
     assert f" is in use by process {mine.process.pid} of root: wait for its end" in err
     assert json.loads(out)["error"]
     assert not (neighbour.folder / "theirs.mcap").exists()
-    device.log.await_events("DAC0", len(device.log.events("DAC0")) + 50)
+    device.log.await_events("DAC0", len(device.log.events("DAC0")) + 20)
     assert mine.interrupt()["code"] == "stopped"
 
 
 def test_root_does_not_take_a_device_from_a_user(neighbour, device, run):
     """Who may do anything is refused as well: the lock is the kernel's, not a file's."""
     theirs = neighbour.start()
-    device.log.await_events("DAC0", 100)
-    said = run(device.section).refused()
+    device.log.await_events("DAC0", 40)
+    said = run(device.section, **PATIENT).refused()
     assert f" is in use by process {theirs.pid} of nobody: wait for its end" in said
     assert len(said.splitlines()) == 1
-    device.log.await_events("DAC0", len(device.log.events("DAC0")) + 50)
+    device.log.await_events("DAC0", len(device.log.events("DAC0")) + 20)
     theirs.terminate()
     out, err = theirs.communicate(timeout=60)
     assert "Traceback" not in err
