@@ -74,7 +74,9 @@ class Neighbours:
             "held_devices": lambda holds: self.around("devices", "devices let go", [*holds]),
             "Recorder": lambda *a, overwrite: self.note("claimed", self.recorder),
             "run_folder": self.run_folder,
-            "Requests": lambda *a: SimpleNamespace(answer=None, attend=lambda: None),
+            "Requests": lambda *a: SimpleNamespace(
+                answer=None, attend=lambda: self.note("requests")
+            ),
             "ControlServer": self.server,
             "LoopChild": self.child,
             "RingRecorder": self.ring_recorder,
@@ -186,11 +188,13 @@ def stage(tmp_path, monkeypatch):
 def test_a_run_is_begun_in_one_order_and_undone_in_the_other(stage):
     """The start signal comes last: the loop then reads its time and its supervisor's heartbeat."""
     result = stage.run()
-    serves = ["serve"] * 3
+    serves = ["requests", "serve"] * 3
     assert stage.log == [*READY, *serves, "progress ended", "safety closed", *UNDONE]
     page = stage.ring.page
     assert page.get(Field.GO) == 1
+    assert stage.guardian_looks == -1  # it was waited for, and not a moment longer
     ((unix_ns, at_ns),) = stage.begun
+    assert 10**12 < at_ns <= 10**12 + 20 * MS
     assert page.get(Field.START_NS) == at_ns + 50 * MS
     assert unix_ns - 10**18 == page.get(Field.START_NS)
     assert page.get(Field.SUPERVISOR_HEARTBEAT_NS) == stage.time.now_ns
@@ -269,7 +273,9 @@ def test_what_breaks_afterwards_costs_neither_coil_nor_recording(stage):
     stage.fails["serve"] = ZeroDivisionError("a bug")
     stage.run()
     assert stage.attended == [0] * 4
-    assert stage.log[len(READY) :][:3] == ["serve", "broken off: a bug", "progress ended"]
+    assert stage.log[len(READY) :][:4] == [
+        "requests", "serve", "broken off: a bug", "progress ended",
+    ]  # fmt: skip
     assert stage.log[-5:] == ["safety closed", *UNDONE]
 
 
