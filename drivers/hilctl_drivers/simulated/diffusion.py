@@ -13,7 +13,7 @@ step, so that flux is kept. Nothing else lags; skin effect, harmonics and the de
 delay on the permeability come of themselves. Each shell has a magnetisation of its own, of cells
 with dry friction (A. Bergqvist, Physica B 233 (1997) 342; F. Henrotte et al., COMPEL 25 (2006) 71)
 on the anhysteretic curve of O. Froelich and A. E. Kennelly (R. M. Bozorth, "Ferromagnetism", Van
-Nostrand 1951, p. 476), M = M_s H / (b + |H|). The rod is clamped across its ends: its displacement
+Nostrand 1951), M = M_s H / (b + |H|). The rod is clamped across its ends: its displacement
 is the mean of the shells' strain 3/2 lambda_s (M / M_s)^2 over the cross-section.
 
 Fields and magnetisation are in A/m, displacements in um, times in s.
@@ -42,8 +42,8 @@ _NEAR_A_PER_M = 0.5  # the next correction would be some millionths of it
 class DiffusionParameters(RodParameters):
     """Constants of the rods.
 
-    Saturation, strain and resistivity are those of Terfenol-D (Etrema; Calkins et al., IEEE Trans.
-    Magn. 36 (2000) 429); knee and pinning were set for the published strokes and widths.
+    Saturation, strain and resistivity are of the size given for Terfenol-D; knee and pinning were
+    set for the published strokes and widths.
 
     Attributes:
         saturation_a_per_m: M_s.

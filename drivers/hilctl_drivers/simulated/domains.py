@@ -61,9 +61,9 @@ _NEAR_A_PER_M = 0.5  # so near, the tangents are good to ten digits
 class DomainsParameters(RodParameters):
     """Constants of the rods.
 
-    Magnetostriction, saturation and anisotropy are those of Terfenol-D in the papers named above (K
-    is the curvature 4/3 |K_1| about <111>, with K_1 = -60 kJ/m^3); stress, spread and pinning were
-    set for the published strokes and widths.
+    Magnetostriction, saturation and anisotropy are of the size given for Terfenol-D (K is the
+    curvature 4/3 |K_1| about <111>, with K_1 = -60 kJ/m^3); stress, spread and pinning were set for
+    the published strokes and widths.
 
     Attributes:
         saturation_a_per_m: M_s.

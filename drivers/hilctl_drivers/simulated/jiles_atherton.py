@@ -49,9 +49,9 @@ Material: TypeAlias = tuple[float, float, float, float, float]
 class JilesAthertonParameters(RodParameters):
     """Constants of the rods.
 
-    Saturation, shape, reversibility and coupling are those of Calkins et al.; pinning lies within
-    the 3.3 to 7 kA/m found there and by Dapino et al. The stress is that of a washer that shears
-    the curve enough for the bias of this actuator to lie in the middle of its slope.
+    All are of the size that Calkins et al. and Dapino et al. give for Terfenol-D; pinning was set
+    for the published width. The stress is that of a washer that shears the curve enough for the
+    bias of this actuator to lie in the middle of its slope.
 
     Attributes:
         saturation_a_per_m: M_s.

@@ -3,7 +3,8 @@
 Amplifier, rods, structure and sensor are chained as in the rig of the dissertation "Modeling and
 Compensation of Rate-Dependent Asymmetric Hysteresis Nonlinearities of Magnetostrictive Actuators",
 Concordia, sections 3.3 and 3.4 of its chapter 2. What goes on in the rods is one physics of several
-(``rods.py``); none is the model that a compensator inverts.
+(``rods.py``). The first is near to what a compensator inverts: pinned magnetisation after a
+non-linear lag of the field, where that has plays of the current. The others have nothing of it.
 """
 
 import math
