@@ -127,7 +127,8 @@ class Loop:
             text = f"output was at {output:g}: ramp to {self._limiter.limits.safe:g} first"
             values = {"output": output, "samples": float(samples)}
             self._host.record_event(Event(0, "info", "start_ramp", text, values))
-        self._say_condition()
+        elif self._phase is _Phase.CONDITIONING:
+            self._say_condition()
         try:
             while not self._tick():
                 pass
@@ -230,6 +231,8 @@ class Loop:
         if not self._limiter.at_rest:
             reason = "the way to the safe value before the waveform was late: timing not kept"
             self._leave("fault", "late", reason)
+        elif phase is _Phase.CONDITIONING:
+            self._say_condition()
 
     def _say_condition(self) -> None:
         conditioning = self._plan.conditioning

@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hilctl.analysis.replay import replay
+from hilctl.base.events import OFFSET
 from hilctl.recording.reader import read
 
 CONFIG = Path(__file__).parents[2] / "configs" / "modbus_labjack_t7_stream.yaml"
@@ -28,6 +30,22 @@ def port():
     assert emulator.returncode == 0
 
 
+def ran(port, path, *more):
+    """Run the experiment on the emulated device; return its result and what it said."""
+    rate = (
+        "sample_rate_hz=2500",
+        "waveform.duration_s=3.0",
+        "timing.hang_s=5.0",
+        "device.timeout_s=1.0",
+    )
+    changes = [f"device.tcp_port={port}", *rate, *more]
+    settings = [word for change in changes for word in ("--set", change)]
+    run = start("run", CONFIG, *settings, "--output", path, "--json")
+    out, err = run.communicate(timeout=120)
+    assert run.returncode == 0, out + err
+    return json.loads(out), err
+
+
 def test_every_sample_is_put_out_and_answered(port, tmp_path):
     """At a rate that a busy machine keeps: none is missing, and the loop follows its reference."""
     path = tmp_path / "run.mcap"
@@ -45,3 +63,21 @@ def test_every_sample_is_put_out_and_answered(port, tmp_path):
     assert np.count_nonzero(np.isfinite(samples.reference_um)) == 20_000
     error_um = (samples.displacement_um - samples.reference_um)[6_000:16_000]
     assert np.sqrt(np.mean(error_um**2)) < 2.5
+
+
+def test_an_integrator_and_history_through_a_fifo(port, tmp_path):
+    """The integrator takes out what the model is off by; the next run begins where it ended."""
+    integral = "feedback={kind: integral, bandwidth_hz: 0.012, limit_um: 15.0}"
+    before = ("condition={cycles: 3}", "compensator.offset=measured", "device.sensor.offset_um=2.0")
+    _, said = ran(port, tmp_path / "a.mcap", *before, integral)
+    assert "begins where its condition leaves the actuator" in said
+    recording = read(tmp_path / "a.mcap")
+    assert replay(recording).identical
+    samples = recording.samples
+    correction_um = samples.input_um - samples.reference_um
+    assert np.nanmax(np.abs(correction_um)) > 0.01
+    (event,) = (each for each in recording.events if each.code == OFFSET)
+    assert event.values["offset_um"] == pytest.approx(2.0, abs=1.0)
+    _, said = ran(port, tmp_path / "b.mcap")
+    assert f"begins where {tmp_path}/a.mcap left the actuator" in said
+    assert read(tmp_path / "b.mcap").run["initial_state_run_id"] == recording.run["run_id"]

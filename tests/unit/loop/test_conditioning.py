@@ -74,6 +74,15 @@ class TestLoop:
         assert np.isnan(rig.host.column(0)).all()
         assert rig.device.commands[-1] == LIMITS.safe
 
+    def test_a_stop_on_the_way_to_it(self):
+        """A run that is stopped on the ramp before it does not say that it was conditioned."""
+        rig = Rig(
+            sine(50), device=FakeDevice(4.0), conditioning=conditioning(block=1), stop=lambda: "x"
+        )
+        assert rig.run().code == "stopped"
+        assert "condition" not in {event.code for event in rig.host.events}
+        assert not any(flags[0] & Flag.CONDITION for flags in rig.host.flags)
+
     def test_a_stop_leaves_it_by_the_safe_ramp(self):
         """At once, not after the cycle."""
         beats = iter(range(10_000))
