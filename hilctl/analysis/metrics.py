@@ -20,11 +20,13 @@ MAX_BINS = 1000
 SHORTEST_PERIOD = 16.0
 """Shortest period, in samples, at which the signal still passes for smooth beside the noise."""
 
+MAD_TO_SIGMA = 1.482602218505602
+"""Standard deviation of a normal distribution, of its median absolute deviation."""
+
 _WIDEST_HOLE = 0.05
 _FEWEST_BINS = 4
 _ORDER = 6
 _GAIN = 924.0**0.5  # of white noise: the root of binomial(12, 6)
-_MAD_TO_SIGMA = 1.482602218505602
 _FEWEST_WINDOWS = 32
 
 
@@ -251,7 +253,7 @@ def sensor_noise_um(index: I64, displacement_um: F64) -> float | None:
     windows = np.diff(displacement_um, _ORDER)[unbroken]
     if windows.size < _FEWEST_WINDOWS:
         return None
-    return _MAD_TO_SIGMA * float(np.median(np.abs(windows))) / _GAIN
+    return MAD_TO_SIGMA * float(np.median(np.abs(windows))) / _GAIN
 
 
 def expected_maximum(values: int) -> float:

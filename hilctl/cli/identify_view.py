@@ -15,9 +15,11 @@ from hilctl.identify.summary import HEADINGS, error_rows, parameter_texts, summa
 
 
 def print_identification(found: Identification, output: Path | None) -> None:
-    """Print errors loop by loop, parameters, and where the model went."""
+    """Print what the model is worth, errors loop by loop, parameters, and where it went."""
     terminal = console()
     fit, held_out = found.fit, found.held_out
+    for line in summary(found):
+        terminal.print(line)
     if found.orders:
         terminal.print(_orders_table(found.orders))
     if held_out is not None:
@@ -26,8 +28,6 @@ def print_identification(found: Identification, output: Path | None) -> None:
     rows = ", ".join(f"{name} {text}" for name, text in parameter_texts(fit))
     if rows:
         terminal.print(f"parameters: {rows}")
-    for line in summary(found):
-        terminal.print(line)
     if output is not None and found.verdict.grade != "not a model":
         terminal.print(f"model: {output}", soft_wrap=True)
     elif output is not None:

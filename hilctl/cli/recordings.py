@@ -15,6 +15,10 @@ TableUnit = Annotated[str | None, typer.Option(help="Unit of a table's command, 
 TableColumn = Annotated[str | None, typer.Option(help="Column of a table: name, or number from 1.")]
 RateHz = Annotated[float | None, typer.Option(help="Of a table without a time column.")]
 Whole = Annotated[bool, typer.Option(help="Judge whole histories, not steady cycles.")]
+LeaveOut = Annotated[
+    list[str] | None,
+    typer.Option(help="Loop not to use, by its label or how that begins; may be repeated."),
+]
 Validate = Annotated[
     list[Path] | None, typer.Option(help="File to judge the model on; may be repeated.")
 ]
@@ -125,6 +129,7 @@ def identify(
     time_column: TableColumn = None,
     rate_hz: RateHz = None,
     whole: Whole = False,
+    leave_out: LeaveOut = None,
     validate: Validate = None,
     scheduler: Scheduler = "none",
     html: Annotated[Path | None, typer.Option(help="Page of model against data to write.")] = None,
@@ -146,6 +151,7 @@ def identify(
         "table.time_column": _column(time_column),
         "table.rate_hz": rate_hz,
         "whole": whole or None,
+        "leave_out": leave_out or None,
     }
     texts = [f"{key}={json.dumps(value)}" for key, value in table.items() if value is not None]
     chosen = settings_from(model, [*texts, *(settings or [])])

@@ -26,9 +26,11 @@ from hilctl.experiment.initial_state import (
 from hilctl.experiment.interlocks import interlock_problems
 from hilctl.experiment.load import LoadedExperiment
 from hilctl.experiment.model_range import RangeFindings, range_findings
+from hilctl.loop.compensator import Compensator
 from hilctl.loop.conditioning import Conditioning
 from hilctl.waveforms.build import Reference, build
 
+STILL_S = 0.1  # after which the stages of any actuator rest
 _REPEAT = "identify the model on such motions too, or keep the waveform to what it was found on"
 
 
@@ -104,7 +106,7 @@ def check(loaded: LoadedExperiment, folder: Path | None = None) -> Checked:
     except ModelError as error:
         problems.append(_problem(loaded, "compensator.model", str(error)))
         raise ConfigError(problems) from None
-    problems += command_problems(loaded, forecast)
+    problems += _start_problems(loaded, begun, forecast) or command_problems(loaded, forecast)
     if problems:
         raise ConfigError(problems)
     return Checked(loaded, reference, forecast, begun, findings.warnings)
@@ -232,6 +234,33 @@ def _watchdog_problems(loaded: LoadedExperiment) -> list[Problem]:
     rule = f"must be the safe value, {safe:g} {unit}"
     hint = "or say in device.watchdog.reason why it is not"
     return [_problem(loaded, key, rule, f"{command:g}", hint)]
+
+
+def _start_problems(loaded: LoadedExperiment, begun: Begun, forecast: Forecast) -> list[Problem]:
+    """Return that the reference begins elsewhere than the actuator rests, where that is too fast.
+
+    A higher slew limit would be the wrong remedy: it lets the step into the coil.
+    """
+    model, config, rate_hz = loaded.model, loaded.config, loaded.config.sample_rate_hz
+    if model is None or not config.limits.slew_per_s < forecast.slew_per_s < math.inf:
+        return []
+    compensator = Compensator(model, rate_hz)
+    if begun.state is not None:
+        compensator.restore(begun.state)
+    first = np.empty(1)
+    compensator.process(np.ascontiguousarray(begun.input_um[:1]), first)
+    safe, unit = config.safe.value, config.limits.unit
+    step = abs(float(first[0]) - safe) * rate_hz
+    if not config.limits.slew_per_s < step or not forecast.slew_per_s <= step * (1.0 + 1e-9):
+        return []
+    still = model.forward(rate_hz).process(np.full(max(round(STILL_S * rate_hz), 1), safe))
+    rests_um = float(still[-1])
+    rule = f"must begin where the actuator rests at {safe:g} {unit}, by the model {rests_um:.4g} um"
+    hint = (
+        f"its first command would step to {float(first[0]):.4g} {unit} at once: begin there, by "
+        "waveform.offset and without a soft start, which begins at 0 um"
+    )
+    return [_problem(loaded, "waveform", rule, f"{float(begun.input_um[0]):.4g} um", hint)]
 
 
 def reference_problems(

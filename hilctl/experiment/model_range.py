@@ -95,14 +95,14 @@ def range_findings(
     if found.main_hz > FAR * high_hz + beyond:
         text = (
             f"the reference moves at about {found.main_hz:.3g} Hz, and the model was identified "
-            f"on {low_hz:.3g} to {high_hz:.3g} Hz"
+            f"on {_span(low_hz, high_hz)} Hz"
         )
         return RangeFindings(refused=(text,))
     warnings = list(_motion_warnings(known, values_um, segments, sample_rate_hz))
     if found.highest_hz > MARGIN * high_hz + beyond:
         warnings.append(
             f"the reference has frequencies up to about {found.highest_hz:.3g} Hz; the model was "
-            f"identified on {low_hz:.3g} to {high_hz:.3g} Hz"
+            f"identified on {_span(low_hz, high_hz)} Hz"
         )
     return RangeFindings(warnings=tuple(warnings))
 
@@ -130,3 +130,7 @@ def _motion_warnings(
             f"the reference moves at up to {speed:.3g} um/s; the model was identified at up to "
             f"{known.speed_um_per_s:.3g} um/s"
         )
+
+
+def _span(low: float, high: float) -> str:
+    return f"{low:.3g}" if low == high else f"{low:.3g} to {high:.3g}"

@@ -104,7 +104,7 @@ def identify_files(
         asked = settings.table.unit
         if recorded and asked and recorded != asked:
             raise InputError(f"--unit must be {recorded}, that of the recordings: {asked}")
-        others, _ = load_records(validate, settings, lag)
+        others, _ = load_records(validate, settings.model_copy(update={"leave_out": ()}), lag)
         source = [path.name for path in paths]
         unit = settings.unit(recorded)
         found = identify_records(records, settings, unit, others, source, run, progress)

@@ -216,6 +216,7 @@ class TableSettings(Strict):
 class IdentifySettings(FitSettings):
     """Choices of a fit to files: those of the fit, and how the files are read."""
 
+    leave_out: tuple[str, ...] = Field((), description="Labels of loops, or files, not to use.")
     whole: bool = Field(False, description="Judge whole histories, not their steady cycles.")
     table: TableSettings = Field(TableSettings(), description="How text tables are read.")
 

@@ -35,20 +35,43 @@ def load_records(
         InputError: Recordings of devices driven in A and in V are mixed.
     """
     records: list[Record] = []
+    known: list[str] = []
     units: set[CommandUnit] = set()
+    left_out = settings.leave_out
     for path in paths:
-        if path.suffix.lower() == ".mcap":
-            recording = read(path)
+        recording = read(path) if path.suffix.lower() == ".mcap" else None
+        loops = recording is not None and not settings.whole and recording.segments
+        labels = [segment.label for segment in loops] if loops else [path.name]
+        known += labels
+        kept = [label for label in labels if not label.startswith(left_out)]
+        if recording is not None:
             units.add(recording.command_unit)
-            if settings.whole:
-                records.append(history_from_recording(recording))
-            else:
-                records += loops_from_recording(recording, settings.points)
-        else:
+        if not kept:
+            continue
+        if recording is None:
             records.append(_from_table(path, settings, lag_samples))
+        elif settings.whole:
+            records.append(history_from_recording(recording))
+        else:
+            # Before their cycles are looked for: one that has none can be left out too.
+            records += loops_from_recording(recording, settings.points, kept if left_out else ())
     if len(units) > 1:
         raise InputError("recordings of devices driven in A and in V can't be fitted together")
+    _check_left_out(settings.leave_out, known, records)
     return records, next(iter(units), None)
+
+
+def _check_left_out(labels: Sequence[str], known: Sequence[str], kept: Sequence[Record]) -> None:
+    """Refuse labels of which there is none, and those that leave nothing.
+
+    Raises:
+        InputError: See above.
+    """
+    for label in labels:
+        if not any(each.startswith(label) for each in known):
+            raise InputError(f"--leave-out {label!r}: there is none of {', '.join(known)}")
+    if known and not kept:
+        raise InputError("--leave-out: leaves nothing to identify a model from")
 
 
 def history_from_recording(recording: Recording) -> History:

@@ -5,14 +5,20 @@ import math
 import numpy as np
 from scipy.fft import irfft, next_fast_len, rfft
 from scipy.optimize import minimize_scalar
+from scipy.signal import find_peaks
 
+from hilctl.analysis.metrics import MAD_TO_SIGMA
 from hilctl.base.arrays import F64, I64
 from hilctl.base.errors import DataError
 from hilctl.identify.data.records import FEWEST_POINTS
 
 LIKELY = 0.3  # least similarity worth a closer look; a decay lowers it
+PROMINENT = 0.02  # how far a top stands out: noise has many that do not
+LONGEST = 0.6  # of the samples: longest period looked for
 CANDIDATES = 50  # periods looked at, from the shortest
 STEADY = 0.02  # largest change from cycle to cycle in a steady part, of the peak-to-peak command
+SURE = 4.5  # standard deviations of noise beyond it
+ROUNDING = 0.02  # of a period that may be missing of two
 FULL = 0.5  # least peak-to-peak command of the steady part, of that of all
 
 
@@ -23,14 +29,15 @@ def similarity(signal: F64) -> F64:
     repetition however few samples are left to compare.
 
     Returns:
-        float64[n // 2 + 1], for lags from 0.
+        float64[m], for lags from 0 to a little beyond n / 2: two cycles have their period there.
     """
     x = signal - signal.mean()
     n = x.size
     spectrum = rfft(x, next_fast_len(2 * n, real=True))
-    products = irfft(np.abs(spectrum) ** 2, next_fast_len(2 * n, real=True))[: n // 2 + 1]
+    longest = min(math.ceil(LONGEST * n), n - 1)
+    products = irfft(np.abs(spectrum) ** 2, next_fast_len(2 * n, real=True))[: longest + 1]
     energy = np.concatenate(([0.0], np.cumsum(x * x)))
-    lags = np.arange(n // 2 + 1)
+    lags = np.arange(longest + 1)
     early, late = energy[n - lags], energy[n] - energy[lags]
     scale = np.sqrt(np.maximum(early * late, np.finfo(np.float64).tiny))
     return np.asarray(products / scale, dtype=np.float64)
@@ -52,22 +59,22 @@ def find_period(label: str, command: F64) -> tuple[float, int, int]:
         stretch = steady_stretch(command, period)
         if stretch is None:
             continue
-        period = _refined(command[slice(*stretch)], period)
-        stretch = steady_stretch(command, period)
-        if stretch is not None:
-            return period, *stretch
+        refined = _refined(command[slice(*stretch)], period)
+        better = steady_stretch(command, refined)
+        # Of two cycles the spectral line is so wide that it need not be where their period is.
+        return (period, *stretch) if better is None else (refined, *better)
     raise DataError(
         f"{label}: no steady part in {command.size} samples: the command doesn't repeat at full "
-        "amplitude for two cycles: judge it as a whole history instead"
+        "amplitude for two cycles: judge it as a whole with --whole, and a model without stages "
+        "(--model integrated, say), or record steady cycles"
     )
 
 
 def _tops(alike: F64) -> I64:
     """Return the lags of the maxima beyond the first zero: nearer ones are noise."""
     first = max(int(np.argmax(alike <= 0.0)), FEWEST_POINTS)
-    inner = alike[1:-1]
-    tops = 1 + np.flatnonzero((inner > alike[:-2]) & (inner >= alike[2:]) & (inner > LIKELY))
-    return tops[tops >= first]
+    tops, _ = find_peaks(alike, height=LIKELY, prominence=PROMINENT)
+    return np.asarray(tops[tops >= first], dtype=np.int64)
 
 
 def _parabola(values: F64, top: int) -> float:
@@ -100,17 +107,21 @@ def steady_stretch(command: F64, period: float) -> tuple[int, int] | None:
         period: Samples a period.
 
     Returns:
-        First sample and sample after the last, at least two periods; None where there is none.
+        First sample and sample after the last, two periods at least but for rounding; None where
+        there is none.
     """
     span = float(np.ptp(command))
     later = np.arange(command.size - math.ceil(period))
     again = np.interp(later + period, np.arange(command.size), command)
-    same = np.abs(again - command[later]) <= STEADY * span
+    changes = again - command[later]
+    steps = np.abs(np.diff(changes))
+    noise = MAD_TO_SIGMA * float(np.median(steps)) / math.sqrt(2.0) if steps.size else 0.0
+    same = np.abs(changes) <= STEADY * span + SURE * noise
     edges = np.flatnonzero(np.diff(np.concatenate(([0], same.astype(np.int8), [0]))))
     best: tuple[int, int] | None = None
     for start, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
         stop = min(int(end + period), command.size)
-        if end - start < period or np.ptp(command[start:stop]) < FULL * span:
+        if end - start < (1.0 - ROUNDING) * period or np.ptp(command[start:stop]) < FULL * span:
             continue
         if best is None or stop - start > best[1] - best[0]:
             best = (start, stop)

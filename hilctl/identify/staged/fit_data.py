@@ -23,6 +23,11 @@ from hilctl.models.base import Operator
 Spectrum: TypeAlias = npt.NDArray[np.complex128]
 SETTLED = 20.0  # time constants after which a lag has forgotten its start
 MOST_SUBSTEPS = 200
+WITHOUT_STAGES = (
+    "leave out --whole where they repeat; where they do not, take a model without stages "
+    "(--model integrated, or --set lag=none --set structure=false --set delay=false)"
+)
+"""What to do about data that are no steady loops."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -230,10 +235,7 @@ def _size(place: slice) -> int:
 
 def _harmonics(run: _Run) -> Spectrum:
     if run.s is None:
-        raise DataError(
-            "lag, structure and delay are found from steady loops: leave out --whole, or give "
-            "--set lag=none, structure=false and delay=false"
-        )
+        raise DataError(f"lag, structure and delay are found from steady loops: {WITHOUT_STAGES}")
     return run.s
 
 

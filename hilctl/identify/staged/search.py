@@ -12,7 +12,7 @@ from hilctl.identify.job import OnProgress, StartOutcome
 from hilctl.identify.searched.search import first_least
 from hilctl.identify.staged.convex import WeightedStart, convex_start
 from hilctl.identify.staged.descend import ErrorAndSlopes, descend
-from hilctl.identify.staged.fit_data import StagedFitData
+from hilctl.identify.staged.fit_data import WITHOUT_STAGES, StagedFitData
 from hilctl.identify.staged.layered import (
     RADIAN,
     Layers,
@@ -146,7 +146,7 @@ def _check(data: StagedFitData, layers: Layers) -> None:
     if layers.dynamic and not data.all_steady:
         raise DataError(
             "lag, structure and delay are found from steady loops, and there is a whole time "
-            "history among the data: leave out --whole"
+            f"history among the data: {WITHOUT_STAGES}"
         )
     if layers.dynamic and not data.one_rate:
         raise DataError(

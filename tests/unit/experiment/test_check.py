@@ -425,3 +425,17 @@ def test_a_reference_beyond_what_the_model_was_identified_on_is_warned_or_refuse
     with pytest.raises(ConfigError, match="waveform: the reference moves at about 60 Hz") as caught:
         check(faster)
     assert "identify the model on such motions too" in str(caught.value)
+
+
+def test_a_reference_that_begins_beside_the_rest_position_is_moved_not_hurried() -> None:
+    """At 0 A the actuator rests at 24.5 um: from 0 um the first command would be a step."""
+    moved = terfenol_rdpi().model_copy(update={"output_offset_um": 24.5})
+    with pytest.raises(ConfigError) as caught:
+        check(loaded(DISPLACEMENT, "waveform.offset=0", model=moved))
+    (problem,) = caught.value.problems
+    assert problem.key == "waveform"
+    assert "rests at 0 A, by the model 24.5 um" in problem.rule
+    assert problem.value == "0 um"
+    assert "slew" not in str(problem)
+    there = ("waveform.offset=24.5", "waveform.soft_start_s=0")
+    assert check(loaded(DISPLACEMENT, *there, model=moved))

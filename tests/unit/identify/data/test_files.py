@@ -1,5 +1,6 @@
 """Recordings and tables to records: loops or whole histories, one unit, and no gaps."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -83,3 +84,20 @@ def test_tables_have_no_unit_of_their_own(tmp_path):
     assert history.sample_rate_hz == 200.0
     (late,), _ = load_records([path], settings_from("ppi", texts), 3)
     assert late.command.size == history.command.size - 3
+
+
+def test_a_loop_is_left_out_by_its_label():
+    """Or by what that begins with; the others are as they were."""
+    every, _ = load_records([CURRENT], settings_from("ppi", []), 0)
+    first = every[0].label
+    chosen = settings_from("ppi", [f"leave_out=[{json.dumps(first)}]"])
+    kept = load_records([CURRENT], chosen, 0)[0] if len(every) > 1 else []
+    assert [each.label for each in kept] == [each.label for each in every if each.label != first]
+
+
+@pytest.mark.parametrize(
+    ("label", "rule"), [("nothing", "there is none of"), ("", "leaves nothing")]
+)
+def test_leaving_out_what_is_not_there_or_all_is_refused(label, rule):
+    with pytest.raises(InputError, match=rule):
+        load_records([CURRENT], settings_from("ppi", [f"leave_out=['{label}']"]), 0)

@@ -50,3 +50,23 @@ def test_a_stretch_at_a_small_part_of_the_amplitude_is_none():
     command = np.concatenate((0.01 * sine(50.0, 10), np.linspace(0.0, 1.0, 60)))
     assert steady_stretch(command, 50.0) is None
     assert steady_stretch(sine(50.0, 1.5), 50.0) is None
+
+
+@pytest.mark.parametrize("cycles", [2, 3, 4])
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+@pytest.mark.parametrize("period", [100.0, 1000.0, 73.3])
+def test_few_cycles_with_the_noise_of_a_measured_current_repeat(cycles, noise, period):
+    """A hundredth of the amplitude is more than 2 % from cycle to cycle, somewhere."""
+    time = np.arange(round(cycles * period))
+    command = 6.0 * np.sin(2.0 * np.pi * time / period)
+    command += np.random.default_rng(cycles).normal(0.0, 6.0 * noise, time.size)
+    found, start, stop = find_period("four", command)
+    assert found == pytest.approx(period, rel=0.01)
+    assert stop - start >= 1.95 * period
+
+
+def test_what_grows_does_not_repeat_and_what_then_is_said():
+    """One piece of advice, which does not lead back here."""
+    time = np.arange(2000)
+    with pytest.raises(DataError, match=r"with --whole, and a model without stages"):
+        find_period("growing", time * np.sin(2.0 * np.pi * time / 200.0))
