@@ -189,7 +189,9 @@ class AttackedRuns:
             recorded=recording.samples.command.size,
             lost=log.lost(recording.samples),
             reason=recording.end.get("reason", "none"),
-            other_reader=verdict(path, recording.samples.command.size),
+            other_reader=verdict(
+                path, None if self._wire.streams else recording.samples.command.size
+            ),
         )
 
 
