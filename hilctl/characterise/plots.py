@@ -1,0 +1,113 @@
+"""Figures of a campaign."""
+
+from collections.abc import Sequence
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from hilctl.analysis.canvas import (
+    COMMAND,
+    DISPLACEMENT,
+    ERROR,
+    MARK,
+    QUIET,
+    REFERENCE,
+    STYLE,
+    draw_line,
+    legend,
+    min_max,
+)
+from hilctl.characterise.loops import LoopFigures, ReversalCurves
+from hilctl.characterise.response import SmallSignal
+from hilctl.characterise.results import HeldOut
+
+_WIDTH = 10.0
+_COLOURS = (DISPLACEMENT, COMMAND, ERROR, MARK, "#E69F00", "#56B4E9", REFERENCE, QUIET)
+
+
+@mpl.rc_context(STYLE)
+def response_figure(small: SmallSignal, band_hz: tuple[float, float], unit: str) -> Figure:
+    """Draw magnitude and phase of the small-signal response, measured and fitted."""
+    figure = Figure(figsize=(_WIDTH, 4.6))
+    upper, lower = figure.subplots(2, 1, sharex=True)
+    measured, fitted = small.response, small.fitted
+    upper.errorbar(
+        small.frequency_hz,
+        np.abs(measured),
+        yerr=small.noise,
+        fmt=".",
+        color=DISPLACEMENT,
+        markersize=3,
+        label="measured",
+    )
+    upper.loglog(small.frequency_hz, np.abs(fitted), color=REFERENCE, label="fitted")
+    upper.set(ylabel=f"um/{unit}", title="Small-signal response")
+    for signal, style, colour in ((measured, ".", DISPLACEMENT), (fitted, "-", REFERENCE)):
+        degrees = np.degrees(np.unwrap(np.angle(signal)))
+        lower.semilogx(small.frequency_hz, degrees, style, color=colour, markersize=3)
+    lower.set(xlabel="Hz", ylabel="phase, degrees")
+    for axes in (upper, lower):
+        axes.axvspan(*band_hz, color="#eeeeee", zorder=0)
+        if small.natural_hz is not None:
+            axes.axvline(small.natural_hz, color=MARK, linewidth=0.8, linestyle="--")
+    upper.set_xlim(0.8 * small.frequency_hz[0], 1.2 * small.frequency_hz[-1])
+    legend(upper)
+    return figure
+
+
+@mpl.rc_context(STYLE)
+def loops_figure(groups: Sequence[tuple[str, Sequence[LoopFigures]]], unit: str) -> Figure:
+    """Draw loops, a panel a group."""
+    drawn = [(title, loops) for title, loops in groups if loops]
+    columns = min(2, len(drawn))
+    rows = -(-len(drawn) // columns)
+    figure = Figure(figsize=(_WIDTH, 4.2 * rows))
+    panels = figure.subplots(rows, columns, squeeze=False)
+    for axes in panels.flat:
+        axes.set_visible(False)
+    for axes, (title, loops) in zip(panels.flat, drawn, strict=False):
+        axes.set_visible(True)
+        _loops(axes, loops, unit)
+        axes.set(title=title, xlabel=f"command, {unit}", ylabel="displacement, um")
+    return figure
+
+
+def _loops(axes: Axes, loops: Sequence[LoopFigures], unit: str) -> None:
+    for loop, colour in zip(loops, _COLOURS * len(loops), strict=False):
+        around = (np.append(each, each[0]) for each in (loop.command, loop.displacement_um))
+        at = f"{loop.bias:+.2g} " if abs(loop.bias) > 0.05 * loop.amplitude else ""
+        label = f"{at}{loop.amplitude:.3g} {unit}, {loop.frequency_hz:g} Hz"
+        axes.plot(*around, color=colour, linewidth=0.9, label=label)
+    axes.legend(fontsize=6.5, loc="upper left", ncols=1 if len(loops) <= len(_COLOURS) else 2)
+
+
+@mpl.rc_context(STYLE)
+def reversal_figure(found: ReversalCurves, unit: str) -> Figure:
+    """Draw the reversal curves: as they are, and each less the outer one."""
+    figure = Figure(figsize=(_WIDTH, 4.2))
+    left, right = figure.subplots(1, 2)
+    outer = found.curves[0]
+    for number, curve in enumerate(found.curves):
+        shade = str(0.75 * number / len(found.curves))
+        command, displacement_um = min_max(curve[0], curve[1])
+        left.plot(command, displacement_um, color=shade, linewidth=0.8)
+        apart = curve[1] - np.interp(curve[0], outer[0], outer[1])
+        right.plot(*min_max(curve[0], apart), color=shade, linewidth=0.8)
+    left.set(title="Reversal curves", xlabel=f"command, {unit}", ylabel="displacement, um")
+    right.set(title="Above the outer one", xlabel=f"command, {unit}", ylabel="um")
+    return figure
+
+
+@mpl.rc_context(STYLE)
+def held_out_figure(found: HeldOut) -> Figure:
+    """Draw measured and modelled displacement over time, and the error below."""
+    figure = Figure(figsize=(_WIDTH, 4.6))
+    upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[2.0, 1.0])
+    draw_line(upper, found.time_s, found.measured_um, DISPLACEMENT)
+    draw_line(upper, found.time_s, found.modelled_um, REFERENCE, dashed=True)
+    upper.set(ylabel="um", title=f"{found.label}: measured, and the model dashed")
+    draw_line(lower, found.time_s, found.modelled_um - found.measured_um, ERROR)
+    lower.set(xlabel="s", ylabel="error, um")
+    return figure
