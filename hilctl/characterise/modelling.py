@@ -25,8 +25,12 @@ _SLACK = 0.01
 FITTED = ("growing", "slow-loops", "fast-loops")
 """Beginnings of the names of those steps whose recordings a model is identified from."""
 
-JUDGED = ("held-out", "reversal-curves", "biased-loops")
-"""Steps that no fit sees, the most telling first."""
+JUDGED: Mapping[str, str] = {
+    "held-out": "random reference",
+    "reversal-curves": "first-order reversal curves",
+    "biased-loops": "small loops all over the range",
+}
+"""Steps that no fit sees and what they are for people, the most telling first."""
 
 
 def identified(
@@ -58,18 +62,23 @@ def judged(
 ) -> tuple[HeldOut, ...]:
     """Hold a model against the recordings that it was not identified from."""
     return tuple(
-        held_out(model, read(recordings[name]), noise_um) for name in JUDGED if name in recordings
+        held_out(model, read(recordings[name]), noise_um, label)
+        for name, label in JUDGED.items()
+        if name in recordings
     )
 
 
-def held_out(model: HysteresisModel, recording: Recording, noise_um: float) -> HeldOut:
-    """Hold a model against the last waveform of a recording, run through from its beginning.
+def held_out(model: HysteresisModel, recording: Recording, noise_um: float, label: str) -> HeldOut:
+    """Hold a model against what a recording has after its first waveform, run through as a whole.
+
+    Judged is what the waveforms have at full size, within the commands that the model was found on.
 
     Args:
         model: The model.
         recording: A run that begins with a conditioning cycle, so that what was before it does not
             matter.
         noise_um: rms of a single reading.
+        label: What it is, for people.
 
     Raises:
         DataError: Samples are missing.
@@ -87,7 +96,7 @@ def held_out(model: HysteresisModel, recording: Recording, noise_um: float) -> H
     whole_um = max(float(np.ptp(measured_um[good])), 1e-12)
     floor_um = noise_um * metrics.expected_maximum(error_um.size)
     return HeldOut(
-        label=parts[0].label if len(parts) == 1 else f"{len(parts)} loops",
+        label=label,
         peak_percent=100.0 * metrics.peak(error_um) / whole_um,
         rms_percent=100.0 * metrics.rms(error_um) / whole_um,
         mean_percent=100.0 * float(error_um.mean()) / whole_um,

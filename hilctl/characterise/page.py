@@ -45,7 +45,7 @@ def figure_rows(measured: Measured, unit: str) -> Iterator[tuple[str, str]]:
         if small.natural_hz is not None:
             resonance = f"{small.natural_hz:.4g} Hz, damping ratio {small.damping_ratio:.2g}"
         yield "resonance", resonance
-        yield "left by that fit", f"{small.misfit_percent:.2g} % rms of each line"
+        yield "left by that fit", f"{small.misfit_percent:.2g} % rms of the gain"
     if measured.growing:
         largest = measured.growing[-1]
         low_high = f"{largest.low_um:.4g} to {largest.high_um:.4g} um"
@@ -95,7 +95,10 @@ def _held_out(found: Characterisation) -> list[str]:
         "<h2>Error on references that no fit saw</h2>",
         f"<p>{_text(text)}</p>",
         grid(HELD_OUT_HEADINGS, held_out_rows(found), "numbers"),
-        *(image(_text(each.label), plots.held_out_figure(each)) for each in found.held_out),
+        *(
+            image(_text(each.label), plots.held_out_figure(each, close=i == 0))
+            for i, each in enumerate(found.held_out)
+        ),
     ]
 
 

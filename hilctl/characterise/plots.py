@@ -19,11 +19,13 @@ from hilctl.analysis.canvas import (
     legend,
     min_max,
 )
+from hilctl.base.arrays import F64
 from hilctl.characterise.loops import LoopFigures, ReversalCurves
 from hilctl.characterise.response import SmallSignal
 from hilctl.characterise.results import HeldOut
 
 _WIDTH = 10.0
+_CLOSE = 0.02  # of the duration, to either side
 _COLOURS = (DISPLACEMENT, COMMAND, ERROR, MARK, "#E69F00", "#56B4E9", REFERENCE, QUIET)
 
 
@@ -52,6 +54,8 @@ def response_figure(small: SmallSignal, band_hz: tuple[float, float], unit: str)
         axes.axvspan(*band_hz, color="#eeeeee", zorder=0)
         if small.natural_hz is not None:
             axes.axvline(small.natural_hz, color=MARK, linewidth=0.8, linestyle="--")
+        axes.xaxis.set_major_formatter("{x:g}")
+    upper.yaxis.set_major_formatter("{x:g}")
     upper.set_xlim(0.8 * small.frequency_hz[0], 1.2 * small.frequency_hz[-1])
     legend(upper)
     return figure
@@ -101,13 +105,36 @@ def reversal_figure(found: ReversalCurves, unit: str) -> Figure:
 
 
 @mpl.rc_context(STYLE)
-def held_out_figure(found: HeldOut) -> Figure:
-    """Draw measured and modelled displacement over time, and the error below."""
+def held_out_figure(found: HeldOut, *, close: bool) -> Figure:
+    """Draw measured and modelled displacement over time, and the error below.
+
+    Args:
+        found: The reference and what the model makes of it.
+        close: Whether displacements are drawn about the largest error only, and not throughout.
+    """
     figure = Figure(figsize=(_WIDTH, 4.6))
-    upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[2.0, 1.0])
-    draw_line(upper, found.time_s, found.measured_um, DISPLACEMENT)
-    draw_line(upper, found.time_s, found.modelled_um, REFERENCE, dashed=True)
-    upper.set(ylabel="um", title=f"{found.label}: measured, and the model dashed")
-    draw_line(lower, found.time_s, found.modelled_um - found.measured_um, ERROR)
+    upper, lower = figure.subplots(2, 1, height_ratios=[2.0, 1.0])
+    time_s, measured_um, modelled_um = _with_gaps(found)
+    error_um = modelled_um - measured_um
+    shown = np.full(time_s.size, fill_value=True)
+    if close:
+        worst_s = time_s[np.nanargmax(np.abs(error_um))]
+        shown = np.abs(time_s - worst_s) < _CLOSE * (time_s[-1] - time_s[0])
+    draw_line(upper, time_s[shown], measured_um[shown], DISPLACEMENT)
+    draw_line(upper, time_s[shown], modelled_um[shown], REFERENCE, dashed=True)
+    about = " (about the largest error)" if close else ""
+    upper.set(ylabel="um", title=f"{found.label}: measured, and the model dashed{about}")
+    draw_line(lower, time_s, error_um, ERROR)
     lower.set(xlabel="s", ylabel="error, um")
     return figure
+
+
+def _with_gaps(found: HeldOut) -> tuple[F64, F64, F64]:
+    """Return time and displacements with a NaN where samples are left out, so that lines end."""
+    steps = np.diff(found.time_s)
+    gaps = np.flatnonzero(steps > 1.5 * steps.min()) + 1
+    time_s = np.insert(found.time_s, gaps, found.time_s[gaps - 1])
+    measured_um, modelled_um = (
+        np.insert(each, gaps, np.nan) for each in (found.measured_um, found.modelled_um)
+    )
+    return time_s, measured_um, modelled_um

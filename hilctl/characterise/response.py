@@ -40,7 +40,7 @@ class SmallSignal:
         lag_s: Time constant of a first-order lag; 0 where there is none.
         natural_hz: Natural frequency; None where no resonance shows.
         damping_ratio: Its damping; None without.
-        misfit_percent: rms of what the fit leaves of the lines, relative to each.
+        misfit_percent: rms of what the fit leaves of the lines, of the gain.
         fitted: complex128[k], what the fit makes of the lines.
     """
 
@@ -77,7 +77,7 @@ def small_signal(recording: Recording) -> SmallSignal:
     frequency_hz, response, noise = frequency_hz[usable], response[usable], noise[usable]
     found, resonant = _fit(frequency_hz, response, noise, recording.sample_rate_hz)
     fitted = _response(found, frequency_hz, resonant=resonant)
-    left = np.abs(fitted / response - 1.0)
+    left = np.abs(fitted - response) / math.exp(found[0])
     lag_s = math.exp(found[2])
     return SmallSignal(
         frequency_hz=frequency_hz,

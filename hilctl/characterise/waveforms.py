@@ -94,7 +94,7 @@ def sine(
     keys = {
         "kind": "sine",
         "unit": limits.unit,
-        "amplitude": limits.by_slew(amplitude, frequency_hz),
+        "amplitude": _rounded(limits.by_slew(amplitude, frequency_hz)),
         "frequency_hz": frequency_hz,
         "offset": limits.centre if offset is None else offset,
     }
@@ -206,7 +206,7 @@ def random_reference(limits: CampaignLimits, amplitude: float, seed: int) -> Key
     part = {
         "kind": "random",
         "unit": limits.unit,
-        "amplitude": amplitude,
+        "amplitude": _rounded(amplitude),
         "first_hz": min(first_hz, 0.5 * last_hz),
         "last_hz": last_hz,
         "seed": seed,
@@ -215,6 +215,11 @@ def random_reference(limits: CampaignLimits, amplitude: float, seed: int) -> Key
     seconds = max(RANDOM_S, _RANDOM_CYCLES / limits.middle_hz)
     part, _ = within(limits, _softened(limits, part, seconds, 1.0 / limits.middle_hz))
     return _sequence(limits, [conditioning(limits, amplitude), part])
+
+
+def _rounded(amplitude: float) -> float:
+    """Return an amplitude as people write it; it is far enough from the limits."""
+    return float(f"{amplitude:.4g}")
 
 
 def _sequence(limits: CampaignLimits, parts: list[Keys]) -> Keys:
