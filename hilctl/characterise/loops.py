@@ -176,8 +176,8 @@ def repeatability(first: LoopFigures, again: LoopFigures) -> Repeatability:
     """Compare a loop with itself at another time."""
     phase = np.linspace(0.0, 1.0, _POINTS, endpoint=False)
     one, two = (
-        np.interp(phase, np.linspace(0.0, 1.0, each.displacement_um.size), each.displacement_um)
-        for each in (first, again)
+        np.interp(phase, np.arange(y.size) / y.size, y, period=1.0)
+        for y in (first.displacement_um, again.displacement_um)
     )
     shift_um = float(two.mean() - one.mean())
     whole = max(first.peak_to_peak_um, 1e-12)

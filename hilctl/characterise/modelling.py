@@ -11,7 +11,7 @@ from hilctl.analysis import metrics
 from hilctl.base.arrays import F64
 from hilctl.base.errors import DataError
 from hilctl.base.segments import Segment
-from hilctl.characterise.results import HeldOut
+from hilctl.characterise.results import UnseenReference
 from hilctl.identify.command import Identification, identify_files, settings_from
 from hilctl.identify.job import OnProgress, ignore_progress
 from hilctl.models.base import HysteresisModel
@@ -59,7 +59,7 @@ def identified(
 
 def judged(
     model: HysteresisModel, recordings: Mapping[str, Path], noise_um: float
-) -> tuple[HeldOut, ...]:
+) -> tuple[UnseenReference, ...]:
     """Hold a model against the recordings that it was not identified from."""
     return tuple(
         held_out(model, read(recordings[name]), noise_um, label)
@@ -68,7 +68,9 @@ def judged(
     )
 
 
-def held_out(model: HysteresisModel, recording: Recording, noise_um: float, label: str) -> HeldOut:
+def held_out(
+    model: HysteresisModel, recording: Recording, noise_um: float, label: str
+) -> UnseenReference:
     """Hold a model against what a recording has after its first waveform, run through as a whole.
 
     Judged is what the waveforms have at full size, within the commands that the model was found on.
@@ -95,7 +97,7 @@ def held_out(model: HysteresisModel, recording: Recording, noise_um: float, labe
     error_um = modelled_um[good] - measured_um[good]
     whole_um = max(float(np.ptp(measured_um[good])), 1e-12)
     floor_um = noise_um * metrics.expected_maximum(error_um.size)
-    return HeldOut(
+    return UnseenReference(
         label=label,
         peak_percent=100.0 * metrics.peak(error_um) / whole_um,
         rms_percent=100.0 * metrics.rms(error_um) / whole_um,

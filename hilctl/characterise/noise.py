@@ -129,8 +129,11 @@ def _each_cycle(since: I64, period: float, values: F64, cycles: int) -> np.ndarr
     """Return coefficients 0 to 2 of each whole cycle: complex128[cycles, 3], drift taken out."""
     good = np.isfinite(values)
     since, values = since[good], values[good]
-    trend = np.polynomial.polynomial.polyfit(since, values, 1)
-    values = values - np.polynomial.polynomial.polyval(since, trend)
     number = np.floor((since - since[-1] - 0.5) / period).astype(np.int64) + cycles
     rows = [number == k for k in range(cycles)]
-    return np.array([coefficients(since[r], period, values[r], 2) for r in rows if r.any()])
+    rows = [row for row in rows if row.any()]
+    if len(rows) > 1:  # a line through the samples would take some of the sine with it
+        means = [float(values[row].mean()) for row in rows]
+        slope = np.polynomial.polynomial.polyfit(np.arange(len(rows)), means, 1)[1]
+        values = values - slope * since / period
+    return np.array([coefficients(since[r], period, values[r], 2) for r in rows])

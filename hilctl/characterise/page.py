@@ -7,7 +7,7 @@ from pathlib import Path
 from hilctl.analysis.html import document, grid, image, write_page
 from hilctl.base.printable import printable
 from hilctl.characterise import plots
-from hilctl.characterise.results import Characterisation, HeldOut, Measured
+from hilctl.characterise.results import Characterisation, Measured, UnseenReference
 from hilctl.identify.page import loops_figure
 from hilctl.identify.summary import HEADINGS, error_rows, summary
 from hilctl.models.files import dump_model
@@ -21,7 +21,7 @@ def held_out_rows(found: Characterisation) -> list[tuple[str, ...]]:
     return [(each.label, *_percents(each)) for each in found.held_out]
 
 
-def _percents(each: HeldOut) -> Iterator[str]:
+def _percents(each: UnseenReference) -> Iterator[str]:
     for value in (each.peak_percent, each.rms_percent, each.mean_percent, each.floor_percent):
         yield f"{value:.3g}"
 

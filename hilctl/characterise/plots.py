@@ -22,7 +22,7 @@ from hilctl.analysis.canvas import (
 from hilctl.base.arrays import F64
 from hilctl.characterise.loops import LoopFigures, ReversalCurves
 from hilctl.characterise.response import SmallSignal
-from hilctl.characterise.results import HeldOut
+from hilctl.characterise.results import UnseenReference
 
 _WIDTH = 10.0
 _CLOSE = 0.02  # of the duration, to either side
@@ -105,7 +105,7 @@ def reversal_figure(found: ReversalCurves, unit: str) -> Figure:
 
 
 @mpl.rc_context(STYLE)
-def held_out_figure(found: HeldOut, *, close: bool) -> Figure:
+def held_out_figure(found: UnseenReference, *, close: bool) -> Figure:
     """Draw measured and modelled displacement over time, and the error below.
 
     Args:
@@ -129,7 +129,7 @@ def held_out_figure(found: HeldOut, *, close: bool) -> Figure:
     return figure
 
 
-def _with_gaps(found: HeldOut) -> tuple[F64, F64, F64]:
+def _with_gaps(found: UnseenReference) -> tuple[F64, F64, F64]:
     """Return time and displacements with a NaN where samples are left out, so that lines end."""
     steps = np.diff(found.time_s)
     gaps = np.flatnonzero(steps > 1.5 * steps.min()) + 1

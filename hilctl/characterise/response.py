@@ -110,10 +110,10 @@ def _lines(recording: Recording) -> tuple[F64, C128, F64, float]:
             "look at the sensor and at late ticks ('hilctl report'), then run it again",
         )
     shape = (periods, period)
-    drift = np.linspace(0.0, 1.0, moved.size)
-    moved = moved - np.polynomial.polynomial.polyval(
-        drift, np.polynomial.polynomial.polyfit(drift, moved, 1)
-    )
+    # Drift from period to period: a line through the samples would take low frequencies with it.
+    means = moved.reshape(shape).mean(axis=1)
+    slope = np.polynomial.polynomial.polyfit(np.arange(periods), means, 1)[1]
+    moved = moved - slope * np.arange(moved.size) / period
     wanted = np.fft.rfft(samples.command[whole].reshape(shape)).mean(axis=0)
     each = np.fft.rfft(moved.reshape(shape))
     strong = np.abs(wanted) > 0.2 * np.max(np.abs(wanted[1:]))

@@ -56,7 +56,7 @@ class Measured:
 
 
 @dataclass(frozen=True, slots=True)
-class HeldOut:
+class UnseenReference:
     """How far the model is from a reference that no fit has seen, the mean error included.
 
     Attributes:
@@ -126,7 +126,7 @@ class Characterisation:
     band_hz: tuple[float, float]
     steps: tuple[StepRow, ...]
     measured: Measured
-    held_out: tuple[HeldOut, ...] = ()
+    held_out: tuple[UnseenReference, ...] = ()
     identification: Identification | None = None
     problem: str = ""
     problem_code: str = ""

@@ -12,7 +12,7 @@ from pydantic import TypeAdapter
 
 from hilctl.base.arrays import F64
 from hilctl.characterise.limits import CampaignLimits, round_hz
-from hilctl.waveforms.build import build
+from hilctl.waveforms.build import Reference, build
 from hilctl.waveforms.spec import AnyWaveform
 
 Keys: TypeAlias = dict[str, Any]
@@ -35,35 +35,38 @@ _OF_BIAS = 0.15
 _RANDOM_BAND = (5.0, 0.5)  # of the lowest and of the highest frequency of loops
 
 
-def command_of(limits: CampaignLimits, keys: Keys) -> F64:
-    """Return every command of a waveform: float64[n]."""
-    return build(_ADAPTER.validate_json(json.dumps(keys)), limits.sample_rate_hz, Path()).values
+def reference_of(limits: CampaignLimits, keys: Keys) -> Reference:
+    """Return every command of a waveform, and its segments."""
+    return build(_ADAPTER.validate_json(json.dumps(keys)), limits.sample_rate_hz, Path())
 
 
 def within(limits: CampaignLimits, keys: Keys) -> tuple[Keys, F64]:
-    """Lower a waveform's amplitudes until slew and heat are kept, where that is what it takes.
+    """Shrink a waveform towards rest until slew and heat are kept, where that is what it takes.
 
     Returns:
         Its keys, and every command: float64[n].
     """
     for _ in range(_TRIES):
-        command = command_of(limits, keys)
+        command = reference_of(limits, keys).values.copy()  # kernels take no read-only one
         scale = limits.scale(command)
         if scale >= 1.0:
             break
-        keys = _scaled(keys, 0.99 * scale)
+        keys = _scaled(limits, keys, 0.99 * scale)
     return keys, command
 
 
-def _scaled(keys: Keys, scale: float) -> Keys:
-    changed = dict(keys)
+def _scaled(limits: CampaignLimits, keys: Keys, scale: float) -> Keys:
+    """Shrink a waveform towards rest: within the range it stays."""
+    changed = {
+        key: scale * value if key in {"amplitude", "rate_per_s"} else value
+        for key, value in keys.items()
+    }
     if "parts" in keys:
-        changed["parts"] = [_scaled(part, scale) for part in keys["parts"]]
-    if "amplitude" in keys:
-        changed["amplitude"] = scale * keys["amplitude"]
-    if "levels" in keys:  # the last leads back to rest
-        changed["levels"] = [*(scale * level for level in keys["levels"][:-1]), keys["levels"][-1]]
-        changed["rate_per_s"] = scale * keys["rate_per_s"]
+        changed["parts"] = [_scaled(limits, part, scale) for part in keys["parts"]]
+    if "levels" in keys:
+        changed["levels"] = [scale * level for level in keys["levels"]]
+    if "offset" in keys:
+        changed["offset"] = limits.rest + scale * (keys["offset"] - limits.rest)
     return changed
 
 
