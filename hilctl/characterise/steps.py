@@ -4,6 +4,8 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
+
 from hilctl.characterise import waveforms
 from hilctl.characterise.limits import CampaignLimits
 from hilctl.characterise.loops import (
@@ -21,9 +23,9 @@ from hilctl.characterise.waveforms import Keys
 from hilctl.recording.data import Recording
 
 POLARITY_PARTS = (0.01, 0.03, 0.1)
+SMALL_PARTS = (0.05, 0.25)
 GROWING_PARTS = (0.1, 0.25, 0.5, 0.75, 1.0)
 
-_SMALL_PART = 0.05
 _MOST_RANDOM = 0.95
 _CYCLES = 12.0
 _LOUD = 0.05  # rms noise over the whole stroke at which nothing can be told from it
@@ -135,15 +137,25 @@ def _refuse_silent(
     )
 
 
-def _response(limits: CampaignLimits, measured: Measured) -> Keys:
-    del measured
-    return waveforms.small_multisine(limits, _SMALL_PART * limits.reach)
+def _response(part: float) -> Callable[[CampaignLimits, Measured], Keys | None]:
+    def make(limits: CampaignLimits, measured: Measured) -> Keys | None:
+        if measured.small is not None:
+            return None
+        return waveforms.small_multisine(limits, part * limits.reach)
+
+    return make
 
 
 def _take_response(
     recording: Recording, limits: CampaignLimits, measured: Measured
 ) -> tuple[Measured, str]:
-    found = small_signal(recording)
+    try:
+        found = small_signal(recording)
+    except RigProblemError as error:
+        tried = 0.5 * float(np.ptp(recording.samples.command))
+        if error.code != "noise" or tried > 0.9 * SMALL_PARTS[-1] * limits.reach:
+            raise
+        return measured, f"lost in noise at {100.0 * tried / limits.reach:.2g} % of the range"
     natural_hz = found.natural_hz
     delay = f"delay {1e3 * found.delay_s:.3g} ms, lag {1e3 * found.lag_s:.3g} ms"
     text = f"gain {found.gain_um:.3g} um/{limits.unit}, {delay}"
@@ -306,9 +318,7 @@ def _numbered(
 STEPS: tuple[CampaignStep, ...] = (
     CampaignStep("rest", "noise and drift at rest", _rest, _take_rest),
     *_numbered("polarity", "first reaction, its sign", POLARITY_PARTS, _polarity, _take_polarity),
-    CampaignStep(
-        "response", "gain, delay, lag and resonance, small signals", _response, _take_response
-    ),
+    *_numbered("response", "small-signal response", SMALL_PARTS, _response, _take_response),
     *_numbered("growing", "loop of growing amplitude", GROWING_PARTS, _growing, _take_growing),
     CampaignStep("slow-loops", "loops at the lowest frequency", _slow, _take_slow),
     CampaignStep("fast-loops", "loops at several frequencies", _fast, _take_fast),

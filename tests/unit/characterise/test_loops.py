@@ -118,6 +118,14 @@ def test_repeatability_tells_shape_from_place():
     assert found.shape_percent == pytest.approx(2.0, rel=0.01)
 
 
+def test_noise_is_no_change_of_shape(limits, played):
+    """A sensor noise of 3 % of the peak-to-peak: the loop is what it was."""
+    first, again = (loop(limits, played, noise_um=1.0 + 1e-9 * k) for k in range(2))
+    again = replace(again, displacement_um=again.displacement_um + np.random.default_rng(5).normal(
+        0.0, 0.35, again.displacement_um.size))  # fmt: skip
+    assert repeatability(first, again).shape_percent < 1.0
+
+
 def test_reversal_curves_return_to_one_point(limits, played):
     """Plays do by their nature; what forgets does not."""
     found = reversal_curves(played(limits, reversal_keys(limits, 3.0), plays))
