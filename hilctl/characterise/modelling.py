@@ -34,27 +34,19 @@ JUDGED: Mapping[str, str] = {
 
 
 def identified(
-    recordings: Mapping[str, Path],
-    output: Path | None,
-    *,
-    overwrite: bool = False,
-    progress: OnProgress = ignore_progress,
+    recordings: Mapping[str, Path], progress: OnProgress = ignore_progress
 ) -> Identification:
-    """Identify the model: the only place that says how.
+    """Identify the model: the only place that says how. Nothing is written.
 
     Args:
         recordings: The steps' recordings by name.
-        output: Model file to write; None for none.
-        overwrite: Whether a file of that name may be replaced.
         progress: Called with what is being done.
 
     Raises:
-        InputError: No model can be identified from them, or the file can't be written.
+        InputError: No model can be identified from them.
     """
     fitted = [path for name, path in recordings.items() if name.startswith(FITTED)]
-    return identify_files(
-        fitted, settings_from("staged", []), output, overwrite=overwrite, progress=progress
-    )
+    return identify_files(fitted, settings_from("staged", []), None, progress=progress)
 
 
 def judged(

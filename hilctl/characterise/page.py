@@ -86,14 +86,12 @@ def characterisation_page(found: Characterisation) -> str:
 def _held_out(found: Characterisation) -> list[str]:
     if not found.held_out:
         return []
-    verdict = f"The model is {found.verdict}." if found.verdict != "usable" else "It is usable."
     first = found.held_out[0]
-    floor = f"sensor noise alone would make {first.floor_percent:.2g} %"
-    text = f"{verdict} Largest error on a random reference that no fit saw: "
-    text += f"{first.peak_percent:.3g} % of the peak-to-peak displacement, {floor}."
+    text = f"Verdict: {found.verdict}. Sensor noise alone would make {first.floor_percent:.2g} %."
     return [
         "<h2>Error on references that no fit saw</h2>",
         f"<p>{_text(text)}</p>",
+        *(f"<p>{_text(note)}</p>" for note in (found.verdict.notes if found.verdict else ())),
         grid(HELD_OUT_HEADINGS, held_out_rows(found), "numbers"),
         *(
             image(_text(each.label), plots.held_out_figure(each, close=i == 0))

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
-from typing import Any, Literal, Self, TypeAlias
+from typing import Any, Self
 
 import numpy as np
 
@@ -12,12 +12,7 @@ from hilctl.characterise.loops import LoopFigures, Repeatability, ReversalCurves
 from hilctl.characterise.noise import RestNoise, SineReaction
 from hilctl.characterise.response import SmallSignal
 from hilctl.identify.command import Identification
-
-ModelVerdict: TypeAlias = Literal["good", "usable", "not a model of this actuator"]
-
-GOOD_PERCENT = 2.0
-USABLE_PERCENT = 10.0
-"""Largest held-out errors of a good and of a usable model, peak, in percent of the peak-to-peak."""
+from hilctl.identify.verdict import GOOD_PERCENT, MOST_PERCENT, Grade, Verdict
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,21 +127,35 @@ class Characterisation:
     problem_code: str = ""
 
     @property
-    def verdict(self) -> ModelVerdict | None:
-        """What the held-out error says of the model; None without one."""
-        if not self.held_out:
+    def verdict(self) -> Verdict | None:
+        """What the model is worth; None without one.
+
+        What identification says of the data stands; else the error on the random reference decides,
+        which has more of what a run will ask for than loops left out of a fit.
+        """
+        if self.identification is None or not self.held_out:
             return None
-        peak = self.held_out[0].peak_percent
-        if peak <= GOOD_PERCENT:
-            return "good"
-        return "usable" if peak <= USABLE_PERCENT else "not a model of this actuator"
+        known, first = self.identification.verdict, self.held_out[0]
+        peak = first.peak_percent
+        if known.grade == "not a model":
+            return known
+        if peak > MOST_PERCENT:
+            reason = f"its error reaches {peak:.0f} % of the peak-to-peak of a {first.label}"
+            return Verdict("not a model", peak, held_out=True, reasons=(reason,))
+        grade: Grade = "good" if peak <= GOOD_PERCENT else "usable"
+        return Verdict(grade, peak, held_out=True, notes=known.notes)
+
+    @property
+    def is_model(self) -> bool:
+        """Whether there is a model that may be used."""
+        return self.verdict is not None and self.verdict.grade != "not a model"
 
     def to_mapping(self) -> dict[str, Any]:
         """Return plain values for JSON, the held-out error first."""
         found = self.identification
         return {
             "held_out": [_plain(each) for each in self.held_out],
-            "verdict": self.verdict,
+            "verdict": None if self.verdict is None else self.verdict.to_mapping(),
             "problem": self.problem or None,
             "problem_code": self.problem_code or None,
             "experiment": self.experiment,

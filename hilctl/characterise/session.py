@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TypeAlias
 
 from hilctl.base.errors import DataError, InputError, RunError
-from hilctl.base.files import check_writable
+from hilctl.base.files import check_writable, write_text
 from hilctl.characterise.heat import CampaignHeat
 from hilctl.characterise.limits import CampaignLimits, limits_of
 from hilctl.characterise.modelling import identified, judged
@@ -25,6 +25,7 @@ from hilctl.characterise.settings import unit_of, waveform_setting, without_refe
 from hilctl.characterise.steps import STEPS, CampaignStep
 from hilctl.characterise.waveforms import Keys, at_rest, within
 from hilctl.experiment.load import load_experiment
+from hilctl.models.files import dump_model
 from hilctl.recording.data import Recording
 from hilctl.recording.reader import read
 from hilctl.run.result import Progress, RunResult
@@ -307,14 +308,17 @@ class Campaign:
         self._host.on_progress(1.0, "identify")
         rest = self._measured.rest
         try:
-            found = identified(self._recordings, output, overwrite=overwrite)
+            found = identified(self._recordings)
             apart = judged(found.fit.model, self._recordings, rest.noise_um if rest else 0.0)
         except InputError as error:
             remedy = "look at the loops on the page, and try 'hilctl identify' on the recordings"
             raise RigProblemError(
                 "no_model", f"no model can be identified: {error}", remedy
             ) from None
-        return replace(self._so_far(result), held_out=apart, identification=found)
+        result = replace(self._so_far(result), held_out=apart, identification=found)
+        if result.is_model:
+            write_text(output, dump_model(found.fit.model), overwrite=overwrite)
+        return result
 
     def _path(self, number: int, step: CampaignStep) -> Path:
         return self._folder / f"{number:02d}-{step.name}.mcap"

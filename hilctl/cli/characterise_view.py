@@ -55,15 +55,18 @@ def print_plan(plan: CampaignPlan, folder: Path) -> None:
 def print_step(row: StepRow) -> None:
     """Print a step that is done."""
     how = "kept" if row.kept else f"{row.seconds:.1f} s"
-    console().print(f"{row.name:16s} {how:>7s}  {row.text}", soft_wrap=True)
+    print(f"{row.name:16s} {how:>7s}  {row.text}", flush=True)
 
 
 def print_characterisation(found: Characterisation, model: Path | None, page: Path) -> None:
     """Print the held-out error, what was measured, and where things are."""
     terminal = console()
     if found.held_out:
-        title = Text(f"verdict: {found.verdict}; errors in percent of the peak-to-peak")
+        title = Text("errors on references that no fit saw")
         terminal.print(_table(title, HELD_OUT_HEADINGS, held_out_rows(found)))
+        terminal.print(f"verdict: {found.verdict}", soft_wrap=True)
+        for note in found.verdict.notes if found.verdict else ():
+            terminal.print(note, soft_wrap=True)
     figures = list(figure_rows(found.measured, found.unit))
     if figures:
         terminal.print(_table(Text("measured"), ("figure", "value"), figures))

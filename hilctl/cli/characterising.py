@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from hilctl.characterise.results import Characterisation
     from hilctl.characterise.session import Campaign, CampaignHost
 
-_NONE_OF_IT = "not a model of this actuator"
-
 
 def characterise(
     experiment: ExperimentFile,
@@ -97,7 +95,7 @@ def _finish(
     from hilctl.cli.characterise_view import print_characterisation
 
     write_characterisation(found, page)
-    model = output if found.identification else None
+    model = output if found.is_model else None
     if as_json:
         places = {"output": str(model) if model else None, "page": str(page)}
         print_json({**found.to_mapping(), **places, "folder": str(folder)})
@@ -111,5 +109,5 @@ def _finish(
             file=sys.stderr,
         )
         raise typer.Exit(3)
-    if found.verdict == _NONE_OF_IT:
+    if not found.is_model:
         raise typer.Exit(1)

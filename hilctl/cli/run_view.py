@@ -155,4 +155,6 @@ def print_forecast(checked: Checked) -> None:
         table.add_row(name, text)
     terminal = console()
     terminal.print(table)
+    for warning in checked.warnings:
+        terminal.print(f"warning: {warning}", style="yellow")
     terminal.print("may start", style="green")

@@ -14,7 +14,10 @@ from hilctl.experiment.forecast import Forecast, forecast_of
 from hilctl.experiment.initial_state import Begun, InitialState, begin, initial_state_of
 from hilctl.experiment.interlocks import interlock_problems
 from hilctl.experiment.load import LoadedExperiment
+from hilctl.experiment.model_range import RangeFindings, range_findings
 from hilctl.waveforms.build import Reference, build
+
+_REPEAT = "identify the model on such motions too, or keep the waveform to what it was found on"
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,12 +29,14 @@ class Checked:
         reference: Every sample of its waveform.
         forecast: What it will do.
         begun: What the compensator is given, and what it begins with.
+        warnings: What keeps it from doing as well as its model promises.
     """
 
     loaded: LoadedExperiment
     reference: Reference
     forecast: Forecast
     begun: Begun
+    warnings: tuple[str, ...] = ()
 
     @property
     def state_size(self) -> int:
@@ -63,6 +68,8 @@ def check(loaded: LoadedExperiment) -> Checked:
         raise ConfigError(problems) from None
     low, high = float(reference.values.min()), float(reference.values.max())
     problems += reference_problems(loaded, reference.unit, low, high)
+    findings = _findings(loaded, reference)
+    problems += [_problem(loaded, "waveform", text, hint=_REPEAT) for text in findings.refused]
     values = _corrected(loaded, reference, problems)
     try:
         before = _state_before(loaded, problems)
@@ -78,7 +85,15 @@ def check(loaded: LoadedExperiment) -> Checked:
     problems += command_problems(loaded, forecast)
     if problems:
         raise ConfigError(problems)
-    return Checked(loaded, reference, forecast, begun)
+    return Checked(loaded, reference, forecast, begun, findings.warnings)
+
+
+def _findings(loaded: LoadedExperiment, reference: Reference) -> RangeFindings:
+    """Return where the reference leaves what the model was identified on."""
+    known = loaded.model.provenance.identified_range if loaded.model else None
+    if known is None or reference.unit != "um":
+        return RangeFindings()
+    return range_findings(known, reference.values, reference.segments, loaded.config.sample_rate_hz)
 
 
 def _corrected(loaded: LoadedExperiment, reference: Reference, problems: list[Problem]) -> F64:

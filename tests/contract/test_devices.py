@@ -8,6 +8,7 @@ time passes by one sample an exchange, so that nothing depends on how fast this 
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import ClassVar
 
@@ -16,7 +17,7 @@ import pytest
 
 from hilctl.base.device import Device
 from hilctl.base.errors import DeviceError
-from hilctl.experiment.registry import BUILTIN, device_class
+from hilctl.experiment.registry import BUILTIN, device_class, known_devices
 from hilctl_drivers.emulator.options import EmulatorOptions
 from hilctl_drivers.emulator.setup import build
 from hilctl_drivers.modbus.profile import ModbusProfile
@@ -98,6 +99,37 @@ def simulated(kind: str) -> DrivenDevice:
     return DrivenDevice(device, SAMPLES, RATE_HZ, lambda: device._last_command)
 
 
+def of_another_package(kind: str) -> DrivenDevice:
+    """Return a simulated device that is installed beside hilctl, or the example of one."""
+    chosen = EXAMPLES[kind]() if kind in EXAMPLES else device_class(kind)
+    device = chosen(chosen.Options())
+    if not device.info.simulated:
+        pytest.skip(f"{kind} drives hardware: pytest --device EXPERIMENT tests/hardware")
+    rate_hz = min(RATE_HZ, device.info.max_rate_hz)
+
+    def stands() -> float:
+        try:
+            return device.output()
+        except DeviceError:  # it is not open, and keeps its output while it is not
+            device.open(rate_hz, SAMPLES)
+            current = device.output()
+            device.close()
+            return current
+
+    return DrivenDevice(device, SAMPLES, rate_hz, stands)
+
+
+def _spring() -> type[Device]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(Path(__file__).parents[1] / "data" / "own_device")
+        found: type[Device] = import_module("own_device.spring").Spring
+    return found
+
+
+EXAMPLES = {"spring": _spring}
+OTHERS = sorted({*EXAMPLES, *known_devices()} - set(BUILTIN))
+
+
 RTU_PROFILE = """\
 vendor: nobody
 model: an analogue module on a serial line, which no shipped profile with an input is
@@ -150,7 +182,7 @@ def _fast(section: dict) -> dict:
     return {**section, "baud": 115200} if "serial_port" in section else section
 
 
-CASES = [*SIMULATED, *(f"modbus_dac {words}" for words in MODBUS)]
+CASES = [*SIMULATED, *OTHERS, *(f"modbus_dac {words}" for words in MODBUS)]
 
 
 @pytest.fixture
@@ -165,7 +197,8 @@ def make(tmp_path) -> Iterator[Callable[[str], DrivenDevice]]:
             path = tmp_path / "rtu.yaml"
             path.write_text(RTU_PROFILE, encoding="utf-8")
             words = [str(path)]
-        benches.append(modbus(words, stack) if words else simulated(kind))
+        made = of_another_package if kind in OTHERS else simulated
+        benches.append(modbus(words, stack) if words else made(kind))
         return benches[-1]
 
     yield of
@@ -189,7 +222,7 @@ def driven(make, case) -> DrivenDevice:
 
 def test_no_device_is_left_out():
     """Each device of the table is tried here, or in a file that is there."""
-    assert {case.split()[0] for case in CASES} | set(ELSEWHERE) == set(BUILTIN)
+    assert {case.split()[0] for case in CASES} | set(ELSEWHERE) == {*BUILTIN, *OTHERS}
     folder = Path(__file__).parent
     assert [name for name in ELSEWHERE.values() if not (folder / name).exists()] == []
 
@@ -208,7 +241,7 @@ def test_no_modbus_profile_is_left_out():
 def test_says_what_it_is_before_it_is_opened(driven):
     """Info is complete and sensible without a connection."""
     info = driven.device.info
-    assert info.name in BUILTIN
+    assert info.name in {*BUILTIN, *OTHERS}
     assert info.description
     assert info.command_unit in {"A", "V"}
     assert info.command_min < info.command_max

@@ -7,7 +7,7 @@ import numpy as np
 from hilctl.characterise.page import characterisation_page, write_characterisation
 from hilctl.characterise.results import StepRow
 from tests.unit.characterise.test_plots import SMALL
-from tests.unit.characterise.test_results import FOUND, LOOP, UNSEEN
+from tests.unit.characterise.test_results import FOUND, LOOP, UNSEEN, identification
 
 LINE = np.linspace(0.0, 1.0, 50)
 SEEN = replace(UNSEEN, time_s=LINE, measured_um=LINE, modelled_um=LINE)
@@ -22,11 +22,12 @@ WHOLE = replace(
 
 
 def test_the_held_out_error_comes_first():
-    page = characterisation_page(WHOLE)
+    page = characterisation_page(replace(WHOLE, identification=identification()))
     assert page.index("Error on references that no fit saw") < page.index("<h2>Measured")
-    assert "The model is good. Largest error on a random reference that no fit saw: 1.5 %" in page
+    assert "Verdict: good: within 1.50 %" in page
+    assert "a note" in page
     assert "http://" not in page
-    assert page.count("data:image/png") == 3  # held out, response, loops
+    assert page.count("data:image/png") == 4  # held out, response, loops, model
 
 
 def test_what_ended_a_campaign_stands_on_top():

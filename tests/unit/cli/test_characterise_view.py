@@ -1,5 +1,6 @@
 """A campaign for people."""
 
+from dataclasses import replace
 from pathlib import Path
 
 from hilctl.characterise.results import StepRow
@@ -11,7 +12,7 @@ from hilctl.cli.characterise_view import (
     print_step,
 )
 from tests.unit.characterise.conftest import experiment, limits, limits_with
-from tests.unit.characterise.test_results import FOUND
+from tests.unit.characterise.test_results import FOUND, identification
 
 __all__ = ["experiment", "limits", "limits_with"]
 
@@ -38,7 +39,8 @@ def test_a_step_that_stood_already_is_told_from_one_that_was_run(capsys):
 
 
 def test_the_held_out_error_comes_first(capsys):
-    print_characterisation(FOUND, Path("model.yaml"), Path("model.html"))
+    found = replace(FOUND, identification=identification())
+    print_characterisation(found, Path("model.yaml"), Path("model.html"))
     shown = capsys.readouterr().out
     assert shown.index("random reference") < shown.index("noise at rest")
     assert "verdict: good" in shown

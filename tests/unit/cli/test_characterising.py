@@ -8,6 +8,7 @@ import typer
 
 from hilctl.base.errors import InputError
 from hilctl.characterise import session
+from hilctl.characterise.results import Characterisation
 from hilctl.characterise.session import CampaignPlan, StoppedCampaignError, paced, unpaced
 from hilctl.cli.characterising import characterise
 from tests.unit.characterise.conftest import experiment, limits, limits_with
@@ -20,8 +21,10 @@ __all__ = ["experiment", "limits", "limits_with"]
 def ends(monkeypatch, limits):
     """Let a campaign end as told; return what was asked of it."""
     monkeypatch.setattr("hilctl.cli.characterising.finish_orphans", lambda: None)
-    asked = {"found": replace(FOUND, measured=FOUND.measured.also(growing=(), reversal=None),
-                              held_out=())}  # fmt: skip
+    measured = FOUND.measured.also(growing=(), reversal=None)
+    asked = {"found": replace(FOUND, measured=measured, held_out=())}
+    monkeypatch.setattr(Characterisation, "is_model", property(lambda self: asked["is_model"]))
+    asked["is_model"] = True
 
     class Done:
         plan = CampaignPlan(limits, FOUND.steps, 3.0, 5000.0)
@@ -65,7 +68,7 @@ def test_programs_read_one_object(ends, tmp_path, capsys):
     command(tmp_path, as_json=True, fast=False, highest_hz=20.0)
     printed = json.loads(capsys.readouterr().out)
     assert printed["page"] == str(tmp_path / "model.html")
-    assert printed["output"] is None
+    assert printed["output"] == str(tmp_path / "model.yaml")
     assert (ends["run"], ends["highest_hz"]) == (paced, 20.0)
 
 
@@ -89,6 +92,14 @@ def test_a_problem_of_the_rig_is_exit_code_3(ends, tmp_path, capsys):
     assert ended.value.exit_code == 3
     assert "no reaction: look" in capsys.readouterr().err
     assert (tmp_path / "model.html").is_file()
+
+
+def test_what_is_no_model_is_exit_code_1(ends, tmp_path, capsys):
+    ends["is_model"] = False
+    with pytest.raises(typer.Exit) as ended:
+        command(tmp_path, as_json=True)
+    assert ended.value.exit_code == 1
+    assert json.loads(capsys.readouterr().out)["output"] is None
 
 
 @pytest.mark.parametrize(
