@@ -9,8 +9,8 @@ import numpy.typing as npt
 
 from hilctl.analysis import metrics
 from hilctl.base.arrays import F64
-from hilctl.base.errors import DataError
 from hilctl.base.segments import Segment
+from hilctl.characterise.gaps import without_gaps
 from hilctl.characterise.results import UnseenReference
 from hilctl.identify.command import Identification, identify_files, settings_from
 from hilctl.identify.job import OnProgress, ignore_progress
@@ -75,17 +75,13 @@ def held_out(
         label: What it is, for people.
 
     Raises:
-        DataError: Samples are missing.
+        DataError: Too many samples are missing.
     """
     parts = recording.segments[1:]
     stop = parts[-1].steady_stop
-    samples = recording.samples
-    if np.count_nonzero(samples.index < stop) != stop:
-        raise DataError(f"{recording.path}: samples are missing, so no model can follow it")
-    command = np.ascontiguousarray(samples.command[:stop])
+    command, measured_um = without_gaps(recording, 0, stop)
     modelled_um = model.forward(recording.sample_rate_hz).process(command)
-    measured_um = samples.displacement_um[:stop]
-    good = np.isfinite(measured_um) & _in_range(command, model) & _steady(parts, stop)
+    good = _in_range(command, model) & _steady(parts, stop)
     error_um = modelled_um[good] - measured_um[good]
     whole_um = max(float(np.ptp(measured_um[good])), 1e-12)
     floor_um = noise_um * metrics.expected_maximum(error_um.size)

@@ -10,13 +10,13 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import OptimizeResult, least_squares
 
-from hilctl.analysis.steady import steady_samples
 from hilctl.base.arrays import F64
+from hilctl.base.errors import DataError
+from hilctl.characterise.gaps import without_gaps
 from hilctl.characterise.problem import RigProblemError
 from hilctl.experiment.correction import C128
 from hilctl.recording.data import Recording
 
-_FEWEST_PERIODS = 3
 _FEWEST_LINES = 8
 _USABLE = 0.3  # largest relative noise of a line that is fitted
 _HYSTERESIS = 0.03  # of a line, which no linear response explains
@@ -97,31 +97,25 @@ def small_signal(recording: Recording) -> SmallSignal:
 def _lines(recording: Recording) -> tuple[F64, C128, F64, float]:
     """Return frequencies, response, its noise, and the multisine's peak."""
     segment = recording.segments[-1]
-    samples, _ = steady_samples(recording, segment)
     period = round(segment.period)
-    periods = samples.index.size // period
-    whole = slice(samples.index.size - periods * period, None)
-    moved = samples.displacement_um[whole]
-    gaps = samples.index.size and samples.index[-1] - samples.index[whole][0] + 1 != moved.size
-    if periods < _FEWEST_PERIODS or gaps or not np.isfinite(moved).all():
-        raise RigProblemError(
-            "no_reading",
-            "small-signal response: samples are missing or no numbers",
-            "look at the sensor and at late ticks ('hilctl report'), then run it again",
-        )
+    periods = (segment.steady_stop - segment.steady_start) // period - 1
+    stop = segment.steady_stop
+    try:
+        command, moved = without_gaps(recording, stop - periods * period, stop)
+    except DataError as error:
+        raise RigProblemError("no_reading", str(error), "then run it again") from None
     shape = (periods, period)
     # Drift from period to period: a line through the samples would take low frequencies with it.
     means = moved.reshape(shape).mean(axis=1)
     slope = np.polynomial.polynomial.polyfit(np.arange(periods), means, 1)[1]
     moved = moved - slope * np.arange(moved.size) / period
-    wanted = np.fft.rfft(samples.command[whole].reshape(shape)).mean(axis=0)
+    wanted = np.fft.rfft(command.reshape(shape)).mean(axis=0)
     each = np.fft.rfft(moved.reshape(shape))
     strong = np.abs(wanted) > 0.2 * np.max(np.abs(wanted[1:]))
     strong[0] = False
     k = np.flatnonzero(strong)
     scatter = np.sqrt(np.mean(np.abs(each - each.mean(axis=0)) ** 2, axis=0) / (periods - 1))
     size = np.abs(wanted[k])
-    command = samples.command[whole]
     return (
         k * recording.sample_rate_hz / period,
         each.mean(axis=0)[k] / wanted[k],

@@ -103,14 +103,14 @@ class CampaignHost:
 
     Attributes:
         run: How a step is run.
-        now_s: Time in s that never goes back.
+        now_s: Unix time in s.
         sleep_s: Waits that long.
         on_step: Called with each step that is done.
         on_progress: Called with what is done, from 0 to 1, and what is being done.
     """
 
     run: StepRunner = paced
-    now_s: Callable[[], float] = time.monotonic
+    now_s: Callable[[], float] = time.time
     sleep_s: Callable[[float], None] = time.sleep
     on_step: Callable[[StepRow], None] = field(default=lambda row: None)
     on_progress: Callable[[float, str], None] = field(default=lambda done, text: None)
@@ -156,7 +156,7 @@ class Campaign:
             )
         # What does not depend on the waveform is refused here, before anything moves.
         checked_experiment(experiment, [*self._settings, waveform_setting(at_rest(self.limits))])
-        self._heat = CampaignHeat(self._loaded.config, self._host.now_s())
+        self._heat = CampaignHeat(self._loaded.config, 0.0)
         self._measured = Measured()
         self._rows: list[StepRow] = []
         self._recordings: dict[str, Path] = {}
@@ -244,7 +244,9 @@ class Campaign:
         if recording is None:
             self._cool(step, self._heat.pause_s(command, self._host.now_s()))
             recording = self._recorded(number, step, settings, path)
-        self._heat.run(command, self._host.now_s())
+        now_s = self._host.now_s()
+        # One that was kept has cooled the coil since.
+        self._heat.run(command, min(path.stat().st_mtime, now_s) if kept else now_s)
         self._recordings[step.name] = path
         seconds = command.size / self.limits.sample_rate_hz
         row = StepRow(
@@ -284,8 +286,7 @@ class Campaign:
             return None
         text = load_experiment(self._experiment, settings).yaml_text
         same = recording.run.get("experiment_sha256") == hashlib.sha256(text.encode()).hexdigest()
-        whole = recording.end.get("code") == "completed" and recording.dropped == 0
-        return recording if same and whole else None
+        return recording if same and recording.end.get("code") == "completed" else None
 
     def _cool(self, step: CampaignStep, pause_s: float) -> None:
         """Let the coil cool; a run that need not keep real time is one of a rig without a coil."""
@@ -326,6 +327,8 @@ class Campaign:
     def _step_settings(self, number: int, step: CampaignStep, keys: Keys) -> list[str]:
         name = f"{self._loaded.config.name}-{step.name}"[-_NAME_LENGTH:].lstrip("._-")
         settings = [*self._settings, f"name={json.dumps(name)}", waveform_setting(keys)]
+        if self._rows and self._loaded.config.safe.at_start is not None:
+            settings.append(f"safe.at_start={self.limits.rest!r}")  # the steps before ended there
         seed = self._loaded.device.Options.model_fields.get("seed")
         if seed is not None:  # noise that all steps share would be fitted
             first = self._loaded.config.device.get("seed", seed.default)

@@ -65,11 +65,16 @@ def test_noise_over_everything_is_a_problem(limits, played):
     assert caught.value.code == "noise"
 
 
-def test_readings_that_are_no_numbers_are_a_problem(limits, played):
-    def actuator(command):
-        moved = 4.0 * command
-        moved[moved.size // 2] = np.nan
+def test_a_few_readings_that_are_no_numbers_do_no_harm_many_do(limits, played):
+    def actuator(part):
+        def moved(command):
+            out = 4.0 * command
+            out[:: round(1.0 / part)] = np.nan
+            return out
+
         return moved
 
-    with pytest.raises(RigProblemError, match="missing or no numbers"):
-        response(limits, played, actuator)
+    assert response(limits, played, actuator(0.005)).gain_um == pytest.approx(4.0, rel=0.05)
+    with pytest.raises(RigProblemError, match="missing or have no displacement") as caught:
+        response(limits, played, actuator(0.05))
+    assert caught.value.code == "no_reading"

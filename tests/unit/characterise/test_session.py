@@ -1,6 +1,7 @@
 """A campaign's runs: which are needed, which stand already, what ends it, what it waits for."""
 
 import signal
+import time
 from dataclasses import replace
 
 import pytest
@@ -161,6 +162,25 @@ def test_the_coil_is_let_cool(experiment):
     assert rig.pauses
     assert sum(rig.pauses) < 100.0
     assert any("the coil cools for" in text for _, text in rig.texts)
+
+
+def test_a_coil_that_has_cooled_since_is_not_waited_for(experiment):
+    """What was run an hour ago heats no more."""
+    budget = ["limits.rms_current_a=0.05", "limits.thermal_time_constant_s=20.0"]
+    run(experiment, Rig(), *budget)
+    (experiment.parent / "runs" / "06-growing-2.mcap").unlink()
+    rig = Rig()
+    rig.time_s = time.time() + 3600.0
+    run(experiment, rig, *budget)
+    assert [name for name, _ in rig.runs] == ["06-growing-2.mcap"]
+    assert rig.pauses == []
+
+
+def test_where_the_output_is_given_by_hand_it_is_at_rest_after_the_first_step(experiment):
+    rig = Rig()
+    run(experiment, rig, "safe={value: 0.0, at_start: 0.5}", "device.output_at_open=null")
+    given = [[each for each in settings if "at_start=" in each] for _, settings in rig.runs]
+    assert given == [[], *([["safe.at_start=0.0"]] * 3)]
 
 
 def test_progress_says_the_time_left(experiment):
