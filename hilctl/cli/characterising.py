@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hilctl.base.errors import InputError
+from hilctl.base.errors import InputError, RunError
 from hilctl.base.files import check_writable
 from hilctl.cli.options import AsJson, ExperimentFile, Overwrite, Settings
 from hilctl.cli.output import finish_orphans, print_json
@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
     from hilctl.characterise.results import Characterisation
     from hilctl.characterise.session import Campaign, CampaignHost
+
+_GOES_ON = "the same command goes on from this step"
 
 
 def characterise(
@@ -83,9 +85,10 @@ def _characterised(campaign: "Campaign", output: Path, *, overwrite: bool) -> "C
         return campaign.characterise(output, overwrite=overwrite)
     except (StoppedCampaignError, KeyboardInterrupt) as error:
         number = getattr(error, "signal", signal.SIGINT)
-        print(f"hilctl: stopped: {error or 'Ctrl-C'}", file=sys.stderr)
-        print("hilctl: the same command goes on from the step it had come to", file=sys.stderr)
+        print(f"hilctl: stopped: {error or 'Ctrl-C'}; {_GOES_ON}", file=sys.stderr)
         raise typer.Exit(128 + number) from None
+    except RunError as error:
+        raise RunError(f"{error}; {_GOES_ON}") from None
 
 
 def _finish(

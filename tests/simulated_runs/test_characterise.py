@@ -81,15 +81,18 @@ def test_a_campaign_that_is_killed_loses_one_step(tmp_path):
     words = [
         sys.executable, "-m", "hilctl.cli", "characterise", str(RIG), "--output",
         str(tmp_path / "model.yaml"), "--folder", str(tmp_path / "runs"),
-        "--set", "sample_rate_hz=5000", "--set", "block=50",
+        "--set", "sample_rate_hz=5000", "--set", "block=50", "--set", "recording.flush_s=0.1",
     ]  # fmt: skip
     third = tmp_path / "runs" / "05-response-1.mcap"
+
+    def begun():
+        return third.exists() and third.stat().st_size > 3000
 
     def until(ready):
         process = subprocess.Popen(words, stdout=subprocess.PIPE, text=True, env=os.environ)
         deadline = time.monotonic() + 240.0
         while not ready() and process.poll() is None and time.monotonic() < deadline:
-            time.sleep(0.05)
+            time.sleep(0.02)
         assert process.poll() is None, "it ended before it could be stopped"
         return process
 
@@ -98,7 +101,8 @@ def test_a_campaign_that_is_killed_loses_one_step(tmp_path):
     process.communicate()
     kept = {each.name: each.stat().st_mtime_ns for each in (tmp_path / "runs").glob("0[12]-*")}
     assert len(kept) == 2
-    process = until((tmp_path / "runs" / "07-growing-1.mcap").exists)
+    assert not begun()
+    process = until(begun)
     process.send_signal(signal.SIGINT)
     shown, _ = process.communicate(timeout=120)
     assert process.returncode == 128 + signal.SIGINT

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import typer
 
-from hilctl.base.errors import InputError
+from hilctl.base.errors import InputError, RunError
 from hilctl.characterise import session
 from hilctl.characterise.results import Characterisation
 from hilctl.characterise.session import CampaignPlan, StoppedCampaignError, paced, unpaced
@@ -112,6 +112,12 @@ def test_a_stop_says_how_to_go_on(ends, tmp_path, capsys, error, code):
         command(tmp_path)
     assert ended.value.exit_code == code
     assert "the same command goes on" in capsys.readouterr().err
+
+
+def test_a_fault_says_how_to_go_on(ends, tmp_path):
+    ends["error"] = RunError("slow-loops: the cable was pulled")
+    with pytest.raises(RunError, match="the cable was pulled; the same command goes on"):
+        command(tmp_path)
 
 
 def test_nothing_is_written_over_what_exists(ends, tmp_path):
