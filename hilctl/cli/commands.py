@@ -72,6 +72,10 @@ COMMANDS: dict[str, CommandEntry] = {
         "hilctl.cli.comparing:compare",
         "Identify models of the literature on the same loops, and compare them.",
     ),
+    "characterise": CommandEntry(
+        "hilctl.cli.characterising:characterise",
+        "Find a model of a wired actuator: measure within its limits, identify, judge.",
+    ),
     "learn": CommandEntry(
         "hilctl.cli.learning:learn",
         "Learn a correction for a reference that repeats: run, correct, and run again.",

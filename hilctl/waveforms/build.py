@@ -95,7 +95,7 @@ def _part(
 
 
 def _soften(w: spec.SinglePart, name: str, values: F64, sample_rate_hz: float) -> tuple[int, int]:
-    """Bend start and end of ``values`` to 0; return how many samples of each are bent."""
+    """Bend start and end of ``values`` to rest; return how many samples of each are bent."""
     n = values.size
     soft_s = w.soft_start_s + w.soft_end_s
     if soft_s * sample_rate_hz > n + 0.5:
@@ -106,8 +106,9 @@ def _soften(w: spec.SinglePart, name: str, values: F64, sample_rate_hz: float) -
     # whole samples, and one that rounding kept from being whole: never more than n together
     soft_start = int(w.soft_start_s * sample_rate_hz + 1e-6)
     soft_end = int(w.soft_end_s * sample_rate_hz + 1e-6)
-    values[:soft_start] *= _soft(soft_start)
-    values[n - soft_end :] *= _soft(soft_end)[::-1]
+    start, end = values[:soft_start], values[n - soft_end :]
+    start[:] = w.rest + _soft(soft_start) * (start - w.rest)
+    end[:] = w.rest + _soft(soft_end)[::-1] * (end - w.rest)
     return soft_start, soft_end
 
 

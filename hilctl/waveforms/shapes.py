@@ -58,6 +58,11 @@ def outline(w: spec.Shape, unit: str) -> tuple[str, float, float]:
             count = _multisine_count(w)
             common = [w.first_hz] if count == 1 else [w.first_hz, w.step_hz]
             return label, w.first_hz + (count - 1) * w.step_hz, common_period_s(common)
+        case spec.RandomSines():
+            label = f"{w.kind} {w.amplitude:g} {unit} {w.first_hz:g}-{w.last_hz:g} Hz"
+            return f"{label} seed {w.seed}", w.last_hz, 0.0
+        case spec.LevelPath():
+            return f"{w.kind} {w.rate_per_s:g} {unit}/s", 0.0, 0.0
         case spec.Hold():
             return f"hold {w.level:g} {unit}", 0.0, 0.0
         case spec.Step():
@@ -70,9 +75,18 @@ def sampled(w: spec.Shape, sample_rate_hz: float) -> F64:
     Raises:
         InputError: They do not fit in memory.
     """
-    duration_s = w.dwell_s * len(w.levels) if w.kind == "step" else w.duration_s
-    t = np.arange(sample_count(duration_s, sample_rate_hz)) / sample_rate_hz
+    t = np.arange(sample_count(_duration_s(w), sample_rate_hz)) / sample_rate_hz
     return w.offset + _shape(w, t)
+
+
+def _duration_s(w: spec.Shape) -> float:
+    match w:
+        case spec.Step():
+            return w.dwell_s * len(w.levels)
+        case spec.LevelPath():
+            return float(_arrivals_s(w)[-1])
+        case _:
+            return w.duration_s
 
 
 def _shape(w: spec.Shape, t: F64) -> F64:
@@ -93,12 +107,22 @@ def _shape(w: spec.Shape, t: F64) -> F64:
             return w.amplitude * envelope * np.sin(_angle(w.frequency_hz, 0.0, t))
         case spec.Chirp():
             return _chirp(w, t)
+        case spec.Multisine():
+            return _multisine(w, t)
+        case spec.RandomSines():
+            return _random(w, t)
+        case spec.Step() | spec.Hold() | spec.LevelPath():
+            return _levelled(w, t)
+
+
+def _levelled(w: spec.Step | spec.Hold | spec.LevelPath, t: F64) -> F64:
+    match w:
         case spec.Step():
             return _step(w, t)
         case spec.Hold():
             return np.full_like(t, w.level)
-        case spec.Multisine():
-            return _multisine(w, t)
+        case spec.LevelPath():
+            return np.interp(t, _arrivals_s(w), _levels(w))
 
 
 def _angle(frequency_hz: float, phase_deg: float, t: F64) -> F64:
@@ -139,6 +163,30 @@ def _multisine(w: spec.Multisine, t: F64) -> F64:
         total += np.sin(2.0 * np.pi * frequency_hz * t - np.pi * m * (m + 1) / count)
     peak = float(np.max(np.abs(total)))
     return total if peak == 0.0 else w.amplitude / peak * total
+
+
+def _random(w: spec.RandomSines, t: F64) -> F64:
+    """Return sines of random phases at all multiples of 1 / duration within the band: float64[n].
+
+    Summed in the spectrum: there are more of them the longer it is.
+    """
+    first, last = math.ceil(w.first_hz * w.duration_s), math.floor(w.last_hz * w.duration_s)
+    phases = np.random.default_rng(w.seed).random(last - first + 1)
+    spectrum = np.zeros(t.size // 2 + 1, dtype=np.complex128)
+    spectrum[first : last + 1] = np.exp(2j * np.pi * phases)[: spectrum.size - first]
+    total = np.fft.irfft(spectrum, t.size)
+    return w.amplitude / float(np.max(np.abs(total))) * total
+
+
+def _levels(w: spec.LevelPath) -> F64:
+    """Return the levels, with the one that the path begins at: float64[m + 1]."""
+    return np.array((w.rest - w.offset, *w.levels))
+
+
+def _arrivals_s(w: spec.LevelPath) -> F64:
+    """Return when the path begins, and when it gets to each level: float64[m + 1], in s."""
+    lengths = np.abs(np.diff(_levels(w)))
+    return np.concatenate(([0.0], np.cumsum(lengths))) / w.rate_per_s
 
 
 def _multisine_count(w: spec.Multisine) -> int:

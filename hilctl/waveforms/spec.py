@@ -4,6 +4,7 @@ Amplitudes, offsets and levels are in the waveform's ``unit``: um where a compen
 reference into a command, A or V where none stands between.
 """
 
+import math
 from typing import Annotated, Any, Literal, TypeAlias
 
 from pydantic import (
@@ -29,6 +30,13 @@ def _not_empty(values: tuple[Any, ...]) -> tuple[Any, ...]:
     return values
 
 
+def _not_below(value: float, info: ValidationInfo, other: str) -> float:
+    least = info.data.get(other, value)
+    if value < least:
+        raise ValueError(f"must be >= {other}, {least}: {value}")
+    return value
+
+
 NotEmpty = AfterValidator(_not_empty)
 AtLeastOne = Field(json_schema_extra={"minItems": 1})
 
@@ -39,12 +47,14 @@ class _Shape(Strict):
     Attributes:
         unit: Unit of every amplitude, offset and level.
         offset: Constant that the waveform is centred on.
-        soft_start_s: Time in which the whole waveform, offset included, grows from 0.
-        soft_end_s: Time in which it shrinks back to 0. Both lie within the duration.
+        rest: Value that a soft start grows from and a soft end leads back to.
+        soft_start_s: Time in which the whole waveform, offset included, grows from ``rest``.
+        soft_end_s: Time in which it shrinks back to there. Both lie within the duration.
     """
 
     unit: WaveformUnit | None = Field(default=None, description="um, A or V")
     offset: float = 0.0
+    rest: float = 0.0
     soft_start_s: NotNegative = 0.0
     soft_end_s: NotNegative = 0.0
 
@@ -142,10 +152,7 @@ class Multisine(_Shape):
     @field_validator("last_hz")
     @classmethod
     def _ordered(cls, last_hz: float, info: ValidationInfo) -> float:
-        first_hz = info.data.get("first_hz", last_hz)
-        if last_hz < first_hz:
-            raise ValueError(f"must be >= first_hz, {first_hz}: {last_hz}")
-        return last_hz
+        return _not_below(last_hz, info, "first_hz")
 
     @field_validator("step_hz")
     @classmethod
@@ -154,6 +161,50 @@ class Multisine(_Shape):
         if span_hz / step_hz >= MAX_SINES:
             raise ValueError(f"must leave at most {MAX_SINES} sines in {span_hz} Hz: {step_hz}")
         return step_hz
+
+
+class RandomSines(_Shape):
+    """Equal sines of random phases over a whole band, scaled to a peak amplitude.
+
+    It repeats with its duration, and nowhere within it.
+
+    Attributes:
+        seed: Seed of the phases; another one gives another waveform of the same band.
+    """
+
+    kind: Literal["random"]
+    amplitude: Positive
+    first_hz: Positive
+    last_hz: Positive
+    seed: Annotated[int, Field(ge=0)] = 1
+    duration_s: Positive
+
+    @field_validator("last_hz")
+    @classmethod
+    def _ordered(cls, last_hz: float, info: ValidationInfo) -> float:
+        return _not_below(last_hz, info, "first_hz")
+
+    @field_validator("duration_s")
+    @classmethod
+    def _some_line(cls, duration_s: float, info: ValidationInfo) -> float:
+        first_hz, last_hz = info.data.get("first_hz", 0.0), info.data.get("last_hz", math.inf)
+        if math.ceil(first_hz * duration_s) > last_hz * duration_s:
+            rule = f"must hold whole cycles of a frequency from {first_hz} to {last_hz} Hz"
+            raise ValueError(f"{rule}: {duration_s}")
+        return duration_s
+
+
+class LevelPath(_Shape):
+    """Straight lines from level to level, all at one rate; begins at ``rest``.
+
+    Attributes:
+        levels: Where the lines end, offset not included.
+        rate_per_s: How fast it moves, in the waveform's unit a second.
+    """
+
+    kind: Literal["path"]
+    levels: Annotated[tuple[float, ...], NotEmpty, AtLeastOne]
+    rate_per_s: Positive
 
 
 class FileWaveform(_Shape):
@@ -199,7 +250,16 @@ class FileWaveform(_Shape):
 
 
 Shape: TypeAlias = (
-    Sine | Triangle | ComplexHarmonic | GrowingOrDecaying | Chirp | Step | Hold | Multisine
+    Sine
+    | Triangle
+    | ComplexHarmonic
+    | GrowingOrDecaying
+    | Chirp
+    | Step
+    | Hold
+    | Multisine
+    | RandomSines
+    | LevelPath
 )
 _Single: TypeAlias = Shape | FileWaveform
 SinglePart: TypeAlias = Annotated[_Single, Field(discriminator="kind")]

@@ -93,6 +93,20 @@ def test_is_run(installed, tmp_path):
 
 
 @pytest.mark.slow
+def test_is_characterised(installed, tmp_path):
+    """From its limits to a model that knows a spring for what it is."""
+    model = tmp_path / "model.yaml"
+    words = ("characterise", experiment(tmp_path), "--output", model, "--fast", "--json")
+    done = hilctl(installed, *words, "--set", "compensator={model: model.yaml}")
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert found["measured"]["small"]["gain_um"] == pytest.approx(20.0, rel=0.02)
+    assert found["held_out"][0]["peak_percent"] < 2.0
+    assert model.is_file()
+    assert model.with_suffix(".html").is_file()
+
+
+@pytest.mark.slow
 def test_its_options_are_checked_like_any_other(installed, tmp_path):
     """With file and line, and nothing moved."""
     done = hilctl(installed, "check", experiment(tmp_path, um_per_a=-1.0, um_per_b=2.0))

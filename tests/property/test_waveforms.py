@@ -100,6 +100,14 @@ singles = softened(
             duration_s=durations_s,
         ),
         keys("hold", level=levels, duration_s=durations_s),
+        keys(
+            "random",
+            amplitude=amplitudes,
+            first_hz=st.floats(1e-3, 100.0),
+            last_hz=st.floats(200.0, 499.0),
+            seed=st.integers(0, 10),
+            duration_s=st.floats(0.01, 2.0),
+        ),
         steps(),
         multisines(),
     )

@@ -96,7 +96,7 @@ class TestSchema:
         mapping = schema["properties"]["waveform"]["discriminator"]["mapping"]
         assert set(mapping) == {
             "sine", "triangle", "complex_harmonic", "growing", "decaying", "chirp", "step", "hold",
-            "multisine", "file", "sequence",
+            "multisine", "random", "path", "file", "sequence",
         }  # fmt: skip
 
     def test_deterministic(self) -> None:

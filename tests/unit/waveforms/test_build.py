@@ -37,6 +37,16 @@ class TestSoft:
         np.testing.assert_allclose(values[:200], grow * hard[:200], rtol=0.0, atol=1e-12)
         np.testing.assert_allclose(values[700:], shrink * hard[700:], rtol=0.0, atol=1e-12)
 
+    def test_from_and_to_where_the_actuator_rests(self, made: Made) -> None:
+        """A safe value that is not 0 is left and reached without a step."""
+        keys = {**SINE, "offset": 40.0, "duration_s": 1.0}
+        hard = made(1000.0, **keys).values
+        soft = made(1000.0, **keys, rest=50.0, soft_start_s=0.2, soft_end_s=0.3).values
+        assert soft[0] == soft[-1] == 50.0
+        np.testing.assert_array_equal(soft[200:700], hard[200:700])
+        grow = np.array([raised_cosine(k / 200) for k in range(200)])
+        np.testing.assert_allclose(soft[:200], 50.0 + grow * (hard[:200] - 50.0), atol=1e-12)
+
     def test_offset_is_softened_too(self, made: Made) -> None:
         """A held level grows from 0 and shrinks to 0 without a step, and never overshoots."""
         keys = {"kind": "hold", "level": 2.0, "offset": -7.0, "duration_s": 1.0}

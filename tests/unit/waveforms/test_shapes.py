@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -140,6 +140,57 @@ class TestStep:
         levels = tuple(float(k) for k in range(2000))
         values = made(10.0, kind="step", levels=levels, dwell_s=0.1).values
         np.testing.assert_array_equal(values, levels)
+
+
+class TestRandom:
+    """Equal sines of random phases."""
+
+    KEYS: ClassVar[dict[str, Any]] = {
+        "kind": "random", "amplitude": 3.0, "first_hz": 5.0, "last_hz": 200.0, "duration_s": 2.0,
+    }  # fmt: skip
+
+    def test_band(self, made: Made) -> None:
+        """All lines from the first to the last frequency are alike, and nothing is elsewhere."""
+        lines = np.abs(np.fft.rfft(made(RATE_HZ, **self.KEYS).values))
+        within = lines[10:401]
+        np.testing.assert_allclose(within, within.mean(), rtol=1e-9)
+        assert np.max(np.delete(lines, slice(10, 401))) < 1e-9 * within.mean()
+
+    def test_peak_is_the_amplitude_beside_the_offset(self, made: Made) -> None:
+        values = made(RATE_HZ, **self.KEYS, offset=-1.0).values
+        assert np.max(np.abs(values + 1.0)) == pytest.approx(3.0)
+
+    def test_another_seed_is_another_waveform(self, made: Made) -> None:
+        """Held out means that the fit has not seen it: they share nothing but the band."""
+        first, second = (made(RATE_HZ, **self.KEYS, seed=seed).values for seed in (1, 2))
+        assert abs(np.corrcoef(first, second)[0, 1]) < 0.2
+        np.testing.assert_array_equal(first, made(RATE_HZ, **self.KEYS, seed=1).values)
+
+    def test_nothing_in_it_repeats(self, made: Made) -> None:
+        values = made(RATE_HZ, **self.KEYS).values
+        spectrum = np.abs(np.fft.rfft(values, 2 * values.size)) ** 2
+        alike = np.fft.irfft(spectrum)[: values.size]
+        assert np.max(np.abs(alike[40:])) < 0.4 * alike[0]
+
+
+class TestPath:
+    """Straight lines at one rate."""
+
+    def test_lines(self, made: Made) -> None:
+        """From 0 to 2, to -1, to 0.5 at 10 a second."""
+        values = made(RATE_HZ, kind="path", levels=(2.0, -1.0, 0.5), rate_per_s=10.0).values
+        times_s, levels = (0.0, 0.2, 0.5, 0.65), (0.0, 2.0, -1.0, 0.5)
+        expected = np.interp(np.arange(1300) / RATE_HZ, times_s, levels)
+        np.testing.assert_allclose(values, expected, atol=1e-12)
+
+    def test_begins_at_rest(self, made: Made) -> None:
+        """Wherever that is, and whatever the offset."""
+        values = made(
+            100.0, kind="path", levels=(2.0,), rate_per_s=1.0, offset=50.0, rest=49.0
+        ).values
+        assert values[0] == 49.0
+        np.testing.assert_allclose(np.diff(values), 0.01)
+        assert values[-1] == pytest.approx(51.99)
 
 
 def rising_crossings_s(values: F64, rate_hz: float) -> F64:

@@ -162,3 +162,28 @@ def test_sequence_in_a_sequence() -> None:
     found = problems("  kind: sequence\n  unit: A\n  parts:\n    - {kind: sequence, parts: []}\n")
     assert len(found) == 1
     assert found[0].startswith("x.yaml:8: waveform.parts.0.kind: must be one of 'sine', ")
+
+
+def test_a_random_band_must_hold_a_line() -> None:
+    """In half a second there is no whole cycle between 1 and 1.5 Hz."""
+    found = problems(
+        "  kind: random\n  unit: A\n  amplitude: 1.0\n  first_hz: 1.0\n  last_hz: 1.5\n"
+        "  duration_s: 0.5\n"
+    )
+    assert found == [
+        "x.yaml:10: waveform.duration_s: must hold whole cycles of a frequency from 1.0 to 1.5 Hz: "
+        "0.5"
+    ]
+
+
+def test_a_random_band_has_two_ends_in_order() -> None:
+    found = problems(
+        "  kind: random\n  unit: A\n  amplitude: 1.0\n  first_hz: 9.0\n  last_hz: 1.5\n"
+        "  duration_s: 0.5\n"
+    )
+    assert "x.yaml:9: waveform.last_hz: must be >= first_hz, 9.0: 1.5" in found
+
+
+def test_a_path_needs_levels() -> None:
+    found = problems("  kind: path\n  unit: A\n  levels: []\n  rate_per_s: 2.0\n")
+    assert found == ["x.yaml:7: waveform.levels: must have at least one value: []"]

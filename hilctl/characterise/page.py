@@ -1,0 +1,145 @@
+"""A campaign as one self-contained page; the held-out error comes first."""
+
+import html
+from collections.abc import Iterator
+from pathlib import Path
+
+from hilctl.analysis.html import document, grid, image, write_page
+from hilctl.base.printable import printable
+from hilctl.characterise import plots
+from hilctl.characterise.results import Characterisation, Measured, UnseenReference
+from hilctl.identify.page import loops_figure
+from hilctl.identify.summary import HEADINGS, error_rows, summary
+from hilctl.models.files import dump_model
+
+_FITTED_SHOWN = 12
+HELD_OUT_HEADINGS = ("not fitted", "peak %", "rms %", "mean %", "noise floor %")
+
+
+def held_out_rows(found: Characterisation) -> list[tuple[str, ...]]:
+    """Return one row a reference that no fit saw, under :data:`HELD_OUT_HEADINGS`."""
+    return [(each.label, *_percents(each)) for each in found.held_out]
+
+
+def _percents(each: UnseenReference) -> Iterator[str]:
+    for value in (each.peak_percent, each.rms_percent, each.mean_percent, each.floor_percent):
+        yield f"{value:.3g}"
+
+
+def figure_rows(measured: Measured, unit: str) -> Iterator[tuple[str, str]]:
+    """Give what was measured, as name and text."""
+    if (rest := measured.rest) is not None:
+        yield "noise at rest", f"{rest.noise_um:.3g} um rms"
+        yield "strongest line in it", f"{rest.line_um:.2g} um at {rest.line_hz:.4g} Hz"
+        yield "drift at rest", f"{rest.drift_um_per_s:+.2g} um/s"
+    if (reaction := measured.reaction) is not None:
+        sign = "rises" if reaction.gain_um > 0.0 else "falls"
+        yield "polarity", f"the displacement {sign} with the command"
+        doubt = f"{reaction.gain_um:.4g} ± {reaction.doubt_um:.1g} um/{unit}"
+        yield "first reaction", f"{doubt} at {reaction.amplitude:.3g} {unit}"
+    if (small := measured.small) is not None:
+        yield "small-signal gain", f"{small.gain_um:.4g} um/{unit}"
+        yield "delay", f"{1e3 * small.delay_s:.3g} ms"
+        yield "lag", f"{1e3 * small.lag_s:.3g} ms"
+        resonance = "none found"
+        if small.natural_hz is not None:
+            resonance = f"{small.natural_hz:.4g} Hz, damping ratio {small.damping_ratio:.2g}"
+        yield "resonance", resonance
+        yield "left by that fit", f"{small.misfit_percent:.2g} % rms of the gain"
+    if measured.growing:
+        largest = measured.growing[-1]
+        low_high = f"{largest.low_um:.4g} to {largest.high_um:.4g} um"
+        yield "largest amplitude", f"{largest.amplitude:.4g} {unit}, {low_high}"
+    if (curves := measured.reversal) is not None:
+        yield "return to one point", f"{curves.return_um:.2g} um, {curves.return_percent:.2g} %"
+    if (repeated := measured.repeated) is not None:
+        shift = f"{repeated.shift_um:+.2g} um in place"
+        yield "repeats at the end", f"{repeated.shape_percent:.2g} % in shape, {shift}"
+
+
+def write_characterisation(found: Characterisation, path: Path) -> None:
+    """Write the page; one of that name is replaced.
+
+    Raises:
+        InputError: It can't be written.
+    """
+    write_page(characterisation_page(found), path)
+
+
+def characterisation_page(found: Characterisation) -> str:
+    """Return the page as HTML."""
+    title = f"{found.experiment}: {found.device}"
+    body = [f"<h1>{_text(title)}</h1>"]
+    if found.problem:
+        body.append(f'<p class="note">{_text(found.problem)}</p>')
+    body += [*_held_out(found), "<h2>Measured</h2>"]
+    body.append(grid(("figure", "value"), figure_rows(found.measured, found.unit)))
+    body += [*_drawn(found), *_model(found), "<h2>Steps</h2>"]
+    rows = [
+        (each.name, each.purpose, f"{each.seconds:.1f}", each.text, Path(each.recording).name)
+        for each in found.steps
+    ]
+    body.append(grid(("step", "what for", "s", "found", "recording"), rows))
+    return document(_text(title), body)
+
+
+def _held_out(found: Characterisation) -> list[str]:
+    if not found.held_out:
+        return []
+    first = found.held_out[0]
+    text = f"Verdict: {found.verdict}. Sensor noise alone would make {first.floor_percent:.2g} %."
+    return [
+        "<h2>Error on references that no fit saw</h2>",
+        f"<p>{_text(text)}</p>",
+        *(f"<p>{_text(note)}</p>" for note in (found.verdict.notes if found.verdict else ())),
+        grid(HELD_OUT_HEADINGS, held_out_rows(found), "numbers"),
+        *(
+            image(_text(each.label), plots.held_out_figure(each, close=i == 0))
+            for i, each in enumerate(found.held_out)
+        ),
+    ]
+
+
+def _drawn(found: Characterisation) -> Iterator[str]:
+    measured, unit = found.measured, found.unit
+    if measured.small is not None:
+        yield "<h2>Small-signal response</h2>"
+        yield "<p>Grey: the band of the loops. Dashed: the resonance.</p>"
+        yield image("response", plots.response_figure(measured.small, found.band_hz, unit))
+    groups = [
+        ("Growing amplitude", measured.growing),
+        ("Lowest frequency", measured.slow),
+        ("Several frequencies", [each for each in measured.fast if _large(each, measured)]),
+        ("Small loops all over the range", measured.biased),
+    ]
+    if any(loops for _, loops in groups):
+        yield "<h2>Loops</h2>"
+        yield image("loops", plots.loops_figure(groups, unit))
+    if measured.reversal is not None:
+        yield "<h2>First-order reversal curves</h2>"
+        yield image("reversal curves", plots.reversal_figure(measured.reversal, unit))
+
+
+def _large(loop: object, measured: Measured) -> bool:
+    """Return whether a loop has the full amplitude: the others would hide it."""
+    full = max((each.amplitude for each in measured.fast), default=0.0)
+    return getattr(loop, "amplitude", 0.0) > 0.9 * full
+
+
+def _model(found: Characterisation) -> Iterator[str]:
+    known = found.identification
+    if known is None:
+        return
+    fit = known.fit
+    yield "<h2>Model</h2>"
+    yield f"<p>{_text(fit.model.provenance.method)}</p>"
+    yield from (f"<p>{_text(line)}</p>" for line in summary(known))
+    yield grid(HEADINGS, error_rows(fit.errors), "numbers")
+    shown = known.data[:_FITTED_SHOWN]
+    yield image("model and data", loops_figure(fit.modelled_um, shown, fit.model.input_unit))
+    model = _text(dump_model(fit.model), lines=True)
+    yield f"<details><summary>Model file</summary><pre>{model}</pre></details>"
+
+
+def _text(text: str, *, lines: bool = False) -> str:
+    return html.escape(printable(text, lines=lines))

@@ -1,0 +1,53 @@
+"""The page: the held-out error first, nothing fetched, texts as they are."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from hilctl.characterise.page import characterisation_page, write_characterisation
+from hilctl.characterise.results import StepRow
+from tests.unit.characterise.test_plots import SMALL
+from tests.unit.characterise.test_results import FOUND, LOOP, UNSEEN, identification
+
+LINE = np.linspace(0.0, 1.0, 50)
+SEEN = replace(UNSEEN, time_s=LINE, measured_um=LINE, modelled_um=LINE)
+DRAWN = replace(LOOP, command=LINE, displacement_um=LINE)
+WHOLE = replace(
+    FOUND,
+    held_out=(SEEN,),
+    measured=FOUND.measured.also(
+        small=SMALL, growing=(DRAWN,), reversal=None, fast=(DRAWN, replace(DRAWN, amplitude=0.2))
+    ),
+)
+
+
+def test_the_held_out_error_comes_first():
+    page = characterisation_page(replace(WHOLE, identification=identification()))
+    assert page.index("Error on references that no fit saw") < page.index("<h2>Measured")
+    assert "Verdict: good: within 1.50 %" in page
+    assert "a note" in page
+    assert "http://" not in page
+    assert page.count("data:image/png") == 4  # held out, response, loops, model
+
+
+def test_what_ended_a_campaign_stands_on_top():
+    """With what was measured until then."""
+    stopped = replace(
+        FOUND, held_out=(), problem="no <reaction>: look", measured=FOUND.measured.also(
+            growing=(), reversal=None
+        ),
+        steps=(StepRow("rest", "noise & drift", 2.0, 0.1, "0.03 um", "/x/01-rest.mcap"),),
+    )  # fmt: skip
+    page = characterisation_page(stopped)
+    assert '<p class="note">no &lt;reaction&gt;: look</p>' in page
+    assert "0.03 um rms" in page
+    assert "noise &amp; drift" in page
+    assert "01-rest.mcap" in page
+    assert "data:image/png" not in page
+
+
+def test_a_page_is_written_over(tmp_path):
+    path = tmp_path / "model.html"
+    for _ in range(2):
+        write_characterisation(WHOLE, path)
+    assert path.read_text(encoding="utf-8").startswith("<!DOCTYPE html>")
