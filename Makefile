@@ -11,12 +11,13 @@ run: $(VENV)/.ready
 	$(BIN)/hilctl run configs/demo.yaml
 
 test: $(VENV)/.ready
-	@echo "Takes about 6 minutes of processor time, shared by all cores; whole runs: make test-slow."
-	$(BIN)/pytest -n auto --dist loadfile -m "not slow"
+	@echo "Takes 4 to 5 minutes of processor time, shared by up to 4 cores; whole runs: make test-slow."
+	$(BIN)/pytest -n auto --maxprocesses 4 --dist loadfile -m "not slow"
 
 test-slow: $(VENV)/.ready
-	@echo "Takes about 15 minutes: most of them real time, in which runs go on."
+	@echo "Takes about 20 minutes: most of them real time, in which runs go on."
 	$(BIN)/pytest -n 2 --dist loadfile -m slow
+	$(BIN)/pytest -n 2 --dist loadfile -m "hypothesis and not slow" --hypothesis-profile thorough
 
 lint: $(VENV)/.ready
 	$(BIN)/ruff check .

@@ -1,23 +1,35 @@
 """Settings and fixtures that all tests share."""
 
+import gc
 import hashlib
 import os
+import sys
 import tempfile
+from functools import cache, lru_cache
+from importlib import import_module
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
 
 from hilctl.base.private import memory_folder
+from hilctl.base.yaml import document
 
+ROOT = Path(__file__).parents[1]
 HARDWARE = Path(__file__).parent / "hardware"
 SLOW = tuple(Path(__file__).parent / name for name in ("faults", "peers", "simulated_runs"))
 """Folders whose tests are marked ``slow``; ``make test`` leaves them to ``make test-slow``."""
 
+# Containers often forbid to keep bytecode. Each worker, and each command that a test starts, then
+# compiles all modules anew, and that takes longer than the tests.
+sys.dont_write_bytecode = False
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+
 # A shared machine stalls now and then, and a failure in CI must come back when it is run again.
-settings.register_profile("local", deadline=None)
-settings.register_profile("ci", deadline=None, derandomize=True)
+settings.register_profile("local", deadline=None, max_examples=40)
+settings.register_profile("ci", settings.get_profile("local"), derandomize=True)
 settings.load_profile("ci" if os.environ.get("CI") else "local")
+settings.register_profile("thorough", settings(), max_examples=100)  # make test-slow
 
 
 def pytest_addoption(parser):
@@ -29,17 +41,46 @@ def pytest_addoption(parser):
     )
 
 
+def pytest_configure(config):
+    """Compile the kernels once, before xdist starts workers that would each compile them all."""
+    if getattr(config.option, "dist", "no") == "no" or hasattr(config, "workerinput"):
+        return
+    for root in (ROOT, ROOT / "drivers"):
+        for path in sorted(root.glob("hilctl*/**/*.py")):
+            if "jit import kernel\n" in path.read_text(encoding="utf-8"):
+                import_module(".".join(path.relative_to(root).with_suffix("").parts))
+
+
+def pytest_ignore_collect(collection_path, config):
+    """Import nothing of the folders whose tests would all be left out."""
+    slow = collection_path in SLOW and config.getoption("markexpr") == "not slow"
+    hardware = collection_path == HARDWARE and config.getoption("--device") is None
+    return True if slow or hardware else None
+
+
+@cache
+def slow(path):
+    """Return whether all tests of a file are slow."""
+    return not set(SLOW).isdisjoint(path.parents)
+
+
 def pytest_collection_modifyitems(config, items):
     """Mark the slow ones; leave tests on real devices out, unless one is named."""
     for item in items:
-        if set(SLOW) & set(item.path.parents):
+        if slow(item.path):
             item.add_marker(pytest.mark.slow)
     if config.getoption("--device") is not None:
         return
-    hardware = [item for item in items if HARDWARE in item.path.parents]
+    hardware = [item for item in items if str(item.path).startswith(f"{HARDWARE}{os.sep}")]
     if hardware:
         config.hook.pytest_deselected(items=hardware)
         items[:] = [item for item in items if item not in hardware]
+
+
+def pytest_collection_finish():
+    """Keep what was imported out of every search for garbage: it takes 0.2 s and finds none."""
+    gc.collect()
+    gc.freeze()
 
 
 def pytest_report_collectionfinish(config, items):
@@ -55,6 +96,17 @@ def memory():
     """A folder in memory of this session's own."""
     with tempfile.TemporaryDirectory(prefix="hilctl-tests-", dir=memory_folder()) as folder:
         yield Path(folder)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def composed_once():
+    """Scan each YAML text once: what comes of it depends on nothing else, and is only read.
+
+    A shipped profile has hundreds of lines and is loaded for hundreds of devices.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(document, "compose", lru_cache(maxsize=256)(document.compose))
+        yield
 
 
 # Autouse fixtures come before the others of their scope: what a wider fixture starts, it starts in

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from hilctl.base.arrays import F64, U32
 from hilctl.base.errors import DataError, ModelError
-from hilctl.base.samples import Flag, Samples
+from hilctl.base.samples import NO_WAVEFORM, Flag, Samples
 from hilctl.base.yaml.document import Document
 from hilctl.experiment.file import Experiment
 from hilctl.loop.compensator import Compensator
@@ -18,7 +18,7 @@ from hilctl.models.base import HysteresisModel
 from hilctl.models.files import parse_model
 from hilctl.recording.data import Recording, ReplayStart
 
-_LIMIT_BITS = int(Flag.RANGE_LIMITED | Flag.SLEW_LIMITED | Flag.INVALID | Flag.RAMP)
+_LIMIT_BITS = int(Flag.RANGE_LIMITED | Flag.SLEW_LIMITED | Flag.INVALID | NO_WAVEFORM)
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +97,7 @@ def replay(recording: Recording, model: HysteresisModel | None = None) -> Replay
         if model is None:
             _restore(recording, compensator, start)
         elif rows.start == 0:
-            waveform = (samples.flags[rows] & Flag.RAMP.value) == 0
+            waveform = (samples.flags[rows] & NO_WAVEFORM.value) == 0
             compensator.begin(samples.reference_um[rows][waveform])
         for part in _alike(samples.flags, rows):
             # Another model than the recorded one looks ahead by its own preview.
@@ -138,9 +138,8 @@ def _stretches(recording: Recording) -> list[tuple[ReplayStart, slice]]:
 
 
 def _alike(flags: U32, rows: slice) -> list[slice]:
-    """Cut rows where the waveform gives way to the ramp."""
-    ramp = (flags[rows] & Flag.RAMP.value) != 0
-    cuts = np.flatnonzero(np.diff(ramp)) + rows.start + 1
+    """Cut rows where ramp, conditioning and waveform give way to one another."""
+    cuts = np.flatnonzero(np.diff(flags[rows] & np.uint32(NO_WAVEFORM))) + rows.start + 1
     bounds = [rows.start, *cuts.tolist(), rows.stop]
     return [slice(a, b) for a, b in pairwise(bounds) if b > a]
 
@@ -158,7 +157,11 @@ def _recompute(
         wanted[:] = limiter.limits.safe
         limiter.ramp(command, flags, _skipped_on_ramp(samples, rows.start))
         return
-    compensator.process(inputs, wanted)
+    if samples.flags[rows.start] & Flag.CONDITION.value:
+        flags |= Flag.CONDITION.value
+        wanted[:] = samples.wanted[rows]  # what was fed here, as the input is to a compensator
+    else:
+        compensator.process(inputs, wanted)
     limiter.limit(wanted, command, flags)
 
 

@@ -9,7 +9,7 @@ from hilctl.analysis import metrics, timing
 from hilctl.analysis.figures import RunReport, SegmentReport
 from hilctl.analysis.steady import steady_part
 from hilctl.base.arrays import F64
-from hilctl.base.samples import Flag
+from hilctl.base.samples import NO_WAVEFORM, Flag
 from hilctl.base.segments import Segment
 from hilctl.recording.data import Recording
 
@@ -96,7 +96,7 @@ def _identity(recording: Recording) -> dict[str, Any]:
 
 def _counts(recording: Recording) -> dict[str, Any]:
     samples = recording.samples
-    waveform = (samples.flags & Flag.RAMP) == 0
+    waveform = (samples.flags & NO_WAVEFORM) == 0
     index, flags = samples.index[waveform], samples.flags[waveform]
     first, stop = (int(index[0]), int(index[-1]) + 1) if index.size else (0, 0)
     end = max((segment.stop for segment in recording.segments), default=0)

@@ -7,7 +7,7 @@ import numpy as np
 from hilctl.analysis.metrics import Fold, fold
 from hilctl.base.arrays import F64
 from hilctl.base.events import TUNED
-from hilctl.base.samples import Flag, Samples
+from hilctl.base.samples import NO_WAVEFORM, Flag, Samples
 from hilctl.base.segments import Segment
 from hilctl.recording.data import Recording
 
@@ -39,8 +39,8 @@ class SteadyPart:
 
 
 def waveform_end(samples: Samples) -> int:
-    """Return the index after the last sample that is not of a ramp; 0 without any."""
-    waveform = samples.index[(samples.flags & Flag.RAMP) == 0]
+    """Return the index after the last sample of the waveform; 0 without any."""
+    waveform = samples.index[(samples.flags & NO_WAVEFORM) == 0]
     return int(waveform[-1]) + 1 if waveform.size else 0
 
 

@@ -11,6 +11,13 @@ TUNED = "tuned"
 Its values are ``gain``, ``offset`` and ``samples``, the number of samples that the change takes.
 """
 
+OFFSET = "offset"
+"""Code of the event of an offset between sensor and model that is taken out, at the waveform's
+first sample.
+
+Its values are ``offset_um``, and the displacements at rest, ``resting_um`` and ``model_um``.
+"""
+
 
 @dataclass(frozen=True, slots=True)
 class Event:

@@ -261,5 +261,11 @@ class Flag(IntFlag):
     """The displacement was not finite, outside the stroke limits or at an end of the sensor."""
     UNANSWERED = 32
     """The device did not answer the exchange: the command may not have reached it."""
+    CONDITION = 1 << 17
+    """Of the conditioning before the waveform, which has no reference: its cycle, and the rest."""
     AFTER_SKIPPED = 1 << 16
     """In the first block after skipped ticks: the output had been held, and has to catch up."""
+
+
+NO_WAVEFORM = Flag.RAMP | Flag.CONDITION
+"""What is not of the waveform: there is no reference, and nothing to judge."""

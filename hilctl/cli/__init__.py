@@ -71,6 +71,8 @@ def _command() -> None:
 
 def _machine_refused(error: Exception) -> str:
     """Say what this machine could not give."""
+    if isinstance(error, FileNotFoundError) and error.filename is None:
+        return "the folder that it is started in has been deleted: change to another one"
     if isinstance(error, OSError):
         where = f"{error.filename}: " if error.filename is not None else ""
         return f"{where}{error.strerror or error}"

@@ -20,16 +20,18 @@ def print_identification(found: Identification, output: Path | None) -> None:
     fit, held_out = found.fit, found.held_out
     if found.orders:
         terminal.print(_orders_table(found.orders))
-    terminal.print(_errors_table(fit.model.provenance.method, fit.errors))
     if held_out is not None:
-        terminal.print(_errors_table("not fitted, to check the model", held_out.errors))
+        terminal.print(_errors_table(f"not fitted: {held_out.how}", held_out.judgement.errors))
+    terminal.print(_errors_table(f"fitted: {fit.model.provenance.method}", fit.errors))
     rows = ", ".join(f"{name} {text}" for name, text in parameter_texts(fit))
     if rows:
         terminal.print(f"parameters: {rows}")
     for line in summary(found):
         terminal.print(line)
-    if output is not None:
+    if output is not None and found.verdict.grade != "not a model":
         terminal.print(f"model: {output}", soft_wrap=True)
+    elif output is not None:
+        terminal.print(f"{output} was not written", soft_wrap=True)
 
 
 def _errors_table(title: str, errors: Sequence[LoopError]) -> Table:

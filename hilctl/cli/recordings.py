@@ -156,10 +156,14 @@ def identify(
         )
     if html is not None:
         write_identification(found, html)
+    refused = found.verdict.grade == "not a model"
     if as_json:
-        print_json({"output": str(output) if output else None, **found.to_mapping()})
+        written = str(output) if output and not refused else None
+        print_json({"output": written, **found.to_mapping()})
     else:
         print_identification(found, output)
+    if refused:
+        raise typer.Exit(1)
 
 
 def _column(text: str | None) -> str | int | None:

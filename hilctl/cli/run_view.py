@@ -139,7 +139,8 @@ def print_forecast(checked: Checked) -> None:
         "samples": f"{forecast.samples} at {config.sample_rate_hz:g} Hz, {config.block} a tick",
         "highest rate": f"{forecast.highest_rate_hz:.6g} Hz"
         + (f" ({forecast.rate_note})" if forecast.rate_note else ""),
-        "duration": f"{forecast.duration_s:g} s",
+        "duration": f"{forecast.duration_s:g} s"
+        + (f", after {forecast.before_s:g} s of condition and rest" if forecast.before_s else ""),
         "reference": f"{forecast.reference_min:.4g} to {forecast.reference_max:.4g} "
         f"{reference_unit}",
         "command": f"{forecast.command_min:.4g} to {forecast.command_max:.4g} {unit} "
@@ -147,6 +148,8 @@ def print_forecast(checked: Checked) -> None:
         "slew": f"{forecast.slew_per_s:.4g} {unit}/s (limit {limits.slew_per_s:g})",
         "recording": f"about {forecast.recording_mb:.3g} MB",
     }
+    if forecast.begins:
+        rows["begins"] = forecast.begins
     if note := checked.loaded.device.info.safe_note:
         rows["safe value"] = note
     if forecast.heating_rms_a is not None:
@@ -155,4 +158,6 @@ def print_forecast(checked: Checked) -> None:
         table.add_row(name, text)
     terminal = console()
     terminal.print(table)
+    for warning in checked.warnings:
+        terminal.print(f"warning: {warning}", style="yellow")
     terminal.print("may start", style="green")

@@ -77,7 +77,8 @@ def check(experiment: ExperimentFile, settings: Settings = None, as_json: AsJson
 
     checked = checked_experiment(experiment, settings or [])
     if as_json:
-        print_json({"experiment": str(experiment), **checked.forecast.to_mapping()})
+        found = {"warnings": list(checked.warnings), **checked.forecast.to_mapping()}
+        print_json({"experiment": str(experiment), **found})
     else:
         print_forecast(checked)
 

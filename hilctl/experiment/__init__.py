@@ -5,6 +5,7 @@ load.py           from a file to the experiment with all that it refers to
 correction.py     what learning has added to the compensator's input
 initial_state.py  what the run before left in the actuator
 check.py          the whole run worked out beforehand, held against device, model and limits
+model_range.py    whether the reference stays within what the model was identified on
 forecast.py       what a run will do; tuned.py  what it would with another gain and offset
 interlocks.py     interlocks and feedback.py feedback, from the file's keys
 device.py         the device that it names; registry.py  devices by name

@@ -5,16 +5,31 @@ by the same compensator that will run, and held against the limits.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
 
 from hilctl.base.arrays import F64
 from hilctl.base.errors import ConfigError, DataError, InputError, ModelError, Problem
+from hilctl.experiment.condition import condition_problems, conditioning_of, measures_offset
 from hilctl.experiment.feedback import feedback_problems
 from hilctl.experiment.forecast import Forecast, forecast_of
-from hilctl.experiment.initial_state import Begun, InitialState, begin, initial_state_of
+from hilctl.experiment.history import left_by_last_run
+from hilctl.experiment.initial_state import (
+    Begun,
+    InitialState,
+    begin,
+    initial_state_after,
+    left_by,
+)
 from hilctl.experiment.interlocks import interlock_problems
 from hilctl.experiment.load import LoadedExperiment
+from hilctl.experiment.model_range import RangeFindings, range_findings
+from hilctl.loop.conditioning import Conditioning
 from hilctl.waveforms.build import Reference, build
+
+_REPEAT = "identify the model on such motions too, or keep the waveform to what it was found on"
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,12 +41,14 @@ class Checked:
         reference: Every sample of its waveform.
         forecast: What it will do.
         begun: What the compensator is given, and what it begins with.
+        warnings: What keeps it from doing as well as its model promises.
     """
 
     loaded: LoadedExperiment
     reference: Reference
     forecast: Forecast
     begun: Begun
+    warnings: tuple[str, ...] = ()
 
     @property
     def state_size(self) -> int:
@@ -42,19 +59,26 @@ class Checked:
     def records_input(self) -> bool:
         """Whether the compensator's input is recorded: not where it is the reference itself."""
         own = self.begun.input_um is not self.reference.values
-        return own or self.loaded.config.feedback is not None
+        config = self.loaded.config
+        return own or config.feedback is not None or measures_offset(config)
+
+    def conditioning(self) -> Conditioning | None:
+        """Return what comes before the waveform; None where nothing does."""
+        return conditioning_of(self.loaded, self.begun.stands_um)
 
 
-def check(loaded: LoadedExperiment) -> Checked:
+def check(loaded: LoadedExperiment, folder: Path | None = None) -> Checked:
     """Work out the whole run and hold it against device, model and limits.
 
     Args:
         loaded: The experiment.
+        folder: Folder that the run is written to, where that is not ``recording.folder``: the last
+            run of its device may have been, too.
 
     Raises:
         ConfigError: The run must not start; all reasons are listed, each saying by how much.
     """
-    problems = _device_problems(loaded) + interlock_problems(loaded)
+    problems = _device_problems(loaded) + interlock_problems(loaded) + condition_problems(loaded)
     config = loaded.config
     try:
         reference = build(config.waveform, config.sample_rate_hz, loaded.folder)
@@ -63,22 +87,35 @@ def check(loaded: LoadedExperiment) -> Checked:
         raise ConfigError(problems) from None
     low, high = float(reference.values.min()), float(reference.values.max())
     problems += reference_problems(loaded, reference.unit, low, high)
+    findings = _findings(loaded, reference)
+    problems += [_problem(loaded, "waveform", text, hint=_REPEAT) for text in findings.refused]
     values = _corrected(loaded, reference, problems)
     try:
-        before = _state_before(loaded, problems)
+        conditioning = conditioning_of(loaded)
+        conditioned = np.empty(0) if conditioning is None else conditioning.command
+        before, begins = _state_before(loaded, folder, conditioned, problems)
         if before is not None:
-            lead_in = max(1, round(config.safe.ramp_s * config.sample_rate_hz))
-            values = before.lead_in(values, lead_in)
-        begun = begin(loaded.model, config.sample_rate_hz, values, before)
+            values = before.lead_in(values, config.lead_in_samples)
+        begun = begin(loaded.model, config.sample_rate_hz, values, before, begins)
+        if not measures_offset(config):
+            begun = replace(begun, stands_um=None)
         problems += feedback_problems(loaded, begun.preview)
-        forecast = forecast_of(loaded, reference, begun.input_um, begun.state)
+        forecast = forecast_of(loaded, reference, begun, conditioned)
     except ModelError as error:
         problems.append(_problem(loaded, "compensator.model", str(error)))
         raise ConfigError(problems) from None
     problems += command_problems(loaded, forecast)
     if problems:
         raise ConfigError(problems)
-    return Checked(loaded, reference, forecast, begun)
+    return Checked(loaded, reference, forecast, begun, findings.warnings)
+
+
+def _findings(loaded: LoadedExperiment, reference: Reference) -> RangeFindings:
+    """Return where the reference leaves what the model was identified on."""
+    known = loaded.model.provenance.identified_range if loaded.model else None
+    if known is None or reference.unit != "um":
+        return RangeFindings()
+    return range_findings(known, reference.values, reference.segments, loaded.config.sample_rate_hz)
 
 
 def _corrected(loaded: LoadedExperiment, reference: Reference, problems: list[Problem]) -> F64:
@@ -94,13 +131,39 @@ def _corrected(loaded: LoadedExperiment, reference: Reference, problems: list[Pr
         return reference.values
 
 
-def _state_before(loaded: LoadedExperiment, problems: list[Problem]) -> InitialState | None:
-    """Return where the run before left the actuator; None where that can't be used."""
-    try:
-        return initial_state_of(loaded)
-    except DataError as error:
-        problems.append(_problem(loaded, "compensator.initial_state", str(error)))
-        return None
+def _state_before(
+    loaded: LoadedExperiment, folder: Path | None, conditioned: F64, problems: list[Problem]
+) -> tuple[InitialState | None, str]:
+    """Return where the actuator stands before the waveform, None at rest; and why, in words.
+
+    Args:
+        loaded: The experiment.
+        folder: See :func:`check`.
+        conditioned: float64[m], commands that come before the waveform: a cycle that makes all
+            before it forgotten, and a rest; or the rest alone; or none.
+        problems: Added to where that can't be said.
+
+    Raises:
+        ModelError: The model has no inverse.
+    """
+    config, model = loaded.config, loaded.model
+    if model is None or config.compensator is None:
+        return None, ""
+    rate_hz, named = config.sample_rate_hz, config.compensator.initial_state
+    before, begins = None, "at rest"
+    if config.condition is not None:
+        begins = "where its condition leaves the actuator"
+    elif named == "last":
+        before, begins = left_by_last_run(loaded, folder)
+    elif named != "rest":
+        begins = f"where {named} left the actuator"
+        try:
+            before = initial_state_after(loaded.folder / named, model, rate_hz)
+        except DataError as error:
+            problems.append(_problem(loaded, "compensator.initial_state", str(error)))
+    if before is None and conditioned.size:
+        before = left_by(conditioned, model, rate_hz)
+    return before, begins
 
 
 def _problem(
@@ -224,7 +287,9 @@ def _budget_problems(loaded: LoadedExperiment, forecast: Forecast) -> list[Probl
         return []
     key, rms_a = "limits.rms_current_a", limits.rms_current_a
     rule = f"the coil must stay within {rms_a:g} A rms over {limits.thermal_time_constant_s:g} s"
-    when = f"the budget is used up after {forecast.budget_used_s:.4g} s"
+    used_s = forecast.budget_used_s
+    when = f"the budget is used up after {used_s:.4g} s"
     excess = f"{highest_a - rms_a:.3g} A too much"
-    hint = f"{excess}, and {when}: lower the waveform's amplitude, or shorten the run"
+    by = "condition" if used_s < forecast.before_s else "waveform"
+    hint = f"{excess}, and {when}: lower the {by}'s amplitude, or shorten the run"
     return [_problem(loaded, key, rule, f"{highest_a:.4g} A", hint)]

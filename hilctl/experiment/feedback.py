@@ -12,9 +12,10 @@ import numpy as np
 from hilctl.base.errors import Problem
 from hilctl.experiment.file import Experiment
 from hilctl.experiment.load import LoadedExperiment
-from hilctl.experiment.parts import FeedbackConfig
+from hilctl.experiment.parts import IntegralFeedbackConfig, PiFeedbackConfig
 from hilctl.loop.compensator import Compensator
-from hilctl.loop.feedback import Feedback, Gains
+from hilctl.loop.feedback import Controller, Feedback, Gains
+from hilctl.loop.integral import IntegralFeedback
 
 LOOP_DELAY = 2
 """Samples from a correction to the first tick that sees its effect: one until the sensor can show
@@ -22,19 +23,39 @@ it, and one until the displacement that came with that exchange is used."""
 
 LEAST_GAIN_MARGIN = 2.0
 LEAST_PHASE_MARGIN_DEG = 60.0
+SLOW_SHARE = 0.2
+"""Bandwidth of an integrator of block means, as a share of 1 / (2 pi delay): it leaves a phase
+margin of 79 degrees and a gain margin of nearly 8, also to an actuator of several times the gain
+that the model says, as on small loops."""
+UNKNOWN_RESONANCE_HZ = 5.0
+"""Highest bandwidth of such an integrator where no resonance is known: it leaves a gain margin of 2
+to any above 500 Hz with a damping of 1 %."""
 _FREQUENCIES = 4096
 _HIGHEST_RATE_HZ = 1e6
 
 
-def make_feedback(config: Experiment, compensator: Compensator) -> Feedback | None:
-    """Return the feedback of a run, or None where there is none."""
+def make_feedback(
+    config: Experiment, compensator: Compensator, latency_blocks: int = 0
+) -> Controller | None:
+    """Return the feedback of a run, or None where there is none.
+
+    Args:
+        config: The experiment.
+        compensator: What it corrects the input of.
+        latency_blocks: Exchanges from a block's commands to its displacements.
+    """
     wanted = config.feedback
     if wanted is None:
         return None
     rate_hz = config.sample_rate_hz
     due_after = round(wanted.sensor_delay_s * rate_hz) + (0 if compensator.preview else 1)
-    shown_after = due_after + compensator.preview + LOOP_DELAY
-    return Feedback(_gains(wanted, rate_hz), rate_hz, wanted.limit_um, due_after, shown_after)
+    shown_after = due_after + compensator.preview
+    if isinstance(wanted, IntegralFeedbackConfig):
+        gain = 2.0 * math.pi * wanted.bandwidth_hz * config.tick_s
+        blocks = latency_blocks + LOOP_DELAY + math.ceil(shown_after / config.block)
+        return IntegralFeedback(gain, wanted.limit_um, due_after, blocks)
+    gains = _gains(wanted, rate_hz)
+    return Feedback(gains, rate_hz, wanted.limit_um, due_after, shown_after + LOOP_DELAY)
 
 
 def feedback_problems(loaded: LoadedExperiment, preview: int) -> list[Problem]:
@@ -44,38 +65,77 @@ def feedback_problems(loaded: LoadedExperiment, preview: int) -> list[Problem]:
         loaded: The experiment.
         preview: Samples by which its compensator looks ahead: so long a correction takes to show.
     """
-    config, info = loaded.config, loaded.device.info
-    wanted = config.feedback
+    config, wanted = loaded.config, loaded.config.feedback
     if wanted is None:
         return []
     found: list[tuple[str, str, str, str]] = []
     if config.compensator is None:
         found.append(("feedback", "needs a compensator: it corrects what goes into one", "", ""))
-    if info.latency_blocks:
-        rule = f"needs a device that answers each sample at once: {info.name} plays from a FIFO"
-        hint = f"its displacements come {info.latency_blocks} exchanges later"
-        found.append(("feedback", rule, "", hint))
-    if config.block > 1:
-        hint = "a block's first displacement would be as old as the block"
-        found.append(("block", "must be 1 with feedback", str(config.block), hint))
-    if not found:
-        delay_s = wanted.sensor_delay_s + max(0, preview - 1) / config.sample_rate_hz
-        found += _gain_problems(wanted, config.sample_rate_hz, delay_s)
-        found += _resonance_problems(loaded, wanted)
+    if isinstance(wanted, IntegralFeedbackConfig):
+        found += _slow_problems(loaded, wanted, preview)
+    else:
+        found += _fast_problems(loaded, wanted, preview)
     return [
         Problem(loaded.document.where(tuple(key.split("."))), key, rule, value, hint)
         for key, rule, value, hint in found
     ]
 
 
-def _gains(wanted: FeedbackConfig, rate_hz: float) -> Gains:
+def _fast_problems(
+    loaded: LoadedExperiment, wanted: PiFeedbackConfig, preview: int
+) -> list[tuple[str, str, str, str]]:
+    config, info = loaded.config, loaded.device.info
+    found = []
+    slow = "feedback.kind integral takes out what is slow on every device"
+    if info.latency_blocks:
+        rule = f"needs a device that answers each sample at once: {info.name} plays from a FIFO"
+        found.append(("feedback", rule, "", slow))
+    if config.block > 1:
+        hint = f"a block's first displacement would be as old as the block; {slow}"
+        found.append(("block", "must be 1 with feedback", str(config.block), hint))
+    if found or config.compensator is None:
+        return found
+    delay_s = wanted.sensor_delay_s + max(0, preview - 1) / config.sample_rate_hz
+    found += _gain_problems(wanted, config.sample_rate_hz, delay_s)
+    return found + _resonance_problems(loaded, wanted)
+
+
+def _slow_problems(
+    loaded: LoadedExperiment, wanted: IntegralFeedbackConfig, preview: int
+) -> list[tuple[str, str, str, str]]:
+    """Hold the bandwidth of an integrator against the loop's delay and the resonance."""
+    config, info = loaded.config, loaded.device.info
+    shown_s = wanted.sensor_delay_s + max(1, preview) / config.sample_rate_hz
+    delay_s = (info.latency_blocks + 1) * config.tick_s + shown_s
+    highest_hz = SLOW_SHARE / (2.0 * math.pi * delay_s)
+    rule = (
+        f"must be <= {highest_hz:.4g} Hz, {SLOW_SHARE:g} / (2 pi {delay_s:.3g} s), the delay of "
+        "the loop"
+    )
+    natural_hz, damping = _resonance(loaded, wanted)
+    hint = "a smaller block or a higher rate makes the delay shorter"
+    if natural_hz is not None and damping is not None:
+        if damping * natural_hz < highest_hz:
+            highest_hz = damping * natural_hz
+            rule = f"must be <= {highest_hz:.4g} Hz, damping times frequency of the resonance"
+            hint = f"the gain at {natural_hz:g} Hz must be at most {1.0 / LEAST_GAIN_MARGIN:g}"
+    elif highest_hz > UNKNOWN_RESONANCE_HZ:
+        highest_hz = UNKNOWN_RESONANCE_HZ
+        rule = f"must be <= {highest_hz:g} Hz where no resonance is known"
+        hint = "give resonance_hz and damping_ratio of the actuator with its load"
+    if wanted.bandwidth_hz <= highest_hz:
+        return []
+    return [("feedback.bandwidth_hz", rule, f"{wanted.bandwidth_hz:g}", hint)]
+
+
+def _gains(wanted: PiFeedbackConfig, rate_hz: float) -> Gains:
     if wanted.bandwidth_hz is not None:
         return gains_for(min(wanted.bandwidth_hz, 0.5 * rate_hz), rate_hz)
     return Gains(wanted.kp or 0.0, wanted.ki_per_s or 0.0)
 
 
 def _gain_problems(
-    wanted: FeedbackConfig, rate_hz: float, delay_s: float
+    wanted: PiFeedbackConfig, rate_hz: float, delay_s: float
 ) -> list[tuple[str, str, str, str]]:
     """Hold the gains against the delay: phase margin of 60 degrees, gain margin of 2."""
     if wanted.bandwidth_hz is not None:
@@ -118,12 +178,10 @@ def _needs(rate_hz: float) -> str:
 
 
 def _resonance_problems(
-    loaded: LoadedExperiment, wanted: FeedbackConfig
+    loaded: LoadedExperiment, wanted: PiFeedbackConfig
 ) -> list[tuple[str, str, str, str]]:
     """Hold the gain at the resonance, where a light one multiplies it by 1/(2 damping), to half."""
-    structure = getattr(loaded.model, "structure", None)
-    natural_hz = wanted.resonance_hz or getattr(structure, "natural_hz", None)
-    damping = wanted.damping_ratio or getattr(structure, "damping_ratio", None)
+    natural_hz, damping = _resonance(loaded, wanted)
     if natural_hz is None or damping is None:
         rule = "needs resonance_hz and damping_ratio of the actuator with its load"
         return [("feedback", rule, "", "the model does not tell them, and feedback excites it")]
@@ -137,6 +195,15 @@ def _resonance_problems(
     where = f"{natural_hz:g} Hz, damping {damping:g}"
     hint = f"at most bandwidth_hz {damping * natural_hz:.3g}, or ki_per_s of 2 pi times that"
     return [("feedback", rule, f"{size:.3g} at {where}", hint)]
+
+
+def _resonance(
+    loaded: LoadedExperiment, wanted: PiFeedbackConfig | IntegralFeedbackConfig
+) -> tuple[float | None, float | None]:
+    """Return natural frequency in Hz and damping: the experiment's, else those of the model."""
+    structure = getattr(loaded.model, "structure", None)
+    natural_hz = wanted.resonance_hz or getattr(structure, "natural_hz", None)
+    return natural_hz, wanted.damping_ratio or getattr(structure, "damping_ratio", None)
 
 
 def gains_for(bandwidth_hz: float, rate_hz: float) -> Gains:

@@ -6,7 +6,7 @@ from pydantic import BeforeValidator, Field
 
 from hilctl.base.strict import Strict
 from hilctl.experiment.limits import Limits
-from hilctl.experiment.parts import FeedbackConfig, Name, RecordingConfig, Timing
+from hilctl.experiment.parts import Condition, FeedbackConfig, Name, RecordingConfig, Timing
 from hilctl.loop.limiter import CommandLimits
 from hilctl.machine.settings import Realtime
 from hilctl.waveforms.spec import AnyWaveform
@@ -46,14 +46,20 @@ class CompensatorConfig(Strict):
         model: Model file, relative to the experiment file's folder.
         correction: File that ``hilctl learn`` has written for this waveform, relative to the same
             folder; None where nothing is added to the reference.
-        initial_state: Recording of the run before this one, relative to the same folder, so that
-            the compensator begins with what that run left in the actuator, and reaches the
-            reference from there within ``safe.ramp_s``; None for an actuator at rest.
+        initial_state: What the compensator begins with, unless there is a condition: what the
+            ``last`` run of this device left in the actuator, by its newest recording in
+            ``recording.folder``; ``rest``; or a recording of the run before this one, relative to
+            the same folder as the model. The reference is reached from there within
+            ``safe.ramp_s``.
+        offset: ``identified`` takes the model's offset as it is; ``measured`` takes out what the
+            sensor shows beside the model while it rests before the waveform, for a sensor or an
+            actuator that has moved since.
     """
 
     model: str
     correction: str | None = None
-    initial_state: str | None = None
+    initial_state: str = "last"
+    offset: Literal["identified", "measured"] = "identified"
 
 
 class Experiment(Strict):
@@ -67,6 +73,8 @@ class Experiment(Strict):
         block: Samples exchanged in one tick; more than 1 needs a device with a FIFO.
         waveform: What to run.
         compensator: ``none``, read as None, or the model to invert.
+        condition: What the actuator goes through before the waveform, so that it begins in a state
+            that does not depend on what was before; None for nothing.
         feedback: A controller around the compensator; None where there is none.
         limits: What the run is held to.
         safe: The safe value, and the safe ramp to it.
@@ -87,6 +95,7 @@ class Experiment(Strict):
             _none_or_mapping, json_schema_input_type=Literal["none"] | CompensatorConfig
         ),
     ]
+    condition: Condition | None = None
     feedback: FeedbackConfig | None = None
     limits: Limits
     safe: Safe = Field(default_factory=Safe)
@@ -98,6 +107,11 @@ class Experiment(Strict):
     def tick_s(self) -> float:
         """Time from one tick to the next, in s."""
         return self.block / self.sample_rate_hz
+
+    @property
+    def lead_in_samples(self) -> int:
+        """Samples of the waveform within which its reference is reached from where it stands."""
+        return max(1, round(self.safe.ramp_s * self.sample_rate_hz))
 
     def command_limits(self) -> CommandLimits:
         """Return what the limiter holds commands to, in the device's unit."""

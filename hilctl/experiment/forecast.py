@@ -8,6 +8,7 @@ import numpy as np
 
 from hilctl.base.arrays import F64
 from hilctl.experiment.file import Experiment
+from hilctl.experiment.initial_state import Begun
 from hilctl.experiment.load import LoadedExperiment
 from hilctl.kernels.interlock import heat_block
 from hilctl.loop.compensator import Compensator
@@ -26,6 +27,8 @@ class Forecast:
     Attributes:
         samples: Samples of the waveform.
         duration_s: Its length.
+        before_s: Time of the conditioning before it.
+        begins: Where the compensator begins, in words; empty without one.
         reference_min: Lowest reference, in the waveform's unit.
         reference_max: Highest reference.
         command_unit: ``A`` or ``V``.
@@ -42,6 +45,8 @@ class Forecast:
 
     samples: int
     duration_s: float
+    before_s: float
+    begins: str
     reference_min: float
     reference_max: float
     command_unit: str
@@ -62,25 +67,28 @@ class Forecast:
 def forecast_of(
     loaded: LoadedExperiment,
     reference: Reference,
-    input_um: F64,
-    state: F64 | None = None,
+    begun: Begun,
+    conditioned: F64,
 ) -> Forecast:
     """Run the compensator on its input, and note what comes of it.
 
     Args:
         loaded: The experiment.
         reference: Every sample of its waveform.
-        input_um: float64[n], the compensator's input.
-        state: The compensator's memory at the start; at rest where None.
+        begun: The compensator's input, and its memory at the start.
+        conditioned: float64[m], commands that come before the waveform's.
 
     Raises:
         ModelError: The model has no inverse.
     """
     config = loaded.config
     compensator = Compensator(loaded.model, config.sample_rate_hz)
-    if state is not None:
-        compensator.restore(state)
+    if begun.state is not None:
+        compensator.restore(begun.state)
+    input_um = begun.input_um
     figures = CommandFigures(config, config.safe.value, config.safe.value**2)
+    if conditioned.size:
+        figures.add(conditioned)
     values = reference.values
     wanted = np.empty(min(_CHUNK, input_um.size))
     for start in range(0, input_um.size, _CHUNK):
@@ -92,6 +100,8 @@ def forecast_of(
     return Forecast(
         samples=values.size,
         duration_s=values.size / config.sample_rate_hz,
+        before_s=conditioned.size / config.sample_rate_hz,
+        begins=begun.begins,
         reference_min=float(values.min()),
         reference_max=float(values.max()),
         command_unit=loaded.device.info.command_unit,
@@ -100,7 +110,7 @@ def forecast_of(
         slew_per_s=figures.slew_per_s,
         heating_rms_a=figures.heat.rms_a,
         budget_used_s=figures.heat.used_s,
-        recording_mb=values.size * byte_count / 1e6,
+        recording_mb=(values.size + conditioned.size) * byte_count / 1e6,
         highest_rate_hz=loaded.device.info.max_rate_hz,
         rate_note=loaded.device.info.rate_note,
     )

@@ -1,13 +1,14 @@
 """What a compensator begins with: the memory that a run before left in the actuator, or rest."""
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from hilctl.base.arrays import F64
 from hilctl.base.errors import DataError
-from hilctl.experiment.load import LoadedExperiment
+from hilctl.base.samples import Flag
 from hilctl.loop.compensator import Compensator
 from hilctl.models.base import HysteresisModel
 from hilctl.recording.data import Recording
@@ -25,24 +26,29 @@ class Begun:
         preview: Samples by which its input runs ahead of the commands.
         state_size: Numbers in its memory.
         state: float64[state_size], its memory before the first sample; None where it is at rest.
-        run_id: The run that left this memory; empty where the actuator is at rest.
+        begins: Where the compensator begins, in words, and why.
+        run_id: The run that left this memory; empty where none did.
+        stands_um: Displacement before the first sample by the model, where the sensor is held
+            against it; None where it is not.
     """
 
     input_um: F64
     preview: int
     state_size: int
     state: F64 | None = None
+    begins: str = "at rest"
     run_id: str = ""
+    stands_um: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class InitialState:
-    """Where a run before left the actuator.
+    """Where a run before, or what comes before the waveform, leaves the actuator.
 
     Attributes:
         state: float64[state_size], the compensator's memory, at rest there.
         stands_um: Displacement there, by the model.
-        run_id: That run.
+        run_id: That run; empty where it is this one.
     """
 
     state: F64
@@ -62,25 +68,12 @@ class InitialState:
         return led
 
 
-def initial_state_of(loaded: LoadedExperiment) -> InitialState | None:
-    """Return where the run before left the actuator; None where the experiment names none.
-
-    Raises:
-        DataError: That run can't be used, see :func:`initial_state_after`.
-        ModelError: The model has no inverse.
-    """
-    config, model = loaded.config, loaded.model
-    named = config.compensator.initial_state if config.compensator else None
-    if named is None or model is None:
-        return None
-    return initial_state_after(loaded.folder / named, model, config.sample_rate_hz)
-
-
 def begin(
     model: HysteresisModel | None,
     sample_rate_hz: float,
     values: F64,
     before: InitialState | None = None,
+    begins: str = "at rest",
 ) -> Begun:
     """Return what the compensator is fed, and its memory once it has begun.
 
@@ -89,6 +82,7 @@ def begin(
         sample_rate_hz: Samples a second.
         values: float64[n], the reference with what is added to it, led in from where it begins.
         before: Where the run before left the actuator; at rest where None.
+        begins: That, in words.
 
     Raises:
         ModelError: The model has no inverse.
@@ -103,7 +97,9 @@ def begin(
         preview=compensator.preview,
         state_size=state.size,
         state=state if before is not None or compensator.preview else None,
+        begins=begins,
         run_id=before.run_id if before else "",
+        stands_um=before.stands_um if before else None,
     )
 
 
@@ -124,14 +120,21 @@ def initial_state_after(path: Path, model: HysteresisModel, sample_rate_hz: floa
     """
     recording = read(path)
     _check(recording, model, sample_rate_hz)
-    command = recording.samples.command
+    left = left_by(recording.samples.command, model, sample_rate_hz)
+    if not math.isfinite(left.stands_um):
+        raise DataError(f"{path}: has commands that the model has no displacement for")
+    return replace(left, run_id=recording.run.get("run_id", ""))
+
+
+def left_by(command: F64, model: HysteresisModel, sample_rate_hz: float) -> InitialState:
+    """Return where commands from rest leave the model, once it has stood still for a second."""
     still = np.full(round(_STILL_S * sample_rate_hz), command[-1])
     came = model.forward(sample_rate_hz).process(np.concatenate((command, still)))
     inverse = model.inverse(sample_rate_hz)
     if not np.isfinite(came).all():
-        raise DataError(f"{path}: has commands that the model has no displacement for")
+        return InitialState(inverse.state(), math.nan, "")
     inverse.process(came[inverse.preview :])
-    return InitialState(inverse.state(), float(came[-1]), recording.run.get("run_id", ""))
+    return InitialState(inverse.state(), float(came[-1]), "")
 
 
 def _check(recording: Recording, model: HysteresisModel, sample_rate_hz: float) -> None:
@@ -144,3 +147,7 @@ def _check(recording: Recording, model: HysteresisModel, sample_rate_hz: float) 
         raise DataError(f"{path}: was recorded at {rates}")
     if index.size == 0 or recording.dropped or index[-1] + 1 != index.size or not recording.end:
         raise DataError(f"{path}: is not of a whole run: where it left the actuator is not known")
+    unanswered = np.any(recording.samples.flags & Flag.UNANSWERED.value)
+    if unanswered or recording.end.get("output_safe") == "false":
+        lost = "lost its device, or did not confirm its safe value"
+        raise DataError(f"{path}: {lost}: where it left the actuator is not known")

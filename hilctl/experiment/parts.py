@@ -1,7 +1,7 @@
 """Common types of the experiment file, and its parts about the machine: time, recording, CPU."""
 
 import re
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, TypeAlias
 
 from pydantic import (
     AfterValidator,
@@ -108,14 +108,38 @@ class RecordingConfig(Strict):
         return self
 
 
-class FeedbackConfig(Strict):
-    """A PI controller around the compensator, for devices that exchange sample by sample.
+REST_S = 0.1
+"""Rest before the waveform where an offset is measured and no other rest is given."""
+
+
+class Condition(Strict):
+    """A decaying cycle around the safe value before the waveform, to a repeatable state.
+
+    It goes to both sides of the safe value as far as the amplitude, and no further than the limits.
+
+    Attributes:
+        amplitude_a: Amplitude of the first cycle, for devices driven in A; as far as the limits go
+            where it is left out.
+        amplitude_v: The same for devices driven in V.
+        frequency_hz: Left out, 10 Hz, or less where slew limit or rate ask for it.
+        cycles: How many.
+        decay: Amplitude of each cycle over that of the one before; 1 for one that falls in a line.
+        rest_s: Rest at the safe value after it; over its second half the displacement is averaged.
+    """
+
+    amplitude_a: Annotated[float, Field(gt=0.0)] | None = None
+    amplitude_v: Annotated[float, Field(gt=0.0)] | None = None
+    frequency_hz: Annotated[float, Field(gt=0.0)] | None = None
+    cycles: Annotated[int, Field(ge=2, le=1000)] = 20
+    decay: Annotated[float, Field(ge=0.1, le=1.0)] = 0.8
+    rest_s: Annotated[float, Field(ge=0.0, le=60.0)] = REST_S
+
+
+class _AnyFeedback(Strict):
+    """What every feedback has.
 
     Attributes:
         limit_um: Largest correction of the compensator's input, either way.
-        bandwidth_hz: Frequency up to which the error is brought down; gives the gains.
-        kp: Proportional gain, um of correction per um of error, where there is no bandwidth.
-        ki_per_s: Integral gain, per s, where there is no bandwidth.
         sensor_delay_s: Age of a displacement when it is read, as far as the model does not know it:
             the filter of the sensor, its line.
         resonance_hz: Lowest natural frequency of the actuator with its load; the feedback must stay
@@ -124,12 +148,24 @@ class FeedbackConfig(Strict):
     """
 
     limit_um: Annotated[float, Field(gt=0.0)]
-    bandwidth_hz: Annotated[float, Field(gt=0.0)] | None = None
-    kp: Annotated[float, Field(ge=0.0)] | None = None
-    ki_per_s: Annotated[float, Field(gt=0.0)] | None = None
     sensor_delay_s: Annotated[float, Field(ge=0.0)] = 0.0
     resonance_hz: Annotated[float, Field(gt=0.0)] | None = None
     damping_ratio: Annotated[float, Field(gt=0.0, le=2.0)] | None = None
+
+
+class PiFeedbackConfig(_AnyFeedback):
+    """A PI controller around the compensator, for devices that exchange sample by sample.
+
+    Attributes:
+        bandwidth_hz: Frequency up to which the error is brought down; gives the gains.
+        kp: Proportional gain, um of correction per um of error, where there is no bandwidth.
+        ki_per_s: Integral gain, per s, where there is no bandwidth.
+    """
+
+    kind: Literal["pi"] = "pi"
+    bandwidth_hz: Annotated[float, Field(gt=0.0)] | None = None
+    kp: Annotated[float, Field(ge=0.0)] | None = None
+    ki_per_s: Annotated[float, Field(gt=0.0)] | None = None
 
     @model_validator(mode="after")
     def _one_way(self) -> Self:
@@ -137,3 +173,25 @@ class FeedbackConfig(Strict):
         if by_gains == (self.bandwidth_hz is not None) or (by_gains and self.ki_per_s is None):
             raise ValueError("must have either bandwidth_hz or ki_per_s, the latter with kp or not")
         return self
+
+
+class IntegralFeedbackConfig(_AnyFeedback):
+    """An integrator of the mean error of each block, for every device: see loop/integral.py.
+
+    Attributes:
+        bandwidth_hz: Frequency below which offset, creep and drift are taken out; a disturbance
+            that comes at once fades as e^(-2 pi bandwidth t).
+    """
+
+    kind: Literal["integral"]
+    bandwidth_hz: Annotated[float, Field(gt=0.0)]
+
+
+def _pi_where_not_said(value: Any) -> Any:
+    return {"kind": "pi", **value} if isinstance(value, dict) else value
+
+
+FeedbackConfig: TypeAlias = Annotated[
+    Annotated[PiFeedbackConfig | IntegralFeedbackConfig, Field(discriminator="kind")],
+    BeforeValidator(_pi_where_not_said),
+]

@@ -5,15 +5,15 @@ from typing import Any
 
 from hilctl.base.device import DeviceOptions
 from hilctl.experiment.file import Experiment
-from hilctl.experiment.registry import BUILTIN, device_class
+from hilctl.experiment.registry import device_class, known_devices
 
 
 def experiment_schema() -> dict[str, Any]:
-    """Return the JSON schema of experiment files, with the options of the built-in devices."""
+    """Return the JSON schema of experiment files, with the options of all known devices."""
     schema = Experiment.model_json_schema()
     definitions = schema["$defs"]
     choices = []
-    for kind in BUILTIN:
+    for kind in known_devices():
         options: type[DeviceOptions] = device_class(kind).Options
         part = options.model_json_schema()
         definitions.update(part.pop("$defs", {}))

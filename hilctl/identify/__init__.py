@@ -6,6 +6,9 @@ catalogue.py   every kind of model: its name, how it is identified, what data th
 fit_model.py   fit a model of any kind, with its provenance
 job.py         what a fit takes, and what it returns
 judge.py       how far a model is from data
+held_out.py    the same on data that its fit did not see
+verdict.py     what a model is worth, or why it is none
+found_range.py the motions that it was identified on
 model_size.py  number of plays by loops held out; lag of a table
 workers.py     independent fits over threads, processes or a Dask cluster
 fit_data.py    all data ready for the kernels

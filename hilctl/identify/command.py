@@ -2,23 +2,27 @@
 
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from hilctl.base.device import CommandUnit
 from hilctl.base.errors import InputError
 from hilctl.base.files import check_writable, write_text
 from hilctl.base.yaml.document import Document
 from hilctl.identify.catalogue import entry
 from hilctl.identify.data.files import load_records
 from hilctl.identify.data.records import Record
-from hilctl.identify.fit_model import FittedModel, fit_model
+from hilctl.identify.fit_model import FittedModel, error_table, fit_model
+from hilctl.identify.held_out import HeldOut, held_out_error
 from hilctl.identify.job import OnProgress, ignore_progress
 from hilctl.identify.judge import Judgement, judge
 from hilctl.identify.model_size import OrderError, choose_lag, choose_order
 from hilctl.identify.settings import FitSettings, IdentifySettings
-from hilctl.identify.workers import Map, workers
+from hilctl.identify.verdict import Verdict, verdict_of
+from hilctl.identify.workers import Map, one_by_one, workers
+from hilctl.models.base import HysteresisModel
 from hilctl.models.files import dump_model
 
 
@@ -29,24 +33,25 @@ class Identification:
     Attributes:
         fit: The fit.
         data: What it was fitted to.
-        held_out: Errors on other data; None where there were none.
-        held_out_data: These data.
+        verdict: What the model is worth.
+        held_out: Errors on data that the fit did not see; None where there were none.
         orders: What each number of plays did on loops held out, where that was asked for.
         lag_samples: Samples by which tables' displacements were taken to lag.
     """
 
     fit: FittedModel
     data: Sequence[Record]
-    held_out: Judgement | None
-    held_out_data: Sequence[Record]
+    verdict: Verdict
+    held_out: HeldOut | None
     orders: tuple[OrderError, ...]
     lag_samples: int
 
     def to_mapping(self) -> dict[str, Any]:
         """Return all figures as plain mappings, lists and numbers, for JSON."""
         return {
-            **self.fit.to_mapping(),
+            "verdict": self.verdict.to_mapping(),
             "held_out": None if self.held_out is None else self.held_out.to_mapping(),
+            **self.fit.to_mapping(),
             "orders": [asdict(order) for order in self.orders],
             "lag_samples": self.lag_samples,
         }
@@ -75,13 +80,15 @@ def identify_files(
     overwrite: bool = False,
     progress: OnProgress = ignore_progress,
 ) -> Identification:
-    """Fit a model to files, write it, and judge it on other files.
+    """Fit a model to files, judge it on data that the fit did not see, and write it.
+
+    What is not a model of these data is not written.
 
     Args:
         paths: Recordings and text tables.
         settings: The choices.
         output: Model file to write; None for none.
-        validate: Files to judge the model on.
+        validate: Files to judge the model on; where there are none, parts of the others.
         scheduler: Where independent fits run, see :func:`hilctl.identify.workers.workers`.
         overwrite: Whether a model file of that name may be replaced.
         progress: Called with what is being done.
@@ -97,25 +104,64 @@ def identify_files(
         asked = settings.table.unit
         if recorded and asked and recorded != asked:
             raise InputError(f"--unit must be {recorded}, that of the recordings: {asked}")
-        held_out, _ = load_records(validate, settings, lag)
-        chosen: FitSettings = settings
-        orders: tuple[OrderError, ...] = ()
-        if settings.size == "auto":
-            chosen, orders = choose_order(records, settings, run, progress)
-        fit = fit_model(
-            records,
-            chosen,
-            time.perf_counter,
-            unit=settings.unit(recorded),
-            source=[path.name for path in paths],
-            created=datetime.now(UTC).isoformat(timespec="seconds"),
-            progress=progress,
-            run=run,
-        )
-    if output is not None:
-        write_text(output, dump_model(fit.model), overwrite=overwrite)
-    judged = judge(fit.model, held_out, creep=settings.creep) if held_out else None
-    return Identification(fit, records, judged, held_out, orders, lag)
+        others, _ = load_records(validate, settings, lag)
+        source = [path.name for path in paths]
+        unit = settings.unit(recorded)
+        found = identify_records(records, settings, unit, others, source, run, progress)
+    if output is not None and found.verdict.grade != "not a model":
+        write_text(output, dump_model(found.fit.model), overwrite=overwrite)
+    return replace(found, lag_samples=lag)
+
+
+def identify_records(
+    records: Sequence[Record],
+    settings: FitSettings,
+    unit: CommandUnit,
+    validate: Sequence[Record] = (),
+    source: Sequence[str] = (),
+    run: Map = one_by_one,
+    progress: OnProgress = ignore_progress,
+) -> Identification:
+    """Fit a model to records, and judge it on data that the fit did not see.
+
+    Args:
+        records: What it is fitted to.
+        settings: The choices.
+        unit: Unit of the command.
+        validate: What it is judged on; where there is none, parts of ``records`` are left out of
+            fits for that alone.
+        source: Recordings or files that the data come from, for the provenance.
+        run: Runs fits that do not depend on each other.
+        progress: Called with what is being done.
+
+    Raises:
+        DataError: The data can't be used as asked, or there are none.
+    """
+    chosen, orders = settings, tuple[OrderError, ...]()
+    if settings.size == "auto":
+        chosen, orders = choose_order(records, settings, run, progress)
+    created = datetime.now(UTC).isoformat(timespec="seconds")
+    fit = fit_model(
+        records, chosen, time.perf_counter, unit=unit, source=source, created=created,
+        progress=progress, run=run,
+    )  # fmt: skip
+    if validate:
+        judged = judge(fit.model, validate, creep=settings.creep)
+        held_out: HeldOut | None = HeldOut(judged, tuple(validate), "files that were not fitted")
+    else:
+        held_out = held_out_error(records, chosen, unit, run, progress)
+    verdict = verdict_of(fit, records, chosen, held_out)
+    if held_out is not None:
+        fit = replace(fit, model=_with_held_out(fit.model, held_out.judgement))
+    return Identification(fit, records, verdict, held_out, orders, 0)
+
+
+def _with_held_out(model: HysteresisModel, judgement: Judgement) -> HysteresisModel:
+    """Return a model whose provenance says how it does on data that its fit did not see."""
+    figures = {f"held_out_{name}": value for name, value in error_table(judgement).items()}
+    errors = {**model.provenance.errors_percent, **figures}
+    provenance = model.provenance.model_copy(update={"errors_percent": errors})
+    return model.model_copy(update={"provenance": provenance})
 
 
 def _lag(paths: Sequence[Path], settings: IdentifySettings, run: Map, progress: OnProgress) -> int:

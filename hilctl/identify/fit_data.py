@@ -11,6 +11,7 @@ from hilctl.base.arrays import F64
 from hilctl.base.device import CommandUnit
 from hilctl.base.errors import DataError
 from hilctl.identify.data.records import History, Records, SteadyLoop
+from hilctl.identify.data.thin import thinned
 from hilctl.identify.staged.sensitivity import (
     GAMMA_S,
     PARAMETERS,
@@ -39,6 +40,16 @@ class _Run:
     judged: slice
     place: slice
     loop: bool
+
+
+def search_data(records: Records, kind: str, unit: CommandUnit) -> "FitData":
+    """Return the records as a search of that kind of model goes through them, long ones thinned.
+
+    Raises:
+        DataError: There are none.
+    """
+    # A lag needs every sample: a staged model would take the others for a rest.
+    return FitData(records if kind == "staged" else thinned(records), unit)
 
 
 class FitData:
@@ -99,7 +110,7 @@ class FitData:
         for record, place in zip(self.records, self.places, strict=True):
             part = np.ones((place.stop - place.start, 1))
             if isinstance(record, History):
-                time_s = np.arange(record.command.size)[record.ignore :] / record.sample_rate_hz
+                time_s = record.time_s[record.ignore :]
                 part = np.column_stack([part, np.log1p(time_s / CREEP_S)])
             column = np.zeros((self.target_um.size, part.shape[1]))
             column[place] = part

@@ -11,7 +11,8 @@ import hilctl
 from hilctl.base.device import CommandUnit
 from hilctl.identify.catalogue import CATALOGUE
 from hilctl.identify.data.records import Record, Records, SteadyLoop
-from hilctl.identify.fit_data import FitData
+from hilctl.identify.fit_data import FitData, search_data
+from hilctl.identify.found_range import identified_range
 from hilctl.identify.job import FitJob, OnProgress, StartOutcome, ignore_progress
 from hilctl.identify.judge import Judgement, judge
 from hilctl.identify.settings import FitSettings
@@ -31,6 +32,7 @@ class FittedModel(Judgement):
         starts: What became of each start of the search.
         parameters: Fitted parameters under their published names, in command units, um and s.
         standard_errors: Of the parameters, by the same names; empty where a fit has none.
+        at_bound: Parameters that stand on a bound: not found, but as far as they may go.
         elapsed_s: How long it took.
     """
 
@@ -39,6 +41,7 @@ class FittedModel(Judgement):
     starts: tuple[StartOutcome, ...]
     parameters: Mapping[str, float]
     standard_errors: Mapping[str, float]
+    at_bound: tuple[str, ...]
     elapsed_s: float
 
     def to_mapping(self) -> dict[str, Any]:
@@ -50,6 +53,7 @@ class FittedModel(Judgement):
             "numbers": self.numbers,
             "parameters": dict(self.parameters),
             "standard_errors": dict(self.standard_errors),
+            "at_bound": list(self.at_bound),
             "elapsed_s": self.elapsed_s,
         }
 
@@ -87,15 +91,16 @@ def fit_model(
         DataError: The data can't be used as asked, or there are none.
     """
     begin = clock()
-    data = FitData(records, unit)
-    found = CATALOGUE[settings.kind].fit(FitJob(data, settings, run, progress))
+    data, few = FitData(records, unit), search_data(records, settings.kind, unit)
+    found = CATALOGUE[settings.kind].fit(FitJob(few, settings, run, progress))
     judged = judge(found.model, data, creep=settings.creep)
     provenance = Provenance(
         source=tuple(source),
         method=_method(settings),
         grid=tuple(map(_grid_line, records)),
         parameters=found.parameters,
-        errors_percent=_error_table(judged),
+        errors_percent=error_table(judged),
+        identified_range=identified_range(data),
         versions=VERSIONS,
         created=created,
     )
@@ -111,6 +116,7 @@ def fit_model(
         starts=found.starts,
         parameters=found.parameters,
         standard_errors=found.standard_errors,
+        at_bound=found.at_bound,
         elapsed_s=clock() - begin,
     )
 
@@ -134,7 +140,7 @@ def _grid_line(record: Record) -> str:
     return f"{record.label}: {low:.4g} to {high:.4g}, {points}"
 
 
-def _error_table(judged: Judgement) -> dict[str, float]:
+def error_table(judged: Judgement) -> dict[str, float]:
     """Return the errors by name."""
     areas = [error.area_error_percent for error in judged.errors]
     table = {

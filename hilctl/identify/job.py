@@ -69,6 +69,7 @@ class FoundModel:
             models that are nothing but a table of weights.
         starts: What became of each start of the search; empty where there was none.
         standard_errors: Of the parameters, by the same names; empty where a fit has none.
+        at_bound: Parameters that stand on a bound: not found, but as far as they may go.
     """
 
     model: HysteresisModel
@@ -76,3 +77,4 @@ class FoundModel:
     parameters: dict[str, float] = field(default_factory=dict)
     starts: tuple[StartOutcome, ...] = ()
     standard_errors: dict[str, float] = field(default_factory=dict)
+    at_bound: tuple[str, ...] = ()

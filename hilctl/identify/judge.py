@@ -4,6 +4,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 
 from hilctl.analysis.metrics import loop_area
 from hilctl.base.arrays import F64
@@ -85,6 +86,11 @@ def judge(model: HysteresisModel, data: Records | FitData, *, creep: bool = Fals
     if creep:
         own = np.linalg.lstsq(data.creep, data.target_um - responses_um, rcond=None)[0]
         responses_um = responses_um + data.creep @ own
+    return judgement_of(data, responses_um)
+
+
+def judgement_of(data: FitData, responses_um: F64) -> Judgement:
+    """Return how far responses, float64[N], are from the records' judged samples."""
     errors_um = responses_um - data.target_um
     errors = tuple(
         _loop_error(record, responses_um[place], data.target_um[place])
@@ -106,16 +112,40 @@ def _modelled_um(model: HysteresisModel, data: FitData) -> F64:
         return data.response_um(model)
     parts: list[F64] = []
     for record, speed in zip(data.records, data.speeds, strict=True):
-        if isinstance(model, StagedModel) and isinstance(record, SteadyLoop):
+        if not isinstance(record, SteadyLoop):
+            command, _, ignored = record.run()
+            parts.append(model.forward(record.sample_rate_hz).process(command)[ignored:])
+        elif record.sample_rate_hz > 0.0 and isinstance(model, StagedModel):
+            parts.append(_sampled_cycle_um(model, record))
+        elif isinstance(model, StagedModel):
             parts.append(response_um(model, StagedFitData([record], [speed])))
-        elif isinstance(record, SteadyLoop):
+        else:
             points, rate_hz = record.command.size, record.command.size * record.frequency_hz
             periods = np.tile(record.command, PERIODS)
             parts.append(model.forward(rate_hz).process(periods)[-points:])
-        else:
-            command, _, ignored = record.run()
-            parts.append(model.forward(record.sample_rate_hz).process(command)[ignored:])
     return np.concatenate(parts)
+
+
+def _sampled_cycle_um(model: HysteresisModel, loop: SteadyLoop) -> F64:
+    """Return what a model does with a loop's command, sample by sample as in a run: float64[M].
+
+    A fit takes stages with dynamics as they are in continuous time; a run has samples, and at a
+    low rate the difference is the larger part of the error.
+    """
+    points = loop.command.size
+    turns = np.arange(points + 1) / points
+    command = CubicSpline(turns, np.append(loop.command, loop.command[0]), bc_type="periodic")
+    period = loop.sample_rate_hz / loop.frequency_hz
+    at = np.arange(round(PERIODS * period)) / period
+    ran = model.forward(loop.sample_rate_hz).process(np.ascontiguousarray(command(at)))
+    last = at >= at[-1] - 1.0 + 0.5 / period  # no phase twice
+    phase = at[last] % 1.0
+    order = np.argsort(phase)
+    phase, cycle = phase[order], ran[last][order]
+    spline = CubicSpline(
+        np.append(phase, phase[0] + 1.0), np.append(cycle, cycle[0]), bc_type="periodic"
+    )
+    return np.ascontiguousarray(spline(turns[:-1]))
 
 
 def _loop_error(record: Record, response_um: F64, target_um: F64) -> LoopError:

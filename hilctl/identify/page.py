@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import matplotlib as mpl
+import numpy as np
 from matplotlib.figure import Figure
 
 from hilctl.analysis.canvas import DISPLACEMENT, ERROR, REFERENCE, STYLE
@@ -18,6 +19,7 @@ from hilctl.models.files import dump_model
 
 COLUMNS = 3
 MOST_RECORDS = 36
+MOST_DRAWN = 20_000  # samples of a history: more have no place on a page
 
 
 def write_identification(found: Identification, path: Path) -> None:
@@ -38,14 +40,13 @@ def identification_page(found: Identification) -> str:
         f"<h1>{html.escape(title)}</h1>",
         f"<p>{html.escape(fit.model.provenance.method)}</p>",
         *(f"<p>{html.escape(line)}</p>" for line in summary(found)),
-        "<h2>Errors</h2>",
-        grid(HEADINGS, error_rows(fit.errors), "numbers"),
-        *_drawn("Model and data", fit, found.data, unit),
     ]
-    if found.held_out is not None:
+    if (held_out := found.held_out) is not None:
         body += ["<h2>Errors on data not fitted</h2>"]
-        body += [grid(HEADINGS, error_rows(found.held_out.errors), "numbers")]
-        body += _drawn("Model and data not fitted", found.held_out, found.held_out_data, unit)
+        body += [grid(HEADINGS, error_rows(held_out.judgement.errors), "numbers")]
+        body += _drawn("Model and data not fitted", held_out.judgement, held_out.records, unit)
+    body += ["<h2>Errors on data fitted</h2>", grid(HEADINGS, error_rows(fit.errors), "numbers")]
+    body += _drawn("Model and data", fit, found.data, unit)
     body += ["<h2>Parameters</h2>", grid(("name", "value"), parameter_texts(fit), "numbers")]
     body += [f"<details><summary>Model</summary><pre>{html.escape(dump_model(fit.model))}</pre>"]
     return document(html.escape(title), [*body, "</details>"])
@@ -80,10 +81,11 @@ def loops_figure(modelled_um: Sequence[F64], data: Sequence[Record], unit: str) 
             signal[-modelled.size :] for signal in (record.command, record.displacement_um)
         )
         steady = isinstance(record, SteadyLoop)
-        x = command if steady else range(command.size)
-        upper.plot(x, measured, color=REFERENCE, label="measured", linewidth=1.6)
-        upper.plot(x, modelled, color=DISPLACEMENT, label="model", linewidth=0.9)
-        lower.plot(x, modelled - measured, color=ERROR)
+        step = 1 + command.size // MOST_DRAWN
+        x = (command if steady else np.arange(command.size))[::step]
+        upper.plot(x, measured[::step], color=REFERENCE, label="measured", linewidth=1.6)
+        upper.plot(x, modelled[::step], color=DISPLACEMENT, label="model", linewidth=0.9)
+        lower.plot(x, (modelled - measured)[::step], color=ERROR)
         upper.set(title=record.label, ylabel="um")
         lower.set(xlabel=f"command, {unit}" if steady else "sample", ylabel="error, um")
         upper.set_visible(True)

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from hilctl.identify.command import Identification
 from hilctl.identify.fit_model import FittedModel
-from hilctl.identify.judge import LoopError
+from hilctl.identify.judge import Judgement, LoopError
 
 HEADINGS = ("loop", "p-p um", "peak %", "rms %", "area %")
 
@@ -20,31 +20,48 @@ def error_rows(errors: Sequence[LoopError]) -> list[tuple[str, ...]]:
 
 
 def parameter_texts(fit: FittedModel) -> list[tuple[str, str]]:
-    """Return names and values, with standard errors where there are any."""
+    """Return names and values, with standard errors where there are any, and bounds marked."""
+    return [(name, f"{value:.6g}" + _mark(fit, name)) for name, value in fit.parameters.items()]
+
+
+def _mark(fit: FittedModel, name: str) -> str:
+    if name in fit.at_bound:
+        return " (on its bound)"
     sure = fit.standard_errors
-    return [
-        (name, f"{value:.6g}" + (f" ± {sure[name]:.2g}" if name in sure else ""))
-        for name, value in fit.parameters.items()
-    ]
+    return f" ± {sure[name]:.2g}" if name in sure else ""
 
 
 def summary(found: Identification) -> list[str]:
-    """Return the result in a few lines."""
-    fit, held_out = found.fit, found.held_out
+    """Return the result in a few lines, what it is worth first."""
+    fit, held_out, known = found.fit, found.held_out, found.fit.model.provenance.identified_range
     spread = [start.rms_percent for start in fit.starts]
     ended = f"{fit.numbers} numbers found"
     if spread:
         ended = f"{len(spread)} starts ended at rms {min(spread):.3f} to {max(spread):.3f} %"
-    lines = [
-        f"{ended}, in {fit.elapsed_s:.2f} s",
-        f"peak error {fit.peak_percent:.2f} %, rms {fit.rms_percent:.2f} % of the largest "
-        f"peak-to-peak; {fit.own_peak_percent:.2f} % of a loop's own",
-    ]
+    lines = [str(found.verdict), *found.verdict.notes]
     if held_out is not None:
+        lines.append(f"not fitted: {_errors(held_out.judgement)}; {held_out.how}")
+    lines += [f"fitted: {_errors(fit)}", f"{ended}, in {fit.elapsed_s:.2f} s"]
+    if fit.at_bound:
+        shown = ", ".join(fit.at_bound)
+        lines.append(f"on a bound, so not found but as far as they may go: {shown}")
+    if known is not None:
         lines.append(
-            f"not fitted: peak error {held_out.peak_percent:.2f} %, "
-            f"rms {held_out.rms_percent:.2f} % of the largest peak-to-peak"
+            f"found for {_span(known.peak_to_peak_um)} um peak-to-peak, "
+            f"{_span(known.frequency_hz)} Hz, up to {known.speed_um_per_s:.4g} um/s"
         )
     if found.lag_samples:
         lines.append(f"displacements taken {found.lag_samples} samples later than the commands")
     return lines
+
+
+def _errors(judged: Judgement) -> str:
+    return (
+        f"peak error {judged.peak_percent:.2f} %, rms {judged.rms_percent:.2f} % of the largest "
+        f"peak-to-peak; {judged.own_peak_percent:.2f} % of a record's own"
+    )
+
+
+def _span(limits: tuple[float, float]) -> str:
+    low, high = (f"{limit:.4g}" for limit in limits)
+    return low if low == high else f"{low} to {high}"

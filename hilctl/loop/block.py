@@ -27,7 +27,8 @@ class Block:
         number: The slot's number since the start of the run; -1 where it is a spare one, which is
             not recorded.
         due: Whether the block is to be recorded: not while the loop only waits for answers.
-        following: Whether it begins with samples of the waveform.
+        guarded: Whether an interlock that trips in it ends the run: it begins with samples of the
+            waveform or of the conditioning.
         skipped: Samples that were skipped just before it.
     """
 
@@ -38,5 +39,5 @@ class Block:
         self.reference, self.input_um = columns[REFERENCE], columns[INPUT_UM]
         self.wanted, self.command = columns[WANTED], columns[COMMAND]
         self.displacement_um, self.measured = columns[DISPLACEMENT_UM], columns[MEASURED]
-        self.due = self.following = True
+        self.due = self.guarded = True
         self.number = self.skipped = 0

@@ -8,9 +8,36 @@ is a gain of about 1 and a delay, so what limits the bandwidth is the delay, and
 import math
 from collections import deque
 from dataclasses import dataclass
+from typing import Protocol
 
+from hilctl.base.arrays import F64
 from hilctl.base.errors import InputError
 from hilctl.loop.block import Block
+
+
+class Controller(Protocol):
+    """What corrects the compensator's input; called in every tick, it never waits."""
+
+    correction_um: float
+    """Newest correction, in um."""
+
+    @property
+    def against(self) -> str:
+        """Why sensor and command can't be of one sign; empty as long as they may be."""
+        ...
+
+    def follow(self, block: Block, input_um: F64) -> None:
+        """Correct the input of a block's samples that follow the reference.
+
+        Args:
+            block: The block that is worked out; its reference and its skipped samples stand in it.
+            input_um: float64[n], their input, corrected in place.
+        """
+        ...
+
+    def take(self, block: Block) -> None:
+        """Take a block whose displacements have come, whatever the phase of the run."""
+        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +86,7 @@ class Feedback:
         self._integral_um = 0.0
         self.correction_um = 0.0
         """Correction of the tick under way, in um, within the limit."""
+        self._seen = math.nan, False
         self._polarity = Polarity(limit_um, shown_after)
 
     @property
@@ -66,21 +94,17 @@ class Feedback:
         """Why sensor and command can't be of one sign; empty as long as they may be."""
         return self._polarity.against
 
-    def follow(self, block: Block, last: Block | None) -> None:
-        """Correct the input of the next sample.
-
-        Args:
-            block: Block of that one sample: reference and input stand in it.
-            last: Block of the last exchange; None before the first.
-        """
+    def follow(self, block: Block, input_um: F64) -> None:
+        """Correct the input of the next sample, see :class:`Controller`."""
         if block.skipped:
             self.forget()
-        displacement_um, limited = math.nan, False
-        if last is not None:
-            displacement_um = last.displacement_um.item(0)
-            limited = last.wanted.item(0) != last.command.item(0)
-        reference_um = block.reference.item(0)
-        block.input_um[0] += self.correct(reference_um, displacement_um, limited=limited)
+        displacement_um, limited = self._seen
+        input_um[0] += self.correct(block.reference.item(0), displacement_um, limited=limited)
+
+    def take(self, block: Block) -> None:
+        """Take what the last exchange brought."""
+        limited = block.wanted.item(0) != block.command.item(0)
+        self._seen = block.displacement_um.item(0), limited
 
     def correct(self, reference_um: float, displacement_um: float, *, limited: bool) -> float:
         """Return the correction of the next sample, in um.

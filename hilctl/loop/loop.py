@@ -1,9 +1,10 @@
 """The fixed-rate loop, and nothing else.
 
-Where the output is not at its safe value, a ramp takes it there before the waveform begins. Then:
-reference block, compensator, limiter, device, ring: once a tick, until the waveform ends, a stop is
-asked for, or something goes wrong. All of these end by the same safe ramp: to the safe value within
-the ramp's slew, recorded as before.
+Where the output is not at its safe value, a ramp takes it there before the waveform begins; where
+the plan has one, a conditioning cycle comes after that, and a rest. Then: reference block,
+compensator, limiter, device, ring: once a tick, until the waveform ends, a stop is asked for, or
+something goes wrong. All of these end by the same safe ramp: to the safe value within the ramp's
+slew, recorded as before.
 
 A device that plays blocks from a FIFO gives a block's displacements some blocks later. Blocks wait
 in their slots until then, and after the ramp the loop goes on at the safe value until the last of
@@ -18,9 +19,10 @@ import numpy as np
 from hilctl.base.arrays import F64, U32
 from hilctl.base.device import Device
 from hilctl.base.errors import DeviceError
-from hilctl.base.events import TUNED, Event
+from hilctl.base.events import OFFSET, TUNED, Event
 from hilctl.base.samples import Flag, Head
 from hilctl.loop.block import Block
+from hilctl.loop.conditioning import RestingOffset
 from hilctl.loop.host import Host, Tuning
 from hilctl.loop.interlocks import Interlocks
 from hilctl.loop.limiter import Limiter
@@ -32,14 +34,18 @@ from hilctl.loop.tuning import Tuner, tune
 _FIRST_SAMPLE, _SAMPLES = int(Head.FIRST_SAMPLE), int(Head.SAMPLES)
 _DROPPED_BEFORE, _DEADLINE_NS = int(Head.DROPPED_BEFORE), int(Head.DEADLINE_NS)
 _LATE_NS, _EXCHANGE_NS = int(Head.LATE_NS), int(Head.EXCHANGE_NS)
-_SKIPPED = int(Flag.AFTER_SKIPPED)
+_SKIPPED, _CONDITION = int(Flag.AFTER_SKIPPED), int(Flag.CONDITION)
 
 
 class _Phase(Enum):
     STARTING = "ramps to the safe value, from where the output was"
+    CONDITIONING = "goes through the conditioning cycle, and rests"
     FOLLOWING = "follows the reference"
     LEAVING = "ramps to the safe value"
     HOLDING = "holds the safe value until the last answer has come"
+
+
+_BEFORE = (_Phase.STARTING, _Phase.CONDITIONING)
 
 
 class Loop:
@@ -64,11 +70,11 @@ class Loop:
         self._pacer = Pacer(host.clock, period_ns, plan.late_policy, plan.late_rules)
         self._tuner = Tuner()
         self._in_flight: deque[Block] = deque()
-        self._last: Block | None = None
         self._start_ns = 0
         self._next_sample = 0
         self._ended_at = 0
-        self._waveform_at = 0
+        self._condition_at = self._waveform_at = 0
+        self._resting: RestingOffset | None = None
         self._end = plan.reference.size
         self._on_ramp = False
         self._missing = 0
@@ -89,17 +95,23 @@ class Loop:
             output: Command at which it stands, in the device's unit; may lie outside the limits.
 
         Returns:
-            Samples of the ramp from there to the safe value, whole blocks, which come before the
-            waveform; 0 where it stands there, to within one step of the ramp.
+            Samples that come before the waveform, whole blocks: a ramp from there to the safe
+            value, none where it stands there to within one step of the ramp, and the conditioning.
         """
         self._limiter.last = output
         self._interlocks.begin_at(output)
-        block = self._plan.block
-        self._waveform_at = -(-self._limiter.ramp_samples // block) * block
+        block, conditioning = self._plan.block, self._plan.conditioning
+        self._condition_at = -(-self._limiter.ramp_samples // block) * block
+        self._waveform_at = self._condition_at
+        if conditioning is not None:
+            self._waveform_at += conditioning.command.size
+            self._resting = RestingOffset(conditioning, self._condition_at)
         self._end = self._waveform_at + self._plan.reference.size
-        if self._waveform_at:
+        if self._condition_at:
             self._phase = _Phase.STARTING
             self._pacer.policy = self._plan.ramp_policy
+        elif conditioning is not None:
+            self._phase = _Phase.CONDITIONING
         return self._waveform_at
 
     def run(self, start_ns: int) -> Outcome:
@@ -111,10 +123,11 @@ class Loop:
         self._start_ns = start_ns
         self._pacer.begin(start_ns)
         if self._phase is _Phase.STARTING:
-            output, samples = self._limiter.last, self._waveform_at
+            output, samples = self._limiter.last, self._condition_at
             text = f"output was at {output:g}: ramp to {self._limiter.limits.safe:g} first"
             values = {"output": output, "samples": float(samples)}
             self._host.record_event(Event(0, "info", "start_ramp", text, values))
+        self._say_condition()
         try:
             while not self._tick():
                 pass
@@ -139,8 +152,11 @@ class Loop:
         feedback = self._plan.feedback
         if feedback is not None and feedback.against:
             self._leave("fault", "feedback_sign", feedback.against)
-        if self._phase is _Phase.STARTING and self._next_sample >= self._waveform_at:
-            self._begin_waveform()
+        if self._phase is _Phase.STARTING and self._next_sample >= self._condition_at:
+            self._begin(_Phase.CONDITIONING if self._plan.conditioning else _Phase.FOLLOWING)
+        if self._phase is _Phase.CONDITIONING and self._next_sample >= self._waveform_at:
+            self._begin(_Phase.FOLLOWING)
+            self._take_offset_out()
         return done
 
     def _hold(self) -> None:
@@ -154,8 +170,9 @@ class Loop:
         """Wait for the tick; return its block with the head filled in."""
         pacer, block_samples = self._pacer, self._plan.block
         most = None
-        if self._phase is _Phase.STARTING:  # its last tick is not skipped: the waveform waits
-            most = (self._waveform_at - self._next_sample) // block_samples - 1
+        if self._phase in _BEFORE:  # their last tick is not skipped: what comes next waits
+            ends = self._condition_at if self._phase is _Phase.STARTING else self._waveform_at
+            most = (ends - self._next_sample) // block_samples - 1
         skipped = pacer.wait(most) * block_samples
         # Before the block is claimed: its number and the state kept with it are those after it.
         if skipped:
@@ -184,6 +201,8 @@ class Loop:
         factors = self._tuner.advance(passed.size)
         if factors is not None:
             tune(factors, passed, passed)
+        if self._resting is not None:
+            self._resting.apply(passed, start - at)
         if plan.feedback is not None:
             passed += plan.feedback.correction_um
         self._compensator.process(passed, np.empty_like(passed))
@@ -204,13 +223,41 @@ class Loop:
         elif self._phase is _Phase.FOLLOWING and (tuning := self._host.tuning()):
             self._tune(tuning)
 
-    def _begin_waveform(self) -> None:
-        """Follow the reference from now on, unless skipped ticks have left the output elsewhere."""
-        self._phase = _Phase.FOLLOWING
+    def _begin(self, phase: _Phase) -> None:
+        """Go on to a phase, unless skipped ticks have left the output elsewhere."""
+        self._phase = phase
         self._pacer.policy = self._plan.late_policy
         if not self._limiter.at_rest:
-            reason = "the ramp to the safe value before the waveform was late: timing not kept"
+            reason = "the way to the safe value before the waveform was late: timing not kept"
             self._leave("fault", "late", reason)
+
+    def _say_condition(self) -> None:
+        conditioning = self._plan.conditioning
+        if conditioning is not None and conditioning.cycle_samples:
+            cycle, rest = conditioning.cycle_samples, conditioning.command.size
+            text = f"conditioning cycle of {cycle} samples, {rest} with the rest after it"
+            values = {"cycle_samples": float(cycle), "samples": float(rest)}
+            event = Event(self._condition_at, "info", "condition", text, values)
+            self._host.record_event(event)
+
+    def _take_offset_out(self) -> None:
+        """Hold the resting displacement against the model's; beyond the limit the run ends."""
+        conditioning, resting = self._plan.conditioning, self._resting
+        assert conditioning is not None
+        assert resting is not None
+        stands_um, measured_um = conditioning.stands_um, resting.resting_um
+        if stands_um is None or self._phase is not _Phase.FOLLOWING:
+            return
+        offset_um = measured_um - stands_um
+        rests = f"at rest the sensor shows {measured_um:.4g} um, the model {stands_um:.4g} um"
+        if not abs(offset_um) <= conditioning.largest_um:
+            limit = f"an offset beyond {conditioning.largest_um:.4g} um"
+            self._leave("fault", OFFSET, f"{rests}: {limit}: identify the model anew")
+            return
+        resting.take_out(offset_um)
+        values = {"offset_um": offset_um, "resting_um": measured_um, "model_um": stands_um}
+        text = f"{rests}: {offset_um:.4g} um are taken out of the compensator's input"
+        self._host.record_event(Event(self._next_sample, "info", OFFSET, text, values))
 
     def _tune(self, tuning: Tuning) -> None:
         self._tuner.move(tuning)
@@ -224,7 +271,7 @@ class Loop:
 
         Leaving twice is ignored, but for a fault of the waveform that shows after its end.
         """
-        if self._phase in {_Phase.STARTING, _Phase.FOLLOWING}:
+        if self._phase is not _Phase.LEAVING and self._phase is not _Phase.HOLDING:
             self._phase = _Phase.LEAVING
             self._pacer.policy = self._plan.ramp_policy
         elif self._code != "completed" or code != "fault":
@@ -247,9 +294,13 @@ class Loop:
         block.state[-1] = self._limiter.last
         if block.skipped:
             block.flags |= _SKIPPED
-        block.following = self._phase is _Phase.FOLLOWING
+        following = self._phase is _Phase.FOLLOWING
+        conditioning = self._phase is _Phase.CONDITIONING
+        block.guarded = following or conditioning
+        if conditioning:
+            return False, self._condition(block)
         left = self._end - self._next_sample
-        n = min(left, plan.block) if block.following else 0
+        n = min(left, plan.block) if following else 0
         on_ramp, self._on_ramp = self._on_ramp, n < plan.block
         if n == plan.block:
             reference, input_um = block.reference, block.input_um
@@ -266,6 +317,15 @@ class Loop:
         skipped = block.skipped if on_ramp else 0
         there = self._limiter.ramp(block.command[n:], block.flags[n:], skipped)
         return there and self._phase is _Phase.LEAVING, first_invalid
+
+    def _condition(self, block: Block) -> int:
+        """Fill a block of the conditioning; return the first wish that is not finite, or -1."""
+        assert self._plan.conditioning is not None
+        start = self._next_sample - self._condition_at
+        block.reference[:] = block.input_um[:] = np.nan
+        block.wanted[:] = self._plan.conditioning.command[start : start + self._plan.block]
+        block.flags |= _CONDITION
+        return self._limiter.limit(block.wanted, block.command, block.flags)
 
     def _follow(
         self,
@@ -288,8 +348,10 @@ class Loop:
         else:
             tune(factors, plan.reference[start:stop], reference)
             tune(factors, plan.input_um[start:stop], input_um)
+        if self._resting is not None:
+            self._resting.apply(input_um, start)
         if plan.feedback is not None:
-            plan.feedback.follow(block, self._last)
+            plan.feedback.follow(block, input_um)
         self._compensator.process(input_um, wanted)
         return self._limiter.limit(wanted, command, flags)
 
@@ -310,7 +372,6 @@ class Loop:
             sent.head[_FIRST_SAMPLE], sent.command, answered.displacement_um, answered.measured
         )
         sent.head[_EXCHANGE_NS] = self._clock.now_ns() - before_ns
-        self._last = sent
         if not early:
             in_flight.popleft()
             self._take(answered)
@@ -325,9 +386,14 @@ class Loop:
             block.measured,
             block.flags,
         )
+        if self._resting is not None:
+            self._resting.take(block.head[_FIRST_SAMPLE], block.displacement_um)
+        # Before it is recorded: from then on its slot may be another block's.
+        if self._plan.feedback is not None:
+            self._plan.feedback.take(block)
         # Recorded before the run leaves for it: the event refers to samples that are there.
         self._record(block)
-        if trip is not None and block.following:
+        if trip is not None and block.guarded:
             self._leave("fault", trip.code, trip.reason, trip.sample)
 
     def _record(self, block: Block) -> None:

@@ -5,7 +5,8 @@ from typing import Literal, TypeAlias
 
 from hilctl.base.arrays import F64
 from hilctl.loop.compensator import Compensator
-from hilctl.loop.feedback import Feedback
+from hilctl.loop.conditioning import Conditioning
+from hilctl.loop.feedback import Controller
 from hilctl.loop.interlocks import InterlockContext, InterlockSettings
 from hilctl.loop.limiter import CommandLimits
 from hilctl.loop.pacer import LatePolicy, LateRules
@@ -51,6 +52,7 @@ class Plan:
         ramp_policy: The same on the ramps before and after the waveform.
         late_rules: From when a tick counts as late, and when lateness ends the run.
         feedback: Corrects the compensator's input; None where nothing does.
+        conditioning: What comes before the waveform; None where nothing does.
         keep_all: Whether a block that finds no room in the ring ends the run.
     """
 
@@ -66,5 +68,6 @@ class Plan:
     late_policy: LatePolicy = "skip"
     ramp_policy: LatePolicy = "skip"
     late_rules: LateRules = field(default_factory=LateRules)
-    feedback: Feedback | None = None
+    feedback: Controller | None = None
+    conditioning: Conditioning | None = None
     keep_all: bool = True

@@ -99,7 +99,11 @@ def disk_space(machine: Machine, folder: Path) -> Finding:
         machine: The machine.
         folder: Where recordings go; it need not exist yet.
     """
-    place = folder.absolute()
+    try:
+        place = folder.absolute()
+    except FileNotFoundError:
+        said = f"{folder}: the working folder has been deleted"
+        return Finding("recordings", "bad", said, "change to another one")
     while not place.exists():
         place = place.parent
     free = machine.free_bytes(place)

@@ -222,6 +222,12 @@ def refusals(steps: Sequence[SetUpStep]) -> list[str]:
     ]
 
 
+def be_quick(priority: int, system: System = _THIS_PROCESS) -> None:
+    """Put the calling thread before all that is not real-time, where that is allowed."""
+    with suppress(OSError):
+        system.set_fifo(priority)
+
+
 def be_ordinary(system: System = _THIS_PROCESS) -> bool:
     """Give up a real-time policy inherited from whoever started this process.
 

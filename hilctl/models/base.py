@@ -106,6 +106,27 @@ class Operator:
             self.process(np.array([first_input]))
 
 
+class IdentifiedRange(Strict):
+    """The motions that a model was identified on; beyond them its error is not known.
+
+    Attributes:
+        peak_to_peak_um: Peak-to-peak displacement of the smallest and of the largest of them.
+        frequency_hz: Lowest fundamental, and highest frequency of a command.
+        speed_um_per_s: Largest speed.
+    """
+
+    peak_to_peak_um: tuple[float, float]
+    frequency_hz: tuple[float, float]
+    speed_um_per_s: float = Field(gt=0.0)
+
+    @field_validator("peak_to_peak_um", "frequency_hz")
+    @classmethod
+    def _check_order(cls, limits: tuple[float, float]) -> tuple[float, float]:
+        if not 0.0 < limits[0] <= limits[1]:
+            raise ValueError(f"must be above 0, and the second no less than the first: {limits}")
+        return limits
+
+
 class Provenance(Strict):
     """Where a model's parameters come from.
 
@@ -115,6 +136,7 @@ class Provenance(Strict):
         grid: The loops they were found on.
         parameters: Parameters of the parametrisation that was fitted, by name.
         errors_percent: Model errors, by name, in percent of the peak-to-peak output.
+        identified_range: The motions that it was identified on; None where that is not known.
         versions: Software versions, by name.
         created: Date and time in ISO 8601, UTC.
     """
@@ -124,6 +146,7 @@ class Provenance(Strict):
     grid: tuple[str, ...] = ()
     parameters: Mapping[str, float] = Field(default_factory=dict)
     errors_percent: Mapping[str, float] = Field(default_factory=dict)
+    identified_range: IdentifiedRange | None = None
     versions: Mapping[str, str] = Field(default_factory=dict)
     created: str = ""
 

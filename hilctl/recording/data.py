@@ -10,6 +10,9 @@ from hilctl.base.events import Event
 from hilctl.base.samples import Samples
 from hilctl.base.segments import Segment
 
+HOLDS_FACT = "holds"
+"""Fact of a run, by which later ones know its device: JSON list of what it holds while open."""
+
 
 @dataclass(frozen=True, slots=True)
 class Ticks:

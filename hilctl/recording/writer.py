@@ -9,6 +9,7 @@ import errno
 import fcntl
 import json
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
@@ -146,9 +147,10 @@ class OutputFile:
 
     def give_back(self) -> None:
         """Close the file unwritten; remove it unless it stood there before."""
-        self.stream.close()
+        with suppress(OSError):  # closing writes what a full disk has refused before
+            self.stream.close()
         if self._ours:
-            self._path.unlink()
+            self._path.unlink(missing_ok=True)
 
 
 def lock(stream: BinaryIO, kind: int) -> None:

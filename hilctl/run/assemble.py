@@ -9,6 +9,7 @@ from hilctl.experiment.file import Experiment
 from hilctl.experiment.interlocks import interlock_context
 from hilctl.experiment.load import LoadedExperiment
 from hilctl.loop.compensator import Compensator
+from hilctl.loop.conditioning import Conditioning
 from hilctl.loop.pacer import LatePolicy, LateRules
 from hilctl.loop.plan import Plan
 
@@ -21,6 +22,7 @@ def assemble(
     reference: F64,
     input_um: F64,
     state: F64 | None,
+    conditioning: Conditioning | None = None,
     *,
     paced: bool = True,
 ) -> Plan:
@@ -31,6 +33,7 @@ def assemble(
         reference: float64[n], in the waveform's unit.
         input_um: float64[n], the compensator's input.
         state: The compensator's memory before the first sample; at rest where None.
+        conditioning: What comes before the waveform; None for nothing.
         paced: Whether the run keeps real time; else no tick is late.
     """
     config, info = loaded.config, loaded.device.info
@@ -54,7 +57,8 @@ def assemble(
         # By time, not by ticks: a device that takes its time for each would be at it for long.
         ramp_policy=policy if not paced or info.buffered or info.latency_blocks else "skip",
         late_rules=_late_rules(config, reference.size) if paced else LateRules(),
-        feedback=make_feedback(config, compensator),
+        feedback=make_feedback(config, compensator, info.latency_blocks),
+        conditioning=conditioning,
         keep_all=config.recording.on_failure == "stop",
     )
 

@@ -87,11 +87,15 @@ class LoopChild:
         """Whether the process is gone."""
         return self._process.poll() is not None
 
-    def kill(self) -> None:
-        """End it at once; one that the kernel keeps from dying is not waited for."""
+    def kill(self, wait_s: float = _DEATH_S) -> None:
+        """End it at once; one that the kernel keeps from dying is not waited for.
+
+        Args:
+            wait_s: Longest wait until it is gone.
+        """
         self._process.kill()
         with suppress(subprocess.TimeoutExpired):
-            self._process.wait(_DEATH_S)
+            self._process.wait(wait_s)
 
     def death(self) -> str:
         """Return why it could not say how it ended."""

@@ -18,6 +18,7 @@ import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Self
 
@@ -27,12 +28,15 @@ from hilctl.base.files import TextFiles
 from hilctl.base.yaml.document import Document
 from hilctl.experiment.device import made_device
 from hilctl.machine.linux import LinuxProcess
+from hilctl.machine.realtime import be_quick
 from hilctl.run.hang_watch import HangWatch, SilenceLimits, is_stopped
 from hilctl.run.safe_action import SafeAction
 from hilctl.run.shared_page import SIZE, Field, GuardianPhase, PageText, Phase, SharedPage
 
 _POLL_MS = 5
-_DEATH_MS = 50
+LAST_CALL_MS = 5
+"""How long a process that was killed may be in a call that it is to end. Then it is dying: giving
+back its memory takes much longer, and only a device that takes one connection waits for that."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,8 +134,7 @@ class Guardian:
         """End the loop for good: should it go on, it would send commands from before."""
         with suppress(ProcessLookupError):
             signal.pidfd_send_signal(self._loop, signal.SIGKILL)
-        # Not for long: one that the kernel keeps from dying can't come back to its commands either.
-        self._death.poll(_DEATH_MS)
+        self._death.poll(LAST_CALL_MS)
 
     def _make_safe(self, *, hung: bool) -> None:
         page = self._page
@@ -156,10 +159,10 @@ def main(words: list[str]) -> int:
         return 1
     "localhost".encode("idna")  # the codec, which is imported at the first connection otherwise
     process = LinuxProcess()
-    be_quick = _quick(process, job.priority)
     _stay_in_memory(process)
-    be_quick()
-    Guardian(page, device, job, int(words[1]), be_quick).watch()
+    be_quick(job.priority, process)
+    prepare = partial(be_quick, job.priority, process)
+    Guardian(page, device, job, int(words[1]), prepare).watch()
     return 0
 
 
@@ -169,16 +172,6 @@ def _page(ring: str) -> SharedPage:
         return SharedPage(mmap.mmap(descriptor, SIZE))
     finally:
         os.close(descriptor)
-
-
-def _quick(process: LinuxProcess, priority: int) -> Callable[[], None]:
-    """Return what puts the calling thread before all that is not real-time, where allowed."""
-
-    def be_quick() -> None:
-        with suppress(OSError):
-            process.set_fifo(priority)
-
-    return be_quick
 
 
 def _stay_in_memory(process: LinuxProcess) -> None:

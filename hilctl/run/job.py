@@ -9,6 +9,7 @@ from typing import Self
 import numpy as np
 
 from hilctl.base.arrays import F64
+from hilctl.base.errors import RunError
 from hilctl.base.files import TextFiles
 from hilctl.base.yaml.document import Document
 from hilctl.experiment.check import Checked
@@ -28,6 +29,7 @@ class Job:
         reference: File of the reference samples.
         input_um: File of the compensator's input.
         state: The compensator's memory before the first sample; None where it is at rest.
+        stands_um: Displacement there by the model, where the sensor is held against it.
         supervisor: The supervisor's process number.
         silence_s: Longest that it may be silent.
     """
@@ -39,18 +41,23 @@ class Job:
     reference: str
     input_um: str
     state: list[float] | None
+    stands_um: float | None
     supervisor: int
     silence_s: float
 
     @classmethod
     def of(cls, checked: Checked, folder: RunFolder, *, supervisor: int, silence_s: float) -> Self:
-        """Return the job of a checked experiment; its arrays are left in the run's folder."""
+        """Return the job of a checked experiment; its arrays are left in the run's folder.
+
+        Raises:
+            RunError: There is no room for them.
+        """
         begun = checked.begun
         reference = input_um = folder.reference
-        np.save(reference, checked.reference.values)
+        _save(reference, checked.reference.values)
         if begun.input_um is not checked.reference.values:
             input_um = folder.input_um
-            np.save(input_um, begun.input_um)
+            _save(input_um, begun.input_um)
         return cls(
             experiment=checked.loaded.yaml_text,
             files=checked.loaded.files.texts,
@@ -59,6 +66,7 @@ class Job:
             reference=str(reference),
             input_um=str(input_um),
             state=None if begun.state is None else begun.state.tolist(),
+            stands_um=begun.stands_um,
             supervisor=supervisor,
             silence_s=silence_s,
         )
@@ -92,6 +100,14 @@ class Job:
         reference = _mapped(self.reference)
         same = self.input_um == self.reference
         return reference, reference if same else _mapped(self.input_um)
+
+
+def _save(path: Path, values: F64) -> None:
+    try:
+        np.save(path, values)
+    except OSError as error:  # numpy's own has no errno: "8000 requested and 512 written"
+        hint = "less recording.ring_s, or a shorter waveform, needs less of it"
+        raise RunError(f"{path}: no memory: {error.strerror or error}; {hint}") from None
 
 
 def _mapped(path: str) -> F64:

@@ -10,6 +10,7 @@ import sys
 import time
 
 from hilctl.base.errors import DeviceError, HilctlError, InputError, RunError
+from hilctl.experiment.condition import conditioning_of
 from hilctl.experiment.load import LoadedExperiment
 from hilctl.loop.loop import Loop
 from hilctl.loop.pacer import SystemClock
@@ -57,7 +58,8 @@ def run_job(job: Job, ring: SampleRing, loaded: LoadedExperiment) -> Outcome:
     """
     config, device, page = loaded.config, loaded.device, ring.page
     host = RingHost(ring, SystemClock(), job.supervisor, job.silence_s)
-    loop = Loop(assemble(loaded, *job.arrays(), job.memory), device, host)
+    conditioning = conditioning_of(loaded, job.stands_um)
+    loop = Loop(assemble(loaded, *job.arrays(), job.memory, conditioning), device, host)
     # After the warm-up, so that all it has mapped gets locked; before the device is opened, so that
     # a refusal moves nothing.
     steps = prepare(config.realtime)

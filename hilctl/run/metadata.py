@@ -20,6 +20,7 @@ from hilctl.base.samples import COLUMNS
 from hilctl.loop.pacer import Lateness
 from hilctl.loop.plan import Outcome
 from hilctl.machine.diagnosis import machine_facts
+from hilctl.recording.data import HOLDS_FACT
 
 if TYPE_CHECKING:
     from hilctl.experiment.check import Checked
@@ -55,7 +56,9 @@ def run_facts(checked: "Checked", started: str, model_yaml: str) -> dict[str, st
         "block": str(config.block),
         "waveform_samples": str(checked.forecast.samples),
         "compensator": getattr(loaded.model, "kind", "none"),
+        "initial_state": checked.begun.begins,
         "initial_state_run_id": checked.begun.run_id,
+        HOLDS_FACT: json.dumps(list(info.holds)),
         "experiment_sha256": _sha256(loaded.yaml_text),
         "model_sha256": _sha256(model_yaml) if model_yaml else "",
         "limits": config.limits.model_dump_json(exclude_none=True),

@@ -82,6 +82,9 @@ class Recorder:
             self._writer = RecordingWriter(self._file.begin(), self._run)
         except OSError as error:
             raise self._unwritable(error) from None
+        self.flush()  # what was taken away since it was claimed is noticed before anything moves
+        if self.error:
+            raise InputError(self.error)
 
     def give_back(self) -> None:
         """Leave no file behind where there was none: the run does not start."""
@@ -128,6 +131,7 @@ class Recorder:
                 if done:
                     self._note("recording_moved", f"the recording {done}")
         except OSError as error:
+            self._flushed = 0  # it stands under no name: nobody can read what is in it
             self.fail(f"somebody has taken it away: {error.strerror}")
         return kept
 

@@ -172,11 +172,12 @@ def run_folder(
         RunError: It can't be made.
     """
     base, number = base_folder(), os.getpid()
+    recorded = str(recording.resolve())  # it fails where the working folder is gone
     with ExitStack() as stack:
         try:
             path = _new_folder(base / f"{experiment}-{number}")
             stack.callback(shutil.rmtree, path, ignore_errors=True)
-            card = RunCard(path.name, experiment, str(recording.resolve()), number, started)
+            card = RunCard(path.name, experiment, recorded, number, started)
             folder = RunFolder(path, card)
             shared = stack.enter_context(_locked(path / "run.lock"))
             stack.enter_context(_locked(path / "supervisor.lock"))

@@ -10,12 +10,14 @@ import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from functools import partial
 
 from hilctl.base.errors import RunError
 from hilctl.base.events import Event
 from hilctl.experiment.check import Checked
+from hilctl.machine.realtime import be_ordinary, be_quick
 from hilctl.run.child import LoopChild
-from hilctl.run.guardian import GuardianJob
+from hilctl.run.guardian import LAST_CALL_MS, GuardianJob
 from hilctl.run.hang_watch import HangWatch, SilenceLimits, is_stopped
 from hilctl.run.run_folder import RunFolder
 from hilctl.run.safe_action import SafeAction
@@ -42,6 +44,14 @@ def silence_limits(checked: Checked) -> SilenceLimits:
         hang_s = timing.max_late_s + _SIMULATED_MARGIN_S if simulated else _HANG_S
     # A device that takes longer than this makes the next tick too late, which ends the run as well.
     return SilenceLimits(2.0 * config.tick_s + hang_s, timing.max_late_s)
+
+
+def _priority(checked: Checked) -> int:
+    """Return the SCHED_FIFO priority of whoever makes the output safe.
+
+    Above the loop: one that runs wild at its own priority must not keep that waiting.
+    """
+    return checked.loaded.config.realtime.priority + 1
 
 
 class GuardianProcess:
@@ -99,10 +109,15 @@ class GuardianProcess:
         """Why it could not start."""
         return self._page.read_text(PageText.GUARDIAN) or "it died"
 
-    def kill(self) -> None:
-        """End it at once."""
+    def kill(self, wait_s: float | None = None) -> None:
+        """End it at once.
+
+        Args:
+            wait_s: Longest wait until it is gone; None for as long as that takes.
+        """
         self._process.kill()
-        self._process.wait()
+        with suppress(subprocess.TimeoutExpired):
+            self._process.wait(wait_s)
 
     def end(self) -> None:
         """Let it end by itself, as it does once the loop has; not for long."""
@@ -133,8 +148,7 @@ def guardian_of(
         safe_value=loaded.config.safe.value,
         limits=silence_limits(checked),
         loop=loop,
-        # Above the loop: one that runs wild at its own priority must not keep the guardian waiting.
-        priority=loaded.config.realtime.priority + 1,
+        priority=_priority(checked),
     )
     return lambda: GuardianProcess(job, folder, page, inherits)
 
@@ -161,6 +175,7 @@ class Safety:
         self._page, self._child = page, child
         self._device = checked.loaded.device
         self._safe_value = checked.loaded.config.safe.value
+        self._priority = _priority(checked)
         self._watch = HangWatch(page, silence_limits(checked), lambda: is_stopped(child.pid))
         self._start_guardian, self._record_event = start_guardian, record_event
         self._guardian = start_guardian() if start_guardian else None
@@ -215,14 +230,23 @@ class Safety:
         if ended and (made_safe := self._page.made_safe()) is not None:
             self.made_safe, self.by = made_safe, "guardian"
         elif not self._guardian_acts(now_ns):
-            # Both before the device: many take one connection only, and neither may come back.
-            if self._guardian is not None:
-                self._guardian.kill()
-            self._child.kill()
-            # It may have been done in the very last moment.
-            self.made_safe, self.by = self._page.made_safe(), "guardian"
-            if self.made_safe is None:
-                self._action = SafeAction(self._device, self._safe_value, hung=self._hung)
+            be_quick(self._priority)
+            self._stand_in()
+            be_ordinary()
+
+    def _stand_in(self) -> None:
+        # Both before the device: neither may come back to it.
+        last_call_s = 1e-3 * LAST_CALL_MS
+        if self._guardian is not None:
+            self._guardian.kill(last_call_s)
+        self._child.kill(last_call_s)
+        # It may have been done in the very last moment.
+        self.made_safe, self.by = self._page.made_safe(), "guardian"
+        if self.made_safe is None:
+            prepare = partial(be_quick, self._priority)
+            self._action = SafeAction(
+                self._device, self._safe_value, hung=self._hung, prepare=prepare
+            )
 
     def _guardian_acts(self, now_ns: int) -> bool:
         guardian = self._guardian

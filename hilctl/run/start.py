@@ -1,5 +1,6 @@
 """From an experiment file to a finished run: load, check, run."""
 
+import logging
 import os
 import time
 from collections.abc import Callable, Sequence
@@ -12,15 +13,22 @@ from hilctl.run.architecture import require_ordered_memory
 from hilctl.run.result import Progress, RunResult
 from hilctl.run.supervisor import Supervisor
 
+_log = logging.getLogger(__name__)
 
-def checked_experiment(path: Path, settings: Sequence[str]) -> Checked:
+
+def checked_experiment(path: Path, settings: Sequence[str], output: Path | None = None) -> Checked:
     """Load an experiment and hold it against device, model and limits.
+
+    Args:
+        path: Experiment file.
+        settings: ``key=value`` texts over it.
+        output: Recording to write; None where it goes to the experiment's folder.
 
     Raises:
         InputError: It can't be used, all problems are listed; or this machine can't run any.
     """
     require_ordered_memory()
-    return check(load_experiment(path, settings))
+    return check(load_experiment(path, settings), output.parent if output else None)
 
 
 def output_of(checked: Checked, output: Path | None) -> Path:
@@ -59,7 +67,10 @@ def start_run(
         InputError: Nothing has moved, and no file is left.
         RunError: The device could not be opened; nothing has moved, and no file is left.
     """
-    checked = checked_experiment(path, settings)
+    checked = checked_experiment(path, settings, output)
+    # Of a device with a past: nobody should have to look into the recording for what was taken.
+    if checked.begun.begins and checked.loaded.device.info.holds:
+        _log.warning("the compensator begins %s", checked.begun.begins)
     output = output_of(checked, output)
     return Supervisor(checked, output, overwrite=overwrite, on_progress=on_progress).run()
 

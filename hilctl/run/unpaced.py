@@ -148,7 +148,8 @@ def run_unpaced(checked: Checked, output: Path, *, overwrite: bool = False) -> R
 
 def _run(checked: Checked, recorder: Recorder) -> tuple[Outcome, Lateness]:
     loaded, begun = checked.loaded, checked.begun
-    plan = assemble(loaded, checked.reference.values, begun.input_um, begun.state, paced=False)
+    arrays = (checked.reference.values, begun.input_um)
+    plan = assemble(loaded, *arrays, begun.state, checked.conditioning(), paced=False)
     host = BatchHost(
         plan, on_batch=recorder.batch, on_event=recorder.event, stop=lambda: recorder.error
     )

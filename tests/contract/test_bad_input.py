@@ -353,20 +353,23 @@ class TestOtherCommands:
 @pytest.mark.parametrize(
     ("text", "arguments", "message"),
     [
-        (GOOD.replace("60.0]}", "60.0}"), (), "x.yaml:7: is not readable YAML"),
+        pytest.param(
+            GOOD.replace("60.0]}", "60.0}"), (), "x.yaml:7: is not readable YAML",
+            marks=pytest.mark.slow,
+        ),
         (
             GOOD.replace("amplitude: 1.0", "amplitude: .nan"),
             ("--json",),
             "x.yaml:5: waveform.amplitude: must be a finite number, got nan",
         ),
-        (
-            GOOD,
-            ("--output", "x.yaml/run.mcap"),
+        pytest.param(
+            GOOD, ("--output", "x.yaml/run.mcap"),
             "x.yaml/run.mcap: can't be written: Not a directory",
+            marks=pytest.mark.slow,
         ),
     ],
     ids=["malformed", "not a number, for programs", "unwritable"],
-)
+)  # fmt: skip
 def test_process(tmp_path: Path, text: str, arguments: tuple[str, ...], message: str) -> None:
     """As a process of its own, too, a refusal is a message, an exit code, and nothing else."""
     (tmp_path / "x.yaml").write_text(text)

@@ -2,12 +2,13 @@
 
 Simulated devices stand for themselves. Devices on a wire meet an emulator on loopback, one for each
 shipped profile: alone where it can drive and measure, else beside the one that it goes with. Its
-time passes by one sample an exchange, so that nothing depends on how fast this machine is.
+time passes by the exchanges, so that nothing depends on how fast this machine is.
 """
 
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import ClassVar
 
@@ -16,7 +17,7 @@ import pytest
 
 from hilctl.base.device import Device
 from hilctl.base.errors import DeviceError
-from hilctl.experiment.registry import BUILTIN, device_class
+from hilctl.experiment.registry import BUILTIN, device_class, known_devices
 from hilctl_drivers.emulator.options import EmulatorOptions
 from hilctl_drivers.emulator.setup import build
 from hilctl_drivers.modbus.profile import ModbusProfile
@@ -25,6 +26,8 @@ from tests.fakes import ManualClock, VirtualTime
 
 RATE_HZ = 10_000.0
 SAMPLES = 20
+SETTLED_NS = 2_000_000
+"""What the emulated rig takes to settle, 0.1 ms, many times over: it computes each sample of it."""
 STEP = 0.01
 """Of the coarsest converter, in the command's unit."""
 ELSEWHERE = {
@@ -33,6 +36,8 @@ ELSEWHERE = {
 }
 """Devices that meet this contract, or the part of it that streams have, in a file of their own."""
 SIMULATED = sorted(set(BUILTIN) - {"modbus_dac", *ELSEWHERE})
+PHYSICS = ("domains", "diffusion", "jiles_atherton")
+"""What simulated_terfenol is tried with beside its default."""
 MODBUS = (
     "adam_6024", "beckhoff_bk9000", "generic_float32", "icp_et7000", "labjack_t4", "labjack_t7",
     "labjack_t8", "wago_750", "rtu",
@@ -92,10 +97,41 @@ class DrivenDevice:
         return 0.5 * (info.command_max + max(0.0, info.command_min))
 
 
-def simulated(kind: str) -> DrivenDevice:
+def simulated(kind: str, words: list[str]) -> DrivenDevice:
     chosen = device_class(kind)
-    device = chosen(chosen.Options())
+    device = chosen(chosen.Options(physics=words[0]) if words else chosen.Options())
     return DrivenDevice(device, SAMPLES, RATE_HZ, lambda: device._last_command)
+
+
+def of_another_package(kind: str) -> DrivenDevice:
+    """Return a simulated device that is installed beside hilctl, or the example of one."""
+    chosen = EXAMPLES[kind]() if kind in EXAMPLES else device_class(kind)
+    device = chosen(chosen.Options())
+    if not device.info.simulated:
+        pytest.skip(f"{kind} drives hardware: pytest --device EXPERIMENT tests/hardware")
+    rate_hz = min(RATE_HZ, device.info.max_rate_hz)
+
+    def stands() -> float:
+        try:
+            return device.output()
+        except DeviceError:  # it is not open, and keeps its output while it is not
+            device.open(rate_hz, SAMPLES)
+            current = device.output()
+            device.close()
+            return current
+
+    return DrivenDevice(device, SAMPLES, rate_hz, stands)
+
+
+def _spring() -> type[Device]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(Path(__file__).parents[1] / "data" / "own_device")
+        found: type[Device] = import_module("own_device.spring").Spring
+    return found
+
+
+EXAMPLES = {"spring": _spring}
+OTHERS = sorted({*EXAMPLES, *known_devices()} - set(BUILTIN))
 
 
 RTU_PROFILE = """\
@@ -140,7 +176,7 @@ def modbus(words: list[str], stack: list[Callable[[], None]]) -> DrivenDevice:
     rate_hz = min(RATE_HZ, device.info.max_rate_hz)
 
     def pass_time() -> None:
-        clock.now_ns += round(1e9 / rate_hz)
+        clock.now_ns += min(round(1e9 / rate_hz), SETTLED_NS)
 
     return DrivenDevice(device, 1, rate_hz, lambda: emulator.device._rig.current_a, pass_time)
 
@@ -150,7 +186,12 @@ def _fast(section: dict) -> dict:
     return {**section, "baud": 115200} if "serial_port" in section else section
 
 
-CASES = [*SIMULATED, *(f"modbus_dac {words}" for words in MODBUS)]
+CASES = [
+    *SIMULATED,
+    *OTHERS,
+    *(f"simulated_terfenol {words}" for words in PHYSICS),
+    *(f"modbus_dac {words}" for words in MODBUS),
+]
 
 
 @pytest.fixture
@@ -165,7 +206,12 @@ def make(tmp_path) -> Iterator[Callable[[str], DrivenDevice]]:
             path = tmp_path / "rtu.yaml"
             path.write_text(RTU_PROFILE, encoding="utf-8")
             words = [str(path)]
-        benches.append(modbus(words, stack) if words else simulated(kind))
+        if kind == "modbus_dac":
+            benches.append(modbus(words, stack))
+        elif kind in OTHERS:
+            benches.append(of_another_package(kind))
+        else:
+            benches.append(simulated(kind, words))
         return benches[-1]
 
     yield of
@@ -189,7 +235,7 @@ def driven(make, case) -> DrivenDevice:
 
 def test_no_device_is_left_out():
     """Each device of the table is tried here, or in a file that is there."""
-    assert {case.split()[0] for case in CASES} | set(ELSEWHERE) == set(BUILTIN)
+    assert {case.split()[0] for case in CASES} | set(ELSEWHERE) == {*BUILTIN, *OTHERS}
     folder = Path(__file__).parent
     assert [name for name in ELSEWHERE.values() if not (folder / name).exists()] == []
 
@@ -208,7 +254,7 @@ def test_no_modbus_profile_is_left_out():
 def test_says_what_it_is_before_it_is_opened(driven):
     """Info is complete and sensible without a connection."""
     info = driven.device.info
-    assert info.name in BUILTIN
+    assert info.name in {*BUILTIN, *OTHERS}
     assert info.description
     assert info.command_unit in {"A", "V"}
     assert info.command_min < info.command_max

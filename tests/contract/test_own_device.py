@@ -73,6 +73,12 @@ def test_is_listed(installed):
     assert devices["spring"] == "own_device.spring:Spring"
 
 
+def test_is_in_the_schema(installed):
+    """So that an editor knows its options too."""
+    schema = json.loads(hilctl(installed, "schema").stdout)
+    assert "um_per_a" in schema["$defs"]["device_spring"]["properties"]
+
+
 @pytest.mark.slow
 def test_is_run(installed, tmp_path):
     """A whole run in hilctl's own processes, recorded and replayed."""
@@ -126,4 +132,5 @@ def test_make_safe_moves_the_spring(monkeypatch):
         assert displacement_um[0] == pytest.approx(20.0 * safe)
     device.close()
     device.make_safe(0.0)
+    device.open(1000.0, 50)
     assert device.output() == 0.0

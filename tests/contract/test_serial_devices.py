@@ -41,9 +41,9 @@ turnaround_s: 0.001
 max_rate_hz: 100.0
 watchdog: none
 """
-STREAM_RATE_HZ = 2000.0
+STREAM_RATE_HZ = 640.0
 BLOCK = 10
-FIFO_BLOCKS = 32  # 160 ms, which is what a busy machine may stall for
+FIFO_BLOCKS = 32  # 500 ms, which is what a busy machine may stall for
 MUST_BE_AT_REST = {"kepco_bop", "tdk_lambda_gen"}
 
 
@@ -74,7 +74,7 @@ def serial_profiles():
 
 
 class EmulatorClock:
-    """The emulator's time: for streams the machine's, else it passes one sample an exchange."""
+    """The emulator's time: for streams the machine's, else it passes by the exchanges."""
 
     def __init__(self, *, real):
         self.now_ns = 1_000_000_000
@@ -119,7 +119,7 @@ class DrivenSerial:
         measured = np.full(padded.size + held.size, np.nan)
         for start in range(0, padded.size + held.size, self.block):
             part = slice(start, start + self.block)
-            self._clock.now_ns += round(1e9 / self.rate_hz)
+            self._clock.now_ns += min(round(1e9 / self.rate_hz), CHECKS.SETTLED_NS)
             sent = np.concatenate([padded, held])[part]
             before = sent.copy()
             self.device.exchange(self._sent, sent, displacement_um[part], measured[part])

@@ -5,6 +5,9 @@ What a device says it put out is the judge: its own log, not what hilctl believe
 
 import json
 import os
+import pwd
+import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -199,3 +202,61 @@ def run(tmp_path):
 def profile():
     """Return a function that gives the path of a profile of ``tests/data``."""
     return lambda name: str(PROFILES / f"{name}.yaml")
+
+
+class Device:
+    """An emulated device, with its section of an experiment."""
+
+    def __init__(self, emulated: Emulated) -> None:
+        host, port = emulated.address.split(":")
+        self.log = emulated.log
+        self.section = {
+            "kind": "modbus_dac",
+            "profile": "labjack_t7",
+            "host": host,
+            "tcp_port": int(port),
+            "output": "DAC0",
+            "input": "AIN0",
+            "timeout_s": 5.0,
+            "amplifier": {"gain_a_per_v": 4.0, "offset_a": -10.0},
+            "sensor": {"um_per_v": 12.5},
+            "watchdog": "none",
+        }
+
+    def has_not_moved(self) -> bool:
+        """Return whether it has put out only what it powered up with."""
+        return len(self.log.writes("DAC0")) <= 1
+
+
+@pytest.fixture
+def device(emulate):
+    """An emulated T7."""
+    return Device(emulate("labjack_t7"))
+
+
+@pytest.fixture
+def own_mounts():
+    """Return a function that lets shell words, with ``"$@"``, run where mounts are their own."""
+    prefix = "unshare --mount" if os.geteuid() == 0 else "unshare --user --map-root-user --mount"
+    tried = subprocess.run(f"{prefix} mount -t tmpfs none /mnt", shell=True, capture_output=True)
+    if tried.returncode:
+        pytest.skip(f"needs file systems of its own: {tried.stderr.decode().strip()}")
+    return lambda words: f'exec {prefix} sh -c {shlex.quote(words)} sh "$@"'
+
+
+@pytest.fixture
+def nobody():
+    """Return the words that run a command as another user, who can run hilctl."""
+    if os.geteuid() or not shutil.which("setpriv"):
+        pytest.skip("needs a second user: only root can be one, by setpriv of util-linux")
+    user = pwd.getpwnam("nobody")
+    words = ["setpriv", f"--reuid={user.pw_uid}", f"--regid={user.pw_gid}", "--clear-groups"]
+    may_read = ["--inh-caps=+dac_read_search", "--ambient-caps=+dac_read_search"]
+    code = "import subprocess as s, sys; s.run([sys.executable, '-c', 'import hilctl'], check=True)"
+    # Where the interpreter stands in root's home, another user may read all, and still write none.
+    for more in ([], may_read):
+        command = [*words, *more, sys.executable, "-c", code]
+        tried = subprocess.run(command, cwd="/", capture_output=True, text=True)
+        if tried.returncode == 0:
+            return [*words, *more]
+    pytest.skip(f"needs a hilctl that nobody can run: {tried.stderr.strip()}")

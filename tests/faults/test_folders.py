@@ -1,11 +1,16 @@
 """Where hilctl is run from does not matter, whatever lies there."""
 
 import json
+import shutil
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
+import yaml
+
+from tests.faults.conftest import EXPERIMENT
 
 ROOT = Path(__file__).parents[2]
 TRAPS = ("signal", "json", "numpy", "yaml", "struct", "hilctl", "hilctl_drivers", "mmap", "queue")
@@ -47,3 +52,58 @@ def test_from_above_the_checkout():
     command = [sys.executable, "-c", code]
     ended = subprocess.run(command, cwd=ROOT.parent, capture_output=True, text=True, timeout=60)
     assert ended.returncode == 0, ended.stderr
+
+
+GONE = 'mkdir gone; cd gone; rmdir ../gone; exec "$@"'
+
+
+@pytest.mark.parametrize(
+    ("experiment", "output", "code", "said"),
+    [
+        ("demo.yaml", "/run.mcap", 3, "the folder that it is started in has been deleted: change"),
+        ("/demo.yaml", "run.mcap", 2, "run.mcap: can't be written: No such file or directory"),
+        ("/demo.yaml", "/run.mcap", 0, ""),
+    ],
+)
+def test_working_folder_that_is_gone_before_the_start(tmp_path, experiment, output, code, said):
+    """Names that begin there are refused in one message; a run that needs none of them runs."""
+    shutil.copy(ROOT / "configs" / "demo.yaml", tmp_path)
+    shutil.copytree(ROOT / "configs" / "models", tmp_path / "models")
+    names = [f"{tmp_path}{each}" if each[0] == "/" else each for each in (experiment, output)]
+    command = [sys.executable, "-P", "-m", "hilctl.cli", "run", names[0], "--output", names[1]]
+    command += ["--set", "waveform.duration_s=0.5"]
+    ended = subprocess.run(
+        ["sh", "-c", GONE, "sh", *command],
+        cwd=tmp_path, capture_output=True, text=True, timeout=240,
+    )  # fmt: skip
+    assert ended.returncode == code, ended.stderr
+    assert said in ended.stderr
+    assert len(ended.stderr.splitlines()) == (code != 0)
+    assert (tmp_path / "run.mcap").exists() == (code == 0)
+
+
+@pytest.mark.parametrize("inside", [False, True])
+def test_folder_that_is_deleted_while_a_run_starts(tmp_path, device, inside):
+    """With the recording that was claimed in it: nothing has moved, and one message says so."""
+    (tmp_path / "e.yaml").write_text(yaml.safe_dump({**EXPERIMENT, "device": device.section}))
+    lab = tmp_path / "lab"
+    lab.mkdir()
+    command = [sys.executable, "-P", "-m", "hilctl.cli", "run", str(tmp_path / "e.yaml")]
+    command += ["--output", "run.mcap" if inside else str(lab / "run.mcap")]
+    with subprocess.Popen(
+        command, cwd=lab if inside else tmp_path, stderr=subprocess.PIPE, text=True
+    ) as process:
+        deadline = time.monotonic() + 240.0
+        while not (lab / "run.mcap").exists():
+            assert time.monotonic() < deadline
+            time.sleep(0.002)
+        shutil.rmtree(lab)
+        _, err = process.communicate(timeout=240)
+    # Inside, it depends on how far it has come which of the two is noticed first.
+    gone = "hilctl: the folder that it is started in has been deleted: change to another one"
+    taken = "run.mcap: can't be written: somebody has taken it away: No such file or directory"
+    (line,) = err.splitlines()
+    assert line.endswith(taken) or (inside and line == gone)
+    assert process.returncode in {2, 3}
+    assert not lab.exists()
+    assert device.has_not_moved()

@@ -23,9 +23,10 @@ EXPERIMENT = {
 @pytest.fixture
 def hilctl(tmp_path):
     """Return a function that runs a shell's words around ``hilctl run``, in a folder of its own."""
-    (tmp_path / "e.yaml").write_text(yaml.safe_dump(EXPERIMENT), encoding="utf-8")
 
-    def run(shell='"$@"', output="run.mcap", folder=tmp_path, **environment):
+    def run(shell='"$@"', output="run.mcap", folder=tmp_path, changes=None, **environment):
+        text = yaml.safe_dump({**EXPERIMENT, **(changes or {})})
+        (tmp_path / "e.yaml").write_text(text, encoding="utf-8")
         command = ["sh", "-c", shell, "sh", sys.executable, "-P", "-m", "hilctl.cli", "run"]
         command += [str(tmp_path / "e.yaml"), "--output", str(output), "--overwrite"]
         ended = subprocess.run(
@@ -77,6 +78,76 @@ def test_too_little_is_one_message(hilctl, tmp_path, shell):
     assert ended.returncode == 3, ended.stderr
     assert ended.stderr.startswith("hilctl: ")
     assert not (tmp_path / "run.mcap").exists()
+
+
+@pytest.mark.parametrize(
+    ("size", "seconds", "file"), [("4k", 0.1, "ring"), ("1m", 500.0, "reference.npy")]
+)
+def test_too_little_shared_memory_is_one_message(hilctl, own_mounts, size, seconds, file, device):
+    """For the ring, or for the samples to come: it says of what there is less to be had."""
+    small = f'mount -t tmpfs -o size={size} none /dev/shm; "$@"'
+    shell = own_mounts(f"{small}; code=$?; ls -A /dev/shm/runs; exit $code")
+    waveform = {**EXPERIMENT["waveform"], "duration_s": seconds}
+    changes = {"device": device.section, "sample_rate_hz": 500, "block": 1, "waveform": waveform}
+    ended = hilctl(shell, changes=changes, HILCTL_RUNS="/dev/shm/runs")
+    assert ended.returncode == 3, ended.stderr
+    assert len(ended.stderr.splitlines()) == 1
+    assert f"/{file}: no memory: " in ended.stderr
+    assert "less recording.ring_s" in ended.stderr
+    assert ended.stdout == ""
+    assert device.has_not_moved()
+
+
+def test_a_megabyte_of_shared_memory_is_enough_for_a_small_run(hilctl, own_mounts, tmp_path):
+    shell = own_mounts('mount -t tmpfs -o size=1m none /dev/shm; "$@"')
+    ended = hilctl(shell, HILCTL_RUNS="/dev/shm/runs")
+    assert ended.returncode == 0, ended.stderr
+    assert (tmp_path / "run.mcap").stat().st_size > 1000
+
+
+@pytest.mark.parametrize("before", [False, True], ids=["new", "overwrite"])
+def test_a_full_disk_at_the_start_is_one_message(hilctl, own_mounts, tmp_path, before, device):
+    """What a run begins with does not fit: nothing has moved, and no file is left of it."""
+    (tmp_path / "disk").mkdir()
+    full = 'mount -t tmpfs -o size=64k none disk; cat /dev/zero > disk/full 2> /dev/null; "$@"'
+    shell = own_mounts(f"{full}; code=$?; ls disk; exit $code")
+    if before:
+        shell = shell.replace("cat", "touch disk/run.mcap; cat", 1)
+    changes = {"device": device.section, "sample_rate_hz": 500, "block": 1}
+    ended = hilctl(shell, output="disk/run.mcap", changes=changes)
+    assert ended.returncode == 2, ended.stderr
+    assert ended.stderr == "hilctl: disk/run.mcap: can't be written: No space left on device\n"
+    assert ended.stdout.split() == ["full", *["run.mcap"][:before]]
+    assert device.has_not_moved()
+
+
+@pytest.mark.parametrize(
+    ("what", "second"),
+    [
+        ("mkdir -m 777", False),
+        ("ln -s $PWD/mine", False),
+        ("mkfifo", False),
+        ("ln -s $PWD/mine", True),
+    ],
+)
+def test_what_another_user_has_put_in_the_way(hilctl, own_mounts, tmp_path, nobody, what, second):
+    """It is neither used nor followed: the run goes elsewhere, or says what to remove."""
+    (tmp_path / "mine").mkdir(mode=0o700)
+    place, other = f"/dev/shm/hilctl-{os.geteuid()}", f"/run/user/{os.geteuid()}"
+    shell = own_mounts(
+        "mount -t tmpfs -o mode=1777 none /dev/shm; mount -t tmpfs none /run; unset HILCTL_RUNS; "
+        f"{' '.join(nobody)} {what} {place}; {f'mkdir -p -m 700 {other};' * second} "
+        f'"$@"; code=$?; find {place}/ mine -mindepth 1 2> /dev/null; exit $code'
+    )
+    ended = hilctl(shell)
+    assert ended.returncode == (0 if second else 3), ended.stderr
+    assert (tmp_path / "run.mcap").exists() == second
+    assert not list((tmp_path / "mine").iterdir())
+    if not second:
+        assert ended.stdout == ""
+        assert len(ended.stderr.splitlines()) == 1
+        assert f"no folder for runs: {place}: " in ended.stderr
+        assert "remove it, or name another one by HILCTL_RUNS" in ended.stderr
 
 
 def test_device_folder_of_somebody_else_is_not_written_through(hilctl, tmp_path):

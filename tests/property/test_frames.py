@@ -50,7 +50,9 @@ ADDRESS = st.integers(0, 65000)
 UNIT = st.integers(1, 247)
 TRANSACTION = st.integers(0, 65535)
 WORDS = st.lists(st.integers(0, 65535), min_size=1, max_size=121)
-CORRUPTIONS = 20_000
+CORRUPTIONS = pytest.mark.parametrize(
+    "count", [2_000, pytest.param(20_000, marks=pytest.mark.slow)]
+)
 
 
 def words(values):
@@ -348,7 +350,7 @@ SUBJECTS = {
 }
 
 
-def damaged(name):
+def damaged(name, wanted):
     """Yield the kind of damage, the good and the bad bytes, and what was taken from the bad ones.
 
     Only our own errors may come out of reading; anything else ends the test.
@@ -356,7 +358,7 @@ def damaged(name):
     make = SUBJECTS[name]
     rng = random.Random(f"damage to {name}")
     count = 0
-    while count < CORRUPTIONS:
+    while count < wanted:
         good, reader = make(rng)
         value = reader(good)
         for harm in DAMAGE * 2:
@@ -372,35 +374,38 @@ def damaged(name):
                 yield harm.__name__, good, bad, taken
 
 
+@CORRUPTIONS
 @pytest.mark.parametrize("name", [name for name in SUBJECTS if name.startswith("rtu")])
-def test_damaged_rtu_replies(name):
+def test_damaged_rtu_replies(name, count):
     """Flips and bursts never pass; rubbish would need the right CRC and beginning."""
-    taken = Counter(harm for harm, *_ in damaged(name))
+    taken = Counter(harm for harm, *_ in damaged(name, count))
     assert not taken["flip"]
     assert not taken["burst"]
     assert taken.total() <= 1
 
 
+@CORRUPTIONS
 @pytest.mark.parametrize("name", [name for name in SUBJECTS if name.startswith("tcp")])
-def test_damaged_tcp_replies(name):
+def test_damaged_tcp_replies(name, count):
     """What passes differs in the register values alone, which only TCP's own checksum covers."""
     header = {"tcp read": 9, "tcp write_read": 9, "tcp feedback": 8}.get(name, 12)
     passed = 0
-    for _, good, bad, _ in damaged(name):
+    for _, good, bad, _ in damaged(name, count):
         assert len(bad) == len(good)
         assert bad[:header] == good[:header]
         passed += 1
     assert (passed == 0) == (header == 12)
 
 
+@CORRUPTIONS
 @pytest.mark.parametrize("name", [" ".join(kind) for kind in BINARY])
-def test_damaged_binary_frames(name):
+def test_damaged_binary_frames(name, count):
     """Of the length-prefixed, flips and bursts within the CRC's reach never pass.
 
     A flip in a COBS code moves zeros about, which is more than a flip to the CRC: it passes as
     seldom as rubbish does.
     """
-    taken = Counter(harm for harm, *_ in damaged(name))
+    taken = Counter(harm for harm, *_ in damaged(name, count))
     if name.startswith("length"):
         assert not taken["flip"]
     if name in {"length crc16_modbus", "length crc32"}:
@@ -408,11 +413,12 @@ def test_damaged_binary_frames(name):
     assert taken.total() <= (0 if name.endswith("crc32") else 3)
 
 
+@CORRUPTIONS
 @pytest.mark.parametrize("name", ["line dcon", "line gen"])
-def test_damaged_lines_with_a_checksum(name):
+def test_damaged_lines_with_a_checksum(name, count):
     """What passes is well formed and has the right sum: two errors that cancel, or a swap."""
     digits = 2 if name == "line dcon" else 3
-    for harm, good, bad, taken in damaged(name):
+    for harm, good, bad, taken in damaged(name, count):
         text, mark = bad[: -1 - digits], bad[-1 - digits :]
         assert mark[-3:] == b"%02X\r" % (sum(text) % 256)
         assert all(32 <= byte < 127 for byte in text)
@@ -420,9 +426,10 @@ def test_damaged_lines_with_a_checksum(name):
         assert harm != "flip" or sum(a != b for a, b in zip(good, bad, strict=True)) > 1
 
 
-def test_damaged_lines_without_a_checksum():
+@CORRUPTIONS
+def test_damaged_lines_without_a_checksum(count):
     """Nothing but the form can be checked: what passes is one number and nothing else."""
-    for _, _, bad, taken in damaged("line none"):
+    for _, _, bad, taken in damaged("line none", count):
         assert bad.endswith(b"\r")
         assert taken == float(bad[:-1])
         assert set(bad[:-1]) <= set(b"+-.0123456789eE ")

@@ -20,7 +20,7 @@ LEVEL = st.floats(-100.0, 100.0)
 GROWTH_S = st.floats(0.0, 1e-3)
 
 
-def signals(max_size=80):
+def signals(max_size=40):
     """Signals whose values repeat, cross and jump: float64[n]."""
     repeated = st.one_of(LEVEL, st.integers(-20, 20).map(float))
     return hnp.arrays(np.float64, st.integers(1, max_size), elements=repeated)

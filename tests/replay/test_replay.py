@@ -8,7 +8,10 @@ import pytest
 import yaml
 
 from hilctl.analysis.replay import replay
+from hilctl.analysis.report import summarize
 from hilctl.base.errors import DataError
+from hilctl.base.events import OFFSET
+from hilctl.base.samples import Flag
 from hilctl.experiment.initial_state import initial_state_after
 from hilctl.loop.compensator import Compensator
 from hilctl.models.base import HysteresisModel
@@ -16,9 +19,11 @@ from hilctl.models.files import dump_model
 from hilctl.models.staged import FieldLag, StagedModel, Structure
 from hilctl.recording.data import Recording
 from hilctl.recording.reader import read
-from hilctl.run.start import start_run
+from hilctl.run.start import checked_experiment, start_run
+from hilctl.run.unpaced import run_unpaced
 from tests.published import terfenol_rdpi
 
+SINE = Path(__file__).parents[2] / "configs" / "terfenol_sine_6a.yaml"
 GOLDEN = sorted((Path(__file__).parents[2] / "recordings" / "golden").glob("*.mcap"))
 
 
@@ -115,6 +120,37 @@ def test_run_that_goes_on_after_another_is_identical(ahead, tmp_path):
     assert after.run["initial_state_run_id"] == ahead.run["run_id"] != ""
     assert ahead.run["initial_state_run_id"] == ""
     assert replay(after).identical
+
+
+@pytest.mark.parametrize("block", [1, 50])
+@pytest.mark.parametrize("output", [0.0, 2.0])
+def test_run_with_a_condition_is_identical(tmp_path, block, output):
+    """Ramp, conditioning, measured offset, integrator; no figure has it."""
+    settings = [
+        f"block={block}",
+        "sample_rate_hz=5000",
+        f"device.output_at_open={output}",
+        "device.drift={um: 4.0, tau_s: 0.01}",
+        "condition={cycles: 4, rest_s: 0.2}",
+        "feedback={kind: integral, limit_um: 5.0, bandwidth_hz: 2.0}",
+        "waveform.duration_s=0.5",
+        "waveform.offset=0.0",
+        "waveform.amplitude=20.0",
+        "compensator={model: models/terfenol_staged.yaml, offset: measured}",
+    ]
+    checked = checked_experiment(SINE, settings)
+    recording = read(run_unpaced(checked, tmp_path / "run.mcap").path)
+    result = replay(recording)
+    assert (result.identical, result.left_out_samples) == (True, 0)
+    samples, conditioning = recording.samples, checked.conditioning()
+    conditioned = (samples.flags & Flag.CONDITION) != 0
+    assert samples.wanted[conditioned].tolist() == conditioning.command.tolist()
+    assert recording.segments[0].start == int(samples.index[conditioned][-1]) + 1
+    (event,) = (each for each in recording.events if each.code == OFFSET)
+    assert event.values["offset_um"] == pytest.approx(4.0, abs=1.0)
+    report = summarize(recording)
+    assert report.samples == checked.forecast.samples
+    assert report.segments[0].steady_cycles == 1
 
 
 @pytest.mark.parametrize("row", [0, 777, 7999])

@@ -16,7 +16,6 @@ WITHOUT = {
     "loop/host": "a contract and a record; loop/test_loop.py runs the loop on a double of it",
     "loop/plan": "two records of plain values; loop/test_loop.py fills and reads all of them",
     "recording/data": "records of plain values; recording/test_reader.py fills them",
-    "run/supervisor": "two processes: tests/faults/test_processes.py, test_runs.py, test_daemon.py",
 }
 """Modules without a file of their own, and where they are tested instead."""
 

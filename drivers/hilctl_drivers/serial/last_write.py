@@ -15,7 +15,8 @@ PATIENCE_S = 3.0
 """How long a device that does not answer is tried, beside the time that it needs to boot."""
 _ANSWER_S = 0.5
 """Longest wait for one answer: where the device did not get the value, it must be sent again."""
-_PAUSE_S = 0.05
+_PAUSE_S = 0.01
+"""Between two tries: a port is free as soon as the process that had it has died."""
 _QUIET_S = 0.02
 """First silence that is taken for the end of late answers; doubled with each try, for an answer
 that came later than that would pass for the next one's."""
@@ -64,14 +65,15 @@ class SerialLastWrite:
         send: Callable[[], None],
         confirm: Callable[[], None],
     ) -> None:
-        quiet_s = _QUIET_S
+        quiet_s, in_doubt = _QUIET_S, False
         while True:
             try:
                 if not link.is_open:
                     link.open(boot=False)
                 # The coil first: waiting for a line that is out of step to fall silent takes time,
-                # and some never do.
-                if not link.is_in_step:
+                # and some never do. After a failure the line is taken to be: the answer to one
+                # try would pass for the next one's, and each time again.
+                if in_doubt or not link.is_in_step:
                     send()
                     link.await_silence(quiet_s)
                 confirm()
@@ -79,5 +81,5 @@ class SerialLastWrite:
             except DeviceError as error:
                 if self._clock() >= deadline_s:
                     raise DeviceError(f"not known whether the value stands: {error}") from None
-            quiet_s = min(2.0 * quiet_s, _ANSWER_S)
+            quiet_s, in_doubt = min(2.0 * quiet_s, _ANSWER_S), True
             self._sleep(_PAUSE_S)

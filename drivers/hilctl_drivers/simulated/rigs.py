@@ -1,7 +1,7 @@
 """The simulated rigs as devices: ``simulated_terfenol`` and ``simulated_piezo``."""
 
 from dataclasses import asdict, replace
-from typing import Annotated, Any, ClassVar, Self, TypeAlias
+from typing import Annotated, Any, ClassVar, Literal, Self, TypeAlias
 
 from pydantic import Field, model_validator
 
@@ -12,10 +12,23 @@ from hilctl_drivers.simulated.device import (
     SimulatedDevice,
     SimulatedOptions,
 )
+from hilctl_drivers.simulated.diffusion import DiffusionParameters
+from hilctl_drivers.simulated.domains import DomainsParameters
+from hilctl_drivers.simulated.extras import Creep, SecondMode, Thermal, VoltageLimit
+from hilctl_drivers.simulated.jiles_atherton import JilesAthertonParameters
 from hilctl_drivers.simulated.piezo import PiezoActuator, PiezoParameters
+from hilctl_drivers.simulated.pinned_cells import PinnedCellsParameters
 from hilctl_drivers.simulated.plant import Plant
+from hilctl_drivers.simulated.rods import RodParameters
 from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
 
+Physics: TypeAlias = Literal["pinned_cells", "domains", "diffusion", "jiles_atherton"]
+PHYSICS: dict[Physics, type[RodParameters]] = {
+    "pinned_cells": PinnedCellsParameters,
+    "domains": DomainsParameters,
+    "diffusion": DiffusionParameters,
+    "jiles_atherton": JilesAthertonParameters,
+}
 Factor: TypeAlias = Annotated[float, Field(ge=0.5, le=2.0)]
 
 
@@ -32,9 +45,7 @@ class Variation(DeviceOptions):
         """Return an actuator that differs from ``rated`` by these factors."""
         return replace(
             rated,
-            lag_s=rated.lag_s * self.lag,
-            pinning_max_a_per_m=rated.pinning_max_a_per_m * self.pinning,
-            strain_um=rated.strain_um * self.strain,
+            rods=rated.rods.varied(self.lag, self.pinning, self.strain),
             stiffness_n_per_m=rated.stiffness_n_per_m * self.resonance**2,
             damping_ratio=rated.damping_ratio * self.damping,
         )
@@ -50,6 +61,13 @@ class Drift(DeviceOptions):
 class TerfenolOptions(SimulatedOptions):
     """Options of ``simulated_terfenol``."""
 
+    physics: Physics = Field(
+        default="pinned_cells",
+        description="what goes on in the rods; pinned_cells: cells with dry friction behind one lag"
+        " of the field; domains: domains of eight orientations, averaged over their energies;"
+        " diffusion: the field diffuses into conducting rods, shell by shell;"
+        " jiles_atherton: Jiles and Atherton's equations with eddy and excess loss",
+    )
     load_kg: float = Field(default=0.0, ge=0.0, le=100.0, description="mass on the actuator, kg")
     magnet: bool = Field(
         default=True,
@@ -72,6 +90,16 @@ class TerfenolOptions(SimulatedOptions):
         default=Variation(), description="factors on the rated actuator, for tests of robustness"
     )
     drift: Drift | None = Field(default=None, description="slow growth of the displacement")
+    creep: Creep | None = Field(default=None, description="creep of the displacement")
+    thermal: Thermal | None = Field(
+        default=None, description="growth of the displacement with the rods' temperature"
+    )
+    second_mode: SecondMode | None = Field(
+        default=None, description="a mode of the structure beside the first"
+    )
+    amplifier: VoltageLimit | None = Field(
+        default=None, description="limit of the amplifier's voltage"
+    )
 
     @model_validator(mode="after")
     def _room(self) -> Self:
@@ -91,7 +119,14 @@ class TerfenolOptions(SimulatedOptions):
 
     def parameters(self) -> TerfenolParameters:
         """Return the actuator that the options describe."""
-        parameters = self.vary.of(TerfenolParameters())
+        rated = TerfenolParameters(
+            rods=PHYSICS[self.physics](),
+            creep=self.creep,
+            thermal=self.thermal,
+            second_mode=self.second_mode,
+            amplifier=self.amplifier,
+        )
+        parameters = self.vary.of(rated)
         if not self.noise:
             parameters = replace(parameters, sensor_noise_um=0.0)
         if not self.magnet:
@@ -134,7 +169,7 @@ class PiezoOptions(SimulatedOptions):
 
 def _details(parameters: dict[str, Any], options: SimulatedOptions) -> dict[str, str]:
     """Return physical parameters and options as text, to be kept with a recording."""
-    everything = parameters | options.model_dump()
+    everything = parameters | parameters.pop("rods", {}) | options.model_dump()
     return {name: str(value) for name, value in everything.items()}
 
 

@@ -1,21 +1,23 @@
-"""Physics of the simulated Terfenol-D actuator, from DAC code to ADC code.
+"""The simulated Terfenol-D actuator, from DAC code to ADC code: what is round its rods.
 
-Amplifier, field lag, pinned-cell magnetic hysteresis, magnetostriction, structure and sensor are
-chained as in the rig of the dissertation "Modeling and Compensation of Rate-Dependent Asymmetric
-Hysteresis Nonlinearities of Magnetostrictive Actuators", Concordia, sections 3.3 and 3.4 of its
-chapter 2. It is not the model that a compensator inverts: pinned magnetisation after a non-linear
-lag of the field, where the compensator has plays of the current.
+Amplifier, rods, structure and sensor are chained as in the rig of the dissertation "Modeling and
+Compensation of Rate-Dependent Asymmetric Hysteresis Nonlinearities of Magnetostrictive Actuators",
+Concordia, sections 3.3 and 3.4 of its chapter 2. What goes on in the rods is one physics of several
+(``rods.py``); none is the model that a compensator inverts.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.linalg import expm
 
 from hilctl.base.arrays import F64
-from hilctl_drivers.simulated.plant import Plant
-from hilctl_drivers.simulated.terfenol_kernel import free_displacement, run
+from hilctl_drivers.simulated.extras import Creep, SecondMode, Thermal, VoltageLimit
+from hilctl_drivers.simulated.pinned_cells import PinnedCellsParameters
+from hilctl_drivers.simulated.plant import CHUNK, Plant
+from hilctl_drivers.simulated.rods import Coil, RodParameters
+from hilctl_drivers.simulated.terfenol_kernel import Amplification, amplify, creep, respond, warm
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,11 +27,6 @@ class TerfenolParameters:
     The rated values are those of sections 3.3.1 and 3.4.4 (chapter 2) of the dissertation: coil
     factor, permanent-magnet field, stiffness, damping ratio, moving mass, sensor bandwidth, noise
     and range. Converters and amplifier bandwidth are not published; plausible ones are assumed.
-    Lag, cells and strain were fitted to the figures given with the loops, minor loops among them
-    (figures 2.7 to 2.14, 4.2, 5.5 and 6.3): all agree within 7.1 % but the asymmetry at 3 A, which
-    is 10.4 % of the stroke instead of 6.4 %. The pinned cells follow A. Bergqvist, "Magnetic vector
-    hysteresis model with dry friction-like pinning", Physica B 233 (1997) 342, and F. Henrotte et
-    al., "An energy-based vector hysteresis model for ferromagnetic materials", COMPEL 25 (2006) 71.
 
     Attributes:
         dac_range_a: Current at either end of the DAC's range.
@@ -38,15 +35,6 @@ class TerfenolParameters:
         coil_factor_per_m: Field of one ampere, k_o in H = k_o I + H_PM.
         magnet_field_a_per_m: Field of the permanent magnets, H_PM; 0 where there are none: the
             displacement is then even in the current.
-        lag_s: Time constant of the field inside the rods, for small changes.
-        lag_growth_m_per_a: Relative growth of that time constant per A/m the field is behind.
-        langevin_field_a_per_m: Field scale of the anhysteretic curve.
-        pinning_max_a_per_m: Pinning field of the hardest cell; the others are evenly spaced to 0.
-        cells: Number of cells.
-        free_fraction: Weight of the cell that is not pinned.
-        weight_decay: Exponent of the fall of the other weights towards the hardest cell.
-        strain_um: Displacement scale of the even polynomial in the magnetisation.
-        strain_quartic: Weight of its fourth-order term beside the second-order one.
         stiffness_n_per_m: Stiffness of the rods.
         damping_ratio: Damping of the structure, measured without a load and kept with any: the
             guides of a load add friction of their own.
@@ -57,6 +45,11 @@ class TerfenolParameters:
         drift_um: Displacement that slow growth of the rods comes to, beside all the rest.
         drift_s: Time constant of that growth.
         step_max_s: Longest internal time step.
+        rods: Physics of the rods.
+        creep: Creep of the rods.
+        thermal: Growth with their temperature.
+        second_mode: A mode of the structure beside the first.
+        amplifier: Limit of the amplifier's voltage.
     """
 
     dac_range_a: float = 10.0
@@ -64,15 +57,6 @@ class TerfenolParameters:
     amplifier_bandwidth_hz: float = 10e3
     coil_factor_per_m: float = 5.09e3
     magnet_field_a_per_m: float = 44.1e3
-    lag_s: float = 9.57e-5
-    lag_growth_m_per_a: float = 5.66e-5
-    langevin_field_a_per_m: float = 27.1e3
-    pinning_max_a_per_m: float = 28.7e3
-    cells: int = 10
-    free_fraction: float = 0.455
-    weight_decay: float = 2.72
-    strain_um: float = 352.4
-    strain_quartic: float = -0.689
     stiffness_n_per_m: float = 33.597e6
     damping_ratio: float = 0.12
     moving_mass_kg: float = 0.162
@@ -82,36 +66,68 @@ class TerfenolParameters:
     drift_um: float = 0.0
     drift_s: float = 1.0
     step_max_s: float = 10e-6
-
-
-def _cells(parameters: TerfenolParameters) -> F64:
-    """Return float64[3, m]: pinning fields, weights summing to 1, and the cells' fields (zero)."""
-    hardness = np.linspace(0.0, 1.0, parameters.cells)
-    weights = np.exp(-parameters.weight_decay * hardness)
-    weights[0] = 0.0
-    weights *= (1.0 - parameters.free_fraction) / weights.sum()
-    weights[0] = parameters.free_fraction
-    return np.stack([parameters.pinning_max_a_per_m * hardness, weights, np.zeros_like(hardness)])
+    rods: RodParameters = field(default_factory=PinnedCellsParameters)
+    creep: Creep | None = None
+    thermal: Thermal | None = None
+    second_mode: SecondMode | None = None
+    amplifier: VoltageLimit | None = None
 
 
 def _motion(parameters: TerfenolParameters, load_kg: float, step_s: float) -> F64:
-    """Return float64[3, 5], the exact step of structure and sensor for ``_move``.
+    """Return float64[m - 2, m], the exact step of structure and sensor for ``respond``.
 
-    The velocity is kept in um per radian of the natural frequency, so that the matrix is well
+    Velocities are kept in um per radian of their natural frequency, so that the matrix is well
     scaled.
     """
     omega = math.sqrt(parameters.stiffness_n_per_m / (parameters.moving_mass_kg + load_kg))
-    damping = 2.0 * parameters.damping_ratio
+    modes = [(omega, parameters.damping_ratio, 1.0)]
+    second = parameters.second_mode
+    if second is not None:
+        modes[0] = (omega, parameters.damping_ratio, 1.0 - second.share)
+        modes.append((2.0 * math.pi * second.frequency_hz, second.damping_ratio, second.share))
     sensor = 2.0 * math.pi * parameters.sensor_bandwidth_hz
-    # States: position, velocity, sensor output, free displacement, its change over the step.
-    rates = np.zeros((5, 5))
-    rates[0, 1] = omega
-    rates[1, :4] = (-omega, -damping * omega, 0.0, omega)
-    rates[2, :3] = (sensor, 0.0, -sensor)
-    rates[3, 4] = 1.0 / step_s
-    motion: F64 = np.ascontiguousarray(expm(rates * step_s)[:3])
-    motion[:, 3] -= motion[:, 4]
+    # States: position and velocity of each mode, sensor output, free displacement, its change over
+    # the step.
+    size = 2 * len(modes) + 3
+    rates = np.zeros((size, size))
+    for k, (natural, damping_ratio, share) in enumerate(modes):
+        rates[2 * k, 2 * k + 1] = natural
+        rates[2 * k + 1, 2 * k : 2 * k + 2] = -natural, -2.0 * damping_ratio * natural
+        rates[2 * k + 1, -2] = natural * share
+        rates[-3, 2 * k] = sensor
+    rates[-3, -3] = -sensor
+    rates[-2, -1] = 1.0 / step_s
+    motion: F64 = np.ascontiguousarray(expm(rates * step_s)[:-2])
+    motion[:, -2] -= motion[:, -1]
     return motion
+
+
+def _amplifier(parameters: TerfenolParameters, step_s: float) -> Amplification:
+    """Return the constants of ``amplify``."""
+    bandwidth = 2.0 * math.pi * parameters.amplifier_bandwidth_hz
+    decay_half, decay, most = 0.0, 0.0, math.inf
+    limit = parameters.amplifier
+    if limit is not None:
+        rate = limit.resistance_ohm / limit.inductance_h
+        decay_half, decay = math.exp(-0.5 * rate * step_s), math.exp(-rate * step_s)
+        most = limit.voltage_max_v / limit.resistance_ohm
+    return (
+        math.exp(-0.5 * bandwidth * step_s),
+        math.exp(-bandwidth * step_s),
+        decay_half,
+        decay,
+        most,
+        parameters.dac_range_a / parameters.dac_codes,
+    )
+
+
+def _creep(option: Creep | None, step_s: float) -> F64:
+    """Return float64[3, m], the elements of ``creep``."""
+    if option is None:
+        return np.zeros((3, 0))
+    times = np.array(option.time_constants_s)
+    shares = np.full(times.size, option.share / times.size)
+    return np.stack([shares, -np.expm1(-step_s / times), np.zeros(times.size)])
 
 
 class TerfenolActuator(Plant):
@@ -141,38 +157,42 @@ class TerfenolActuator(Plant):
         # The margin keeps rounding from adding a step where the period is a multiple of it.
         self._substeps = math.ceil(1.0 / (sample_rate_hz * parameters.step_max_s) - 1e-9)
         step_s = 1.0 / (sample_rate_hz * self._substeps)
-        bandwidth = 2.0 * math.pi * parameters.amplifier_bandwidth_hz
-        self._amplifier = (math.exp(-0.5 * bandwidth * step_s), math.exp(-bandwidth * step_s))
-        self._bias = parameters.magnet_field_a_per_m + parameters.coil_factor_per_m * bias_a
-        self._coil = (
-            parameters.coil_factor_per_m,
-            self._bias,
-            step_s,
-            parameters.lag_s,
-            parameters.lag_growth_m_per_a,
-        )
-        self._curve = (
-            parameters.langevin_field_a_per_m,
-            parameters.strain_um,
-            parameters.strain_quartic,
-        )
-        self._converters = (
-            parameters.dac_range_a / parameters.dac_codes,
+        self._amplifier = _amplifier(parameters, step_s)
+        bias = parameters.magnet_field_a_per_m + parameters.coil_factor_per_m * bias_a
+        self._rods = parameters.rods.rods(Coil(parameters.coil_factor_per_m, bias, step_s))
+        self._sensor = (
             parameters.sensor_range_um / parameters.dac_codes,
             parameters.sensor_range_um,
         )
         self._drift = (parameters.drift_um, 1.0 / (parameters.drift_s * sample_rate_hz))
         self._samples = 0
+        self._creep = _creep(parameters.creep, step_s)
+        self._warmth = np.zeros(1)
+        self._thermal: tuple[float, float, float, float, float] | None = None
+        thermal = parameters.thermal
+        if thermal is not None:
+            self._thermal = (
+                thermal.rise_k_per_a2,
+                -math.expm1(-step_s / thermal.tau_s),
+                thermal.growth_um_per_k,
+                thermal.ambient_k,
+                bias_a,
+            )
         self._motion = _motion(parameters, load_kg, step_s)
-        self._cells = _cells(parameters)
-        self._state = np.zeros(7)
+        self._mechanics = np.zeros(self._motion.shape[1])
+        self._current = np.zeros(1)
+        # At a low rate one sample period has many steps: a part is then fewer samples.
+        self._part = max(1, CHUNK // self._substeps)
+        self._halves = np.empty(2 * self._part * self._substeps + 1)
+        self._free = np.empty(self._part * self._substeps)
         self.reset()
 
     def _rest(self) -> None:
-        self._state[:] = 0.0
-        self._state[1] = self._bias
-        self._cells[2] = self._bias
-        self._rest_um = free_displacement(self._cells, self._bias, self._curve)
+        self._current[:] = 0.0
+        self._mechanics[:] = 0.0
+        self._creep[2] = 0.0
+        self._warmth[:] = 0.0
+        self._rest_um = self._rods.rest()
         self._samples = 0
 
     def _advance(self, command: F64, noise_um: F64, displacement_um: F64, measured: F64) -> None:
@@ -181,18 +201,31 @@ class TerfenolActuator(Plant):
             past = np.arange(self._samples, self._samples + command.size)
             noise_um -= whole * np.expm1(-past * per_sample)  # the sensor takes no notice of it
         self._samples += command.size
-        run(
-            command,
+        for start in range(0, command.size, self._part):
+            part = slice(start, start + self._part)
+            self._move(command[part], noise_um[part], displacement_um[part], measured[part])
+
+    def _move(self, command: F64, noise_um: F64, displacement_um: F64, measured: F64) -> None:
+        """Pass some samples through amplifier, rods and structure, one after the other.
+
+        The rods don't act back on the amplifier, nor the structure on the rods; so each may take
+        all the steps at once.
+        """
+        steps = command.size * self._substeps
+        halves, free = self._halves[: 2 * steps + 1], self._free[:steps]
+        amplify(command, measured, halves, self._current, self._amplifier, self._substeps)
+        self._rods.follow(halves, free)
+        if self._creep.size:
+            creep(free, self._creep, self._rest_um)
+        if self._thermal is not None:  # the sensor takes no notice of it
+            warm(halves, noise_um, self._warmth, self._thermal, self._substeps)
+        respond(
+            free,
             noise_um,
             displacement_um,
-            measured,
-            self._state,
-            self._cells,
+            self._mechanics,
             self._motion,
-            self._amplifier,
-            self._coil,
-            self._curve,
             self._rest_um,
-            self._converters,
+            self._sensor,
             self._substeps,
         )

@@ -1,143 +1,159 @@
-"""Compiled steps of the simulated Terfenol-D actuator: all that ``terfenol`` calls, in one file.
+"""Compiled steps of the simulated actuator around its rods, from amplifier to sensor.
 
-numba's on-disk cache does not notice a callee that changed in another file. Fields are in A/m,
-displacements in um, times in s.
+numba's on-disk cache does not notice a callee that changed in another file: all that a kernel calls
+stands in its own. Displacements are in um.
 """
 
-import math
+from typing import TypeAlias
 
 import numpy as np
 
 from hilctl.base.arrays import F64
 from hilctl.kernels.jit import kernel
 
-
-@kernel("float64(float64)")
-def _langevin(x: float) -> float:
-    """Return L(x) = coth x - 1/x; by its series near 0, where the difference cancels."""
-    size = abs(x)
-    if size < 0.02:
-        square = x * x
-        return x * (1.0 / 3.0 - square * (1.0 / 45.0 - square * (2.0 / 945.0)))
-    decay = math.exp(-2.0 * size)
-    return math.copysign((1.0 + decay) / (1.0 - decay) - 1.0 / size, x)
+Amplification: TypeAlias = tuple[float, float, float, float, float, float]
 
 
-@kernel("float64(float64, float64, float64)")
-def _field_rate(behind: float, lag: float, growth: float) -> float:
-    """Return dH/dt where the field is ``behind`` its drive: slower the further behind it is."""
-    return behind / (lag * (1.0 + growth * abs(behind)))
-
-
-@kernel("float64(float64, UniTuple(float64, 3), float64, float64, float64)")
-def _advance_field(
-    field: float, drive: tuple[float, float, float], step: float, lag: float, growth: float
-) -> float:
-    """Return H after a Runge-Kutta step; ``drive`` is k_o I + H_PM at its start, middle and end."""
-    start, middle, end = drive
-    k1 = _field_rate(start - field, lag, growth)
-    k2 = _field_rate(middle - field - 0.5 * step * k1, lag, growth)
-    k3 = _field_rate(middle - field - 0.5 * step * k2, lag, growth)
-    k4 = _field_rate(end - field - step * k3, lag, growth)
-    return field + step / 6.0 * (k1 + 2.0 * (k2 + k3) + k4)
-
-
-@kernel("float64(float64[:, ::1], float64, UniTuple(float64, 3))")
-def free_displacement(cells: F64, field: float, material: tuple[float, float, float]) -> float:
-    """Let the pinned cells follow ``field`` and return the unloaded displacement in um.
-
-    M = sum w L(h / a), x = lambda (M^2 + b M^4).
+@kernel("float64(float64, float64, float64, UniTuple(float64, 2))")
+def _toward(start: float, target: float, left: float, limit: tuple[float, float]) -> float:
+    """Return the current after some time: to the target by first order, as far as voltage goes.
 
     Args:
-        cells: float64[3, m]: pinning field, weight and present field h of each cell; h is updated.
-        field: Field in the rods in A/m.
-        material: Field scale a in A/m, displacement scale lambda in um, quartic weight b.
+        start: Current in A before.
+        target: Current in A that is wanted.
+        left: What is then left of the error, had the amplifier all voltages.
+        limit: What is then left of a current that nothing drives, and the current in A that the
+            largest voltage holds, infinite where there is no limit.
     """
-    scale, strain, quartic = material
-    magnetisation = 0.0
-    for i in range(cells.shape[1]):
-        pinning = cells[0, i]
-        cells[2, i] = max(field - pinning, min(field + pinning, cells[2, i]))
-        magnetisation += cells[1, i] * _langevin(cells[2, i] / scale)
-    square = magnetisation * magnetisation
-    return strain * square * (1.0 + quartic * square)
+    decay, most = limit
+    free = target + left * (start - target)
+    driven = decay * start
+    push = (1.0 - decay) * most
+    return max(driven - push, min(driven + push, free))
 
 
-@kernel("void(float64[:, ::1], float64[::1])")
-def _move(motion: F64, mechanics: F64) -> None:
-    """Advance position, velocity and sensor output by one step.
-
-    Args:
-        motion: float64[3, 5], the exact step for a free displacement that changes linearly.
-        mechanics: float64[5]: position, velocity, sensor output (updated), free displacement
-            before and after the step.
-    """
-    position = velocity = sensor = 0.0
-    for i in range(5):
-        position += motion[0, i] * mechanics[i]
-        velocity += motion[1, i] * mechanics[i]
-        sensor += motion[2, i] * mechanics[i]
-    mechanics[0] = position
-    mechanics[1] = velocity
-    mechanics[2] = sensor
-
-
-@kernel(
-    "void(float64[::1], float64[::1], float64[::1], float64[::1], float64[::1], float64[:, ::1],"
-    " float64[:, ::1], UniTuple(float64, 2), UniTuple(float64, 5), UniTuple(float64, 3),"
-    " float64, UniTuple(float64, 3), int64)"
-)
-def run(
+@kernel("void(float64[::1], float64[::1], float64[::1], float64[::1], UniTuple(float64, 6), int64)")
+def amplify(
     command: F64,
-    noise_um: F64,
-    displacement_um: F64,
     current_a: F64,
+    halves_a: F64,
     state: F64,
-    cells: F64,
-    motion: F64,
-    amplifier: tuple[float, float],
-    coil: tuple[float, float, float, float, float],
-    material: tuple[float, float, float],
-    rest_um: float,
-    converters: tuple[float, float, float],
+    amplifier: Amplification,
     substeps: int,
 ) -> None:
-    """Read the sensors, put out the command and advance one sample period; for every sample.
+    """Put out commands and let the current follow.
 
     Args:
         command: float64[n], current in A.
-        noise_um: float64[n], noise of each reading in um.
-        displacement_um: float64[n], filled with the sensor's readings.
-        current_a: float64[n], filled with the amplifier's readings.
-        state: float64[7]: current in A, field in A/m, then ``mechanics`` of ``_move``; updated.
-        cells: float64[3, m], see ``free_displacement``; updated.
-        motion: float64[3, 5], see ``_move``.
-        amplifier: What is left of the current's error after half a step and after a step.
-        coil: Coil factor in 1/m, bias field in A/m, step in s, lag in s, its growth in m/A.
-        material: See ``free_displacement``.
-        rest_um: Free displacement at rest.
-        converters: One DAC code in A, one ADC code in um, the sensor's range in um.
+        current_a: float64[n], filled with the amplifier's readings before each command.
+        halves_a: float64[2 n substeps + 1], filled with the current at the start, then at the
+            middle and the end of each step.
+        state: float64[1], current in A; updated.
+        amplifier: What is left after half a step and after a step of the current's error, then of a
+            current that nothing drives; the current in A that the largest voltage holds; one DAC
+            code in A.
         substeps: Steps in a sample period.
     """
-    left_half, left = amplifier
-    factor, bias, step, lag, growth = coil
-    dac_code, adc_code, sensor_range = converters
+    left_half, left, decay_half, decay, most, dac_code = amplifier
     current = state[0]
-    field = state[1]
-    mechanics = state[2:]
+    halves_a[0] = current
+    k = 0
     for j in range(command.size):
-        reading = np.rint((mechanics[2] + noise_um[j]) / adc_code) * adc_code
-        displacement_um[j] = min(sensor_range, max(-sensor_range, reading))
         current_a[j] = np.rint(current / dac_code) * dac_code
         target = np.rint(command[j] / dac_code) * dac_code
         for _ in range(substeps):
             start = current
-            middle = target + left_half * (start - target)
-            current = target + left * (start - target)
-            drive = (factor * start + bias, factor * middle + bias, factor * current + bias)
-            field = _advance_field(field, drive, step, lag, growth)
-            mechanics[3] = mechanics[4]
-            mechanics[4] = free_displacement(cells, field, material) - rest_um
-            _move(motion, mechanics)
+            halves_a[k + 1] = _toward(start, target, left_half, (decay_half, most))
+            current = _toward(start, target, left, (decay, most))
+            halves_a[k + 2] = current
+            k += 2
     state[0] = current
-    state[1] = field
+
+
+@kernel("void(float64[::1], float64[:, ::1], float64)")
+def creep(free_um: F64, elements: F64, rest_um: float) -> None:
+    """Add what creeps to the free displacement.
+
+    Args:
+        free_um: float64[n], at the end of each step; changed.
+        elements: float64[3, m]: share, what is reached in a step, and displacement that each
+            element stands at, from rest; the last is updated.
+        rest_um: Free displacement at rest.
+    """
+    for k in range(free_um.size):
+        moved = free_um[k] - rest_um
+        for i in range(elements.shape[1]):
+            elements[2, i] += elements[1, i] * (moved - elements[2, i])
+            free_um[k] += elements[0, i] * elements[2, i]
+
+
+@kernel("void(float64[::1], float64[::1], float64[::1], UniTuple(float64, 5), int64)")
+def warm(
+    halves_a: F64,
+    growth_um: F64,
+    state: F64,
+    thermal: tuple[float, float, float, float, float],
+    substeps: int,
+) -> None:
+    """Add what the rods have grown by at the instant of each sample, and warm them.
+
+    Args:
+        halves_a: float64[2 n substeps + 1], see ``amplify``.
+        growth_um: float64[n], added to.
+        state: float64[1], rise in K by the coil; updated.
+        thermal: Steady rise in K/A^2, what of it is reached in a step, growth in um/K, temperature
+            of the room in K, bias in A.
+        substeps: Steps in a sample period.
+    """
+    rise, reached, growth, room, bias = thermal
+    warmth = state[0]
+    for j in range(growth_um.size):
+        growth_um[j] += growth * (room + warmth)
+        for k in range(j * substeps, (j + 1) * substeps):
+            current = halves_a[2 * k + 1] + bias
+            warmth += reached * (rise * current * current - warmth)
+    state[0] = warmth
+
+
+@kernel(
+    "void(float64[::1], float64[::1], float64[::1], float64[::1], float64[:, ::1], float64,"
+    " UniTuple(float64, 2), int64)"
+)
+def respond(
+    free_um: F64,
+    noise_um: F64,
+    displacement_um: F64,
+    mechanics: F64,
+    motion: F64,
+    rest_um: float,
+    sensor: tuple[float, float],
+    substeps: int,
+) -> None:
+    """Read the sensor, then let structure and sensor follow the rods; for every sample.
+
+    Args:
+        free_um: float64[n substeps], free displacement of the rods at the end of each step.
+        noise_um: float64[n], noise of each reading.
+        displacement_um: float64[n], filled with the sensor's readings.
+        mechanics: float64[m]: position and velocity of each mode, sensor output, free displacement
+            from rest before and after the last step; updated.
+        motion: float64[m - 2, m], the exact step for a free displacement that changes linearly.
+        rest_um: Free displacement at rest.
+        sensor: One ADC code and the range, in um.
+        substeps: Steps in a sample period.
+    """
+    adc_code, sensor_range = sensor
+    size = mechanics.size
+    moved = np.empty(size - 2)
+    for j in range(noise_um.size):
+        reading = np.rint((mechanics[size - 3] + noise_um[j]) / adc_code) * adc_code
+        displacement_um[j] = min(sensor_range, max(-sensor_range, reading))
+        for k in range(j * substeps, (j + 1) * substeps):
+            mechanics[size - 2] = mechanics[size - 1]
+            mechanics[size - 1] = free_um[k] - rest_um
+            for row in range(size - 2):
+                value = 0.0
+                for i in range(size):
+                    value += motion[row, i] * mechanics[i]
+                moved[row] = value
+            mechanics[: size - 2] = moved

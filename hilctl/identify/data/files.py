@@ -59,6 +59,9 @@ def history_from_recording(recording: Recording) -> History:
             from another output, so the hysteresis can't be followed from rest.
     """
     samples = recording.samples
+    conditioned = (samples.flags & Flag.CONDITION.value) != 0
+    if conditioned.any():  # what was before its conditioning is forgotten
+        samples = samples.rows(slice(int(np.argmax(conditioned)), None))
     rows = (samples.flags & Flag.RAMP.value) == 0
     if samples.index.size and samples.index[0] == 0 and not rows[0]:
         raise DataError(
@@ -66,14 +69,16 @@ def history_from_recording(recording: Recording) -> History:
             "not at rest: leave out --whole to use its steady cycles"
         )
     index, displacement_um = samples.index[rows], samples.displacement_um[rows]
-    whole = index.size > 0 and index[0] == 0 and index[-1] == index.size - 1
+    begins_at = int(samples.index[0]) if conditioned.any() else 0
+    whole = index.size > 0 and index[0] == begins_at == index[-1] + 1 - index.size
     if not whole or not np.isfinite(displacement_um).all():
         raise DataError(
             f"{recording.path}: samples are missing, so it can't be judged as a whole: "
             "leave out --whole to use its steady cycles"
         )
     command = np.ascontiguousarray(samples.command[rows])
-    return History(recording.path.name, command, displacement_um, recording.sample_rate_hz)
+    ignore = int(np.count_nonzero(conditioned))  # it makes the state, and is not judged
+    return History(recording.path.name, command, displacement_um, recording.sample_rate_hz, ignore)
 
 
 def _from_table(path: Path, settings: IdentifySettings, lag_samples: int) -> Record:

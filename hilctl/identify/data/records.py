@@ -105,6 +105,11 @@ class History:
                 f"{self.command.size} samples: {self.ignore}"
             )
 
+    @property
+    def time_s(self) -> F64:
+        """Time of each sample since the first: float64[n]."""
+        return np.asarray(np.arange(self.command.size) / self.sample_rate_hz, dtype=np.float64)
+
     def without_lag(self, lag_samples: int) -> "History":
         """Return the history with the displacement taken ``lag_samples`` later.
 

@@ -29,4 +29,7 @@ def _searched(problem: SearchProblem, job: FitJob) -> FoundModel:
         found = refine_peak(problem, found, goal_um, job.progress)
     known = problem.parameters(found.x, found.scale)
     numbers = len(known.keys() - {"g_0"})  # which is 1 by definition
-    return FoundModel(problem.build(found.x, found.scale), numbers, known, found.starts)
+    at_bound = problem.space.at_bound(found.x)
+    held = tuple(name for name, bound in zip(problem.searched, at_bound, strict=True) if bound)
+    model = problem.build(found.x, found.scale)
+    return FoundModel(model, numbers, known, found.starts, at_bound=held)

@@ -11,6 +11,10 @@ from hilctl.kernels.hysteresis import deadband_block
 from hilctl.models.integrated import IntegratedModel
 from hilctl.models.published import exponential_integrated, exponential_weights
 
+SEARCHED = (
+    "alpha", "gamma", "a_0", "alpha_0", "beta_0", "alpha_1", "beta_1", "d_p", "alpha_2", "beta_2",
+    "d_n", "output_offset_um",
+)  # fmt: skip
 STEEPEST = 5.0  # largest slope of the deadband function, relative to that around 0
 
 
@@ -61,6 +65,11 @@ class ExponentialProblem:
         ]
         low, high, guess = np.array(rows).T
         return SearchSpace(low.copy(), high.copy(), guess.copy())
+
+    @property
+    def searched(self) -> tuple[str, ...]:
+        """Names of what is searched, in the order of the space."""
+        return SEARCHED if self._settings.offset else SEARCHED[:-1]
 
     def error_um(self, x: F64, scale: F64) -> F64:
         """Return modelled minus measured displacement, see :class:`SearchProblem`."""

@@ -67,6 +67,13 @@ class PlaysProblem:
         """What is searched."""
         return self._space
 
+    @property
+    def searched(self) -> tuple[str, ...]:
+        """Names of what is searched, in the order of the space."""
+        names = ("alpha", "gamma") if self._rate_dependent else ("sigma",)
+        beta = "beta_0" if self._rate_dependent else "beta"
+        return (*names, beta) if self._exponential else names
+
     def error_um(self, x: F64, scale: F64) -> F64:
         """Return modelled minus measured displacement, see :class:`search.Problem`."""
         columns = self._columns(x)

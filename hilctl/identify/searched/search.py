@@ -9,6 +9,7 @@ from scipy.optimize import least_squares
 
 from hilctl.base.arrays import F64
 from hilctl.identify.job import OnProgress, StartOutcome
+from hilctl.identify.linear import Mask
 from hilctl.models.plays import PlayModel
 
 DRAWS_A_START = 12  # random points looked at for each start that is followed
@@ -18,6 +19,7 @@ ROUNDS = 30  # of the refinement for the peak error
 ROUND = 15  # evaluations of the residuals in a round, derivatives apart
 EMPHASIS = 0.3  # what a sample beyond the goal gains in weight in each round
 NEARLY = 0.96  # of the goal: where samples begin to gain
+HELD = 1e-4  # of the space: so near to a bound, a search has run into it
 SAME = 1e-6  # relative difference of two ends that are one and the same minimum
 
 
@@ -35,6 +37,11 @@ class SearchSpace:
     high: F64
     guess: F64
 
+    def at_bound(self, x: F64) -> Mask:
+        """Return what of a point, float64[p], stands on a bound: bool[p]."""
+        near = HELD * (self.high - self.low)
+        return np.asarray((x <= self.low + near) | (x >= self.high - near))
+
     def draw(self, rng: np.random.Generator) -> F64:
         """Return a random point: each parameter up to 4 times below or above its rough value."""
         drawn = self.guess * np.exp(rng.uniform(-1.4, 1.4, self.guess.size))
@@ -48,6 +55,11 @@ class SearchProblem(Protocol):
     @property
     def space(self) -> SearchSpace:
         """What is searched."""
+        ...
+
+    @property
+    def searched(self) -> tuple[str, ...]:
+        """Names of what is searched, in the order of the space."""
         ...
 
     def error_um(self, x: F64, scale: F64) -> F64:

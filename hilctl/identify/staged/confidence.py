@@ -47,6 +47,12 @@ def standard_errors(
     return out
 
 
+def at_bound(found: StagedEnd, layers: Layers, *, staged: bool) -> tuple[str, ...]:
+    """Return the names of the parameters that a bound holds; arguments as above."""
+    by = _stages(found, layers, staged=staged) | _operators(layers, found.held.size)
+    return tuple(name for name, slopes in by.items() if found.held[next(iter(slopes))])
+
+
 def _stages(found: StagedEnd, layers: Layers, *, staged: bool) -> dict[str, dict[int, float]]:
     """Return what each reported parameter of the stages changes with, and how much."""
     by: dict[str, dict[int, float]] = {}

@@ -12,7 +12,7 @@ import numpy as np
 from hilctl.base.arrays import F64
 from hilctl.identify.linear import bounded_weights
 from hilctl.identify.staged.fit_data import Linear, StagedFitData
-from hilctl.identify.staged.layered import STEEPEST, Layers, Point, segments
+from hilctl.identify.staged.layered import STEEPEST, Layers, Point, loop_delay_s, segments
 
 KNOTS = 16  # of Lambda^-1
 
@@ -99,12 +99,12 @@ def _placed(
     data: StagedFitData, layers: Layers, point: Point, before: F64, delay_s: float
 ) -> Point:
     """Put the stages in, a delay shared between a structure well above the data and transport."""
-    linear = Linear(delay_s if layers.delay else layers.least_delay_s)
+    own_s = delay_s - loop_delay_s(layers.half_period_s, float(before[0]))
+    linear = Linear(max(own_s, 0.0) if layers.delay else 0.0)
     if layers.structure:
         q_s = 0.016 / data.top_hz
-        c_s = float(np.clip(delay_s - layers.least_delay_s, 0.1 * q_s, 0.4 * q_s))
-        rest = max(delay_s - c_s, layers.least_delay_s) if layers.delay else layers.least_delay_s
-        linear = Linear(rest, c_s, q_s * q_s)
+        c_s = float(np.clip(own_s, 0.1 * q_s, 0.4 * q_s))
+        linear = Linear(max(own_s - c_s, 0.0) if layers.delay else 0.0, c_s, q_s * q_s)
     return Point(
         before=before.copy(),
         linear=linear,

@@ -2,13 +2,12 @@
 
 from hilctl.identify.geometry import weight_roots
 from hilctl.identify.job import FitJob, FoundModel
-from hilctl.identify.staged.confidence import standard_errors
+from hilctl.identify.staged.confidence import at_bound, standard_errors
 from hilctl.identify.staged.fit_data import StagedFitData
 from hilctl.identify.staged.layered import Layers
 from hilctl.identify.staged.model import (
     STAGE_PARAMETERS,
     integrated_model,
-    loop_delay_s,
     parameters,
     staged_model,
 )
@@ -36,7 +35,8 @@ def fit_free(job: FitJob) -> FoundModel:
     known = parameters(layers, found.point, staged=False)
     errors = standard_errors(found, layers, data.places, staged=False)
     model = integrated_model(data, layers, found.point, job.data.unit)
-    return FoundModel(model, len(known) - 1, known, found.starts, errors)
+    held = at_bound(found, layers, staged=False)
+    return FoundModel(model, len(known) - 1, known, found.starts, errors, held)
 
 
 def fit_staged(job: FitJob) -> FoundModel:
@@ -52,7 +52,7 @@ def fit_staged(job: FitJob) -> FoundModel:
         gamma=not lag,
         structure=settings.structure,
         delay=settings.delay,
-        least_delay_s=loop_delay_s(data.half_period_s, lag=lag),
+        half_period_s=data.half_period_s,
         offset=settings.offset,
         midpoint=settings.layout == "midpoint",
         least_slope=settings.least_slope,
@@ -61,8 +61,9 @@ def fit_staged(job: FitJob) -> FoundModel:
     known = parameters(layers, found.point, staged=True)
     errors = standard_errors(found, layers, data.places, staged=True)
     model = staged_model(data, layers, found.point, job.data.unit)
+    held = at_bound(found, layers, staged=True)
     if settings.hysteresis == "integrated":
-        return FoundModel(model, len(known) - 1, known, found.starts, errors)
+        return FoundModel(model, len(known) - 1, known, found.starts, errors, held)
     job.progress(0.9, "densities of the Preisach triangle")
     scale = weight_roots(job.data.records, settings.weight_by)
     model = with_triangle(data, model, settings.lines, scale, settings.least_slope)
@@ -70,7 +71,8 @@ def fit_staged(job: FitJob) -> FoundModel:
     errors = {name: errors[name] for name in STAGE_PARAMETERS if name in errors}
     known["output_offset_um"] = model.hysteresis.output_offset_um
     numbers = len(known) + settings.lines**2
-    return FoundModel(model, numbers, known, found.starts, errors)
+    held = tuple(name for name in held if name in known)
+    return FoundModel(model, numbers, known, found.starts, errors, held)
 
 
 def _found(job: FitJob, data: StagedFitData, layers: Layers) -> StagedEnd:

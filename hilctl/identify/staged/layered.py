@@ -3,17 +3,41 @@
 Lag -> plays -> deadbands -> structure -> delay; all parameters in one row of numbers.
 """
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from hilctl.base.arrays import F64
 from hilctl.identify.staged.fit_data import Linear, StagedFitData
-from hilctl.identify.staged.sensitivity import PARAMETERS
+from hilctl.identify.staged.sensitivity import LAG_S, PARAMETERS
 
 STEEPEST = 5.0  # largest slope of the deadband function, relative to that around 0
 DYNAMIC = PARAMETERS + 3
+FORGOTTEN = 300.0  # half periods in time constants: nothing is left of a lag
 RADIAN = 0.16  # 1 / (2 pi)
+
+
+def loop_delay_s(half_period_s: float, lag_s: float) -> float:
+    """Return the delay of a sampled loop that a staged model has without any of its own.
+
+    A displacement is sampled one period T after the command that it can first show was put out.
+    Sampled, a lag tau of a command that is held is T / (1 - e^(-T / tau)) late at low frequencies,
+    of which tau is the lag's own. What is left is T / 2 where the lag is long beside T, and T
+    where there is none.
+    """
+    period_s = 2.0 * half_period_s
+    if lag_s <= 0.0 or period_s <= 0.0:
+        return period_s
+    return -period_s / math.expm1(-period_s / lag_s) - lag_s
+
+
+def loop_delay_slope(half_period_s: float, lag_s: float) -> float:
+    """Return the derivative of :func:`loop_delay_s` by the lag."""
+    if lag_s <= 0.0 or half_period_s <= 0.0:
+        return 0.0
+    half = half_period_s / lag_s
+    return (half / math.sinh(half)) ** 2 - 1.0 if half < FORGOTTEN else -1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,7 +52,7 @@ class Layers:
         gamma: Whether thresholds grow with the rate.
         structure: Whether there is a second-order structure.
         delay: Whether a transport delay is fitted.
-        least_delay_s: Delay that a sampled loop has in any case.
+        half_period_s: Half a sample period of the loop; 0.0 where its delay does not count.
         offset: Whether a constant displacement is fitted.
         midpoint: Whether thresholds are alpha (i - 1/2) instead of alpha i.
         least_slope: Smallest slope anywhere, relative to the mean slope of the data.
@@ -41,7 +65,7 @@ class Layers:
     gamma: bool = False
     structure: bool = True
     delay: bool = True
-    least_delay_s: float = 0.0
+    half_period_s: float = 0.0
     offset: bool = True
     midpoint: bool = False
     least_slope: float = 0.01
@@ -59,7 +83,7 @@ class Layers:
     @property
     def dynamic(self) -> bool:
         """Whether any stage has dynamics."""
-        return self.lag or self.structure or self.delay or self.least_delay_s > 0.0
+        return self.lag or self.structure or self.delay or self.half_period_s > 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +92,7 @@ class Point:
 
     Attributes:
         before: float64[4]: lag in s, its growth, spacing of the thresholds, gamma in s.
-        linear: Structure and delay.
+        linear: Structure, and delay beyond that of any sampled loop.
         direct: a_0 in um per command unit.
         weights: float64[n], a_1 to a_n.
         spacings_um: d_p and d_n, distances of the deadbands above and below 0.
@@ -126,7 +150,7 @@ def bounds(data: StagedFitData, layers: Layers, point: Point) -> tuple[F64, F64]
         (0.0, 20.0 / data.reach, layers.lag and layers.growth),
         (0.05 * limit, limit, True),
         (0.0, data.reach / data.top_speed, layers.gamma),
-        (layers.least_delay_s, layers.least_delay_s + radian_s, layers.delay),
+        (0.0, radian_s, layers.delay),
         (1e-3 * radian_s, 2.0 * radian_s, layers.structure),
         (1e-4 * radian_s**2, 4.0 * radian_s**2, layers.structure),
         (layers.least_slope * data.gain, steepest, True),
@@ -160,12 +184,17 @@ def error_and_slopes(data: StagedFitData, layers: Layers, point: Point) -> tuple
     inside[:, first + 1 : first + 1 + outputs.shape[1]] = gain * outputs
     inside[:, first + 1 + outputs.shape[1] : -2] = parts[:, outwards]
     inside[:, -2:] = _by_spacings(inner, point)
-    out = data.through(inside, point.linear)
+    lag_s = float(point.before[0])
+    late_s = point.linear.delay_s + loop_delay_s(layers.half_period_s, lag_s)
+    linear = replace(point.linear, delay_s=late_s)
+    out = data.through(inside, linear)
     slopes = np.empty((w.size, out.shape[1] + 3))
     slopes[:, :PARAMETERS] = out[:, 1:first]
     slopes[:, PARAMETERS:DYNAMIC] = 0.0
-    if layers.structure or layers.delay:
-        slopes[:, PARAMETERS:DYNAMIC] = data.linear_slopes(bare, point.linear)
+    if layers.dynamic:
+        slopes[:, PARAMETERS:DYNAMIC] = data.linear_slopes(bare, linear)
+        by_lag = loop_delay_slope(layers.half_period_s, lag_s)
+        slopes[:, LAG_S] += by_lag * slopes[:, PARAMETERS]
     slopes[:, DYNAMIC:-1] = out[:, first:]
     slopes[:, -1] = 1.0
     return out[:, 0] + (point.offset_um - data.target_um), slopes

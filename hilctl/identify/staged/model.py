@@ -7,23 +7,14 @@ import numpy as np
 from hilctl.base.arrays import F64
 from hilctl.base.device import CommandUnit
 from hilctl.identify.staged.fit_data import Linear, StagedFitData
-from hilctl.identify.staged.layered import Layers, Point
+from hilctl.identify.staged.layered import Layers, Point, loop_delay_s
 from hilctl.models.deadband import DeadbandFunction
 from hilctl.models.integrated import IntegratedModel
 from hilctl.models.plays import PlayModel
 from hilctl.models.staged import FieldLag, StagedModel, Structure
 
+HIGHEST_DAMPING = 10.0  # that a Structure takes
 STAGE_PARAMETERS = ("tau_s", "growth_per_unit", "natural_hz", "damping_ratio", "delay_s")
-
-
-def loop_delay_s(half_period_s: float, *, lag: bool) -> float:
-    """Return the delay of a sampled loop that a staged model has without any of its own.
-
-    A displacement is sampled one period after the command that it can first show was put out. A
-    lag follows a command held between samples, on average half a period late; without one, the
-    model takes the command of the sample before.
-    """
-    return half_period_s if lag else 2.0 * half_period_s
 
 
 def integrated_model(
@@ -67,13 +58,18 @@ def staged_model(
         integrated_model(data, layers, point, unit),
         lag=lag,
         structure=structure,
-        delay_s=max(point.linear.delay_s - layers.least_delay_s, 0.0),
+        delay_s=point.linear.delay_s,
     )
 
 
 def structure_of(linear: Linear) -> tuple[float, float]:
-    """Return natural frequency in Hz and damping ratio."""
-    radian_s = math.sqrt(linear.q_s2)
+    """Return natural frequency in Hz and damping ratio.
+
+    A first-order low-pass, that of a sensor say, is a structure without a mass: it has no damping
+    ratio. It keeps its time constant, and a mass far too small to matter.
+    """
+    least_s = 0.5 * linear.c_s / HIGHEST_DAMPING
+    radian_s = max(math.sqrt(linear.q_s2), least_s * (1.0 + 1e-9))
     return 1.0 / (2.0 * math.pi * radian_s), linear.c_s / (2.0 * radian_s)
 
 
@@ -85,7 +81,7 @@ def parameters(layers: Layers, point: Point, *, staged: bool) -> dict[str, float
     if layers.structure:
         out["natural_hz"], out["damping_ratio"] = structure_of(point.linear)
     if staged:
-        out["delay_s"] = max(point.linear.delay_s - layers.least_delay_s, 0.0)
+        out["delay_s"] = point.linear.delay_s
     out |= {"alpha": float(point.before[2]), "gamma": float(point.before[3])}
     out |= {"a_0": point.direct, "g_0": 1.0}
     out |= dict(zip(("d_p", "d_n"), point.spacings_um, strict=True))
@@ -110,8 +106,8 @@ def response_um(model: StagedModel, data: StagedFitData) -> F64:
 
 def stages_of(model: StagedModel, half_period_s: float) -> Linear:
     """Return structure and all delay of a model in a sampled loop."""
-    lag, structure = model.lag is not None, model.structure
-    delay_s = model.delay_s + loop_delay_s(half_period_s, lag=lag)
+    lag_s, structure = model.lag.tau_s if model.lag else 0.0, model.structure
+    delay_s = model.delay_s + loop_delay_s(half_period_s, lag_s)
     if structure is None:
         return Linear(delay_s)
     radian_s = 1.0 / (2.0 * math.pi * structure.natural_hz)

@@ -13,7 +13,14 @@ from hilctl.identify.searched.search import first_least
 from hilctl.identify.staged.convex import WeightedStart, convex_start
 from hilctl.identify.staged.descend import ErrorAndSlopes, descend
 from hilctl.identify.staged.fit_data import StagedFitData
-from hilctl.identify.staged.layered import RADIAN, Layers, Point, bounds, error_and_slopes
+from hilctl.identify.staged.layered import (
+    RADIAN,
+    Layers,
+    Point,
+    bounds,
+    error_and_slopes,
+    loop_delay_s,
+)
 from hilctl.identify.workers import Map
 
 ROUNDS = 10  # steps from every start
@@ -37,6 +44,7 @@ class StagedEnd:
         errors_um: float64[N], modelled less measured displacement.
         slopes: float64[N, p], their derivatives by ``point.pack()``.
         free: bool[p], parameters that are neither fixed nor held by a bound.
+        held: bool[p], parameters that a bound holds.
         scale: float64[N], square root of the weights at the end.
         starts: All starts.
     """
@@ -45,6 +53,7 @@ class StagedEnd:
     errors_um: F64
     slopes: F64
     free: np.ndarray[tuple[int], np.dtype[np.bool_]]
+    held: np.ndarray[tuple[int], np.dtype[np.bool_]]
     scale: F64
     starts: tuple[StartOutcome, ...]
 
@@ -129,7 +138,8 @@ def find_staged(
     margin = 1e-6 * (high - low)
     errors, slopes = error_and_slopes(data, layers, point)
     free = np.asarray((high > low) & (x > low + margin) & (x < high - margin))
-    return StagedEnd(point, errors, slopes, free, scale, tuple(outcomes))
+    held = np.asarray((high > low) & ~free)
+    return StagedEnd(point, errors, slopes, free, held, scale, tuple(outcomes))
 
 
 def _check(data: StagedFitData, layers: Layers) -> None:
@@ -152,11 +162,12 @@ def _grid(data: StagedFitData, layers: Layers, scale: F64) -> list[WeightedStart
     fastest = data.reach / data.top_speed
     gammas = [part * fastest for part in GAMMAS] if layers.gamma else [0.0]
     late = layers.delay or layers.structure
-    delays = [layers.least_delay_s + part * radian_s for part in (DELAYS if late else (0.0,))]
+    delays = [part * radian_s for part in (DELAYS if late else (0.0,))]
     found = []
     for spacing, lag_s, gamma_s, delay_s in product(SPACINGS, lags, gammas, delays):
         before = np.array([lag_s, 0.0, spacing * limit, gamma_s])
-        found.append(convex_start(data, layers, before, delay_s, scale))
+        late_s = delay_s + loop_delay_s(layers.half_period_s, lag_s)
+        found.append(convex_start(data, layers, before, late_s, scale))
     return found
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hilctl.analysis import canvas
 from hilctl.analysis.html import page, write_html
 from hilctl.analysis.report import summarize
 from hilctl.base.errors import InputError
@@ -16,6 +17,7 @@ from hilctl.base.segments import Segment
 from hilctl.recording.data import Recording
 
 NASTY = """<script>alert("x")</script>&amp;<img src=x onerror='y'>"""
+WHITE = b"\x89PNG\r\n\x1a\n"
 
 
 class Page(HTMLParser):
@@ -70,6 +72,12 @@ def shown(recording: Recording) -> str:
     return page(recording, summarize(recording))
 
 
+@pytest.fixture
+def undrawn(monkeypatch) -> None:
+    """Leave all figures white, for tests of something else."""
+    monkeypatch.setattr(canvas, "png", lambda figure: WHITE)
+
+
 def test_fetches_nothing(shown: str) -> None:
     """All that it refers to is PNG within the page; there is no script, link or address."""
     seen = Page(shown)
@@ -103,6 +111,7 @@ def test_holds_figures_segments_events_and_experiment(recording: Recording, show
     assert "17" in seen.text
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_one_segment_has_no_table_of_its_own(recording: Recording) -> None:
     """What is said above is not said twice."""
     single = replace(recording, segments=recording.segments[1:])
@@ -131,6 +140,7 @@ def test_cut_short_recording_has_a_page(recording: Recording) -> None:
         assert said in text
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_only_the_last_events_are_listed(recording: Recording) -> None:
     """Thousands of warnings don't drown the page, and it says so."""
     many = tuple(Event(k, "warning", "late", f"tick {k} was late") for k in range(1000))
@@ -140,6 +150,7 @@ def test_only_the_last_events_are_listed(recording: Recording) -> None:
     assert "The first 800 are left out" in text
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_is_written_whole_and_replaces(recording: Recording, tmp_path: Path) -> None:
     """A page of that name is replaced, and nothing else is left in the folder."""
     path = tmp_path / "page.html"
@@ -149,6 +160,7 @@ def test_is_written_whole_and_replaces(recording: Recording, tmp_path: Path) -> 
     assert list(tmp_path.iterdir()) == [path]
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_folder_that_is_not_there_is_an_input_error(recording: Recording, tmp_path: Path) -> None:
     """The message names the file."""
     path = tmp_path / "missing" / "page.html"

@@ -6,6 +6,7 @@ import sys
 
 import pytest
 
+from hilctl import cli
 from hilctl.base.errors import InputError
 from hilctl.cli.commands import COMMANDS, CommandEntry, load
 
@@ -14,6 +15,19 @@ def in_a_process(code, *arguments):
     return subprocess.run(
         [sys.executable, "-c", code, *arguments], capture_output=True, text=True, timeout=120
     )
+
+
+@pytest.fixture
+def in_here(monkeypatch, capsys):
+    """Run a command in this process, which has loaded all of it; return its code and streams."""
+
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", ["hilctl", *arguments])
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
+        return ended.value.code, *capsys.readouterr()
+
+    return run
 
 
 @pytest.mark.parametrize("name", COMMANDS)
@@ -56,11 +70,11 @@ def test_a_slip_of_the_finger_is_answered_with_the_nearest_command():
     assert "No such command 'stauts'. Did you mean 'status'?" in ended.stderr
 
 
-def test_a_group_of_commands_runs_its_own():
+def test_a_group_of_commands_runs_its_own(in_here):
     """``devices`` is one, with ``probe`` in it."""
-    ended = in_a_process("from hilctl.cli import main; main()", "devices", "probe", "absent.yaml")
-    assert ended.returncode == 2
-    assert ended.stderr == "hilctl: absent.yaml: no such file\n"
+    code, _, stderr = in_here("devices", "probe", "absent.yaml")
+    assert code == 2
+    assert stderr == "hilctl: absent.yaml: no such file\n"
 
 
 HEAVY = ("numba", "numpy", "scipy", "matplotlib", "mcap", "pydantic", "yaml", "pyarrow")
@@ -100,17 +114,17 @@ def test_version():
     assert hilctl("--version").stdout == f"hilctl {__version__}\n"
 
 
-def test_json_errors_are_json():
+def test_json_errors_are_json(in_here):
     """A program gets the problem as JSON, with the same exit code."""
-    ended = hilctl("check", "absent.yaml", "--json")
-    assert ended.returncode == 2
-    assert "no such file" in json.loads(ended.stdout)["error"]
-    assert ended.stderr.startswith("hilctl: absent.yaml: no such file")
+    code, stdout, stderr = in_here("check", "absent.yaml", "--json")
+    assert code == 2
+    assert "no such file" in json.loads(stdout)["error"]
+    assert stderr.startswith("hilctl: absent.yaml: no such file")
 
 
 @pytest.mark.parametrize("command", ["report", "replay", "identify"])
-def test_absent_recordings_are_refused(command):
+def test_absent_recordings_are_refused(in_here, command):
     """A recording that is not there is one line and exit code 2."""
-    ended = hilctl(command, "absent.mcap")
-    assert ended.returncode == 2
-    assert ended.stderr == "hilctl: absent.mcap: no such file\n"
+    code, _, stderr = in_here(command, "absent.mcap")
+    assert code == 2
+    assert stderr == "hilctl: absent.mcap: no such file\n"

@@ -14,7 +14,7 @@ from hilctl.base.errors import ConfigError
 from hilctl.base.yaml.document import Document
 from hilctl.experiment.check import Checked, check
 from hilctl.experiment.load import LoadedExperiment, resolve
-from hilctl.models.base import HysteresisModel, Operator
+from hilctl.models.base import HysteresisModel, IdentifiedRange, Operator, Provenance
 from hilctl.models.plays import RdpiModel
 from tests.published import piezo_ppi, terfenol_rdpi
 
@@ -405,3 +405,23 @@ class TestWatchdog:
             checked(CURRENT, watchdog_command=command, watchdog_reason=reason)
         (problem,) = caught.value.problems
         assert str(problem).endswith(f"device.watchdog.safe_command: {rule}")
+
+
+def within(frequency_hz: float) -> HysteresisModel:
+    """Return a model that was identified at that frequency alone."""
+    known = IdentifiedRange(
+        peak_to_peak_um=(20.0, 20.0),
+        frequency_hz=(frequency_hz, frequency_hz),
+        speed_um_per_s=70.0 * frequency_hz,
+    )
+    return terfenol_rdpi().model_copy(update={"provenance": Provenance(identified_range=known)})
+
+
+def test_a_reference_beyond_what_the_model_was_identified_on_is_warned_or_refused() -> None:
+    """Warned where the error is not known, refused where it is known to be large."""
+    assert check(loaded(DISPLACEMENT, model=within(10.0))).warnings == ()
+    assert "repeats at 10 Hz" in check(loaded(DISPLACEMENT, model=within(30.0))).warnings[0]
+    faster = loaded(DISPLACEMENT, "waveform.frequency_hz=60", model=within(10.0))
+    with pytest.raises(ConfigError, match="waveform: the reference moves at about 60 Hz") as caught:
+        check(faster)
+    assert "identify the model on such motions too" in str(caught.value)

@@ -1,6 +1,8 @@
 """Feedback gains are checked with the device, its rate and its resonance."""
 
 import math
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,6 +13,7 @@ from hilctl.base.errors import ConfigError, InputError
 from hilctl.base.yaml.document import Document
 from hilctl.experiment.check import check
 from hilctl.experiment.feedback import (
+    feedback_problems,
     gains_for,
     highest_bandwidth_hz,
     margins,
@@ -98,6 +101,49 @@ class TestExperiment:
         """There is nothing to correct the input of."""
         settings = ("compensator=none", "waveform.unit=A", "waveform.amplitude=1.0")
         assert "feedback: needs a compensator" in self.problems(tmp_path, *settings)
+
+    INTEGRAL = "feedback={kind: integral, limit_um: 5.0, bandwidth_hz: 1.0}"
+
+    def test_integral_takes_blocks(self, tmp_path):
+        """An integrator needs neither a block of 1 nor a resonance, and its input is recorded."""
+        (tmp_path / "model.yaml").write_text(MODEL)
+        checked = check(resolve(Document("e", EXPERIMENT), tmp_path, ["block=50", self.INTEGRAL]))
+        assert checked.records_input
+
+    @pytest.mark.parametrize(
+        ("settings", "model", "rule"),
+        [
+            (("block=50", "{b: 3.2}"), MODEL, "must be <= 3.121 Hz, 0.2 / (2 pi 0.0102 s)"),
+            (("block=1", "{b: 5.1}"), MODEL, "must be <= 5 Hz where no resonance is known"),
+            (
+                ("block=1", "{b: 13.0}"),
+                STAGED.replace("0.12", "0.04"),
+                "must be <= 12 Hz, damping times frequency",
+            ),
+            (("block=1", "{b: 1.0, sensor_delay_s: 0.1}"), MODEL, "must be <= 0.317 Hz"),
+        ],
+    )
+    def test_integral_too_fast(self, tmp_path, settings, model, rule):
+        """Its bandwidth stays well below the loop's delay, and below the resonance."""
+        keys = settings[1].replace("b:", "bandwidth_hz:")
+        chosen = f"feedback={{kind: integral, limit_um: 5.0, {keys[1:]}"
+        text = self.problems(tmp_path, settings[0], chosen, model=model)
+        assert f"feedback.bandwidth_hz: {rule}" in text
+
+    def test_integral_counts_a_fifo(self, tmp_path):
+        """What the device plays later than it is sent is part of the delay."""
+        (tmp_path / "model.yaml").write_text(MODEL)
+        loaded = resolve(Document("experiment", EXPERIMENT), tmp_path, ["block=50", self.INTEGRAL])
+        info = replace(loaded.device.info, latency_blocks=4)
+        late = replace(loaded, device=SimpleNamespace(info=info))
+        (problem,) = feedback_problems(late, 0)
+        assert problem.rule.startswith("must be <= 0.6341 Hz, 0.2 / (2 pi 0.0502 s)")
+
+    def test_unknown_kind(self, tmp_path):
+        """The kinds are named."""
+        (tmp_path / "model.yaml").write_text(MODEL)
+        with pytest.raises(ConfigError, match="must be one of 'pi', 'integral'"):
+            resolve(Document("e", EXPERIMENT), tmp_path, ["feedback={kind: pid, limit_um: 1.0}"])
 
     @pytest.mark.parametrize("keys", ["{}", "{kp: 0.1}", "{bandwidth_hz: 1.0, ki_per_s: 1.0}"])
     def test_bandwidth_or_gains(self, tmp_path, keys):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hilctl.base.errors import DataError
-from hilctl.base.samples import COLUMNS, Batch, Head
+from hilctl.base.samples import COLUMNS, Batch, Flag, Head
 from hilctl.experiment.initial_state import InitialState, initial_state_after
 from hilctl.models.published import exponential_integrated
 from hilctl.models.staged import FieldLag, StagedModel
@@ -26,7 +26,7 @@ STAGED = StagedModel.around(
 COMMAND = 4.0 * np.sin(np.pi * np.arange(1000) / 999.0)
 
 
-def record(path: Path, command, *, first=0, whole=True) -> Path:
+def record(path: Path, command, *, first=0, whole=True, flags=0, facts=None, end=None) -> Path:
     """Write a run of these commands, of which the compensator knew nothing."""
     blocks = command.size // BLOCK
     batch = Batch.empty(blocks, BLOCK, 1)
@@ -34,8 +34,9 @@ def record(path: Path, command, *, first=0, whole=True) -> Path:
     batch.heads[:, Head.SAMPLES] = BLOCK
     batch.heads[0, Head.DROPPED_BEFORE] = first
     batch.columns[:, list(COLUMNS).index("command")] = command.reshape(blocks, BLOCK)
-    facts = RunFacts(
-        facts={"run_id": "before", "compensator": "none"},
+    batch.flags[-1, -1] = flags
+    run = RunFacts(
+        facts={"run_id": "before", "compensator": "none", **(facts or {})},
         segments=(), experiment_yaml="name: made\n", model_yaml="",
         layout=RecordingLayout(
             sample_rate_hz=RATE_HZ, command_unit="A", measures_command=False,
@@ -43,10 +44,10 @@ def record(path: Path, command, *, first=0, whole=True) -> Path:
         ),
     )  # fmt: skip
     with path.open("xb") as stream:
-        writer = RecordingWriter(stream, facts)
+        writer = RecordingWriter(stream, run)
         writer.batch(batch)
         if whole:
-            writer.finish({"code": "completed"}, first + command.size)
+            writer.finish({"code": "completed", **(end or {})}, first + command.size)
         else:
             writer.flush()
     return path
@@ -96,6 +97,8 @@ def test_lead_in_of_a_run_that_is_shorter():
     (piezo_ppi(), RATE_HZ, {}, "was recorded in A, the model takes V"),
     (OMEGA, RATE_HZ, {"first": 50}, "is not of a whole run"),
     (OMEGA, RATE_HZ, {"whole": False}, "is not of a whole run"),
+    (OMEGA, RATE_HZ, {"flags": int(Flag.UNANSWERED)}, "lost its device"),
+    (OMEGA, RATE_HZ, {"end": {"output_safe": "false"}}, "did not confirm its safe value"),
 ])  # fmt: skip
 def test_recordings_that_don_t_tell_are_refused(tmp_path, model, rate_hz, made, message):
     """Another rate, another unit, lost samples, no end: refused with the reason."""

@@ -3,7 +3,7 @@
 import pytest
 from pydantic import TypeAdapter, ValidationError
 
-from hilctl.experiment.parts import FeedbackConfig, Interval, Name, RecordingConfig
+from hilctl.experiment.parts import Interval, Name, PiFeedbackConfig, RecordingConfig
 
 NAME, INTERVAL = TypeAdapter(Name), TypeAdapter(Interval)
 
@@ -37,11 +37,11 @@ def test_the_ring_bridges_three_flushes():
 @pytest.mark.parametrize("way", [{"bandwidth_hz": 5.0}, {"ki_per_s": 3.0},
                                  {"ki_per_s": 3.0, "kp": 0.0}])  # fmt: skip
 def test_one_way_of_feedback_is_enough(way):
-    assert FeedbackConfig(limit_um=1.0, **way).limit_um == 1.0
+    assert PiFeedbackConfig(limit_um=1.0, **way).limit_um == 1.0
 
 
 @pytest.mark.parametrize("ways", [{}, {"kp": 0.1}, {"bandwidth_hz": 5.0, "ki_per_s": 3.0},
                                   {"bandwidth_hz": 5.0, "kp": 0.1}])  # fmt: skip
 def test_no_way_of_feedback_and_both_are_refused(ways):
     with pytest.raises(ValidationError, match="must have either bandwidth_hz or ki_per_s"):
-        FeedbackConfig(limit_um=1.0, **ways)
+        PiFeedbackConfig(limit_um=1.0, **ways)

@@ -70,8 +70,8 @@ class TestSchema:
     def test_devices(self, schema: dict[str, Any]) -> None:
         """Every built-in device is a choice, with its kind and its own options."""
         choices = [each["$ref"] for each in schema["properties"]["device"]["oneOf"]]
-        assert choices == [f"#/$defs/device_{kind}" for kind in registry.BUILTIN]
-        for kind in registry.BUILTIN:
+        assert choices == [f"#/$defs/device_{kind}" for kind in registry.known_devices()]
+        for kind in registry.known_devices():
             part = schema["$defs"][f"device_{kind}"]
             assert part["properties"]["kind"] == {"const": kind}
             assert "kind" in part["required"]

@@ -6,6 +6,7 @@ import pytest
 from hilctl.identify.data.records import SteadyLoop
 from hilctl.identify.judge import judge
 from hilctl.models.plays import PpiModel, RdpiModel
+from hilctl.models.staged import FieldLag, StagedModel, Structure
 
 PLAYS = {"direct": 4.0, "weights": (1.0, 2.0), "thresholds": (0.5, 1.5)}
 PPI = PpiModel(**PLAYS)
@@ -54,3 +55,14 @@ def test_errors_are_of_the_right_stroke(loop_of):
     assert error.peak_percent == pytest.approx(100.0 / np.ptp(large.displacement_um), 1e-3)
     expected = np.sqrt(0.5) * 100.0 / np.ptp(large.displacement_um)
     assert error.rms_percent == pytest.approx(expected, 1e-3)
+
+
+@pytest.mark.parametrize("frequency_hz", [10.0, 17.3])
+def test_stages_are_judged_sample_by_sample_at_the_rate_of_the_data(loops_of, frequency_hz):
+    """At 1 kHz a lag of 0.1 ms is a whole sample late, not half a one."""
+    lag = FieldLag(tau_s=1e-4, growth_per_unit=0.1)
+    model = StagedModel.around(PPI, lag=lag, structure=Structure(natural_hz=300, damping_ratio=0.1))
+    error = judge(model, loops_of(model, [(6.0, frequency_hz)], rate_hz=1000.0))
+    assert error.peak_percent <= 0.5
+    late = model.model_copy(update={"delay_s": 5e-4})
+    assert judge(late, loops_of(model, [(6.0, frequency_hz)], rate_hz=1000.0)).peak_percent > 1.0

@@ -7,9 +7,11 @@ from hilctl.identify import page as module
 from hilctl.identify.command import Identification
 from hilctl.identify.data.records import History
 from hilctl.identify.fit_model import fit_model
+from hilctl.identify.held_out import HeldOut
 from hilctl.identify.judge import judge
 from hilctl.identify.page import identification_page, loops_figure
 from hilctl.identify.settings import FitSettings
+from hilctl.identify.verdict import verdict_of
 from hilctl.models.plays import PpiModel
 
 TRUTH = PpiModel(direct=4.0, weights=(1.0,), thresholds=(0.5,))
@@ -22,8 +24,9 @@ def page_of(data_of):
     def make(held_out=()):
         records = data_of(TRUTH).records
         fit = fit_model(records, FitSettings(kind="straight"), lambda: 0.0, source=["<a & b>.csv"])
-        judged = judge(fit.model, held_out) if held_out else None
-        return identification_page(Identification(fit, records, judged, held_out, (), 0))
+        unseen = HeldOut(judge(fit.model, held_out), held_out, "others") if held_out else None
+        verdict = verdict_of(fit, records, FitSettings(kind="straight"), unseen)
+        return identification_page(Identification(fit, records, verdict, unseen, (), 0))
 
     return make
 
@@ -35,6 +38,7 @@ def test_the_page_fetches_nothing_and_shows_names_as_they_are(page_of):
     assert "&lt;a &amp; b&gt;.csv" in page
     assert "<a & b>" not in page
     assert "not fitted" not in page
+    assert "usable within" in page
 
 
 def test_data_not_fitted_have_errors_and_a_figure_of_their_own(page_of, data_of, monkeypatch):

@@ -6,15 +6,19 @@ import pytest
 
 from hilctl.identify.judge import LoopError
 from hilctl.identify.summary import HEADINGS, error_rows, parameter_texts, summary
+from hilctl.identify.verdict import Verdict
+from hilctl.models.base import IdentifiedRange, Provenance
 
 
-def found(held_out=None, lag_samples=0, starts=()):
+def found(held_out=None, lag_samples=0, starts=(), at_bound=(), known=None):
     fit = SimpleNamespace(
         numbers=7, elapsed_s=1.234, peak_percent=2.5, rms_percent=0.75, own_peak_percent=4.0,
         starts=[SimpleNamespace(rms_percent=each) for each in starts],
-        parameters={"a_0": 4.0, "tau_s": 1e-4}, standard_errors={"tau_s": 2e-6},
+        parameters={"a_0": 4.0, "tau_s": 1e-4}, standard_errors={"tau_s": 2e-6}, at_bound=at_bound,
+        model=SimpleNamespace(provenance=Provenance(identified_range=known)),
     )  # fmt: skip
-    return SimpleNamespace(fit=fit, held_out=held_out, lag_samples=lag_samples)
+    verdict = Verdict("usable", 4.0, held_out=held_out is not None, notes=("one note",))
+    return SimpleNamespace(fit=fit, held_out=held_out, lag_samples=lag_samples, verdict=verdict)
 
 
 @pytest.mark.parametrize(("area", "text"), [(None, "-"), (1.5, "+1.50"), (-0.25, "-0.25")])
@@ -28,16 +32,31 @@ def test_a_parameter_stands_with_its_standard_error_where_there_is_one():
     assert parameter_texts(found().fit) == [("a_0", "4"), ("tau_s", "0.0001 ± 2e-06")]
 
 
+def test_a_parameter_on_a_bound_is_marked_and_named():
+    shown = found(at_bound=("a_0",))
+    assert parameter_texts(shown.fit)[0] == ("a_0", "4 (on its bound)")
+    assert summary(shown)[-1].endswith("as far as they may go: a_0")
+
+
 def test_starts_that_ended_apart_are_shown_by_their_spread():
-    assert (
-        summary(found(starts=(0.75, 0.8)))[0] == "2 starts ended at rms 0.750 to 0.800 %, in 1.23 s"
-    )
-    assert summary(found())[0] == "7 numbers found, in 1.23 s"
+    spread = "2 starts ended at rms 0.750 to 0.800 %, in 1.23 s"
+    assert summary(found(starts=(0.75, 0.8)))[-1] == spread
+    assert summary(found())[-1] == "7 numbers found, in 1.23 s"
 
 
-def test_data_not_fitted_and_a_lag_have_lines_of_their_own():
-    held_out = SimpleNamespace(peak_percent=3.0, rms_percent=1.0)
-    lines = summary(found(held_out, lag_samples=2))
-    assert len(lines) == len(summary(found())) + 2
-    assert lines[-2].startswith("not fitted: peak error 3.00 %")
+def test_what_was_not_fitted_comes_before_what_was():
+    judgement = SimpleNamespace(peak_percent=3.0, rms_percent=1.0, own_peak_percent=5.0)
+    lines = summary(found(SimpleNamespace(judgement=judgement, how="others"), lag_samples=2))
+    assert lines[0].startswith("usable within 4.00 %")
+    assert lines[1] == "one note"
+    assert lines[2].startswith("not fitted: peak error 3.00 %")
+    assert lines[3].startswith("fitted: peak error 2.50 %")
     assert lines[-1] == "displacements taken 2 samples later than the commands"
+
+
+def test_the_range_that_it_was_found_for_is_said():
+    known = IdentifiedRange(
+        peak_to_peak_um=(20.0, 80.0), frequency_hz=(50.0, 50.0), speed_um_per_s=12e3
+    )
+    line = "found for 20 to 80 um peak-to-peak, 50 Hz, up to 1.2e+04 um/s"
+    assert summary(found(known=known))[-1] == line

@@ -25,4 +25,4 @@ def test_memory_is_the_state_without_the_command_before():
     block = Block(head, state, np.zeros((len(COLUMNS), 1)), np.zeros(1, dtype=np.uint32))
     block.memory[:] = 1.0
     assert state.tolist() == [1.0, 1.0, 1.0, 0.0]
-    assert (block.due, block.following, block.number, block.skipped) == (True, True, 0, 0)
+    assert (block.due, block.guarded, block.number, block.skipped) == (True, True, 0, 0)

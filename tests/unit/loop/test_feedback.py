@@ -13,7 +13,7 @@ from hilctl.experiment.feedback import (
     make_feedback,
 )
 from hilctl.experiment.file import Experiment
-from hilctl.experiment.parts import FeedbackConfig
+from hilctl.experiment.parts import PiFeedbackConfig
 from hilctl.loop.compensator import Compensator
 from hilctl.loop.feedback import Feedback, Gains
 from hilctl.models.plays import PpiModel
@@ -203,26 +203,29 @@ class TestFollow:
     def test_correction_is_added_to_the_input(self):
         """The input of the block is what it was, and the correction."""
         feedback, block = loop(due_after=0), self.block()
-        feedback.follow(block, block)
+        feedback.follow(block, block.input_um)
         block.displacement_um[0], block.input_um[0] = -1.0, 7.0
-        feedback.follow(block, block)
+        feedback.take(block)
+        feedback.follow(block, block.input_um)
         assert block.input_um[0] == 7.0 + feedback.correction_um
         assert feedback.correction_um == pytest.approx(gains_for(100.0, RATE_HZ).ki_per_s / RATE_HZ)
 
     def test_gap_is_passed_over(self):
         """After skipped samples, old displacements are held against nothing."""
         feedback, block = loop(due_after=0), self.block()
-        feedback.follow(block, block)
+        feedback.follow(block, block.input_um)
         block.displacement_um[0], block.skipped = -1.0, 3
-        feedback.follow(block, block)
+        feedback.take(block)
+        feedback.follow(block, block.input_um)
         assert feedback.correction_um == 0.0
 
     def test_a_command_that_was_held_back_stops_the_integral(self):
         """The limiter is known to have acted where wanted and command differ."""
         feedback, block = loop(due_after=0), self.block()
-        feedback.follow(block, block)
+        feedback.follow(block, block.input_um)
         block.displacement_um[0], block.wanted[0] = -1.0, 1.0
-        feedback.follow(block, block)
+        feedback.take(block)
+        feedback.follow(block, block.input_um)
         assert feedback.correction_um == 0.0
 
 
@@ -242,7 +245,7 @@ class TestAroundModels:
         compensator = Compensator(model, RATE_HZ)
         config = Document("experiment", EXPERIMENT).validate(Experiment)
         settings = {"limit_um": limit_um, "bandwidth_hz": 20.0}
-        config = config.model_copy(update={"feedback": FeedbackConfig(**settings)})
+        config = config.model_copy(update={"feedback": PiFeedbackConfig(**settings)})
         feedback = make_feedback(config, compensator)
         actuator = model.forward(RATE_HZ)
         reference = 8.0 * np.sin(2.0 * np.pi * 5.0 * np.arange(5000) / RATE_HZ) ** 3

@@ -44,6 +44,7 @@ class Rig:
             interlocks=InterlockContext(stroke_um=options.get("stroke_um", (-60.0, 60.0))),
             late_policy=options.get("policy", "skip"),
             late_rules=LateRules(**{**late, **options.get("late", {})}),
+            conditioning=options.get("conditioning"),
             keep_all=options.get("keep_all", False),
         )
         self.loop = Loop(plan, self.device, self.host)

@@ -1,8 +1,10 @@
 """Pacing on absolute deadlines, with a clock that the test turns."""
 
+import errno
+
 import pytest
 
-from hilctl.loop.pacer import LateRules, Pacer, SystemClock, deadline_misses
+from hilctl.loop.pacer import Lateness, LateRules, Pacer, SystemClock, deadline_misses
 from tests.fakes import FakeClock
 
 PERIOD_NS = 1_000_000
@@ -163,6 +165,68 @@ def test_system_clock_sleeps_to_a_deadline():
     clock.sleep_until_ns(deadline_ns)
 
 
+def test_sleep_that_a_signal_interrupts_goes_on():
+    """To the same deadline, as it is absolute; any other error is one."""
+    clock, codes, deadlines = SystemClock(), [errno.EINTR, errno.EINTR, 0], []
+
+    def nanosleep(kind, flags, spec, left):
+        deadlines.append((spec._obj.tv_sec, spec._obj.tv_nsec))
+        return codes.pop(0)
+
+    clock._nanosleep = nanosleep
+    clock.sleep_until_ns(3_000_000_007)
+    assert deadlines == [(3, 7)] * 3
+    codes.append(errno.EINVAL)
+    with pytest.raises(OSError, match="Invalid argument") as caught:
+        clock.sleep_until_ns(0)
+    assert caught.value.errno == errno.EINVAL
+
+
+class TestTooLate:
+    """Lateness that ends a run, and lateness that does not."""
+
+    def paced(self, stalls_ns, ticks, **rules):
+        """Return a pacer after so many ticks; every sleep but those named ends in time."""
+        rules = LateRules(late_after_ns=0.5 * PERIOD_NS, **rules)
+        made = Pacer(FakeClock(0, stalls_ns), PERIOD_NS, "catch_up", rules)
+        made.begin(0)
+        for _ in range(ticks):
+            made.wait()
+        return made
+
+    def test_nothing_is_counted_before_the_first_late_tick(self):
+        paced = self.paced({}, 3)
+        assert paced.counters == Lateness(0, 0, 0, 0, 0)
+        assert paced.late_run == 0
+        assert self.paced({}, 0).late_run == 0
+        assert Lateness() == Lateness(0, 0, 0, 0, 0)
+
+    def test_without_a_rule_no_lateness_ends_a_run(self):
+        paced = self.paced({0: 100 * PERIOD_NS}, 90)
+        assert paced.late_run == 90
+        assert paced.too_late() == ""
+
+    @pytest.mark.parametrize(("beyond_ns", "ends"), [(0, False), (1, True)])
+    def test_one_tick_beyond_the_limit_ends_it(self, beyond_ns, ends):
+        paced = self.paced({2: 1_250_000_000 + beyond_ns}, 3, max_late_ns=1_250_000_000)
+        said = "tick 2 woke 1.250 s late, more than the limit"
+        assert paced.too_late() == (said if ends else "")
+
+    @pytest.mark.parametrize(("ticks", "ends"), [(5, False), (6, True)])
+    def test_so_many_in_a_row_end_it(self, ticks, ends):
+        """As many as the rule says: not one more, and none that came before a tick in time."""
+        stalls_ns = {0: PERIOD_NS, 3: 100 * PERIOD_NS}
+        paced = self.paced(stalls_ns, ticks, max_consecutive_late=3)
+        assert paced.too_late() == ("3 ticks in a row woke late, up to tick 5" if ends else "")
+        assert paced.counters.longest_run == ticks - 3
+
+    def test_the_grace_ends_with_its_tick(self):
+        rules = {"max_late_ns": 1.0, "grace_ticks": 4}
+        stalls_ns = {0: 100 * PERIOD_NS}
+        assert self.paced(stalls_ns, 4, **rules).too_late() == ""
+        assert self.paced(stalls_ns, 5, **rules).too_late()
+
+
 class TestFollow:
     """Deadlines follow a device whose exchange waits for its own clock."""
 
@@ -195,7 +259,8 @@ class TestFollow:
         """Exchanges that return at once move the deadlines; the ticks after them are on time."""
         burst = 8
         paced, late_ns = self.run(FakeClock(5_000), lambda k: PERIOD_NS if k >= burst else 0, 100)
-        assert max(late_ns) == 0
+        assert max(late_ns) == min(late_ns) == 0
+        assert paced.deadline_ns == 10_000 + (100 - 1 - burst) * PERIOD_NS
         assert paced.counters.late_ticks == 0
 
     def test_a_stall_is_late_and_soon_forgotten(self):

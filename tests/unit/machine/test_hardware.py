@@ -1,5 +1,7 @@
 """What the computer itself does to a loop: processor, firmware, clock and serial adapters."""
 
+from pathlib import Path
+
 import pytest
 
 from hilctl.machine import findings, hardware
@@ -88,3 +90,14 @@ def test_disk_space(make_machine, tmp_path, free, level):
     """Little room for recordings is bad; the folder need not exist yet."""
     folder = tmp_path / "not" / "yet"
     assert check(hardware.disk_space, make_machine(free=free), folder)[0] == level
+
+
+def test_disk_space_without_a_working_folder(make_machine, tmp_path, monkeypatch):
+    """It was deleted: relative names lead nowhere, absolute ones still do."""
+    (tmp_path / "gone").mkdir()
+    monkeypatch.chdir(tmp_path / "gone")
+    (tmp_path / "gone").rmdir()
+    level, said, remedy = check(hardware.disk_space, make_machine(), Path("recordings"))
+    assert (level, remedy) == ("bad", "change to another one")
+    assert said == "recordings: the working folder has been deleted"
+    assert check(hardware.disk_space, make_machine(free=1 << 40), tmp_path)[0] == "ok"

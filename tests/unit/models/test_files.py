@@ -167,17 +167,18 @@ def test_files_that_cannot_be_read_say_so(tmp_path):
         load_model(binary)
 
 
-def test_damaged_files_are_refused_in_words():
-    """Two thousand damaged model files: each is read or refused, and never anything else."""
+@pytest.mark.parametrize("count", [200, pytest.param(2_000, marks=pytest.mark.slow)])
+def test_damaged_files_are_refused_in_words(count):
+    """Damaged model files: each is read or refused, and never anything else."""
     texts = [RDPI, dump_model(OMEGA)]
     refusals = []
-    for seed in range(2_000):
+    for seed in range(count):
         rng = random.Random(seed)
         text = mutated(rng, rng.choice(texts))
         try:
             parse_model("m.yaml", text)
         except InputError as error:
             refusals.append(str(error))
-    assert len(refusals) > 1_500
+    assert len(refusals) > 0.75 * count
     assert all(text.startswith("m.yaml") for text in refusals)
     assert "\n".join(refusals).encode("utf-8")

@@ -51,3 +51,33 @@ def test_a_pipe_is_no_place_for_a_recording(tmp_path, overwrite, said):
     os.mkfifo(tmp_path / "run.mcap")
     with pytest.raises(OSError, match=said):
         OutputFile(tmp_path / "run.mcap", overwrite=overwrite)
+
+
+class FullDisk:
+    """An open file whose last bytes the disk refuses when it is closed."""
+
+    def close(self):
+        raise OSError(28, "No space left on device")
+
+
+def test_a_claimed_file_is_given_back_on_a_full_disk_too(tmp_path):
+    claimed = OutputFile(tmp_path / "run.mcap", overwrite=False)
+    claimed.stream.close()
+    claimed.stream = FullDisk()
+    claimed.give_back()
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_claimed_file_that_is_gone_can_be_given_back(tmp_path):
+    """Why the run does not start is told, and not that."""
+    claimed = OutputFile(tmp_path / "run.mcap", overwrite=False)
+    (tmp_path / "run.mcap").unlink()
+    claimed.give_back()
+    assert claimed.stream.closed
+
+
+def test_a_file_that_stood_there_stays(tmp_path):
+    path = tmp_path / "run.mcap"
+    path.write_bytes(b"before")
+    OutputFile(path, overwrite=True).give_back()
+    assert path.read_bytes() == b"before"

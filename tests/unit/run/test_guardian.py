@@ -6,6 +6,7 @@ import subprocess
 import sys
 import threading
 import time
+from contextlib import suppress
 from types import SimpleNamespace
 
 import pytest
@@ -21,12 +22,14 @@ SLEEP = [sys.executable, "-c", "import time; time.sleep(600)"]
 
 
 class Device:
-    """Notes what it is asked for, and whether the loop was alive then."""
+    """Notes what it is asked for, and whether the loop was left to live then."""
 
     def __init__(self, loop, error=None):
         self.loop, self.error, self.asked = loop, error, []
 
     def make_safe(self, value):
+        with suppress(subprocess.TimeoutExpired):  # one that was killed may still be dying
+            self.loop.wait(5.0)
         self.asked.append((value, self.loop.poll() is None))
         if self.error:
             raise self.error

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hilctl.base.errors import RunError
 from hilctl.run.job import Job
 from hilctl.run.run_folder import run_folder
 from hilctl.run.start import checked_experiment
@@ -44,3 +45,15 @@ def test_an_input_that_is_the_reference_is_kept_once(folder):
     job = Job.of(plain, folder, supervisor=1, silence_s=1.0)
     assert (job.reference == job.input_um) == (plain.begun.input_um is plain.reference.values)
     assert job.memory is None if plain.begun.state is None else job.memory is not None
+
+
+def test_samples_that_find_no_room_are_told(folder, monkeypatch):
+    """With what needs less of it: numpy gives no reason of its own."""
+
+    def save(path, values):
+        raise OSError("8000 requested and 512 written")
+
+    plain = checked_experiment(CONFIGS / "terfenol_sine_6a_uncompensated.yaml", [])
+    monkeypatch.setattr(np, "save", save)
+    with pytest.raises(RunError, match=r"npy: no memory: 8000 requested and 512 written; less rec"):
+        Job.of(plain, folder, supervisor=1, silence_s=1.0)

@@ -1,15 +1,23 @@
 """The loop's process, run in this one: what it says when something breaks."""
 
+import io
+import json
+import os
+import signal
+import time
 from pathlib import Path
 
 import pytest
 
 from hilctl.base.errors import DeviceError, InputError, RunError
+from hilctl.loop.pacer import Lateness
+from hilctl.loop.plan import Outcome
+from hilctl.machine.realtime import SetUpStep
 from hilctl.run import loop_process
 from hilctl.run.job import Job
 from hilctl.run.ring import SampleRing
 from hilctl.run.run_folder import RunCard, RunFolder
-from hilctl.run.shared_page import Field, Phase
+from hilctl.run.shared_page import Field, PageText, Phase
 from hilctl.run.start import checked_experiment
 
 EXPERIMENT = Path(__file__).parents[3] / "configs" / "demo.yaml"
@@ -36,25 +44,53 @@ class Closing:
         self.events.append("close")
 
 
+class Prepared:
+    """A job with everything it needs, a device that notes what is asked of it, and the page."""
+
+    def __init__(self, folder, monkeypatch, **device_is):
+        checked = checked_experiment(EXPERIMENT, ["waveform.duration_s=1.0"])
+        folder = RunFolder(folder, RunCard("demo", "demo", "", 1, 0.0))
+        self.ring = SampleRing.create(
+            folder.ring, slots=16, block=50, state_size=checked.state_size
+        )
+        self.page = self.ring.page
+        self.page.put(Field.GO, 1)
+        self.job = Job.of(checked, folder, supervisor=os.getppid(), silence_s=1.0)
+        self.loaded = self.job.load()
+        self.device = Closing(checked.loaded.device.info, **device_is)
+        object.__setattr__(self.loaded, "device", self.device)
+        self._patch = monkeypatch
+        self.steps = ()
+        monkeypatch.setattr(loop_process, "prepare", self._prepare)
+
+    def _prepare(self, settings):
+        assert settings is self.loaded.config.realtime
+        self.device.events.append("prepare")
+        return self.steps
+
+    def loop_does(self, run):
+        self._patch.setattr("hilctl.loop.loop.Loop.run", run)
+
+    def run(self):
+        return loop_process.run_job(self.job, self.ring, self.loaded)
+
+
 @pytest.fixture
-def broken(tmp_path, monkeypatch):
+def prepared(tmp_path, monkeypatch):
+    """Return a function that makes a job; arguments are the device's."""
+    return lambda **device_is: Prepared(tmp_path, monkeypatch, **device_is)
+
+
+@pytest.fixture
+def broken(prepared):
     """Run a job that breaks; return its device, what was raised and the page."""
 
     def run(**device_is):
-        checked = checked_experiment(EXPERIMENT, ["waveform.duration_s=1.0"])
-        folder = RunFolder(tmp_path, RunCard("demo", "demo", "", 1, 0.0))
-        info = checked.loaded.device.info
-        ring = SampleRing.create(folder.ring, slots=16, block=50, state_size=checked.state_size)
-        ring.page.put(Field.GO, 1)
-        job = Job.of(checked, folder, supervisor=1, silence_s=1.0)
-        loaded = job.load()
-        device = Closing(info, **device_is)
-        object.__setattr__(loaded, "device", device)
-        monkeypatch.setattr(loop_process, "prepare", lambda settings: ())
-        monkeypatch.setattr("hilctl.loop.loop.Loop.run", lambda self, start_ns: 1 / 0)
+        made = prepared(**device_is)
+        made.loop_does(lambda self, start_ns: 1 / 0)
         with pytest.raises((ZeroDivisionError, RunError, InputError)) as caught:
-            loop_process.run_job(job, ring, loaded)
-        return device, caught.value, ring.page
+            made.run()
+        return made.device, caught.value, made.page
 
     return run
 
@@ -62,7 +98,7 @@ def broken(tmp_path, monkeypatch):
 def test_a_loop_that_breaks_makes_the_output_safe_and_closes(broken):
     """The error is the loop's own."""
     device, error, page = broken(reachable=True)
-    assert device.events == ["open", "make_safe", "close"]
+    assert device.events == ["prepare", "open", "make_safe", "close"]
     assert isinstance(error, ZeroDivisionError)
     assert page.get(Field.PHASE) == Phase.RUNNING
 
@@ -79,7 +115,7 @@ def test_the_cause_is_not_lost_behind_a_device_that_can_not_be_reached(broken):
 def test_a_start_that_is_refused_moves_nothing(broken, output):
     """Not to the safe value either, which would be the jump that the refusal is to spare."""
     device, error, page = broken(output=output)
-    assert device.events == ["open", "close"]
+    assert device.events == ["prepare", "open", "close"]
     assert isinstance(error, InputError)
     assert str(error).endswith("nothing has moved")
     assert page.get(Field.PHASE) == Phase.STARTING
@@ -90,3 +126,116 @@ def test_the_waveform_begins_after_the_ramp(broken, output, ramps):
     """The recorder needs to know before the first sample: the page says it."""
     _, _, page = broken(output=output)
     assert (page.get(Field.WAVEFORM_AT) > 0) == ramps
+
+
+OUTCOME = Outcome("completed", "waveform completed", 7, True, 0)
+REFUSED = (SetUpStep("fifo", "failed", "not permitted", "raise rtprio"),)
+
+
+def test_the_loop_is_started_at_the_time_that_the_supervisor_says(prepared):
+    """It is ready with all that it set up, says so, and leaves how late it was."""
+    made = prepared()
+    made.page.put(Field.START_NS, 12345)
+    made.steps = REFUSED
+    seen = []
+
+    def run(loop, start_ns):
+        seen.append((start_ns, made.page.get(Field.PHASE)))
+        loop.lateness.late_ticks, loop.lateness.worst_ns = 3, 70
+        return OUTCOME
+
+    made.loop_does(run)
+    assert made.run() == OUTCOME
+    assert seen == [(12345, Phase.RUNNING)]
+    assert made.page.get(Field.PHASE) == Phase.CLOSING
+    assert made.device.events == ["prepare", "open", "close"]
+    assert made.page.lateness() == Lateness(late_ticks=3, worst_ns=70)
+    facts, refused = json.loads(made.page.read_text(PageText.SET_UP))
+    assert facts == {"rt.fifo": "failed: not permitted"}
+    assert refused == ["fifo: not permitted: raise rtprio"]
+
+
+@pytest.mark.parametrize("required", [False, True])
+def test_real_time_that_is_required_is_refused_before_the_device_is_opened(prepared, required):
+    made = prepared()
+    made.steps = REFUSED
+    made.loop_does(lambda loop, start_ns: OUTCOME)
+    realtime = made.loaded.config.realtime.model_copy(update={"require": required})
+    config = made.loaded.config.model_copy(update={"realtime": realtime})
+    object.__setattr__(made.loaded, "config", config)
+    if not required:
+        assert made.run() == OUTCOME
+        return
+    with pytest.raises(InputError, match="real time is required and can't be had"):
+        made.run()
+    assert made.device.events == ["prepare"]
+
+
+class Waiting:
+    """Time that the loop lets pass while it waits for the start signal."""
+
+    def __init__(self, made, supervised=True):
+        self.made, self.supervised, self.slept_s = made, supervised, []
+
+    def sleep(self, seconds):
+        assert self.made.page.get(Field.PHASE) == Phase.READY
+        self.slept_s.append(seconds)
+        if len(self.slept_s) == 3:
+            self.made.page.put(Field.GO, 1)
+
+    def __getattr__(self, name):
+        return getattr(time, name)
+
+
+def test_it_waits_for_the_start_signal(prepared, monkeypatch):
+    """Ready, and looking often: what it sleeps is missing between the signal and sample 0."""
+    made = prepared()
+    made.page.put(Field.GO, 0)
+    made.loop_does(lambda loop, start_ns: OUTCOME)
+    waiting = Waiting(made)
+    monkeypatch.setattr(loop_process, "time", waiting)
+    assert made.run() == OUTCOME
+    assert len(waiting.slept_s) == 3
+    assert max(waiting.slept_s) < 0.005
+
+
+def test_it_does_not_wait_for_a_supervisor_that_died(prepared, monkeypatch):
+    made = prepared()
+    made.page.put(Field.GO, 0)
+    made.loop_does(lambda loop, start_ns: OUTCOME)
+    monkeypatch.setattr("hilctl.run.host.RingHost.supervised", lambda host: False)
+    with pytest.raises(DeviceError, match="the supervisor died before the start"):
+        made.run()
+    assert made.device.events[-1] == "close"
+    assert made.page.get(Field.PHASE) == Phase.READY
+
+
+@pytest.mark.parametrize(
+    ("raised", "code", "phase", "text"),
+    [
+        (None, 0, Phase.ENDED, ""),
+        (InputError("no such output"), 1, Phase.REFUSED, "no such output"),
+        (DeviceError("no answer"), 1, Phase.FAILED, "no answer"),
+        (RunError("then that"), 1, Phase.FAILED, "then that"),
+        (KeyError("a bug"), 1, Phase.FAILED, "the loop broke: KeyError: 'a bug'"),
+    ],
+)
+def test_all_that_it_has_to_say_is_in_the_page(prepared, monkeypatch, raised, code, phase, text):
+    """The supervisor tells by the phase what is there: an outcome, a refusal, or a fault."""
+    made, ignored = prepared(), {}
+
+    def run_job(job, ring, loaded):
+        assert job == made.job
+        if raised is not None:
+            raise raised
+        return OUTCOME
+
+    monkeypatch.setattr(loop_process.sys, "stdin", io.StringIO(made.job.to_json()))
+    monkeypatch.setattr(loop_process.signal, "signal", ignored.__setitem__)
+    monkeypatch.setattr(loop_process, "run_job", run_job)
+    assert loop_process.main() == code
+    assert made.page.get(Field.PHASE) == phase
+    assert made.page.read_text(PageText.ERROR) == text
+    assert made.page.outcome() == (OUTCOME if code == 0 else None)
+    # A stop comes from the supervisor alone, so that it ends by the ramp.
+    assert ignored == dict.fromkeys((signal.SIGINT, signal.SIGTERM, signal.SIGHUP), signal.SIG_IGN)

@@ -1,11 +1,13 @@
 """The recorder of a run whose file can't be written to its end: every sample is counted once."""
 
 import io
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from hilctl.base.errors import InputError
 from hilctl.base.samples import Batch, Head
 from hilctl.recording.reader import read
 from hilctl.run import recorder
@@ -187,13 +189,30 @@ def test_a_recording_that_is_emptied_begins_anew(checked, tmp_path):
     ]
 
 
-def test_a_recording_that_can_not_be_put_back_is_an_error(checked, tmp_path):
+@pytest.fixture
+def on_a_disk(checked, tmp_path):
+    """A recorder in a folder that may go."""
     folder = tmp_path / "disk"
     folder.mkdir()
-    made = Recorder(checked, folder / "run.mcap", overwrite=False)
-    made.begin(10**18, {})
-    made.path.unlink()
-    folder.rmdir()
-    made.flush()
-    made.finish(END, 0)
-    assert "somebody has taken it away: No such file or directory" in made.error
+    return Recorder(checked, folder / "run.mcap", overwrite=False)
+
+
+def test_a_recording_that_can_not_be_put_back_is_an_error(on_a_disk):
+    """What was in it is lost with it: nobody can read a file without a name."""
+    on_a_disk.begin(10**18, {})
+    on_a_disk.batch(batch(0, 20))
+    assert on_a_disk.flush()
+    assert (on_a_disk.samples, on_a_disk.missing) == (200, 0)
+    shutil.rmtree(on_a_disk.path.parent)
+    on_a_disk.flush()
+    on_a_disk.finish(END, 200)
+    assert "somebody has taken it away: No such file or directory" in on_a_disk.error
+    assert (on_a_disk.samples, on_a_disk.missing) == (0, 200)
+
+
+def test_a_recording_that_is_taken_away_before_the_start_is_refused(on_a_disk):
+    """Claimed, and gone before anything has moved."""
+    shutil.rmtree(on_a_disk.path.parent)
+    with pytest.raises(InputError, match="taken it away: No such file or directory"):
+        on_a_disk.begin(10**18, {})
+    on_a_disk.give_back()

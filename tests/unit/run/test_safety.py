@@ -22,7 +22,7 @@ class Guardian:
         self.phase = GuardianPhase.WATCHING
         self.heartbeat_ns = 0
 
-    def kill(self):
+    def kill(self, wait_s=None):
         self.log.append("guardian killed")
         self.ended = True
 
@@ -41,10 +41,18 @@ class Run:
             make_safe=lambda value: self.log.append(f"safe {value}"),
         )
         timing = SimpleNamespace(hang_s=None, max_late_s=1.0)
-        config = SimpleNamespace(timing=timing, tick_s=0.01, safe=SimpleNamespace(value=0.25))
+        config = SimpleNamespace(
+            timing=timing,
+            tick_s=0.01,
+            safe=SimpleNamespace(value=0.25),
+            realtime=SimpleNamespace(priority=80),
+        )
         self.checked = SimpleNamespace(loaded=SimpleNamespace(config=config, device=device))
-        child = SimpleNamespace(pid=1, kill=lambda: self.log.append("loop killed"))
+        child = SimpleNamespace(pid=1, kill=lambda wait_s: self.log.append("loop killed"))
         monkeypatch.setattr(module, "is_stopped", lambda pid: False)
+        self.priorities = []
+        monkeypatch.setattr(module, "be_quick", self.priorities.append)
+        monkeypatch.setattr(module, "be_ordinary", lambda: self.priorities.append(0))
         start = self.start if guarded else None
         self.safety = Safety(self.checked, page, child, start, self.events.append)
 
@@ -103,12 +111,14 @@ def test_where_the_guardian_can_not_the_supervisor_does(run, what):
     assert run.settle() == MadeSafe(hung=False, error="")
     assert run.log == ["guardian killed", "loop killed", "safe 0.25"]
     assert run.safety.by == "supervisor"
+    # Both threads that do it stand before the loop, and one of them goes back.
+    assert sorted(run.priorities) == [0, 81, 81]
 
 
 def test_a_guardian_that_was_just_done_when_it_was_killed_is_believed(run, page):
     """Nothing is sent twice."""
     guardian = run.guardians[0]
-    guardian.kill = lambda: page.leave_made_safe(MadeSafe(hung=False, error=""))
+    guardian.kill = lambda wait_s: page.leave_made_safe(MadeSafe(hung=False, error=""))
     run.look(ended=True, passed_ms=60, awake=False)
     assert run.safety.by == "guardian"
     assert "safe 0.25" not in run.log

@@ -65,6 +65,8 @@ class Spring(Device):
 
     def output(self) -> float:
         """Return the current that it puts out; it keeps it while it is not open."""
+        if not self._block:
+            raise DeviceError("spring: is not open")
         return self._current_a
 
     def exchange(

@@ -39,7 +39,7 @@ class ScriptedPort:
             self.is_in_step = False
             raise NoAnswerError(f"no answer within {self.timeout_s:g} s")
         if self.late_answers and self.late_s:
-            self.is_in_step = False  # this one's answer is late, too
+            # The port takes any whole answer for a good one: it does not know what was asked.
             raise DeviceError("an answer to something else")
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from hilctl.base.arrays import F64
+from hilctl_drivers.simulated.pinned_cells import PinnedCellsParameters
 from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
 
 RATED = TerfenolParameters()
@@ -147,7 +148,8 @@ class TestPublishedFigures:
         mass_kg = RATED.moving_mass_kg + load_kg
         damped = np.sqrt(RATED.stiffness_n_per_m / mass_kg * (1.0 - RATED.damping_ratio**2))
         # Far less lag than rated, and no current loop to speak of: the ringing stands alone.
-        brisk = replace(QUIET, lag_s=1e-5, amplifier_bandwidth_hz=50e3, dac_codes=2**30)
+        rods = replace(PinnedCellsParameters(), lag_s=1e-5)
+        brisk = replace(QUIET, rods=rods, amplifier_bandwidth_hz=50e3, dac_codes=2**30)
         ringing = run(TerfenolActuator(brisk, 200e3, load_kg), np.full(20_000, 0.1))
         ringing -= ringing[-1]
         crossings = np.flatnonzero(np.diff(np.sign(ringing)))[:5]
@@ -191,7 +193,7 @@ class TestTiming:
 
     def test_sensor_stops_at_its_range(self) -> None:
         """A displacement beyond +-10 V of sensor output reads as the end of the range."""
-        strong = replace(QUIET, strain_um=1500.0)
+        strong = replace(QUIET, rods=replace(PinnedCellsParameters(), strain_um=1500.0))
         displacement_um = run(TerfenolActuator(strong, RATE_HZ), np.repeat([-9.0, 9.0], 1000))
         assert displacement_um.min() == -125.0
         assert displacement_um.max() == 125.0

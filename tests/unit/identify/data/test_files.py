@@ -45,6 +45,19 @@ def test_a_history_that_begins_with_a_ramp_is_refused(recording_of):
         history_from_recording(recording)
 
 
+@pytest.mark.parametrize("ramp", [0, 20])
+def test_a_conditioned_history_begins_with_its_cycle(recording_of, ramp):
+    """What made the state belongs to the history, and is not judged; what was before is not."""
+    command = np.linspace(0.0, 1.0, 150)
+    recording = recording_of(command, 2.0 * command, [])
+    recording.samples.flags[:ramp] |= Flag.RAMP.value
+    recording.samples.flags[ramp:60] |= Flag.CONDITION.value
+    recording.samples.flags[130:] |= Flag.RAMP.value
+    history = history_from_recording(recording)
+    np.testing.assert_array_equal(history.command, command[ramp:130])
+    assert history.ignore == 60 - ramp
+
+
 @pytest.mark.parametrize("what", ["begins late", "has a gap", "has no reading"])
 def test_a_history_with_missing_samples_is_refused(recording_of, what):
     """A model's memory would be another behind the gap."""

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hilctl.identify.staged.confidence import standard_errors
+from hilctl.identify.staged.confidence import at_bound, standard_errors
 from hilctl.identify.staged.fit_data import Linear
 from hilctl.identify.staged.layered import DYNAMIC, Layers, Point
 from hilctl.identify.staged.search import StagedEnd
@@ -15,7 +15,7 @@ POINT = Point(np.zeros(4), Linear(), 1.0, np.ones(1), (1.0, 1.0), np.zeros(0), n
 PLACES = tuple(slice(EACH * i, EACH * (i + 1)) for i in range(RECORDS))
 
 
-def ended(noise_um, free, seed=1):
+def ended(noise_um, free, seed=1, bound=()):
     """Where a search ended whose errors are each record's own deviation of a_0."""
     rng = np.random.default_rng(seed)
     slopes = np.zeros((RECORDS * EACH, SIZE))
@@ -25,7 +25,9 @@ def ended(noise_um, free, seed=1):
     errors = slopes[:, DYNAMIC] * np.repeat(own - own.mean(), EACH)
     mask = np.zeros(SIZE, dtype=bool)
     mask[list(free)] = True
-    return StagedEnd(POINT, errors, slopes, mask, np.ones(RECORDS * EACH), ())
+    held = np.zeros(SIZE, dtype=bool)
+    held[list(bound)] = True
+    return StagedEnd(POINT, errors, slopes, mask, held, np.ones(RECORDS * EACH), ())
 
 
 def test_records_that_differ_by_so_much_give_so_much_over_their_root():
@@ -42,3 +44,9 @@ def test_a_parameter_that_was_not_free_has_none():
 
 def test_one_record_disagrees_with_nobody():
     assert standard_errors(ended(0.5, [DYNAMIC]), LAYERS, PLACES[:1], staged=True) == {}
+
+
+def test_what_a_bound_holds_is_named():
+    """Of what is in the model: it has no lag, so there is none to stand anywhere."""
+    held = at_bound(ended(0.5, [], bound=[0, SPACING, DYNAMIC + 1]), LAYERS, staged=True)
+    assert held == ("alpha", "a_1")

@@ -1,6 +1,7 @@
 """Lag, hysteresis, structure and delay are found again together from their own loops."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -71,3 +72,24 @@ def test_without_a_lag_thresholds_grow(loops_of: Loops) -> None:
     assert found.model.delay_s == pytest.approx(4e-5, abs=2e-6)
     assert found.parameters["gamma"] < 1e-5
     assert found.own_peak_percent < 0.3
+
+
+def test_at_a_low_rate_the_delay_is_that_of_the_sampled_lag(loops_of: Loops) -> None:
+    """At 1 kHz a lag of 0.1 ms is a whole sample late: half of it is no delay of the actuator."""
+    slow = [(a, f / 10.0) for a, f in GRID]
+    made = loops_of(truth(lag=FieldLag(tau_s=1e-4)), slow, rate_hz=1000.0)
+    found = fit(made, lag="plain", structure=False)
+    assert isinstance(found.model, StagedModel)
+    assert found.model.delay_s < 5e-5
+    assert found.own_peak_percent < 1.0
+
+
+def test_a_low_pass_behind_the_plant_is_a_structure(loops_of: Loops) -> None:
+    """That of a sensor, of 1 kHz and first order: no resonance, and no mass to find."""
+    loops = []
+    for loop in loops_of(truth(lag=FieldLag(tau_s=1e-4)), GRID):
+        s = 2j * np.pi * loop.frequency_hz * np.arange(loop.command.size // 2 + 1)
+        slower = np.fft.rfft(loop.displacement_um) / (1.0 + s / (2.0 * np.pi * 1000.0))
+        passed = np.fft.irfft(slower, loop.command.size)
+        loops.append(replace(loop, displacement_um=passed))
+    assert fit(loops).own_peak_percent < 1.0

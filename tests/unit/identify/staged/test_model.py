@@ -7,9 +7,8 @@ import pytest
 
 from hilctl.identify.fit_data import FitData
 from hilctl.identify.staged.fit_data import Linear, StagedFitData
-from hilctl.identify.staged.layered import Layers, Point
+from hilctl.identify.staged.layered import Layers, Point, loop_delay_s
 from hilctl.identify.staged.model import (
-    loop_delay_s,
     parameters,
     response_um,
     staged_model,
@@ -17,9 +16,10 @@ from hilctl.identify.staged.model import (
     structure_of,
 )
 from hilctl.models.published import exponential_integrated
+from hilctl.models.staged import Structure
 
 HALF_S = 1e-5
-LAYERS = Layers(plays=2, deadbands=1, least_delay_s=HALF_S)
+LAYERS = Layers(plays=2, deadbands=1, half_period_s=HALF_S)
 RADIAN_S = 1.0 / (2.0 * math.pi * 2000.0)
 POINT = Point(
     before=np.array([1e-4, 0.3, 0.5, 0.0]), linear=Linear(5e-5, 0.3 * RADIAN_S, RADIAN_S**2),
@@ -38,19 +38,24 @@ def data(loops_of):
     return StagedFitData(loops, FitData(loops).speeds)
 
 
-def test_a_sampled_loop_has_a_delay_that_is_not_the_model_s():
-    """Half a period behind a lag, which holds its command; a whole one without."""
-    assert loop_delay_s(HALF_S, lag=True) == HALF_S
-    assert loop_delay_s(HALF_S, lag=False) == 2.0 * HALF_S
-
-
 def test_structure_is_told_in_hertz_and_damping():
     assert structure_of(POINT.linear) == pytest.approx((2000.0, 0.15))
 
 
+def test_a_low_pass_keeps_its_time_constant_and_is_a_structure():
+    """A sensor of 1 kHz has no mass: whatever the search found for one is too small to matter."""
+    low_pass = Linear(0.0, 1.6e-4, 1e-14)
+    natural_hz, damping = structure_of(low_pass)
+    Structure(natural_hz=natural_hz, damping_ratio=damping)
+    assert damping / (np.pi * natural_hz) == pytest.approx(1.6e-4)
+    s = 2j * np.pi * 250.0
+    kept = 1.0 / (1.0 + s * 1.6e-4 + (s / (2.0 * np.pi * natural_hz)) ** 2)
+    assert kept == pytest.approx(low_pass.response(np.array([s]))[0], abs=1e-3)
+
+
 def test_parameters_are_under_their_published_names():
     found = parameters(LAYERS, POINT, staged=True)
-    assert found["delay_s"] == pytest.approx(5e-5 - HALF_S)
+    assert found["delay_s"] == 5e-5
     assert (found["a_1"], found["a_2"], found["g_0"]) == (1.0, 0.5, 1.0)
     assert found["g_1"] == pytest.approx(-0.2)
     assert found["g_-1"] == pytest.approx(0.2)
@@ -63,7 +68,7 @@ def test_a_model_has_the_stages_of_its_point_and_gives_them_back(data):
     assert model.structure.natural_hz == pytest.approx(2000.0)
     assert model.hysteresis.thresholds == pytest.approx((0.5, 1.0))
     back = stages_of(model, HALF_S)
-    assert back.delay_s == pytest.approx(POINT.linear.delay_s)
+    assert back.delay_s == pytest.approx(POINT.linear.delay_s + loop_delay_s(HALF_S, 1e-4))
     assert (back.c_s, back.q_s2) == pytest.approx((POINT.linear.c_s, POINT.linear.q_s2))
 
 

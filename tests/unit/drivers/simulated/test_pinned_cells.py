@@ -1,11 +1,11 @@
-"""Compiled steps of the actuator against plain formulas."""
+"""Compiled steps of lag and cells against plain formulas."""
 
 import math
 
 import numpy as np
 import pytest
 
-from hilctl_drivers.simulated.terfenol_kernel import _advance_field, _langevin, free_displacement
+from hilctl_drivers.simulated.pinned_cells import _advance_field, _langevin, free_displacement
 
 MATERIAL = (10_000.0, 50.0, 0.3)
 

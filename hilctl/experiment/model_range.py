@@ -1,0 +1,132 @@
+"""Whether a reference stays within the motions that the model was identified on."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.fft import rfft
+from scipy.signal import detrend
+
+from hilctl.base.arrays import F64
+from hilctl.base.segments import Segment
+from hilctl.models.base import IdentifiedRange
+
+WINDOW_S = 0.2
+FEWEST_SAMPLES = 256  # of a window
+BATCH = 64  # windows at a time: a run of minutes at 50 kHz must not fill the memory
+ALL, MOST = 0.999, 0.5  # parts of a signal's power
+STILL = 0.02  # of the largest motion: windows that move less say nothing
+MARGIN = 1.1  # of the highest frequency
+FAR = 2.0  # the same, beyond which a run is refused
+SMALL = 0.5  # of the smallest motion
+SLOW = 0.5  # of the lowest frequency
+FAST = 1.25  # of the largest speed
+
+
+@dataclass(frozen=True, slots=True)
+class Spectrum:
+    """What frequencies a signal has.
+
+    Attributes:
+        main_hz: Most of the power lies below it, where it lies highest.
+        highest_hz: All but a thousandth of the power lies below it, the same.
+        resolution_hz: How exactly these are known.
+    """
+
+    main_hz: float
+    highest_hz: float
+    resolution_hz: float
+
+
+@dataclass(frozen=True, slots=True)
+class RangeFindings:
+    """Where a reference leaves what a model was identified on.
+
+    Attributes:
+        refused: So far that the run must not start.
+        warnings: So that the error is not known.
+    """
+
+    refused: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+
+def spectrum(values: F64, sample_rate_hz: float, least_move: float = 0.0) -> Spectrum:
+    """Return the frequencies of a signal, window after window.
+
+    Args:
+        values: float64[n].
+        sample_rate_hz: Samples a second.
+        least_move: Peak-to-peak value below which a window is left out.
+    """
+    size = min(max(round(WINDOW_S * sample_rate_hz), FEWEST_SAMPLES), values.size)
+    step_hz = sample_rate_hz / size
+    windows = np.lib.stride_tricks.sliding_window_view(values, size)[:: max(size // 2, 1)]
+    main = highest = 0
+    for first in range(0, len(windows), BATCH):
+        batch = windows[first : first + BATCH]
+        batch = batch[np.ptp(batch, axis=1) > least_move]
+        if not len(batch):
+            continue
+        tapered = detrend(batch, axis=1) * np.hanning(size)
+        power = np.cumsum(np.abs(rfft(tapered, axis=1)) ** 2, axis=1)
+        main = max(main, int((power < MOST * power[:, -1:]).sum(axis=1).max()))
+        highest = max(highest, int((power < ALL * power[:, -1:]).sum(axis=1).max()))
+    return Spectrum(main * step_hz, highest * step_hz, step_hz)
+
+
+def range_findings(
+    known: IdentifiedRange,
+    values_um: F64,
+    segments: tuple[Segment, ...],
+    sample_rate_hz: float,
+) -> RangeFindings:
+    """Hold a reference against what a model was identified on.
+
+    Args:
+        known: The motions that the model was identified on.
+        values_um: float64[n], the reference.
+        segments: Its segments.
+        sample_rate_hz: Samples a second.
+    """
+    found = spectrum(values_um, sample_rate_hz, STILL * known.peak_to_peak_um[1])
+    low_hz, high_hz = known.frequency_hz
+    beyond = 2.0 * found.resolution_hz  # what a window adds to any frequency
+    if found.main_hz > FAR * high_hz + beyond:
+        text = (
+            f"the reference moves at about {found.main_hz:.3g} Hz, and the model was identified "
+            f"on {low_hz:.3g} to {high_hz:.3g} Hz"
+        )
+        return RangeFindings(refused=(text,))
+    warnings = list(_motion_warnings(known, values_um, segments, sample_rate_hz))
+    if found.highest_hz > MARGIN * high_hz + beyond:
+        warnings.append(
+            f"the reference has frequencies up to about {found.highest_hz:.3g} Hz; the model was "
+            f"identified on {low_hz:.3g} to {high_hz:.3g} Hz"
+        )
+    return RangeFindings(warnings=tuple(warnings))
+
+
+def _motion_warnings(
+    known: IdentifiedRange, values_um: F64, segments: tuple[Segment, ...], sample_rate_hz: float
+) -> Iterator[str]:
+    steady = [(each, values_um[each.steady_start : each.steady_stop]) for each in segments]
+    moves = [float(np.ptp(part)) for _, part in steady if part.size and np.ptp(part) > 0.0]
+    smallest_um = known.peak_to_peak_um[0]
+    if moves and min(moves) < SMALL * smallest_um:
+        yield (
+            f"the reference moves by {min(moves):.3g} um peak-to-peak; the smallest motion that "
+            f"the model was identified on is {smallest_um:.3g} um"
+        )
+    turns_hz = [sample_rate_hz / each.period for each in segments if each.period > 0.0]
+    if turns_hz and min(turns_hz) < SLOW * known.frequency_hz[0]:
+        yield (
+            f"the reference repeats at {min(turns_hz):.3g} Hz; the slowest motion that the model "
+            f"was identified on is at {known.frequency_hz[0]:.3g} Hz"
+        )
+    speed = float(np.max(np.abs(np.diff(values_um)), initial=0.0)) * sample_rate_hz
+    if speed > FAST * known.speed_um_per_s:
+        yield (
+            f"the reference moves at up to {speed:.3g} um/s; the model was identified at up to "
+            f"{known.speed_um_per_s:.3g} um/s"
+        )

@@ -1,0 +1,44 @@
+"""The motions that a model is identified on, for whoever runs it."""
+
+import numpy as np
+from scipy.fft import rfft, rfftfreq
+
+from hilctl.base.arrays import F64
+from hilctl.experiment.model_range import ALL, spectrum
+from hilctl.identify.data.records import Record, SteadyLoop
+from hilctl.identify.fit_data import FitData
+from hilctl.models.base import IdentifiedRange
+
+LEAST = 0.01  # part of a history's power below its lowest frequency
+
+
+def identified_range(data: FitData) -> IdentifiedRange:
+    """Return what motions, frequencies and speeds the records have."""
+    moves = [float(np.ptp(data.target_um[place])) for place in data.places]
+    speeds = [
+        move * float(speed.max()) / float(np.ptp(record.command))
+        for move, speed, record in zip(moves, data.speeds, data.records, strict=True)
+    ]
+    lowest, highest = zip(*map(frequencies_hz, data.records), strict=True)
+    return IdentifiedRange(
+        peak_to_peak_um=(min(moves), max(moves)),
+        frequency_hz=(min(lowest), max(highest)),
+        speed_um_per_s=max(speeds),
+    )
+
+
+def frequencies_hz(record: Record) -> tuple[float, float]:
+    """Return the lowest and the highest frequency of a record's command."""
+    command = record.command
+    if isinstance(record, SteadyLoop):
+        return record.frequency_hz, record.frequency_hz * _below(rfft(command - command.mean()))
+    rate_hz = record.sample_rate_hz
+    power = np.cumsum(np.abs(rfft(command - command.mean())) ** 2)
+    first = int(np.searchsorted(power, LEAST * power[-1]))
+    lowest = float(rfftfreq(command.size, 1.0 / rate_hz)[max(first, 1)])
+    return lowest, max(lowest, spectrum(command, rate_hz).highest_hz)
+
+
+def _below(harmonics: F64) -> int:
+    power = np.cumsum(np.abs(harmonics) ** 2)
+    return max(int(np.searchsorted(power, ALL * power[-1])), 1)

@@ -1,0 +1,159 @@
+"""How a fit does on data that it has not seen: parts of the data are left out of it in turn."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from hilctl.base.arrays import F64
+from hilctl.base.device import CommandUnit
+from hilctl.base.errors import DataError
+from hilctl.identify.catalogue import CATALOGUE
+from hilctl.identify.data.records import History, Record, SteadyLoop
+from hilctl.identify.fit_data import FitData, search_data
+from hilctl.identify.job import FitJob, OnProgress
+from hilctl.identify.judge import Judgement, judge, judgement_of
+from hilctl.identify.settings import FitSettings
+from hilctl.identify.workers import Map
+
+FEWEST_LOOPS = 4
+FOLDS = 3
+SEED = 1
+HEAD = 0.7  # part of a history that is fitted, where the rest is held out
+SAME = 0.02  # of a span: what counts as within it
+
+
+@dataclass(frozen=True, slots=True)
+class Fold:
+    """One fit for the sake of what it does not see.
+
+    Attributes:
+        fitted: The records that it sees.
+        held_out: Those that it is judged on.
+    """
+
+    fitted: tuple[Record, ...]
+    held_out: tuple[Record, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class HeldOut:
+    """How a model does on data that its fit did not see.
+
+    Attributes:
+        judgement: The errors.
+        records: The data.
+        how: Where they come from, for people.
+    """
+
+    judgement: Judgement
+    records: tuple[Record, ...]
+    how: str
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return the errors as plain mappings, lists and numbers, for JSON."""
+        return self.judgement.to_mapping() | {"how": self.how}
+
+
+@dataclass(frozen=True, slots=True)
+class _Trial:
+    fold: Fold
+    settings: FitSettings
+    unit: CommandUnit
+
+
+def folds_of(records: Sequence[Record]) -> list[Fold]:
+    """Return what is held out of which fit; none where there are too few data.
+
+    What would narrow the range of commands, frequencies or speeds is not held out: beyond its
+    range a model need not hold, and a run is warned. Of whole histories the last part is held out.
+    """
+    if any(isinstance(record, History) for record in records):
+        heads, tails = zip(*map(_halved, records), strict=True)
+        held_out = tuple(tail for tail in tails if tail is not None)
+        return [Fold(heads, held_out)] if held_out else []
+    if len(records) < FEWEST_LOOPS:
+        return []
+    folds = []
+    # Every third of a grid in its own order would be all loops of one frequency.
+    mixed = np.random.default_rng(SEED).permutation(len(records)).tolist()
+    for first in range(FOLDS):
+        members = sorted(mixed[first::FOLDS])
+        rest = [record for i, record in enumerate(records) if i not in members]
+        out = [records[i] for i in members if _within(records[i], rest)]
+        fitted = tuple(r for r in records if not any(r is other for other in out))
+        if out:
+            folds.append(Fold(fitted, tuple(out)))
+    return folds
+
+
+def held_out_error(
+    records: Sequence[Record],
+    settings: FitSettings,
+    unit: CommandUnit,
+    run: Map,
+    progress: OnProgress,
+) -> HeldOut | None:
+    """Fit with parts of the data left out, and judge on these; None where too few are left.
+
+    Args:
+        records: All data.
+        settings: The choices of the fit; one start of its search is enough.
+        unit: Unit of the command.
+        run: Runs fits that do not depend on each other.
+        progress: Called with what is being done.
+    """
+    lean = settings.model_copy(update={"starts": 1})
+    trials = [_Trial(fold, lean, unit) for fold in folds_of(records)]
+    progress(0.0, f"{len(trials)} fits with data left out")
+    done = [
+        (trial.fold.held_out, modelled)
+        for trial, modelled in zip(trials, run(_modelled_um, trials), strict=True)
+        if modelled is not None
+    ]
+    if not done:
+        return None
+    held_out = tuple(record for out, _ in done for record in out)
+    responses_um = np.concatenate([modelled for _, modelled in done])
+    parts = "the last parts of histories" if isinstance(held_out[-1], History) else "loops"
+    how = f"{len(held_out)} of {len(records)} {parts}, left out of the fit in turn"
+    return HeldOut(judgement_of(FitData(held_out, unit), responses_um), held_out, how)
+
+
+def _modelled_um(trial: _Trial) -> F64 | None:
+    data = search_data(trial.fold.fitted, trial.settings.kind, trial.unit)
+    try:
+        found = CATALOGUE[trial.settings.kind].fit(FitJob(data, trial.settings))
+    except DataError:  # what is left is too little for this kind of fit; all of it need not be
+        return None
+    judged = judge(found.model, trial.fold.held_out, creep=trial.settings.creep)
+    return np.concatenate(judged.modelled_um)
+
+
+def _halved(record: Record) -> tuple[Record, Record | None]:
+    """Return what is fitted of a record, and what is held out; nothing of a loop."""
+    if isinstance(record, SteadyLoop):
+        return record, None
+    label, rate_hz = record.label, record.sample_rate_hz
+    command, displacement_um = record.command, record.displacement_um
+    cut = record.ignore + round(HEAD * (command.size - record.ignore))
+    try:
+        head = History(label, command[:cut], displacement_um[:cut], rate_hz, record.ignore)
+        tail = History(label, command, displacement_um, rate_hz, cut)
+    except DataError:
+        return record, None
+    return (head, tail) if _within(record, [head]) else (record, None)
+
+
+def _within(record: Record, others: Sequence[Record]) -> bool:
+    reached = np.max([_extremes(other) for other in others], axis=0)
+    return bool(np.all(_extremes(record) <= reached + SAME * np.abs(reached)))
+
+
+def _extremes(record: Record) -> F64:
+    """Return what no record held out may exceed: command, frequency and speed, both ways."""
+    command, rate, _ = record.run()
+    frequency_hz = record.frequency_hz if isinstance(record, SteadyLoop) else 0.0
+    speed = float(np.abs(rate).max())
+    return np.array([command.max(), -command.min(), frequency_hz, -frequency_hz, speed])

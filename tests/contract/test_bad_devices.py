@@ -1,0 +1,296 @@
+"""The contract of devices must be able to fail: each of these breaks one rule, and is found out."""
+
+import importlib.util
+from inspect import signature
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hilctl.base.device import DeviceInfo
+from hilctl.base.errors import DeviceError
+
+UM_PER_A = 10.0
+HIGHEST_A = 5.0
+
+
+def _checks():
+    path = Path(__file__).with_name("test_devices.py")
+    spec = importlib.util.spec_from_file_location("device_contract_for_bad_ones", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+CONTRACT = _checks()
+REFUSED = next(
+    mark.args[1]
+    for mark in CONTRACT.test_refuses_what_it_can_not_do.pytestmark
+    if mark.name == "parametrize"
+)
+
+
+class Ideal:
+    """Keeps the contract: a spring without mass, whose output stays where it was put."""
+
+    info = DeviceInfo(
+        name="modbus_dac",
+        description="ideal spring",
+        command_unit="A",
+        command_min=-HIGHEST_A,
+        command_max=HIGHEST_A,
+        sensor_min_um=-100.0,
+        sensor_max_um=100.0,
+        max_rate_hz=20_000.0,
+    )
+
+    def __init__(self):
+        self.current_a, self.is_open = 0.0, False
+
+    def open(self, sample_rate_hz, block):
+        if sample_rate_hz > self.info.max_rate_hz:
+            raise DeviceError("modbus_dac: too fast")
+        self.is_open = True
+
+    def output(self):
+        self.need_open()
+        return self.current_a
+
+    def need_open(self):
+        if not self.is_open:
+            raise DeviceError("modbus_dac: not open")
+
+    def refuse(self, command):
+        if not (np.abs(command) <= HIGHEST_A).all():
+            raise DeviceError("modbus_dac: out of range, nothing was sent")
+
+    def exchange(self, first_sample, command, displacement_um, measured):
+        self.need_open()
+        self.refuse(command)
+        for j, value in enumerate(command):
+            displacement_um[j] = UM_PER_A * self.current_a
+            self.current_a = float(value)
+
+    def make_safe(self, command):
+        self.current_a = command
+
+    def close(self):
+        self.is_open = False
+
+
+class DoesNothing(Ideal):
+    def exchange(self, first_sample, command, displacement_um, measured):
+        pass
+
+    def make_safe(self, command):
+        pass
+
+
+class NeverMadeSafe(Ideal):
+    def make_safe(self, command):
+        pass
+
+
+class SafeOnlyWhileOpen(Ideal):
+    def make_safe(self, command):
+        if self.is_open:
+            self.current_a = command
+
+
+class SafeElsewhere(Ideal):
+    """Puts out zero, whatever the safe value is."""
+
+    def make_safe(self, command):
+        self.current_a = 0.0
+
+
+class LiesAboutItsOutput(Ideal):
+    """Takes what it would like to be there for what is there."""
+
+    def output(self):
+        self.need_open()
+        return 0.0
+
+
+class DoesNotSayWhatItKnows(Ideal):
+    def output(self):
+        self.need_open()
+
+
+class SaysItsOutputWhenClosed(Ideal):
+    def output(self):
+        return self.current_a
+
+
+class Clips(Ideal):
+    def exchange(self, first_sample, command, displacement_um, measured):
+        clipped = np.clip(np.nan_to_num(command), -HIGHEST_A, HIGHEST_A)
+        super().exchange(first_sample, clipped, displacement_um, measured)
+
+
+class ClipsWhatIsWritten(Ideal):
+    """Refuses nothing, and leaves its caller another command than it gave."""
+
+    def refuse(self, command):
+        np.clip(np.nan_to_num(command, copy=False), -HIGHEST_A, HIGHEST_A, out=command)
+
+
+class SendsTheGoodPart(Ideal):
+    """Finds a bad value only when it comes to it."""
+
+    def exchange(self, first_sample, command, displacement_um, measured):
+        for j in range(command.size):
+            part = slice(j, j + 1)
+            super().exchange(first_sample + j, command[part], displacement_um[part], measured[part])
+
+
+class RoundsItsRange(Ideal):
+    """Takes a little less than it says."""
+
+    def refuse(self, command):
+        super().refuse(command * 1.001)
+
+
+class Late(Ideal):
+    """Hands out the displacements of the block before."""
+
+    def __init__(self):
+        super().__init__()
+        self.before_um = 0.0
+
+    def exchange(self, first_sample, command, displacement_um, measured):
+        found = np.empty(command.size)
+        super().exchange(first_sample, command, found, measured)
+        displacement_um[:] = self.before_um
+        self.before_um = found
+
+
+class Early(Ideal):
+    """Reads its sensor after the command has acted."""
+
+    def exchange(self, first_sample, command, displacement_um, measured):
+        super().exchange(first_sample, command, displacement_um, measured)
+        displacement_um[:] = UM_PER_A * command
+
+
+class NeverFillsReadings(Ideal):
+    def exchange(self, first_sample, command, displacement_um, measured):
+        super().exchange(first_sample, command, np.empty(command.size), measured)
+
+
+class FillsTheFirstReading(Ideal):
+    def exchange(self, first_sample, command, displacement_um, measured):
+        found = np.empty(command.size)
+        super().exchange(first_sample, command, found, measured)
+        displacement_um[0] = found[0]
+
+
+class FillsWhatItDoesNotMeasure(Ideal):
+    def exchange(self, first_sample, command, displacement_um, measured):
+        super().exchange(first_sample, command, displacement_um, measured)
+        measured[:] = command
+
+
+class WritesTheCommand(Ideal):
+    def exchange(self, first_sample, command, displacement_um, measured):
+        super().exchange(first_sample, command, displacement_um, measured)
+        command[:] = 0.0
+
+
+class MovesAtOpen(Ideal):
+    def open(self, sample_rate_hz, block):
+        super().open(sample_rate_hz, block)
+        self.current_a = 0.0
+
+
+class NeedsNoOpening(Ideal):
+    def need_open(self):
+        pass
+
+
+class ClosesOnce(Ideal):
+    def close(self):
+        self.need_open()
+        super().close()
+
+
+class TakesAnyRate(Ideal):
+    def open(self, sample_rate_hz, block):
+        self.is_open = True
+
+
+class ByChance(Ideal):
+    """Adds noise of a generator that nobody has seeded."""
+
+    def exchange(self, first_sample, command, displacement_um, measured):
+        super().exchange(first_sample, command, displacement_um, measured)
+        displacement_um += 0.01 * np.random.default_rng().normal(size=command.size)
+
+
+MUST_FAIL = {
+    DoesNothing: {"exchanges_blocks", "make_safe_works_open_or_closed"},
+    NeverMadeSafe: {"make_safe_works_open_or_closed"},
+    SafeOnlyWhileOpen: {"make_safe_works_open_or_closed"},
+    SafeElsewhere: {"make_safe_works_open_or_closed"},
+    LiesAboutItsOutput: {"says_what_it_puts_out"},
+    DoesNotSayWhatItKnows: {"says_what_it_puts_out"},
+    SaysItsOutputWhenClosed: {"says_what_it_puts_out"},
+    Clips: {"refuses_what_it_can_not_do"},
+    ClipsWhatIsWritten: {"refuses_what_it_can_not_do"},
+    SendsTheGoodPart: {"refuses_what_it_can_not_do"},
+    RoundsItsRange: {"takes_its_whole_range"},
+    Late: {"displacement_is_sampled_before_the_command_acts"},
+    Early: {"displacement_is_sampled_before_the_command_acts"},
+    NeverFillsReadings: {"exchanges_blocks", "displacement_is_sampled_before_the_command_acts"},
+    FillsTheFirstReading: {"exchanges_blocks"},
+    FillsWhatItDoesNotMeasure: {"exchanges_blocks"},
+    WritesTheCommand: {"does_not_change_the_command"},
+    MovesAtOpen: {"opening_does_not_move_the_output"},
+    NeedsNoOpening: {"use_before_open_and_after_close_is_refused"},
+    ClosesOnce: {"use_before_open_and_after_close_is_refused"},
+    TakesAnyRate: {"rate_beyond_its_limit_is_refused"},
+    ByChance: {"two_of_a_kind_agree"},
+}  # fmt: skip
+
+
+def failures(kind):
+    """Return the names of the checks that a device fails."""
+
+    def make(case=""):
+        made = kind()
+        return CONTRACT.DrivenDevice(
+            made, CONTRACT.SAMPLES, CONTRACT.RATE_HZ, lambda: made.current_a
+        )
+
+    found = set()
+    for name, check in vars(CONTRACT).items():
+        if not name.startswith("test_") or name.endswith("_left_out"):
+            continue
+        asked = signature(check).parameters
+        for bad in REFUSED if "bad" in asked else [None]:
+            given = {"driven": make(), "make": make, "case": "", "bad": bad}
+            try:
+                check(**{each: given[each] for each in asked})
+            except (AssertionError, DeviceError, pytest.fail.Exception):
+                found.add(name.removeprefix("test_"))
+    return found
+
+
+def test_a_device_that_keeps_the_contract_fails_nothing():
+    """So what others fail is what they break."""
+    assert failures(Ideal) == set()
+
+
+@pytest.mark.parametrize("kind", MUST_FAIL)
+def test_a_device_that_breaks_the_contract_is_found_out(kind):
+    assert failures(kind) >= MUST_FAIL[kind]
+
+
+def test_each_check_finds_somebody_out():
+    """A check that nobody could fail would be none."""
+    checks = {name for name in vars(CONTRACT) if name.startswith("test_")}
+    able = {f"test_{name}" for names in MUST_FAIL.values() for name in names}
+    never = {name for name in checks - able if not name.endswith("_left_out")}
+    assert never == {"test_says_what_it_is_before_it_is_opened"}

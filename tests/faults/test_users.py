@@ -1,0 +1,84 @@
+"""Two users of one machine who want the same device: one has it, the other is told by whom."""
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import pytest
+import yaml
+
+from tests.faults.conftest import EXPERIMENT
+
+# No machine is too busy for it, and no second run comes after its end.
+PATIENT = {
+    "sample_rate_hz": 50,
+    "waveform": {**EXPERIMENT["waveform"], "duration_s": 3600.0},
+    "timing": {"on_misses": "warn", "max_late_s": 30.0, "hang_s": 30.0},
+}
+
+
+class Neighbour:
+    """Another user with a folder of their own."""
+
+    def __init__(self, words, folder, section):
+        self._words, self.folder, self.process = words, folder, None
+        text = yaml.safe_dump({**EXPERIMENT, **PATIENT, "device": section})
+        (folder / "theirs.yaml").write_text(text, encoding="utf-8")
+
+    def start(self):
+        command = [sys.executable, "-P", "-m", "hilctl.cli", "run", "theirs.yaml", "--json"]
+        self.process = subprocess.Popen(
+            [*self._words, *command, "--output", "theirs.mcap"],
+            cwd=self.folder,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env={**os.environ, "HILCTL_RUNS": str(self.folder / "runs"), "HOME": "/nonexistent"},
+        )
+        return self.process
+
+
+@pytest.fixture
+def neighbour(nobody, device):
+    # Not below tmp_path, which is this user's alone.
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        os.chown(folder, *(int(each.partition("=")[2]) for each in nobody[1:3]))
+        made = Neighbour(nobody, folder, device.section)
+        yield made
+        if made.process is not None and made.process.poll() is None:
+            made.process.kill()
+            made.process.communicate()
+
+
+def test_the_second_user_of_a_device_is_refused(neighbour, device, run):
+    """In one message, and the first one's run goes on."""
+    mine = run(device.section, **PATIENT)
+    device.log.await_events("DAC0", 40)
+    theirs = neighbour.start()
+    out, err = theirs.communicate(timeout=240)
+    assert theirs.returncode == 2, err
+    assert len(err.splitlines()) == 1
+    assert f" is in use by process {mine.process.pid} of root: wait for its end" in err
+    assert json.loads(out)["error"]
+    assert not (neighbour.folder / "theirs.mcap").exists()
+    device.log.await_events("DAC0", len(device.log.events("DAC0")) + 20)
+    assert mine.interrupt()["code"] == "stopped"
+
+
+def test_root_does_not_take_a_device_from_a_user(neighbour, device, run):
+    """Who may do anything is refused as well: the lock is the kernel's, not a file's."""
+    theirs = neighbour.start()
+    device.log.await_events("DAC0", 40)
+    said = run(device.section, **PATIENT).refused()
+    assert f" is in use by process {theirs.pid} of nobody: wait for its end" in said
+    assert len(said.splitlines()) == 1
+    device.log.await_events("DAC0", len(device.log.events("DAC0")) + 20)
+    theirs.terminate()
+    out, err = theirs.communicate(timeout=60)
+    assert "Traceback" not in err
+    assert json.loads(out)["output_safe"]
+    assert (neighbour.folder / "theirs.mcap").stat().st_uid != os.geteuid()

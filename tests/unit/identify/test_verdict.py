@@ -1,0 +1,127 @@
+"""What is wrong with data is said; what can't be known from them is not promised."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hilctl.identify.command import identify_records
+from hilctl.identify.data.records import History
+from hilctl.identify.settings import FitSettings
+from hilctl.models.plays import PpiModel
+
+TRUTH = PpiModel(direct=4.0, weights=(1.0, 2.0), thresholds=(2.0, 4.0))
+GRID = [(a, f) for a in (2.0, 4.0, 6.0) for f in (10.0, 50.0, 100.0)]
+
+
+@pytest.fixture
+def grid(loop_of):
+    """Nine loops of a model."""
+    return [loop_of(TRUTH, a, f) for a, f in GRID]
+
+
+def judged(records, validate=(), **choices):
+    chosen = {"plays": 2, "starts": 1, "weights": "free", **choices}
+    return identify_records(records, FitSettings(kind="ppi", **chosen), "A", validate)
+
+
+def changed(records, change):
+    return [replace(each, displacement_um=change(each.displacement_um)) for each in records]
+
+
+def test_a_model_that_holds_on_what_it_did_not_see_is_good(grid):
+    """Eight of nine: without the largest and fastest, it would be beyond what is left."""
+    found = judged(grid)
+    assert found.verdict.grade == "good"
+    assert found.verdict.within_percent < 1.0
+    assert not found.verdict.notes
+    assert found.held_out.how == "8 of 9 loops, left out of the fit in turn"
+    errors = found.fit.model.provenance.errors_percent
+    assert errors["held_out_own_peak"] == found.verdict.within_percent
+
+
+def test_an_error_on_what_was_not_fitted_decides(grid):
+    """However well the fit does on its own data."""
+    others = changed(grid[:1], lambda y: y + 0.1 * np.ptp(y))
+    verdict = judged(grid, others).verdict
+    assert verdict.grade == "usable"
+    assert verdict.within_percent == pytest.approx(10.0, abs=0.5)
+    assert str(verdict).startswith(f"usable within {verdict.within_percent:.2f} %")
+    far = judged(grid, changed(grid[:1], lambda y: y + 0.3 * np.ptp(y))).verdict
+    assert far.grade == "not a model"
+    assert "'sine 2 A 10 Hz', which the fit did not see" in str(far)
+
+
+def dead(y):
+    return np.random.default_rng(y.size).normal(0.0, 0.05, y.size)
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (dead, "does not follow the command: 0 % of its variance goes with it; look for a dead"),
+        (lambda y: 1000.0 * y, "is the displacement in nm"),
+        (lambda y: -y, "falls where the command rises: swap the wires"),
+        (np.abs, "--model butterfly"),
+    ],
+)
+def test_data_that_are_no_actuator_s_are_refused_with_the_reason(grid, change, reason):
+    verdict = judged(changed(grid, change)).verdict
+    assert verdict.grade == "not a model"
+    assert reason in str(verdict)
+
+
+def test_swapped_columns_are_seen_by_what_comes_first(grid):
+    swapped = [replace(r, command=r.displacement_um, displacement_um=r.command) for r in grid]
+    assert "ahead of the command" in str(judged(swapped).verdict)
+
+
+def test_one_record_in_other_units_is_named(grid):
+    odd = [*grid[:4], *changed(grid[4:5], lambda y: y / 1000.0), *grid[5:]]
+    assert "'sine 4 A 50 Hz' moves 0.00" in str(judged(odd).verdict)
+
+
+@pytest.mark.parametrize(
+    ("chosen", "note"),
+    [
+        (slice(0, 1), "nothing was held out"),
+        (slice(0, None, 3), "all loops are at 10 Hz"),
+        (slice(0, 3), "all loops have one amplitude"),
+    ],
+)
+def test_what_a_campaign_can_t_know_is_said_and_nothing_is_good(grid, chosen, note):
+    verdict = judged(grid[chosen]).verdict
+    assert verdict.grade == "usable"
+    assert any(note in each for each in verdict.notes)
+
+
+def test_without_data_held_out_nothing_is_promised(grid):
+    assert str(judged(grid[:1]).verdict).endswith("elsewhere its error is not known")
+
+
+def test_an_offset_is_suggested_where_the_error_is_one(grid):
+    """And not once it is found, or where something else is wrong."""
+    moved = changed(grid, lambda y: y + 4.0)
+    verdict = judged(moved).verdict
+    assert any(note.endswith("--set offset=true finds it") for note in verdict.notes)
+    assert not judged(moved, offset=True).verdict.notes
+
+
+def test_the_last_part_of_a_history_is_held_out():
+    """The model is run through all of it."""
+    time_s = np.arange(4000) / 1000.0
+    command = 5.0 * np.sin(2.0 * np.pi * 5.0 * time_s) * np.cos(2.0 * np.pi * 0.5 * time_s)
+    displacement_um = TRUTH.forward(1000.0).process(command)
+    displacement_um[3500:] += 5.0
+    found = judged([History("beat", command, displacement_um, 1000.0)])
+    assert found.held_out.records[0].ignore == 2800
+    assert found.held_out.judgement.own_peak_percent == pytest.approx(
+        500.0 / np.ptp(displacement_um[2800:]), rel=0.1
+    )
+    assert np.max(np.abs(found.held_out.judgement.modelled_um[0])) > 20.0
+
+
+def test_the_figures_are_plain_values(grid):
+    mapping = judged(grid[:1]).to_mapping()["verdict"]
+    assert mapping["grade"] == "usable"
+    assert mapping["text"].startswith("usable within")

@@ -1,0 +1,155 @@
+"""What comes before a waveform: in the loop, and the offset that is measured at its end."""
+
+import math
+
+import numpy as np
+import pytest
+
+from hilctl.base.events import OFFSET
+from hilctl.base.samples import Flag
+from hilctl.loop.conditioning import Conditioning, RestingOffset
+from tests.fakes import FakeClock, FakeDevice, FakeFifoDevice
+from tests.published import terfenol_rdpi
+from tests.unit.loop.test_loop import LIMITS, RATE_HZ, Rig, sine
+
+CYCLE = np.concatenate((2.0 * np.sin(np.arange(100) * np.pi / 25.0), np.zeros(40)))
+
+
+def conditioning(latency=0, block=10, **options):
+    command = np.concatenate((CYCLE, np.zeros(latency * block)))
+    return Conditioning(command, rest=(120, 140), cycle_samples=100, **options)
+
+
+class Biased(FakeDevice):
+    """Shows 3 um more than ten times the command."""
+
+    def exchange(self, first_sample, command, displacement_um, measured):
+        super().exchange(first_sample, command, displacement_um, measured)
+        displacement_um += 3.0
+
+
+class TestLoop:
+    """The way through it."""
+
+    @pytest.mark.parametrize("output", [0.0, 4.0])
+    @pytest.mark.parametrize("latency", [0, 3])
+    def test_it_comes_after_the_ramp_and_before_the_waveform(self, latency, output):
+        """Every command of it is put out and flagged; the waveform follows in whole blocks."""
+        device = FakeFifoDevice(latency, output) if latency else FakeDevice(output)
+        given = conditioning(latency)
+        rig = Rig(sine(230), block=10, device=device, conditioning=given)
+        assert rig.run().code == "completed"
+        ramp = 40 if output else 0
+        n = ramp + given.command.size
+        assert rig.waveform_at == n
+        assert device.commands[ramp:n] == given.command.tolist()
+        assert device.commands[n : n + 230] == sine(230).tolist()
+        flags = np.concatenate(rig.host.flags)
+        assert (flags[ramp:n] == Flag.CONDITION).all()
+        assert not (flags[n:] & Flag.CONDITION).any()
+        assert np.isnan(rig.host.column(0)[:n]).all()
+        assert np.isnan(rig.host.column(5)[:n]).all()
+        (event,) = (each for each in rig.host.events if each.code == "condition")
+        assert (event.sample, event.values["cycle_samples"]) == (ramp, 100.0)
+
+    def test_it_passes_the_limiter(self):
+        """What is out of range or too fast does not come out, and is flagged."""
+        command = np.concatenate((np.full(20, 9.0), np.zeros(20)))
+        given = Conditioning(command, rest=(30, 40), cycle_samples=20)
+        rig = Rig(sine(50), block=10, conditioning=given)
+        assert rig.run().code == "completed"
+        commands = np.array(rig.device.commands)
+        assert commands[:40].max() == LIMITS.high
+        assert np.abs(np.diff(commands, prepend=0.0)).max() <= LIMITS.slew_per_s / RATE_HZ + 1e-12
+        flags = np.concatenate(rig.host.flags)[:20]
+        assert (flags & (Flag.RANGE_LIMITED | Flag.SLEW_LIMITED)).all()
+
+    def test_an_interlock_ends_the_run_in_it(self):
+        """By the safe ramp, and no waveform follows."""
+        rig = Rig(sine(50), conditioning=conditioning(block=1), stroke_um=(-15.0, 15.0))
+        outcome = rig.run()
+        assert (outcome.code, outcome.safe) == ("fault", True)
+        assert "stroke limits" in outcome.reason
+        assert outcome.ended_at < 60
+        assert np.isnan(rig.host.column(0)).all()
+        assert rig.device.commands[-1] == LIMITS.safe
+
+    def test_a_stop_leaves_it_by_the_safe_ramp(self):
+        """At once, not after the cycle."""
+        beats = iter(range(10_000))
+        rig = Rig(
+            sine(50),
+            conditioning=conditioning(block=1),
+            stop=lambda: "asked" if next(beats) >= 13 else "",
+        )
+        outcome = rig.run()
+        assert (outcome.code, outcome.safe) == ("stopped", True)
+        commands = np.array(rig.device.commands)
+        assert outcome.ended_at < 60
+        assert np.abs(np.diff(commands[13:])).max() <= LIMITS.ramp_per_s / RATE_HZ + 1e-12
+
+    def test_skipped_ticks_leave_the_waveform_where_it_is(self):
+        """The cycle goes on by time; the waveform has all of its samples."""
+        clock = FakeClock(stall_ns={20: 15_000_000, 123: 30_000_000})
+        rig = Rig(sine(50), conditioning=conditioning(block=1), clock=clock, late={})
+        assert rig.run().code == "completed"
+        at = rig.firsts.index(rig.waveform_at)
+        assert rig.firsts[at : at + 50] == list(range(140, 190))
+        assert len(rig.firsts[:at]) < 140
+
+
+class TestOffset:
+    """The resting displacement against the model's."""
+
+    @pytest.mark.parametrize("block", [1, 10])
+    @pytest.mark.parametrize("latency", [0, 3])
+    def test_what_the_sensor_shows_beside_the_model_is_taken_out(self, latency, block):
+        """From the first sample on within the lead-in, out of the input only; once said."""
+        device = FakeFifoDevice(latency) if latency else FakeDevice()
+        given = conditioning(latency, block, stands_um=-3.0, lead_in=50)
+        rig = Rig(
+            10.0 * sine(200), block=block, device=device, model=terfenol_rdpi(), conditioning=given
+        )
+        assert rig.run().code == "completed"
+        reference, fed = (rig.host.column(row)[rig.waveform_at :][:200] for row in (0, 5))
+        assert reference.tolist() == (10.0 * sine(200)).tolist()
+        taken_um = fed - reference
+        assert taken_um[0] == pytest.approx(0.0, abs=0.01)
+        np.testing.assert_allclose(taken_um[49:], -3.0, atol=1e-12)
+        assert np.abs(np.diff(taken_um)).max() < 0.1
+        (event,) = (each for each in rig.host.events if each.code == OFFSET)
+        assert event.sample == rig.waveform_at
+        assert dict(event.values) == {"offset_um": 3.0, "resting_um": 0.0, "model_um": -3.0}
+
+    def test_nothing_is_taken_out_where_none_is_measured(self):
+        """Without the model's displacement there is nothing to hold the sensor against."""
+        rig = Rig(sine(50), device=Biased(), conditioning=conditioning(block=1))
+        assert rig.run().code == "completed"
+        assert rig.host.column(5)[140:190].tolist() == sine(50).tolist()
+
+    def test_an_offset_beyond_the_limit_ends_the_run(self):
+        """It is no offset, but another actuator, another sensor, or a model of neither."""
+        given = conditioning(block=1, stands_um=-3.0, largest_um=2.0)
+        rig = Rig(sine(50), conditioning=given)
+        outcome = rig.run()
+        assert (outcome.code, outcome.safe) == ("fault", True)
+        assert "an offset beyond 2 um: identify the model anew" in outcome.reason
+        assert np.isnan(rig.host.column(0)).all()
+
+    def test_no_reading_is_no_offset(self):
+        """Where nothing was read at rest there is no number, which is beyond every limit."""
+        resting = RestingOffset(conditioning(stands_um=0.0), 40)
+        resting.take(150, np.zeros(10))
+        assert math.isnan(resting.resting_um)
+        given = conditioning(block=1, stands_um=math.nan)
+        outcome = Rig(sine(50), conditioning=given).run()
+        assert (outcome.code, "the model nan um" in outcome.reason) == ("fault", True)
+
+    @pytest.mark.parametrize("size", [1, 7, 20, 200])
+    def test_mean_over_the_rest_whatever_the_block(self, size):
+        """Samples of the window alone count."""
+        shown = np.arange(220.0)
+        resting = RestingOffset(conditioning(), 40)
+        for first in range(0, 220, size):
+            resting.take(first, shown[first : first + size])
+        assert resting.resting_um == np.arange(160.0, 180.0).mean()

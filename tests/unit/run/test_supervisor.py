@@ -1,0 +1,370 @@
+"""The order in which a run is begun, what is given back where it can't be, and what is said of it.
+
+All neighbours are doubles that note what is asked of them; whole runs are in ``tests/faults``.
+"""
+
+import json
+import os
+import signal
+from contextlib import contextmanager
+from types import SimpleNamespace
+
+import pytest
+
+from hilctl.base.errors import InputError, RunError
+from hilctl.loop.pacer import Lateness
+from hilctl.loop.plan import Outcome
+from hilctl.run import supervisor as module
+from hilctl.run.ring import SampleRing
+from hilctl.run.shared_page import Field, PageText
+from hilctl.run.stopping import STOP_SIGNAL
+from hilctl.run.supervisor import Supervisor
+
+MS = 1_000_000
+STARTED = ["ordinary", "worker", "devices", "claimed", "folder", "server", "child", "guardian"]
+READY = [*STARTED, "await ready", "begin", "recording"]
+UNDONE = ["server closed", "folder removed", "devices let go", "worker closed"]
+
+
+class Time:
+    """The machine's time, which passes in sleeps and where a test lets it."""
+
+    def __init__(self):
+        self.now_ns = 10**12
+        self.time = lambda: 5.0
+        self.time_ns = lambda: 10**18 + self.now_ns
+        self.monotonic_ns = lambda: self.now_ns
+
+    def sleep(self, seconds):
+        self.now_ns += round(seconds * 1e9)
+
+
+class Neighbours:
+    """All that the supervisor works with."""
+
+    def __init__(self, folder, patch):
+        self.log, self.fails, self.begun = [], {}, []
+        self.time, self.begin_takes_ns = Time(), [0]
+        self.guardian_looks, self.attended, self.on_attend = 2, [], {}
+        self.refused = []
+        self.ring = None
+        self.info = SimpleNamespace(simulated=False, holds=("tcp:here",), latency_blocks=0)
+        self.config = SimpleNamespace(
+            name="stage",
+            tick_s=0.01,
+            block=5,
+            recording=SimpleNamespace(ring_s=10.0, on_failure="stop", flush_s=0.1),
+            timing=SimpleNamespace(max_missed_share=0.01),
+        )
+        device = SimpleNamespace(info=self.info)
+        loaded = SimpleNamespace(config=self.config, device=device)
+        self.checked = SimpleNamespace(loaded=loaded, state_size=1)
+        self.output = folder / "run.mcap"
+        self.recorder = SimpleNamespace(
+            path=self.output, samples=95, missing=5, error="", notes=[],
+            begin=self.begin, give_back=lambda: self.note("given back"),
+        )  # fmt: skip
+        self.outcome, self.broke = Outcome("completed", "waveform completed", 100, True, 0), ""
+        self.folder = SimpleNamespace(ring=folder / "ring", socket=folder / "socket")
+        self.said = []
+        for name, double in {
+            "time": self.time,
+            "be_ordinary": lambda: self.note("ordinary"),
+            "ChangeWorker": lambda checked: self.around("worker", "worker closed", None),
+            "held_devices": lambda holds: self.around("devices", "devices let go", [*holds]),
+            "Recorder": lambda *a, overwrite: self.note("claimed", self.recorder),
+            "run_folder": self.run_folder,
+            "Requests": lambda *a: SimpleNamespace(
+                answer=None, attend=lambda: self.note("requests")
+            ),
+            "ControlServer": self.server,
+            "LoopChild": self.child,
+            "RingRecorder": self.ring_recorder,
+            "guardian_of": lambda *a: self.note("guardian", a[-1]),
+            "Safety": self.safety,
+            "StartedRun": self.started_run,
+            "ProgressThread": lambda *a: SimpleNamespace(
+                start=lambda: None, end=lambda: self.note("progress ended")
+            ),
+            "Notifier": lambda: SimpleNamespace(
+                say=lambda *lines: self.said.extend(lines), alive=lambda: None
+            ),
+        }.items():
+            patch.setattr(module, name, double)
+
+    def note(self, what, value=None):
+        self.log.append(what)
+        if what in self.fails:
+            raise self.fails[what]
+        return value
+
+    @contextmanager
+    def around(self, what, afterwards, value):
+        self.note(what)
+        try:
+            yield value
+        finally:
+            self.log.append(afterwards)
+
+    def run_folder(self, name, output, started):
+        assert (name, output, started) == ("stage", self.output, 5.0)
+        return self.around("folder", "folder removed", (self.folder, ["lock"]))
+
+    @contextmanager
+    def server(self, socket, answer):
+        assert socket == self.folder.socket
+        with self.around("server", "server closed", None):
+            yield SimpleNamespace(serve=lambda wait_s: self.note("serve"))
+
+    def child(self, checked, folder, ring, inherits, silence_s):
+        self.ring, self.silence_s = ring, silence_s
+        assert inherits == ["tcp:here", "lock"]
+        set_up = json.dumps([{"rt.fifo": "done: 50"}, self.refused])
+        ring.page.write_text(PageText.SET_UP, set_up)
+        ring.page.put(Field.WAVEFORM_AT, 40)
+        self.note("child")
+        return SimpleNamespace(
+            pid=1, await_ready=self.await_ready, kill=lambda: self.note("child killed")
+        )
+
+    def await_ready(self, stopped):
+        assert not stopped()
+        if "signal before the start" in self.fails:
+            os.kill(os.getpid(), signal.SIGTERM)
+            assert stopped()
+        self.note("await ready")
+
+    def begin(self, start_unix_ns, set_up, waveform_at):
+        assert (set_up, waveform_at) == ({"rt.fifo": "done: 50"}, 40)
+        self.begun.append((start_unix_ns, self.time.now_ns))
+        self.time.now_ns += self.begin_takes_ns.pop(0) if self.begin_takes_ns else 0
+        self.note("begin")
+
+    def ring_recorder(self, ring, recorder, flush_s):
+        return SimpleNamespace(recorder=recorder, start=self.start, record_event=None)
+
+    def start(self):
+        assert self.ring.page.get(Field.GO) == 0
+        self.note("recording")
+
+    def safety(self, checked, page, child, guardian, record_event):
+        self.guardian = guardian
+        return SimpleNamespace(ready=self.ready, close=lambda: self.note("safety closed"))
+
+    def ready(self):
+        self.guardian_looks -= 1
+        return self.guardian_looks < 0
+
+    def started_run(self, checked, ring, child, safety, recording):
+        return SimpleNamespace(
+            attend=self.attend,
+            progress=None,
+            progress_failed=None,
+            break_off=lambda error: self.note(f"broken off: {error}"),
+            outcome=self.outcome,
+            broke=self.broke,
+        )
+
+    def attend(self, stop_signal):
+        assert self.ring.page.get(Field.GO) == 1
+        self.attended.append(stop_signal)
+        self.on_attend.get(len(self.attended), lambda: None)()
+        return len(self.attended) < 4
+
+    def run(self):
+        return Supervisor(
+            self.checked, self.output, overwrite=True, on_progress=lambda _: None
+        ).run()
+
+
+@pytest.fixture
+def stage(tmp_path, monkeypatch):
+    before = {number: signal.getsignal(number) for number in (*module.STOPS, STOP_SIGNAL)}
+    yield Neighbours(tmp_path, monkeypatch)
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+def test_a_run_is_begun_in_one_order_and_undone_in_the_other(stage):
+    """The start signal comes last: the loop then reads its time and its supervisor's heartbeat."""
+    result = stage.run()
+    serves = ["requests", "serve"] * 3
+    assert stage.log == [*READY, *serves, "progress ended", "safety closed", *UNDONE]
+    page = stage.ring.page
+    assert page.get(Field.GO) == 1
+    assert stage.guardian_looks == -1  # it was waited for, and not a moment longer
+    ((unix_ns, at_ns),) = stage.begun
+    assert 10**12 < at_ns <= 10**12 + 20 * MS
+    assert page.get(Field.START_NS) == at_ns + 50 * MS
+    assert unix_ns - 10**18 == page.get(Field.START_NS)
+    assert page.get(Field.SUPERVISOR_HEARTBEAT_NS) == stage.time.now_ns
+    assert stage.guardian == ["tcp:here", "lock"]
+    assert (result.path, result.code, result.reason) == (
+        stage.output, "completed", "waveform completed",
+    )  # fmt: skip
+    assert (result.samples, result.missing, result.safe, result.stop_signal) == (95, 5, True, 0)
+    assert stage.said == ["READY=1", f"STATUS=recording to {stage.output}", "STOPPING=1"]
+
+
+def test_a_simulated_device_has_no_guardian(stage):
+    stage.info.simulated = True
+    stage.run()
+    assert stage.guardian is None
+    assert "guardian" not in stage.log
+
+
+@pytest.mark.parametrize("number", range(len(READY)))
+def test_whatever_fails_before_the_start_signal_leaves_nothing(stage, number):
+    """No lock, no folder, no file and no loop: and the loop is never told to go."""
+    what = READY[number]
+    stage.fails[what] = InputError("that")
+    with pytest.raises(InputError, match="that"):
+        stage.run()
+    done = stage.log[: number + 1]
+    assert done == READY[: number + 1]
+    expected = []
+    if number > READY.index("child"):
+        expected.append("child killed")
+    if number > READY.index("guardian"):
+        expected.append("safety closed")
+    if number > READY.index("claimed"):
+        expected.append("given back")
+    undo = dict(zip(("server", "folder", "devices", "worker"), UNDONE, strict=True))
+    expected += [undone for begun, undone in undo.items() if READY.index(begun) < number]
+    assert stage.log[number + 1 :] == expected
+    if stage.ring is not None:
+        assert stage.ring.page.get(Field.GO) == 0
+
+
+def test_what_the_system_refuses_at_the_start_is_a_message(stage):
+    stage.fails["guardian"] = OSError(24, "Too many open files")
+    with pytest.raises(RunError, match=r"can't be started: .*Too many open files; nothing has mov"):
+        stage.run()
+
+
+def test_a_signal_before_the_start_is_seen(stage):
+    stage.fails["signal before the start"] = True
+    stage.fails["await ready"] = RunError("stopped before the start")
+    with pytest.raises(RunError, match="stopped before the start"):
+        stage.run()
+
+
+@pytest.mark.parametrize(
+    ("takes_ms", "delays_ms"),
+    [([24], [50]), ([25], [50, 125]), ([400, 600], [50, 1250]), ([400, 700], [50, 1250, 2150])],
+)
+def test_a_slow_disk_has_the_start_put_off(stage, takes_ms, delays_ms):
+    """The file is written again where half of the time to the first sample went by meanwhile."""
+    stage.begin_takes_ns = [each * MS for each in takes_ms]
+    stage.run()
+    assert [(unix - 10**18 - at) // MS for unix, at in stage.begun] == delays_ms
+    assert stage.ring.page.get(Field.START_NS) == stage.begun[-1][1] + delays_ms[-1] * MS
+
+
+def test_a_disk_that_takes_too_long_three_times_ends_it(stage):
+    stage.begin_takes_ns = [100 * MS, 1_000 * MS, 3_000 * MS]
+    with pytest.raises(RunError, match=r"the disk took 3 s for the first bytes; nothing has moved"):
+        stage.run()
+    assert len(stage.begun) == 3
+
+
+def test_what_breaks_afterwards_costs_neither_coil_nor_recording(stage):
+    """The run is seen to without all that may have broken, until its recording is closed."""
+    stage.fails["serve"] = ZeroDivisionError("a bug")
+    stage.run()
+    assert stage.attended == [0] * 4
+    assert stage.log[len(READY) :][:4] == [
+        "requests", "serve", "broken off: a bug", "progress ended",
+    ]  # fmt: skip
+    assert stage.log[-5:] == ["safety closed", *UNDONE]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, STOP_SIGNAL])
+def test_the_first_signal_is_the_one_that_stops_it(stage, number):
+    """One that comes later changes nothing; afterwards signals are as they were."""
+    stage.outcome = Outcome("stopped", "stopped by someone", 100, True, 0)
+    stage.on_attend[1] = lambda: os.kill(os.getpid(), number)
+    stage.on_attend[2] = lambda: os.kill(os.getpid(), signal.SIGTERM)
+    before = signal.getsignal(signal.SIGINT)
+    result = stage.run()
+    assert stage.attended == [0, number, number, number]
+    # By another command it is stopped as if by SIGTERM.
+    assert result.stop_signal == (signal.SIGTERM if number == STOP_SIGNAL else number)
+    assert result.code == "stopped"
+    assert signal.getsignal(signal.SIGINT) == before
+    assert signal.getsignal(STOP_SIGNAL) == signal.SIG_IGN
+
+
+def wrong(stage, **changes):
+    for name, value in changes.items():
+        setattr(stage if hasattr(stage, name) else stage.recorder, name, value)
+
+
+@pytest.mark.parametrize(
+    ("changes", "code", "reason"),
+    [
+        ({"error": "no room"}, "fault", "waveform completed; 5 samples are lost: no room"),
+        ({"broke": "a bug"}, "fault", "waveform completed; the supervisor broke: a bug"),
+        ({"notes": ["it was renamed"]}, "fault", "waveform completed; it was renamed"),
+        ({"outcome": Outcome("stopped", "gone", 1, True, 0)}, "fault", "gone"),
+        ({"outcome": Outcome("fault", "late", 1, False, 0)}, "fault", "late"),
+    ],
+)
+def test_how_it_ended(stage, changes, code, reason):
+    """Whatever was not as it should be makes it a fault; a stop nobody asked for is one too."""
+    wrong(stage, **changes)
+    result = stage.run()
+    assert (result.code, result.reason, result.stop_signal) == (code, reason, 0)
+    assert result.safe == stage.outcome.safe
+
+
+@pytest.mark.parametrize(
+    ("skipped", "said"),
+    [
+        (0, ""),
+        (1, "deadline misses 1 of 20 (5 %): timing not kept"),
+        (20, "deadline misses 20 of 20 (1e+02 %): timing not kept"),
+    ],
+)
+def test_deadline_misses_are_counted_in_ticks(stage, skipped, said):
+    """A hundred samples are twenty ticks of five."""
+    lateness = Lateness(late_ticks=2, skipped_ticks=skipped)
+    stage.on_attend[1] = lambda: stage.ring.page.leave_lateness(lateness)
+    result = stage.run()
+    assert (result.late_ticks, result.deadline_misses) == (
+        stage.ring.page.get(Field.LATE_TICKS),
+        said,
+    )
+
+
+@pytest.mark.parametrize("simulated", [False, True])
+def test_refused_real_time_is_said_where_it_matters(stage, simulated, caplog):
+    stage.refused, stage.info.simulated = ["fifo: not permitted", "memory: too little"], simulated
+    stage.run()
+    said = [each.getMessage() for each in caplog.records]
+    head = "real time refused, timing may not be kept: "
+    assert said == ([] if simulated else [head + each for each in stage.refused])
+
+
+@pytest.mark.parametrize(("on_failure", "silence_s"), [("stop", 5.0), ("go_on", float("inf"))])
+def test_the_supervisor_may_be_silent_for_half_a_ring(stage, on_failure, silence_s):
+    stage.config.recording.on_failure = on_failure
+    stage.run()
+    assert stage.silence_s == silence_s
+
+
+@pytest.mark.parametrize(("ring_s", "slots"), [(10.0, 1000), (0.1, 16), (0.17, 17)])
+def test_the_ring_holds_what_the_experiment_says(stage, ring_s, slots):
+    stage.config.recording.ring_s = ring_s
+    stage.run()
+    assert (stage.ring.slots, stage.ring.block) == (slots, 5)
+
+
+def test_memory_that_is_not_to_be_had_is_told(stage, monkeypatch):
+    def create(path, **sizes):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(SampleRing, "create", create)
+    with pytest.raises(RunError, match="ring: no memory: No space left on device; less recording"):
+        stage.run()
+    assert stage.log[-4:] == ["given back", *UNDONE[1:]]
