@@ -225,6 +225,7 @@ class TableSettings(Strict):
 class IdentifySettings(FitSettings):
     """Choices of a fit to files: those of the fit, and how the files are read."""
 
+    auto: bool = Field(False, description="Take the kind that does best on data held out.")
     whole: bool = Field(False, description="Judge whole histories, not their steady cycles.")
     table: TableSettings = Field(TableSettings(), description="How text tables are read.")
 
