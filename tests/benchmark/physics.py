@@ -33,6 +33,7 @@ RATE_HZ = 50_000.0
 CAMPAIGN = Path(__file__).parents[2] / "configs" / "identify_any.yaml"
 PARTS = (1.0, 0.5, 0.25, 0.1)
 FREQUENCIES_HZ = (1.0, 50.0, 100.0, 250.0)
+UNJUDGED = 250  # samples at the end, where the reference that an inverse looks ahead to stops
 GOAL, SMALL_GOAL, RANDOM_GOAL = 0.5, 1.0, 1.5
 
 
@@ -53,7 +54,8 @@ def swelling(time_s: F64, over_s: float) -> F64:
 def sine_um(middle_um: float, amplitude_um: float, frequency_hz: float) -> tuple[F64, int]:
     """Return a reference, and its first sample that is judged."""
     begin_s = max(0.04, 1.0 / frequency_hz)
-    time_s = np.arange(round((begin_s + max(0.04, 2.0 / frequency_hz)) * RATE_HZ)) / RATE_HZ
+    samples = round((begin_s + max(0.04, 2.0 / frequency_hz)) * RATE_HZ) + UNJUDGED
+    time_s = np.arange(samples) / RATE_HZ
     wave = np.sin(2.0 * np.pi * frequency_hz * time_s)
     return swelling(time_s, begin_s) * (middle_um + amplitude_um * wave), round(begin_s * RATE_HZ)
 
@@ -95,8 +97,8 @@ def judged(
     command = np.empty_like(reference_um)
     compensator.process(compensator.ahead(reference_um), command)
     command = np.clip(command, -8.0, 8.0)
-    error = (driven(physics, command, seed) - reference_um)[first:]
-    to_percent = 100.0 / float(np.ptp(reference_um[first:]))
+    error = (driven(physics, command, seed) - reference_um)[first:-UNJUDGED]
+    to_percent = 100.0 / float(np.ptp(reference_um[first:-UNJUDGED]))
     noise = np.random.default_rng(seed).standard_normal(error.size)
     floor = TerfenolOptions().parameters().sensor_noise_um * float(np.max(np.abs(noise)))
     bare = error - float(np.mean(error))

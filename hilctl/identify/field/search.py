@@ -34,8 +34,6 @@ FIRST_LAGS = (0.02, 0.1, 0.4)  # starts: lag of the field
 FIRST_COUPLINGS = (-0.6, -0.3, 0.0, 0.3)
 LEAST_WIDEST = 0.1  # of half the span
 TAIL = 0.02  # of all weights: those of thresholds beyond the widest that is worth its place
-BLOCKS = 40  # parts of the rows; every HELD-th of them is held out
-HELD = 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +53,12 @@ class Size:
 
 @dataclass(frozen=True, slots=True)
 class Paths:
-    """For each record, the samples of its path, and which of these are rows: int64."""
+    """Samples and rows of all records.
+
+    Attributes:
+        samples: For each record, int64[n_i], those that its path is made of.
+        rows: For each record, int64[N_i], which of these are rows.
+    """
 
     samples: tuple[I64, ...]
     rows: tuple[I64, ...]
@@ -63,13 +66,11 @@ class Paths:
 
 @dataclass(frozen=True, slots=True)
 class FieldEnd:
-    """What was found, and the error on rows that the weights never saw, rms in um."""
+    """What was found."""
 
-    stages: Stages
     known: Physical
     grid: Grid
     weights: Weights
-    held_out_um: float
 
 
 class FieldSearch:
@@ -157,7 +158,7 @@ class FieldSearch:
         fields, _, known = self._signals(x)
         reach = max(float(np.ptp(u)) for u in fields)
         alone = max(reach - known.coupling * self._data.stroke_um, 0.1 * reach)
-        return self._solved(x, paths)[0].errors_um * (reach / alone)
+        return self._solved(x, paths).errors_um * (reach / alone)
 
     def _signals(self, x: F64) -> tuple[list[F64], list[F64], Physical]:
         known = physical(stages_in(x), self._data)
@@ -165,7 +166,7 @@ class FieldSearch:
         both = [signals(run, known, self._curve, span) for run in self._data.runs]
         return [u for u, _ in both], [y for _, y in both], known
 
-    def _solved(self, x: F64, paths: Paths) -> tuple[Weights, F64, F64]:
+    def _solved(self, x: F64, paths: Paths) -> Weights:
         fields, bare, _ = self._signals(x)
         grid = self._laid()
         ways = [np.ascontiguousarray(u[s]) for u, s in zip(fields, paths.samples, strict=True)]
@@ -173,7 +174,7 @@ class FieldSearch:
         y = np.concatenate(
             [b[s[rows]] for b, s, rows in zip(bare, paths.samples, paths.rows, strict=True)]
         )
-        return solve(columns, y, grid, self._least, self._scale(y)), columns, y
+        return solve(columns, y, grid, self._least, self._scale(y))
 
     def _scale(self, y: F64) -> F64:
         """Return what makes errors of the operators' those of the displacement: float64[N]."""
@@ -189,7 +190,7 @@ class FieldSearch:
 
     def _learn(self, x: F64, paths: Paths) -> Weights:
         """Work out weights; what drags and curve do follows from them the next time."""
-        found, _, _ = self._solved(x, paths)
+        found = self._solved(x, paths)
         grid = self._laid()
         plays = grid.thresholds.size
         self._curve = self._between(found)
@@ -241,12 +242,8 @@ class FieldSearch:
         self._lay(stages_in(x), self._size)
         paths = self._paths(stages_in(x), final=True)
         self._learn(x, paths)
-        found, columns, y = self._solved(x, paths)
-        known = physical(stages_in(x), self._data)
-        grid = self._laid()
-        return FieldEnd(
-            stages_in(x), known, grid, found, held_out_um(columns, y, grid, self._least)
-        )
+        found = self._solved(x, paths)
+        return FieldEnd(physical(stages_in(x), self._data), self._laid(), found)
 
 
 def _error(tried: tuple[float, Stages]) -> float:
@@ -258,14 +255,3 @@ def _lengths(count: int) -> tuple[float, ...]:
         return (0.15,)[:count]
     first, last = np.log(LENGTHS[0]), np.log(LENGTHS[-1])
     return tuple(np.exp(np.linspace(first, last, count)).tolist())
-
-
-def held_out_um(columns: F64, y: F64, grid: Grid, least: float) -> float:
-    """Return the rms error on parts of the rows that weights are not found from, in um."""
-    held = (np.arange(y.size) * BLOCKS // y.size) % HELD == HELD - 1
-    found = solve(columns[~held], y[~held], grid, least, np.ones(int((~held).sum())))
-    edges = grid.lowest + grid.width * np.arange(grid.cells)
-    at_rest = float((found.slopes[: grid.thresholds.size] @ np.clip(-edges, 0.0, grid.width)).sum())
-    operators = columns[held] @ found.slopes.ravel() - at_rest
-    inverse = Curve(found.curve.displacement_um + found.offset_um, found.curve.operators)
-    return float(np.sqrt(np.mean((inverse.operators_of(operators) - y[held]) ** 2)))
