@@ -9,6 +9,7 @@ judge.py       how far a model is from data
 held_out.py    the same on data that its fit did not see
 verdict.py     what a model is worth, or why it is none
 found_range.py the motions that it was identified on
+candidates.py  the kind of model that does best on data held out
 model_size.py  number of plays by loops held out; lag of a table
 workers.py     independent fits over threads, processes or a Dask cluster
 fit_data.py    all data ready for the kernels
@@ -18,5 +19,6 @@ geometry.py    weights of loops by hysteresis
 data           loops and histories, from recordings and tables
 searched       thresholds searched from several starts
 staged         free weights and stages, without a search for what is linear
+field          plays and drags of an effective field, from whole histories
 literature     the other models of the literature
 """

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 from hilctl.base.errors import InputError
 from hilctl.base.yaml.messages import did_you_mean
+from hilctl.identify.field.fits import fit_field
 from hilctl.identify.job import FitJob, FoundModel
 from hilctl.identify.literature.asymmetric import fit_asymmetric
 from hilctl.identify.literature.differential import fit_bouc_wen, fit_duhem
@@ -67,6 +68,12 @@ CATALOGUE: Mapping[FitKind, CatalogueEntry] = {
     "duhem": CatalogueEntry("Duhem, Coleman-Hodgdon (1.22)", _WEIGHTS_FOLLOW, ANY, fit_duhem),
     "butterfly": CatalogueEntry(
         "plays, then an even function: rods without bias", _WEIGHTS_FOLLOW, LOOPS, fit_butterfly
+    ),
+    "field": CatalogueEntry(
+        "plays and drags of an effective field, with its losses",
+        "densities by non-negative least squares, the stages searched",
+        ANY,
+        fit_field,
     ),
     "straight": CatalogueEntry("straight line: no hysteresis", "least squares", ANY, fit_straight),
 }

@@ -11,6 +11,7 @@ from hilctl.base.device import CommandUnit
 from hilctl.base.errors import InputError
 from hilctl.base.files import check_writable, write_text
 from hilctl.base.yaml.document import Document
+from hilctl.identify.candidates import CandidateError, choose_kind
 from hilctl.identify.catalogue import entry
 from hilctl.identify.data.files import load_records
 from hilctl.identify.data.records import Record
@@ -37,6 +38,7 @@ class Identification:
         held_out: Errors on data that the fit did not see; None where there were none.
         orders: What each number of plays did on loops held out, where that was asked for.
         lag_samples: Samples by which tables' displacements were taken to lag.
+        candidates: How each kind did on data held out, where the best of them was asked for.
     """
 
     fit: FittedModel
@@ -45,6 +47,7 @@ class Identification:
     held_out: HeldOut | None
     orders: tuple[OrderError, ...]
     lag_samples: int
+    candidates: tuple[CandidateError, ...] = ()
 
     def to_mapping(self) -> dict[str, Any]:
         """Return all figures as plain mappings, lists and numbers, for JSON."""
@@ -53,6 +56,7 @@ class Identification:
             "held_out": None if self.held_out is None else self.held_out.to_mapping(),
             **self.fit.to_mapping(),
             "orders": [asdict(order) for order in self.orders],
+            "candidates": [asdict(candidate) for candidate in self.candidates],
             "lag_samples": self.lag_samples,
         }
 
@@ -60,11 +64,18 @@ class Identification:
 def settings_from(kind: str, texts: Sequence[str]) -> IdentifySettings:
     """Return the choices of a fit, those of the kind changed by ``key=value`` texts.
 
+    Args:
+        kind: Kind of model; ``auto`` for the one that does best on data held out.
+        texts: ``key=value``.
+
     Raises:
         InputError: There is no such kind, or a choice breaks a rule; all that do are listed.
     """
-    known, _ = entry(kind)
-    document = Document("hilctl identify", f"kind: {known}")
+    if kind == "auto":
+        document = Document("hilctl identify", "kind: field\nauto: true")
+    else:
+        known, _ = entry(kind)
+        document = Document("hilctl identify", f"kind: {known}")
     for text in texts:
         document.set(text)
     return document.validate(IdentifySettings)
@@ -138,7 +149,11 @@ def identify_records(
         DataError: The data can't be used as asked, or there are none.
     """
     chosen, orders = settings, tuple[OrderError, ...]()
-    if settings.size == "auto":
+    candidates = tuple[CandidateError, ...]()
+    held_out: HeldOut | None = None
+    if isinstance(settings, IdentifySettings) and settings.auto:
+        chosen, held_out, candidates = choose_kind(records, settings, unit, run, progress)
+    elif settings.size == "auto":
         chosen, orders = choose_order(records, settings, run, progress)
     created = datetime.now(UTC).isoformat(timespec="seconds")
     fit = fit_model(
@@ -147,13 +162,13 @@ def identify_records(
     )  # fmt: skip
     if validate:
         judged = judge(fit.model, validate, creep=settings.creep)
-        held_out: HeldOut | None = HeldOut(judged, tuple(validate), "files that were not fitted")
-    else:
+        held_out = HeldOut(judged, tuple(validate), "files that were not fitted")
+    elif held_out is None:
         held_out = held_out_error(records, chosen, unit, run, progress)
     verdict = verdict_of(fit, records, chosen, held_out)
     if held_out is not None:
         fit = replace(fit, model=_with_held_out(fit.model, held_out.judgement))
-    return Identification(fit, records, verdict, held_out, orders, 0)
+    return Identification(fit, records, verdict, held_out, orders, 0, candidates)
 
 
 def _with_held_out(model: HysteresisModel, judgement: Judgement) -> HysteresisModel:

@@ -48,8 +48,8 @@ def search_data(records: Records, kind: str, unit: CommandUnit) -> "FitData":
     Raises:
         DataError: There are none.
     """
-    # A lag needs every sample: a staged model would take the others for a rest.
-    return FitData(records if kind == "staged" else thinned(records), unit)
+    # A lag needs every sample: models with one would take the others for a rest.
+    return FitData(records if kind in {"staged", "field"} else thinned(records), unit)
 
 
 class FitData:

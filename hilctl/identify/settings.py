@@ -15,7 +15,7 @@ from hilctl.base.strict import Strict
 
 FitKind: TypeAlias = Literal[
     "integrated", "staged", "rdpi", "asymmetric", "ppi", "spi", "generalised", "preisach", "kp",
-    "bouc_wen", "duhem", "butterfly", "straight",
+    "bouc_wen", "duhem", "butterfly", "straight", "field",
 ]  # fmt: skip
 Choices: TypeAlias = Mapping[str, Any]
 
@@ -32,6 +32,7 @@ PUBLISHED: Mapping[str, Choices] = {
     "staged": {"plays": 20, "deadbands": 12, "offset": True, "starts": 4},
     "preisach": {"lines": 16},
     "butterfly": {"plays": 16},
+    "field": {"plays": 16},
 }
 """Defaults of a kind that are not those of all; sections 3.4.2 (PPI), 5.3 (RDPI), 6.4."""
 
@@ -52,6 +53,7 @@ class FitSettings(Strict):
         "asymmetric",
         "generalised",
         "butterfly",
+        "field",
         default=12,
         ge=1,
         le=200,
@@ -76,6 +78,13 @@ class FitSettings(Strict):
     )
     levels: int = _of(
         "kp", default=16, ge=4, le=60, description="Levels of the Krasnosel'skii-Pokrovskii grid."
+    )
+    drags: int = _of("field", default=3, ge=0, le=12, description="Drags, whose small loops creep.")
+    cells: int = _of(
+        "field", default=24, ge=2, le=60, description="Cells of each table of plays and drags."
+    )
+    knots: int = _of(
+        "field", default=24, ge=2, le=60, description="Pieces of the curve after them."
     )
     corners: int = _of(
         "butterfly", default=16, ge=1, le=100, description="Slopes of the even function."
@@ -217,8 +226,17 @@ class IdentifySettings(FitSettings):
     """Choices of a fit to files: those of the fit, and how the files are read."""
 
     leave_out: tuple[str, ...] = Field((), description="Labels of loops, or files, not to use.")
+    auto: bool = Field(False, description="Take the kind that does best on data held out.")
     whole: bool = Field(False, description="Judge whole histories, not their steady cycles.")
     table: TableSettings = Field(TableSettings(), description="How text tables are read.")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _histories(cls, given: Any) -> Any:
+        """Whole histories for a kind whose small loops remember the large ones before them."""
+        if isinstance(given, dict) and given.get("kind") == "field":
+            return {"whole": True, **given}
+        return given
 
     def unit(self, recorded: CommandUnit | None) -> CommandUnit:
         """Return the command's unit, that of the recordings where there are any."""

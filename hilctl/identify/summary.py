@@ -41,6 +41,11 @@ def summary(found: Identification) -> list[str]:
     lines = [str(found.verdict), *found.verdict.notes]
     if held_out is not None:
         lines.append(f"not fitted: {_errors(held_out.judgement)}; {held_out.how}")
+    lines += [
+        f"tried: {each.settings}: peak error {each.peak_percent:.2f} %, "
+        f"rms {each.rms_percent:.2f} %"
+        for each in found.candidates
+    ]
     lines += [f"fitted: {_errors(fit)}", f"{ended}, in {fit.elapsed_s:.2f} s"]
     if fit.at_bound:
         shown = ", ".join(fit.at_bound)

@@ -8,6 +8,7 @@ does not notice a callee that changed in another file. Units live one level abov
     hysteresis.py  play, stop, deadband, their sums, the integrated model and its inverse
     implicit.py  operators whose inverse is found root by root: Preisach, KP, Bouc-Wen, Duhem
     envelope.py  play operators between envelopes
+    field.py     plays and drags of an effective field, its losses, and their inverse
     dynamics.py  field lag, structure and delay, and their inverses
     limit.py     peak and slew limits of a command
     interlock.py what ends a run, looked at in every sample

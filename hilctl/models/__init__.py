@@ -12,6 +12,7 @@ staged.py      field lag, hysteresis, structure, delay, and their inverse; chain
 generalised.py generalised PI model: plays between envelopes, and its inverse
 numeric_inverse.py  models whose inverse is found root by root: preisach.py, kp.py
                (Krasnosel'skii-Pokrovskii), bouc_wen.py, duhem.py
+field.py       plays and drags of an effective field, a curve, losses; for staged.py
 published.py   parametrisations and parameter sets from the literature
 files.py       model files, in and out
 """

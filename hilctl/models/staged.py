@@ -29,12 +29,14 @@ from hilctl.kernels.dynamics import (
 )
 from hilctl.models.base import HysteresisModel, Operator, Provenance, refuse
 from hilctl.models.chain import Chain, between, delayed, smoothing_weights
+from hilctl.models.field import FieldModel
 from hilctl.models.integrated import IntegratedModel
 from hilctl.models.plays import PpiModel, RdpiModel
 from hilctl.models.preisach import PreisachModel
 
 AnyHysteresis = Annotated[
-    PpiModel | RdpiModel | IntegratedModel | PreisachModel, Field(discriminator="kind")
+    PpiModel | RdpiModel | IntegratedModel | PreisachModel | FieldModel,
+    Field(discriminator="kind"),
 ]
 _WHOLE = 1e-6
 _SLOWEST = 1e12  # samples in a radian of the structure: beyond it, it does not move
@@ -139,7 +141,7 @@ class StagedModel(HysteresisModel):
     @classmethod
     def around(
         cls,
-        hysteresis: PpiModel | RdpiModel | IntegratedModel | PreisachModel,
+        hysteresis: AnyHysteresis,
         *,
         lag: FieldLag | None = None,
         structure: Structure | None = None,

@@ -18,7 +18,9 @@ def found(held_out=None, lag_samples=0, starts=(), at_bound=(), known=None):
         model=SimpleNamespace(provenance=Provenance(identified_range=known)),
     )  # fmt: skip
     verdict = Verdict("usable", 4.0, held_out=held_out is not None, notes=("one note",))
-    return SimpleNamespace(fit=fit, held_out=held_out, lag_samples=lag_samples, verdict=verdict)
+    return SimpleNamespace(
+        fit=fit, held_out=held_out, lag_samples=lag_samples, verdict=verdict, candidates=()
+    )
 
 
 @pytest.mark.parametrize(("area", "text"), [(None, "-"), (1.5, "+1.50"), (-0.25, "-0.25")])
@@ -60,3 +62,9 @@ def test_the_range_that_it_was_found_for_is_said():
     )
     line = "found for 20 to 80 um peak-to-peak, 50 Hz, up to 1.2e+04 um/s"
     assert summary(found(known=known))[-1] == line
+
+
+def test_every_kind_that_was_tried_is_said_with_its_error():
+    tried = found()
+    tried.candidates = (SimpleNamespace(settings="kind ppi", peak_percent=2.0, rms_percent=0.5),)
+    assert "tried: kind ppi: peak error 2.00 %, rms 0.50 %" in summary(tried)

@@ -1,0 +1,9 @@
+"""Fit of the effective-field model to whole histories, loops as well.
+
+fits.py      from a job to a model
+prepared.py  records as the fit needs them: thinned in time, displacement without its structure
+columns.py   kernels of what plays and drags of each cell give
+weights.py   densities and output curve by one non-negative least-squares problem
+stages.py    losses, coupling, structure and delay: in a row for the search, out of it for a model
+search.py    from a few starts to the stages, the weights following
+"""

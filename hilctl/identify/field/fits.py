@@ -1,0 +1,55 @@
+"""Fit of the effective-field model between its stages."""
+
+import math
+
+from hilctl.identify.field.prepared import Prepared
+from hilctl.identify.field.search import FieldEnd, FieldSearch, Size
+from hilctl.identify.field.stages import Stages
+from hilctl.identify.job import FitJob, FoundModel
+from hilctl.models.field import FieldModel, OutputCurve
+from hilctl.models.staged import StagedModel, Structure
+
+
+def fit_field(job: FitJob) -> FoundModel:
+    """Fit plays and drags of an effective field, losses, coupling, structure and delay."""
+    settings = job.settings
+    data = Prepared(job.data.records)
+    size = Size(settings.plays, settings.drags, settings.cells, settings.knots)
+    found = FieldSearch(data, size, job.least).find(Stages(), job.progress)
+    known = _parameters(found)
+    numbers = len(known) + int((found.weights.slopes > 0.0).sum()) + settings.knots
+    return FoundModel(_model(job, found), numbers, known)
+
+
+def _model(job: FitJob, found: FieldEnd) -> StagedModel:
+    grid, weights, known = found.grid, found.weights, found.known
+    hysteresis = FieldModel(
+        thresholds=tuple(grid.thresholds.tolist()),
+        lengths=tuple(grid.lengths.tolist()),
+        lowest=grid.lowest,
+        cell=grid.width,
+        slopes=tuple(tuple(line) for line in weights.slopes.tolist()),
+        coupling=known.coupling,
+        curve=OutputCurve(
+            operators_um=tuple(weights.curve.operators.tolist()),
+            displacement_um=tuple(weights.curve.displacement_um.tolist()),
+        ),
+        losses=known.losses,
+        **job.data.common(weights.offset_um),
+    )
+    structure = Structure(
+        natural_hz=0.5 / (math.pi * known.radian_s), damping_ratio=known.damping_ratio
+    )
+    return StagedModel.around(hysteresis, structure=structure, delay_s=known.delay_s)
+
+
+def _parameters(found: FieldEnd) -> dict[str, float]:
+    known = found.known
+    return {
+        **known.losses.model_dump(),
+        "coupling": known.coupling,
+        "natural_hz": 0.5 / (math.pi * known.radian_s),
+        "damping_ratio": known.damping_ratio,
+        "delay_s": known.delay_s,
+        "output_offset_um": found.weights.offset_um,
+    }

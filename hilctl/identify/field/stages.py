@@ -1,0 +1,119 @@
+"""Losses, coupling, structure and delay: in a row for the search, out of it for a model."""
+
+import math
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from hilctl.base.arrays import F64
+from hilctl.identify.field.prepared import Prepared, Run
+from hilctl.identify.field.weights import Curve
+from hilctl.kernels.field import field_left
+from hilctl.models.field import FieldLosses, even_excess
+
+
+@dataclass(frozen=True, slots=True)
+class Stages:
+    """All that is not a weight; times in units of 1 / (2 pi top_hz), commands of the reach.
+
+    Attributes:
+        field: Lag of the field that is always the same.
+        output: Loss that follows the slope of the hysteresis, at its mean slope.
+        decay: By which the losses come later.
+        growth: Of the losses with themselves.
+        bend: The same, squared.
+        excess: Of the losses' square root.
+        coupling: Effective field of half the stroke.
+        radian: 1 / w of the structure.
+        damping: Its damping ratio.
+        delay: Transport delay.
+    """
+
+    field: float = 0.1
+    output: float = 0.02
+    decay: float = 0.01
+    growth: float = 0.1
+    bend: float = 0.1
+    excess: float = 0.01
+    coupling: float = 0.0
+    radian: float = 0.1
+    damping: float = 0.2
+    delay: float = 0.03
+
+
+NAMES = tuple(field.name for field in fields(Stages))
+LOW = Stages(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -0.95, 0.01, 0.02, 0.0)
+HIGH = Stages(2.0, 2.0, 0.3, 3.0, 5.0, 0.5, 0.6, 0.3, 2.0, 0.3)
+STEP = Stages(0.02, 0.02, 0.01, 0.05, 0.05, 0.01, 0.05, 0.02, 0.05, 0.01)
+"""Bounds, and changes that make about as much difference as each other."""
+
+
+def row(stages: Stages) -> F64:
+    """Return stages as float64[10]."""
+    return np.array([getattr(stages, name) for name in NAMES])
+
+
+def stages_in(x: F64) -> Stages:
+    """Undo :func:`row`."""
+    return Stages(*(float(value) for value in x))
+
+
+@dataclass(frozen=True, slots=True)
+class Physical:
+    """The same in s, um and the unit of the command."""
+
+    losses: FieldLosses
+    coupling: float
+    radian_s: float
+    damping_ratio: float
+    delay_s: float
+
+
+def physical(stages: Stages, data: Prepared) -> Physical:
+    """Give stages their units."""
+    unit_s = 1.0 / (2.0 * math.pi * data.top_hz)
+    gain = 2.0 * data.reach / data.stroke_um
+    losses = FieldLosses(
+        field_s=stages.field * unit_s,
+        output_s=stages.output * unit_s * gain,
+        decay_s=stages.decay * unit_s,
+        growth=stages.growth / data.reach,
+        bend=stages.bend / data.reach**2,
+        excess=stages.excess * math.sqrt(data.reach),
+    )
+    return Physical(
+        losses,
+        stages.coupling * gain,
+        stages.radian * unit_s,
+        stages.damping,
+        stages.delay * unit_s,
+    )
+
+
+def signals(run: Run, known: Physical, curve: Curve | None, span: float) -> tuple[F64, F64]:
+    """Return effective field and bare displacement of a record: float64[n] each.
+
+    Args:
+        run: The record.
+        known: The stages.
+        curve: From displacement to what the operators give; None where it is not known yet, and
+            the displacement itself stands for it.
+        span: Of the effective field, which says below what size the excess loss is even.
+    """
+    slope_s = 2.0 * known.damping_ratio * known.radian_s
+    y = run.bare_um(known.delay_s, slope_s, known.radian_s**2)
+    m = y if curve is None else curve.operators_of(y)
+    lost = known.losses
+    left = math.exp(-run.step_s / lost.decay_s) if lost.decay_s > 0.0 else 0.0
+    w = np.empty_like(y)
+    losses = (
+        lost.field_s / run.step_s,
+        lost.output_s / run.step_s,
+        left,
+        lost.growth,
+        lost.bend,
+        lost.excess,
+        even_excess(span),
+    )
+    field_left(run.command, np.ascontiguousarray(m), losses, w)
+    return w + known.coupling * m, y

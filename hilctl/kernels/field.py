@@ -1,0 +1,428 @@
+"""Hysteresis of an effective field: plays and drags of it, and the field that losses take.
+
+Notation: ``v`` is a command, ``w`` the field that is left of it, ``m`` what the operators give,
+``u = w + coupling m`` the effective field that they act on, ``T`` the sample period. All operators
+are tables over the same even cells of ``u``, so that next to one another in memory they are quick.
+
+A *play* of threshold r gives q(F_r[u]); a line of them for each r is Preisach's triangle. A *drag*
+of length k follows how far u is through a cell, s, as u travels: ds/d|u| = (s_u - s) / k where that
+is the way that u goes, else ds = 0. Its small loops creep from one to the next, as plays' never do.
+
+The command is ahead of the field by what the losses take, in the mean over a sample::
+
+    v = w + z,  z + tau_b z' = h(e),  e = tau_0 w' + tau_1 m',
+    h(e) = e (1 + b |e| + c e^2 + x / sqrt(|e| + e_0))
+
+Memory, float64[p + d c + 3 d + 6]: the plays' outputs, each drag's in each of c cells less those at
+rest, three sums over each drag, then u, m, z, w, the last du / dm, and the previous input; NaN
+means that there is none yet. It is updated in place, so any cut into blocks gives the same bits.
+
+Sources: I. D. Mayergoyz, "Mathematical Models of Hysteresis", Springer 1991 (plays as Preisach's
+triangle); E. Della Torre, "Magnetic Hysteresis", IEEE Press 1999 (the moving model); D. C. Jiles,
+J. B. Thoelke and M. K. Devine, IEEE Trans. Magn. 28 (1992) 27 (drags); G. Bertotti, "Hysteresis in
+Magnetism", Academic Press 1998, chapter 12 (losses that follow the permeability).
+"""
+
+import math
+from typing import TypeAlias
+
+import numpy as np
+
+from hilctl.base.arrays import F64, I64
+from hilctl.kernels.jit import kernel
+
+Bank: TypeAlias = tuple[F64, F64, F64, F64, F64]
+"""Thresholds float64[p], lengths float64[d], tables of the plays at the edges of c cells, float64[
+p (c + 1)], weights of the drags in these, float64[d c], and the grid: lowest edge, width, c."""
+Span: TypeAlias = tuple[float, float, float]
+Losses: TypeAlias = tuple[float, float, float, float, float, float, float]
+"""tau_0 / T, tau_1 / T, what is left of z after a sample, b, c, x, e_0."""
+
+_STEPS = 100
+_NARROWEST = 1e-14
+_NEAR = 1e-5  # of a change, and of its unit, to which it is worked out
+_OUTPUT, _COMMAND, _FIELD = 0, 1, 2
+_SPAN = "UniTuple(float64, 3)"
+_CURVE = "UniTuple(float64[::1], 2)"
+_BANK = "UniTuple(float64[::1], 5)"
+_LOSSES = "UniTuple(float64, 7)"
+
+
+@kernel("int64(float64, float64)", inline=True)
+def _cell(place: float, cells: float) -> int:
+    """Return the cell that a place lies in, or the one at the end that it is beyond."""
+    # A place that is not a number, from a memory that is none, must not become an index.
+    return int(min(place, cells - 1.0)) if place > 0.0 else 0
+
+
+@kernel("float64(float64)", inline=True)
+def _gone(x: float) -> float:
+    """Return 1 - exp(-x) for x >= 0: by its series where x is small, as it is at most samples."""
+    if x > 0.06:
+        return -math.expm1(-x)
+    tail = 1.0 - x / 6.0 * (1.0 - x / 7.0 * (1.0 - x / 8.0))
+    return x * (1.0 - x / 2.0 * (1.0 - x / 3.0 * (1.0 - x / 4.0 * (1.0 - x / 5.0 * tail))))
+
+
+@kernel("float64(float64, float64, float64, float64, float64)")
+def dragged(held: float, low: float, width: float, last: float, way: float) -> float:
+    """Return a drag's output in a cell after the field has gone up by a way, in lengths.
+
+    Args:
+        held: Output before, 0 to ``width``.
+        low: Lower end of the cell.
+        width: Of the cell.
+        last: Field before.
+        way: How far it goes up, >= 0; nothing moves before it has passed ``low + held``.
+    """
+    begin = max(last, low + held)
+    end = last + way
+    if end <= begin:
+        return held
+    top = low + width
+    inside = max(min(end, top) - begin, 0.0)
+    if inside > 0.0:
+        gone = _gone(inside)
+        held = (min(end, top) - low) - gone - (begin - low - held) * (1.0 - gone)
+    above = end - max(begin, top)
+    if above > 0.0:
+        held += (width - held) * _gone(above)
+    return held
+
+
+@kernel("float64(float64, float64, float64, float64, float64, float64)")
+def drag_step(held: float, low: float, width: float, last: float, u: float, length: float) -> float:
+    """Return a drag's output in a cell, 0 to ``width``, after the field went from last to u."""
+    if u >= last:
+        up = dragged(
+            held / length, low / length, width / length, last / length, (u - last) / length
+        )
+        return up * length
+    low, last, u = -(low + width), -last, -u  # downwards is upwards in a mirror
+    up = dragged(
+        (width - held) / length, low / length, width / length, last / length, (u - last) / length
+    )
+    return width - up * length
+
+
+@kernel("void(float64[::1], int64[::1], float64, float64, float64, int64, int64, float64[:, ::1])")
+def drag_columns(
+    u: F64, rows: I64, length: float, lowest: float, width: float, cells: int, first: int, out: F64
+) -> None:
+    """Fill in what a drag of weight 1 gives in each cell, for identification.
+
+    Args:
+        u: float64[n], a path from rest; it need hold no more than its turning points.
+        rows: int64[N], samples of the path that are filled in, rising.
+        length: k.
+        lowest: Lower end of the first cell.
+        width: Of a cell.
+        cells: Number of cells c.
+        first: Column of the first cell.
+        out: float64[N, m], of which c columns are filled; 0 is rest.
+    """
+    for j in range(cells):
+        low = lowest + j * width
+        rest = min(max(-low, 0.0), width)
+        held, last, k = rest, 0.0, 0
+        for row in range(rows.size):
+            while k <= rows[row]:
+                held = drag_step(held, low, width, last, u[k], length)
+                last = u[k]
+                k += 1
+            out[row, first + j] = held - rest
+
+
+@kernel("float64(float64, float64[::1], float64[::1])")
+def mapped(x: float, knots: F64, values: F64) -> float:
+    """Return the value at ``x`` of a line through points, whose ends go on straight."""
+    low, high = 0, knots.size - 1
+    while high - low > 1:
+        middle = (low + high) // 2
+        if x < knots[middle]:
+            high = middle
+        else:
+            low = middle
+    slope = (values[high] - values[low]) / (knots[high] - knots[low])
+    return float(values[low] + slope * (x - knots[low]))
+
+
+@kernel("float64(int64, float64, float64)", inline=True)
+def _rest(cell: int, lowest: float, width: float) -> float:
+    """Return how far a field of 0 is through a cell."""
+    return min(max(-(lowest + cell * width), 0.0), width)
+
+
+@kernel(f"UniTuple(float64, 2)(float64, float64, int64, float64[::1], {_BANK})", inline=True)
+def _drag(u: float, last: float, i: int, memory: F64, bank: Bank) -> tuple[float, float]:
+    """Return what a drag would give at a next u, and its slope.
+
+    In the cells that the field has passed all goes alike, so their sums do.
+    """
+    thresholds, lengths, _, weights, grid = bank
+    lowest, width, cells = grid[0], grid[1], int(grid[2])
+    start, first = i * cells, thresholds.size + i * cells
+    sums = thresholds.size + lengths.size * cells + 3 * i
+    length = lengths[i]
+    gone = _gone(abs(u - last) / length)
+    side = 1 if u >= last else 2
+    passed = memory[sums + side]
+    total = memory[sums] + gone * passed
+    slope = (1.0 - gone) * abs(passed)
+    here, there = _cell((last - lowest) / width, grid[2]), _cell((u - lowest) / width, grid[2])
+    for j in range(min(here, there), max(here, there) + 1):
+        low, rest = lowest + j * width, _rest(j, lowest, width)
+        held = memory[first + j] + rest
+        now = drag_step(held, low, width, last, u, length)
+        behind = abs(min(max(u - low, 0.0), width) - now) if now != held else 0.0
+        total += weights[start + j] * (now - held)
+        slope += weights[start + j] * behind
+    return total, slope / length
+
+
+@kernel(f"void(float64, float64, int64, float64[::1], {_BANK})", inline=True)
+def _move_drag(u: float, last: float, i: int, memory: F64, bank: Bank) -> None:
+    """Bring a drag to a next u, and keep what :func:`_drag` needs from there on."""
+    thresholds, lengths, _, weights, grid = bank
+    lowest, width, cells = grid[0], grid[1], int(grid[2])
+    start, first = i * cells, thresholds.size + i * cells
+    sums = thresholds.size + lengths.size * cells + 3 * i
+    gone = _gone(abs(u - last) / lengths[i])
+    here, there = _cell((last - lowest) / width, grid[2]), _cell((u - lowest) / width, grid[2])
+    total = up = down = 0.0
+    for j in range(cells):
+        rest = _rest(j, lowest, width)
+        held = memory[first + j]
+        if min(here, there) <= j <= max(here, there):
+            held = drag_step(held + rest, lowest + j * width, width, last, u, lengths[i]) - rest
+        elif j < here and u >= last:
+            held += gone * (width - rest - held)
+        elif j > here and u < last:
+            held += gone * (-rest - held)
+        memory[first + j] = held
+        total += weights[start + j] * held
+        up += weights[start + j] * (width - rest - held if j < there else 0.0)
+        down += weights[start + j] * (-rest - held if j > there else 0.0)
+    memory[sums], memory[sums + 1], memory[sums + 2] = total, up, down
+
+
+@kernel(f"UniTuple(float64, 2)(float64, float64[::1], {_BANK})", inline=True)
+def _peek(u: float, memory: F64, bank: Bank) -> tuple[float, float]:
+    """Return what the operators would give at a next u, and its slope; change nothing."""
+    thresholds, lengths, values, _, grid = bank
+    low, per_cell, cells = grid[0], 1.0 / grid[1], grid[2]
+    stride, plays = int(cells) + 1, thresholds.size
+    total = slope = 0.0
+    for i in range(plays):
+        held = max(min(memory[i], u + thresholds[i]), u - thresholds[i])
+        place = (held - low) * per_cell
+        j = i * stride + _cell(place, cells)
+        rise = values[j + 1] - values[j]
+        total += values[j] + rise * (place - (j - i * stride))
+        slope += rise if held != memory[i] or i == 0 else 0.0
+    slope *= per_cell
+    last = memory[memory.size - 6]
+    for i in range(lengths.size):
+        more, steeper = _drag(u, last, i, memory, bank)
+        total += more
+        slope += steeper
+    return total, slope
+
+
+@kernel(f"void(float64, float64[::1], {_BANK})", inline=True)
+def _settle(u: float, memory: F64, bank: Bank) -> None:
+    """Bring all operators to an effective field, and keep it."""
+    thresholds, lengths = bank[0], bank[1]
+    for i in range(thresholds.size):
+        memory[i] = max(min(memory[i], u + thresholds[i]), u - thresholds[i])
+    for i in range(lengths.size):
+        _move_drag(u, memory[memory.size - 6], i, memory, bank)
+    memory[memory.size - 6] = u
+
+
+@kernel(f"UniTuple(float64, 2)(float64, {_LOSSES})", inline=True)
+def lost_field(e: float, losses: Losses) -> tuple[float, float]:
+    """Return h(e) and its slope."""
+    _, _, _, growth, bend, excess, even = losses
+    size = abs(e)
+    root = math.sqrt(size + even)
+    more = growth * size + bend * size * size
+    value = e * (1.0 + more + excess / root)
+    slope = 1.0 + growth * size + 2.0 * more + bend * size * size
+    return value, slope + excess / root * (1.0 - 0.5 * size / (size + even))
+
+
+@kernel(f"void(float64[::1], float64[::1], {_LOSSES}, float64[::1])")
+def field_left(v: F64, m: F64, losses: Losses, w: F64) -> None:
+    """Work out the field that the losses leave of a command, for outputs that are known.
+
+    Args:
+        v: float64[n], mean command over the step that ends at each sample.
+        m: float64[n], the operators' output at each.
+        losses: See :data:`Losses`, for these steps.
+        w: float64[n], filled; the first is the first command.
+    """
+    w[0] = v[0]
+    z = change = 0.0
+    for k in range(1, v.size):
+        was = w[k - 1]
+        for _ in range(_STEPS):
+            e = losses[0] * change + losses[1] * (m[k] - m[k - 1])
+            lost, slope = lost_field(e, losses)
+            command = was + 0.5 * change + losses[2] * z + (1.0 - losses[2]) * lost
+            step = (v[k] - command) / (0.5 + (1.0 - losses[2]) * slope * losses[0])
+            change += step
+            if abs(step) <= _NEAR * (abs(change) + _NEAR):
+                break
+        w[k] = was + change
+        z = losses[2] * z + (1.0 - losses[2]) * lost
+
+
+@kernel(
+    f"UniTuple(float64, 3)(int64, float64, float64[::1], {_BANK}, float64, {_LOSSES})", inline=True
+)
+def _given(
+    what: int, u: float, memory: F64, bank: Bank, coupling: float, losses: Losses
+) -> tuple[float, float, float]:
+    """Return what a next u gives, output, command or field, with its slope; and the output."""
+    m, slope = _peek(u, memory, bank)
+    w, w_slope = u - coupling * m, 1.0 - coupling * slope
+    k = memory.size - 6
+    e = losses[0] * (w - memory[k + 3]) + losses[1] * (m - memory[k + 1])
+    lost, lost_slope = lost_field(e, losses)
+    command = 0.5 * (w + memory[k + 3]) + losses[2] * memory[k + 2] + (1.0 - losses[2]) * lost
+    e_slope = losses[0] * w_slope + losses[1] * slope
+    command_slope = 0.5 * w_slope + (1.0 - losses[2]) * lost_slope * e_slope
+    value = m if what == _OUTPUT else (w if what == _FIELD else command)
+    by_u = slope if what == _OUTPUT else (w_slope if what == _FIELD else command_slope)
+    return value, by_u, m
+
+
+@kernel(f"UniTuple(float64, 2)(int64, float64, {_SPAN}, float64[::1], {_BANK}, float64, {_LOSSES})")
+def _root(
+    what: int, target: float, span: Span, memory: F64, bank: Bank, coupling: float, losses: Losses
+) -> tuple[float, float]:
+    """Return the u that gives ``target``, or the end of the span that comes nearest; and m there.
+
+    Newton's steps from the last u on, within the bounds that the signs so far have set, or halfway
+    between these where a step leaves them or gains too little.
+    """
+    low, high, tolerance = span
+    ends = memory.size - 6
+    u, m, gap = max(low, min(high, memory[ends])), 0.0, 0.0
+    if what == _OUTPUT and memory[ends + 4] > 0.0 and low < u < high:
+        # What u gives is known, and the next step goes about as the last one did.
+        short = target - memory[ends + 1]
+        if abs(short) <= tolerance:
+            return u, memory[ends + 1]
+        if short > 0.0:
+            low = u
+        else:
+            high = u
+        guess = u + short * memory[ends + 4]
+        u = guess if low < guess < high else u
+    for k in range(_STEPS):
+        value, slope, m = _given(what, u, memory, bank, coupling, losses)
+        short = target - value
+        if abs(short) <= tolerance or high - low <= _NARROWEST * abs(u):
+            return u, m
+        if short > 0.0:
+            low = u
+        else:
+            high = u
+        step = short / slope
+        gap = high - low
+        u += step
+        if not low < u < high:
+            u = low + 0.5 * gap if k > 3 else max(low, min(high, u))
+        elif k % 8 == 7:
+            u = low + 0.5 * gap
+    return u, m
+
+
+@kernel(f"float64(int64, float64, {_SPAN}, float64[::1], {_BANK}, float64, {_LOSSES})")
+def _advance(
+    what: int, target: float, span: Span, memory: F64, bank: Bank, coupling: float, losses: Losses
+) -> float:
+    """Advance by a sample with a given output or command, and return the other of the two."""
+    k = memory.size - 6
+    fresh = not abs(memory[k + 5]) >= 0.0
+    if fresh and what == _COMMAND:  # it counts as having stood there for ever: nothing is lost
+        u, m = _root(_FIELD, target, span, memory, bank, coupling, losses)
+    else:
+        u, m = _root(what, target, span, memory, bank, coupling, losses)
+    w = u - coupling * m
+    e = losses[0] * (w - memory[k + 3]) + losses[1] * (m - memory[k + 1])
+    if fresh:
+        memory[k + 3], e = w, 0.0
+    memory[k + 2] = losses[2] * memory[k + 2] + (1.0 - losses[2]) * lost_field(e, losses)[0]
+    command = 0.5 * (w + memory[k + 3]) + memory[k + 2]
+    before = memory[k]
+    _settle(u, memory, bank)
+    if m != memory[k + 1]:
+        memory[k + 4] = (u - before) / (m - memory[k + 1])
+    memory[k + 1], memory[k + 3], memory[k + 5] = m, w, target
+    return m if what == _COMMAND else command
+
+
+@kernel(
+    f"void(float64[::1], {_SPAN}, {_BANK}, float64, {_LOSSES}, {_CURVE}, float64[::1],"
+    " float64[::1])"
+)
+def field_forward(
+    v: F64,
+    span: Span,
+    bank: Bank,
+    coupling: float,
+    losses: Losses,
+    curve: tuple[F64, F64],
+    memory: F64,
+    out: F64,
+) -> None:
+    """Run the model.
+
+    Args:
+        v: float64[n], commands, each held through the sample that ends with its output. One that is
+            not a number gives an output that is none, and leaves no trace.
+        span: Lowest and highest effective field, and by how much a root may miss, > 0.
+        bank: The operators.
+        coupling: Effective field for each unit of the operators' output.
+        losses: See :data:`Losses`.
+        curve: float64[k], output of the operators, and float64[k], displacement there in um, both
+            rising.
+        memory: See the module's docstring.
+        out: float64[n], filled with um.
+    """
+    for k in range(v.size):
+        if abs(v[k]) < math.inf:
+            m = _advance(_COMMAND, v[k], span, memory, bank, coupling, losses)
+            out[k] = mapped(m, curve[0], curve[1])
+        else:
+            out[k] = np.nan
+
+
+@kernel(
+    f"void(float64[::1], {_SPAN}, {_BANK}, float64, {_LOSSES}, {_CURVE}, float64[::1],"
+    " float64[::1])"
+)
+def field_inverse(
+    y: F64,
+    span: Span,
+    bank: Bank,
+    coupling: float,
+    losses: Losses,
+    curve: tuple[F64, F64],
+    memory: F64,
+    out: F64,
+) -> None:
+    """Run the inverse; arguments as for :func:`field_forward`, with um in and commands out.
+
+    The field that gives an output is a root of a function that rises, the rest is explicit: so it
+    undoes :func:`field_forward` to within the tolerance wherever the span reaches.
+    """
+    for k in range(y.size):
+        if abs(y[k]) < math.inf:
+            m = mapped(y[k], curve[1], curve[0])
+            out[k] = _advance(_OUTPUT, m, span, memory, bank, coupling, losses)
+        else:
+            out[k] = np.nan

@@ -1,0 +1,43 @@
+"""A fit of the effective-field model to a history of a model that it is not."""
+
+import numpy as np
+
+from hilctl.base.arrays import F64
+from hilctl.identify.data.records import History
+from hilctl.identify.fit_model import fit_model
+from hilctl.identify.judge import judge
+from hilctl.identify.settings import FitSettings
+from hilctl.models.staged import FieldLag, StagedModel, Structure
+from tests.staged import truth
+
+RATE_HZ = 20_000.0
+
+
+def history(seed: int, noise_um: float) -> History:
+    """Return what a staged model of plays and deadbands does with a random command."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(round(0.6 * RATE_HZ)) / RATE_HZ
+    sines = [np.sin(2 * np.pi * f * t + rng.uniform(0, 6)) for f in rng.uniform(4.0, 160.0, 12)]
+    wave = np.sum(sines, axis=0)
+    command: F64 = np.ascontiguousarray(6.0 * np.minimum(t / 0.02, 1.0) * wave / np.abs(wave).max())
+    y = model().forward(RATE_HZ).process(command)
+    return History("random", command, y + noise_um * rng.standard_normal(y.size), RATE_HZ)
+
+
+def model() -> StagedModel:
+    """Return what the data come from."""
+    inner = truth(
+        lag=FieldLag(tau_s=2e-4), structure=Structure(natural_hz=1500.0, damping_ratio=0.2)
+    )
+    assert isinstance(inner, StagedModel)
+    return inner
+
+
+def test_a_history_that_was_not_fitted_is_met() -> None:
+    settings = FitSettings(kind="field", plays=6, drags=1, cells=8, knots=6)
+    found = fit_model([history(1, 0.01)], settings, lambda: 0.0)
+    judged = judge(found.model, [history(2, 0.0)])
+    assert judged.rms_percent < 0.6
+    assert judged.peak_percent < 3.0
+    # What holds the field back by a constant time is found as that, not as what follows the slope.
+    assert 1e-4 < found.parameters["field_s"] < 4e-4
