@@ -131,11 +131,3 @@ def test_structure_and_delay_are_taken_off_the_displacement() -> None:
     np.testing.assert_allclose(y[:-late], before[late:], atol=1e-9)
     # No command leaves no field, so the effective one is the coupling's, of the displacement.
     np.testing.assert_allclose(u, 0.25 * y, atol=1e-9)
-
-
-def test_without_losses_the_command_is_the_mean_of_the_field() -> None:
-    w = np.cos(TIME_S * 300.0)
-    command = np.append(w[0], 0.5 * (w[1:] + w[:-1]))
-    run = plain_run(command, np.zeros((3, w.size)))
-    u, _ = signals(run, Physical(FieldLosses(), 0.0, 0.0, 0.0, 0.0), None, 20.0)
-    np.testing.assert_allclose(u, w, atol=1e-9)
