@@ -248,7 +248,7 @@ def lost_field(e: float, losses: Losses) -> tuple[float, float]:
     root = math.sqrt(size + even)
     more = growth * size + bend * size * size
     value = e * (1.0 + more + excess / root)
-    slope = 1.0 + growth * size + 2.0 * more + bend * size * size
+    slope = 1.0 + 2.0 * more + bend * size * size
     return value, slope + excess / root * (1.0 - 0.5 * size / (size + even))
 
 

@@ -1,0 +1,214 @@
+"""Plays, drags and losses of an effective field: against their equations in plain Python."""
+
+import math
+
+import numpy as np
+import pytest
+
+from hilctl.kernels.field import (
+    drag_columns,
+    drag_step,
+    field_forward,
+    field_inverse,
+    field_left,
+    lost_field,
+    mapped,
+)
+from hilctl.kernels.hysteresis import rest_memory
+
+THRESHOLDS, LENGTHS = np.array([0.0, 0.8]), np.array([0.5, 2.0])
+LOWEST, WIDTH, CELLS = -4.0, 2.0, 4
+EDGES = LOWEST + WIDTH * np.arange(CELLS + 1)
+PLAYS = np.array([[1.0, 2.0, 1.5, 0.5], [0.5, 1.0, 0.0, 2.0]])
+DRAGS = np.array([[0.0, 1.0, 0.5, 1.0], [1.0, 0.5, 2.0, 0.0]])
+VALUES = np.insert(np.cumsum(PLAYS * WIDTH, axis=1), 0, 0.0, axis=1)
+BANK = (
+    THRESHOLDS,
+    LENGTHS,
+    (VALUES - VALUES[:, [2]]).ravel(),  # the third edge is at 0
+    DRAGS.ravel(),
+    np.array([LOWEST, WIDTH, CELLS]),
+)
+SPAN = (-12.0, 12.0, 1e-10)
+LOSSES = (3.0, 0.4, 0.6, 0.1, 0.02, 0.05, 0.01)
+NO_LOSSES = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+CURVE = (np.array([-50.0, 0.0, 50.0]), np.array([-40.0, 0.0, 60.0]))
+SAME = (np.array([0.0, 1.0]), np.array([0.0, 1.0]))
+LINE = (  # one play without a threshold, of slope 2
+    np.zeros(1),
+    np.zeros(0),
+    np.array([-8.0, 8.0]),
+    np.zeros(0),
+    np.array([-4.0, 8.0, 1.0]),
+)
+
+
+def memory(bank):
+    thresholds, lengths, _, weights, _ = bank
+    return rest_memory(thresholds.size + weights.size + 3 * lengths.size + 5)
+
+
+def run(kernel, signal, bank=BANK, coupling=0.05, losses=LOSSES, curve=CURVE):
+    out = np.empty_like(signal)
+    kernel(signal, SPAN, bank, coupling, losses, curve, memory(bank), out)
+    return out
+
+
+def path():
+    """Return loops within loops that leave the cells, with jumps over several: float64[500]."""
+    t = np.arange(500) / 100.0
+    u = 0.7 + 2.8 * np.sin(2.3 * t) + 1.9 * np.sin(7.1 * t)
+    u[200:220] += 3.5
+    u[350:] -= 1.0
+    return u
+
+
+def operators(u):
+    """Return the sum of all plays and drags along a path from rest, cell by cell."""
+    lows, tops = EDGES[:-1].copy(), EDGES[1:].copy()
+    lows[0], tops[-1] = -math.inf, math.inf  # plays go on beyond the cells
+    plays, last = np.zeros(THRESHOLDS.size), 0.0
+    rest = np.clip(-EDGES[:-1], 0.0, WIDTH)
+    drags = np.tile(rest, (LENGTHS.size, 1))
+    out = []
+    for now in u:
+        plays = np.maximum(now - THRESHOLDS, np.minimum(now + THRESHOLDS, plays))
+        ways = np.clip(plays[:, None], lows, tops) - np.clip(0.0, lows, tops)
+        for i, j in np.ndindex(drags.shape):
+            drags[i, j] = drag_step(drags[i, j], EDGES[j], WIDTH, last, now, LENGTHS[i])
+        out.append((PLAYS * ways).sum() + (DRAGS * (drags - rest)).sum())
+        last = now
+    return np.array(out)
+
+
+def h(e, losses):
+    _, _, _, b, c, x, e_0 = losses
+    return e * (1.0 + b * abs(e) + c * e**2 + x / math.sqrt(abs(e) + e_0))
+
+
+def commands(w, m, losses):
+    """Return what leaves the field w, for a run that has stood at its first command for ever."""
+    out, z = [w[0]], 0.0
+    for k in range(1, w.size):
+        e = losses[0] * (w[k] - w[k - 1]) + losses[1] * (m[k] - m[k - 1])
+        z = losses[2] * z + (1.0 - losses[2]) * h(e, losses)
+        out.append(0.5 * (w[k] + w[k - 1]) + z)
+    return np.array(out)
+
+
+@pytest.mark.parametrize("coupling", [-0.2, 0.05])
+@pytest.mark.parametrize("losses", [LOSSES, NO_LOSSES])
+def test_model_and_inverse_are_the_equations(coupling, losses):
+    u = path()
+    m = operators(u)
+    command = commands(u - coupling * m, m, losses)
+    y = np.interp(m, *CURVE)
+    assert np.ptp(m) > 20.0
+    given = {"coupling": coupling, "losses": losses}
+    np.testing.assert_allclose(run(field_forward, command, **given), y, atol=1e-7)
+    np.testing.assert_allclose(run(field_inverse, y, **given), command, atol=1e-7)
+
+
+def test_the_first_command_counts_as_having_stood_for_ever():
+    """m = s u and u = w + coupling m give m = s w / (1 - coupling s), and nothing more comes."""
+    held = np.full(4, 1.5)
+    out = run(field_forward, held, LINE, coupling=0.1, curve=SAME)
+    assert out == pytest.approx(2.0 * 1.5 / (1.0 - 0.1 * 2.0))
+
+
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_beyond_the_span_its_end_is_what_comes_nearest(sign):
+    far = np.array([sign * 1e6])
+    given = {"bank": LINE, "coupling": 0.1, "losses": NO_LOSSES, "curve": SAME}
+    assert run(field_forward, far, **given) == pytest.approx(sign * 2.0 * 12.0)
+    assert run(field_inverse, far, **given) == pytest.approx(sign * 12.0 * (1.0 - 0.1 * 2.0))
+
+
+@pytest.mark.parametrize("x", [1e-6, 0.01, 0.0599, 0.0601, 1.0])
+def test_a_drag_follows_from_the_lower_end(x):
+    """Ds/du = u - s from 0 gives s = u - (1 - exp(-u)), by the series as by the exponential."""
+    assert drag_step(0.0, 0.0, 2.0, 0.0, x, 1.0) == pytest.approx(x + math.expm1(-x), abs=1e-16)
+
+
+def test_a_drag_goes_on_above_its_cell_and_waits_after_a_turn():
+    up = drag_step(0.0, 0.0, 2.0, -1.0, 4.0, 1.0)
+    assert up == pytest.approx(2.0 - (1.0 - math.exp(-2.0)) * math.exp(-2.0))
+    assert drag_step(up, 0.0, 2.0, 4.0, 1.9, 1.0) == up
+    assert drag_step(up, 0.0, 2.0, 4.0, 1.8, 1.0) < up
+
+
+@pytest.mark.parametrize("length", [0.3, 2.0])
+@pytest.mark.parametrize(
+    ("held", "last", "u"),
+    [
+        (0.2, 1.4, 2.1),
+        (0.2, 0.0, 5.0),
+        (1.3, 1.1, 2.9),
+        (0.9, 2.5, 0.4),
+        (1.5, 6.0, -3.0),
+        (0.4, 2.2, 1.7),
+        (0.7, -3.0, 0.9),
+    ],
+)
+def test_a_drag_is_its_differential_equation(held, last, u, length):
+    """ds/d|u| = (s_u - s) / k where that is the way u goes, else 0; here in steps of 1e-3."""
+    low, width, count = 1.0, 1.5, round(abs(u - last) / 1e-3)
+    s, way, step = held, math.copysign(1.0, u - last), abs(u - last) / count
+    for k in range(count):
+        middle = last + (k + 0.5) * (u - last) / count
+        behind = min(max(middle - low, 0.0), width) - s
+        s += behind * -math.expm1(-step / length) if behind * way > 0.0 else 0.0
+    assert drag_step(held, low, width, last, u, length) == pytest.approx(s, abs=2e-5)
+
+
+def columns(u, rows, lowest, width, cells):
+    """Return what a drag of length 0.7 gives in each cell, after two columns of others."""
+    out = np.full((rows.size, cells + 3), 99.0)
+    drag_columns(np.ascontiguousarray(u), rows, 0.7, lowest, width, cells, 2, out)
+    assert (out[:, [0, 1, -1]] == 99.0).all()
+    return out[:, 2:-1]
+
+
+def test_cells_give_together_what_one_does_until_the_field_turns():
+    u, rows = np.linspace(0.0, 5.0, 40), np.array([0, 7, 20, 39])
+    one, four = columns(u, rows, -1.0, 4.0, 1), columns(u, rows, -1.0, 1.0, 4)
+    np.testing.assert_allclose(four.sum(axis=1), one[:, 0], atol=1e-12)
+    # Nor does it matter how many steps the field took there.
+    wanted = [drag_step(1.0, -1.0, 4.0, 0.0, now, 0.7) - 1.0 for now in u[rows]]
+    np.testing.assert_allclose(one[:, 0], wanted, atol=1e-12)
+    assert wanted[-1] > 2.0
+
+
+def test_a_mirrored_path_gives_mirrored_columns():
+    u, rows = path(), np.arange(3, 500, 31)
+    there, back = columns(u, rows, -3.0, 1.5, 5), columns(-u, rows, -4.5, 1.5, 5)
+    np.testing.assert_allclose(back[:, ::-1], -there, atol=1e-12)
+    assert (np.ptp(there, axis=0) > 0.1).all()
+
+
+def test_a_line_through_points_goes_on_straight():
+    knots, values = np.array([-1.0, 0.0, 2.0, 3.0]), np.array([-4.0, 0.0, 1.0, 4.0])
+    places = [-2.0, -1.0, -0.5, 0.0, 1.0, 2.0, 3.0, 5.0]
+    wanted = [-8.0, -4.0, -2.0, 0.0, 0.5, 1.0, 4.0, 10.0]
+    assert [mapped(x, knots, values) for x in places] == pytest.approx(wanted)
+
+
+def test_lost_field_by_hand():
+    losses = (0.0, 0.0, 0.0, 0.1, 0.02, 0.5, 0.25)
+    assert lost_field(2.0, losses)[0] == pytest.approx(2.0 * (1.0 + 0.2 + 0.08 + 0.5 / 1.5))
+    assert lost_field(-2.0, losses) == (-lost_field(2.0, losses)[0], lost_field(2.0, losses)[1])
+
+
+@pytest.mark.parametrize("only", [3, 4, 5])
+@pytest.mark.parametrize("e", [-3.0, -0.2, 0.0, 0.01, 0.4, 5.0])
+def test_the_slope_of_the_losses_is_their_derivative(only, e):
+    losses = (*(0.7 if i == only else 0.0 for i in range(6)), 0.25)
+    rise = lost_field(e + 1e-5, losses)[0] - lost_field(e - 1e-5, losses)[0]
+    assert lost_field(e, losses)[1] == pytest.approx(rise / 2e-5, rel=1e-4)
+
+
+def test_the_field_left_is_the_one_that_the_losses_were_added_to():
+    w, m = path(), 5.0 * np.cos(np.arange(500) / 9.0)
+    left = np.empty_like(w)
+    field_left(commands(w, m, LOSSES), m, LOSSES, left)
+    np.testing.assert_allclose(left, w, atol=1e-4 * np.abs(np.diff(w)).max())
