@@ -88,7 +88,7 @@ def _run(record: Record, top_hz: float) -> Run:
     mean[0] = command[0]
     mean[1:] = np.diff(held[index]) / thin
     derivatives = np.ascontiguousarray(derivatives[:, kept])
-    return Run(thin / rate_hz, mean, derivatives, judged // thin)
+    return Run(thin / rate_hz, mean, derivatives, -(-judged // thin))
 
 
 def _whole(record: Record) -> tuple[F64, F64, float, int]:

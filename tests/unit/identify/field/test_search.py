@@ -1,0 +1,247 @@
+"""The search on a history of a small field model: what it finds, and what makes no difference."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from hilctl.base.arrays import F64
+from hilctl.identify.data.records import History
+from hilctl.identify.field import search
+from hilctl.identify.field.prepared import Prepared
+from hilctl.identify.field.search import (
+    FINAL_WAY,
+    LEAST_WIDEST,
+    LENGTHS,
+    MARGIN,
+    ROUNDS,
+    SEARCH_WAY,
+    SPREAD,
+    FieldEnd,
+    FieldSearch,
+    Paths,
+    Size,
+)
+from hilctl.identify.field.stages import HIGH, LOW, Stages, row
+from hilctl.models.field import FieldLosses, FieldModel, OutputCurve
+from hilctl.models.staged import StagedModel, Structure
+
+RATE_HZ = 2000.0
+SIZE = Size(4, 1, 6, 5)
+LEAST = 0.05
+
+
+def made(command: F64) -> F64:
+    """Return what the known model does: float64[n], in um."""
+    hysteresis = FieldModel(
+        thresholds=(0.0, 1.0),
+        lengths=(1.5,),
+        lowest=-9.0,
+        cell=6.0,
+        slopes=((4.0, 5.0, 4.0), (1.0, 1.0, 0.5), (2.0, 3.0, 2.0)),
+        curve=OutputCurve(operators_um=(-60.0, 0.0, 60.0), displacement_um=(-50.0, 0.0, 45.0)),
+        losses=FieldLosses(field_s=5e-4),
+    )
+    structure = Structure(natural_hz=400.0, damping_ratio=0.2)
+    return StagedModel.around(hysteresis, structure=structure).forward(RATE_HZ).process(command)
+
+
+def data(unit: float = 1.0, um: float = 1.0, ignore: int = 50) -> Prepared:
+    """Return a history of the known model in other units of the command and the displacement."""
+    t, rng = np.arange(700) / RATE_HZ, np.random.default_rng(1)
+    wave = sum(np.sin(2.0 * np.pi * f * t + rng.uniform(0, 6)) for f in (7.0, 17.0, 31.0))
+    command = np.ascontiguousarray(6.0 * np.minimum(t / 0.02, 1.0) * wave / np.abs(wave).max())
+    record = History("random", unit * command, um * made(command), RATE_HZ, ignore)
+    return Prepared([record])
+
+
+@cache
+def found(unit: float = 1.0, um: float = 1.0) -> FieldEnd:
+    """Return what the search ends with."""
+    return FieldSearch(data(unit, um), SIZE, LEAST * um / unit).find(Stages(), lambda *_: None)
+
+
+def laid(size: Size = SIZE) -> FieldSearch:
+    """Return a search whose operators are laid over the data."""
+    out = FieldSearch(data(), size, LEAST)
+    out._lay(Stages(), size)
+    return out
+
+
+def test_the_data_are_met_and_the_lag_is_found() -> None:
+    end = found()
+    assert np.std(end.weights.errors_um) < 0.005 * data().stroke_um
+    assert end.known.losses.field_s == pytest.approx(5e-4, rel=0.3)
+    assert (end.weights.slopes >= 0.0).all()
+    assert (end.weights.slopes[0] >= LEAST).all()
+
+
+def test_the_size_is_what_was_asked_for() -> None:
+    end = found()
+    assert end.weights.slopes.shape == (SIZE.plays + SIZE.drags, SIZE.cells)
+    assert end.weights.curve.operators.size == SIZE.knots + 1
+    assert end.grid.thresholds.size == SIZE.plays
+    assert end.grid.lengths.size == SIZE.drags
+
+
+def test_units_make_no_difference() -> None:
+    one, other = found(), found(unit=4.0, um=2.0)
+    assert other.known.losses.field_s == pytest.approx(one.known.losses.field_s, rel=1e-3)
+    assert other.known.coupling == pytest.approx(2.0 * one.known.coupling, rel=1e-3)
+    assert other.grid.thresholds == pytest.approx(4.0 * one.grid.thresholds, rel=1e-3)
+    assert other.grid.width == pytest.approx(4.0 * one.grid.width, rel=1e-3)
+    assert other.weights.slopes == pytest.approx(0.5 * one.weights.slopes, rel=0.01, abs=0.01)
+
+
+def test_progress_rises_below_1_and_names_each_round() -> None:
+    seen: list[tuple[float, str]] = []
+    FieldSearch(data(), Size(2, 0, 3, 3), LEAST).find(
+        Stages(), lambda part, what: seen.append((part, what))
+    )
+    parts = [part for part, _ in seen]
+    assert parts == sorted(set(parts))
+    assert 0.0 < parts[0] < parts[-1] < 1.0
+    assert [what for _, what in seen] == [f"round {i} of {ROUNDS}" for i in range(1, ROUNDS + 1)]
+
+
+def test_of_the_starts_the_one_with_the_least_error_is_followed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Whatever the order in which they are tried; none of the others leaves anything behind."""
+    with monkeypatch.context() as patch:
+        patch.setattr(search, "FIRST_LAGS", search.FIRST_LAGS[::-1])
+        patch.setattr(search, "FIRST_COUPLINGS", search.FIRST_COUPLINGS[::-1])
+        end = found.__wrapped__()
+    assert end.known == found().known
+    assert np.array_equal(end.weights.slopes, found().weights.slopes)
+
+
+def test_a_search_ends_within_its_bounds_though_it_starts_beyond() -> None:
+    job = laid()
+    x = row(HIGH) + 1.0
+    job._learn(row(Stages()), job._paths(Stages()))
+    ended = job._followed(x, job._paths(Stages()))
+    assert (ended >= row(LOW)).all()
+    assert (ended <= row(HIGH)).all()
+    assert (ended != x).all()
+
+
+def test_slopes_are_those_of_the_errors_and_tried_within_the_bounds(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    job, tried = laid(), []
+    matrix = np.random.default_rng(2).standard_normal((5, row(LOW).size))
+
+    def errors(x: F64, _: Paths) -> F64:
+        tried.append(x)
+        return np.asarray(matrix @ x)
+
+    monkeypatch.setattr(job, "_errors", errors)
+    for x in (row(LOW), row(Stages()), row(HIGH)):
+        slopes = job._slopes(x, job._paths(Stages()))
+        assert slopes == pytest.approx(matrix / job._data.stroke_um)
+    assert (np.array(tried) >= row(LOW)).all()
+    assert (np.array(tried) <= row(HIGH)).all()
+
+
+def test_cells_reach_beyond_the_effective_field_by_the_margin() -> None:
+    job = laid()
+    (u,), _, _ = job._signals(row(Stages()))
+    grid = job._laid()
+    assert grid.lowest == pytest.approx(u.min() - MARGIN * np.ptp(u), rel=1e-3)
+    highest = grid.lowest + grid.cells * grid.width
+    assert highest == pytest.approx(u.max() + MARGIN * np.ptp(u), rel=1e-3)
+    assert grid.lengths == pytest.approx([0.15 * 0.5 * np.ptp(u)], rel=1e-3)
+    assert grid.thresholds[0] == 0.0
+    steps = np.diff(grid.thresholds)
+    assert (np.diff(steps) > 0.0).all()
+    assert grid.thresholds[-1] < 0.5 * np.ptp(u)
+
+
+@pytest.mark.parametrize(
+    ("last", "part"), [(0, LEAST_WIDEST), (3, 1.2 * (4.0 / 8.0) ** SPREAD), (7, 1.0)]
+)
+def test_thresholds_wider_than_what_has_weight_are_given_up(
+    last: int, part: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    size = Size(8, 1, 6, 5)
+    job = laid(size)
+    before, paths = job._laid().thresholds, job._paths(Stages())
+    weights = job._solved(row(Stages()), paths)
+    slopes = np.where(np.arange(9)[:, None] <= last, np.ones((9, 6)), 0.0)
+    slopes[8] = 1.0
+    monkeypatch.setattr(job, "_solved", lambda *_: replace(weights, slopes=slopes))
+    job._learn(row(Stages()), paths)
+    job._lay(Stages(), size)
+    assert job._laid().thresholds == pytest.approx(part * before, rel=0.02)
+
+
+@pytest.mark.parametrize("ignore", [0, 50, 351])
+def test_rows_are_samples_that_count(ignore: int) -> None:
+    job = FieldSearch(data(ignore=ignore), SIZE, LEAST)
+    job._lay(Stages(), SIZE)
+    paths = job._paths(Stages())
+    (samples,), (rows,) = paths.samples, paths.rows
+    run = job._data.runs[0]
+    assert (samples[0], samples[-1]) == (0, run.command.size - 1)
+    assert samples[rows].min() >= run.judged
+    assert samples[rows[0] - 1] < run.judged or rows[0] == 0
+
+
+def test_the_last_fit_sees_more_of_a_path() -> None:
+    job = laid()
+    few, more = job._paths(Stages()), job._paths(Stages(), final=True)
+    assert SEARCH_WAY > FINAL_WAY
+    assert few.samples[0].size < more.samples[0].size
+    span = job._laid().cells * job._laid().width
+    (u,), _, _ = job._signals(row(Stages()))
+    fastest = np.abs(np.diff(u)).max()
+    for paths, way in ((few, SEARCH_WAY), (more, FINAL_WAY)):
+        assert np.abs(np.diff(u[paths.samples[0]])).max() < way * span + fastest
+
+
+def test_errors_of_the_operators_are_brought_to_um_by_the_curve() -> None:
+    """Where it rises by 2 um an um, an error of the operators' is half of one of the output."""
+    job = laid()
+    assert job._scale(np.array([1.0, 2.0])).tolist() == [1.0, 1.0]
+    found_here = job._learn(row(Stages()), job._paths(Stages()))
+    curve = found_here.curve
+    middle = 0.5 * (curve.displacement_um[1:] + curve.displacement_um[:-1]) + found_here.offset_um
+    slopes = np.diff(curve.displacement_um) / np.diff(curve.operators)
+    assert job._scale(middle) == pytest.approx(slopes, rel=1e-6)
+
+
+def test_a_coupling_pays_for_what_comes_back_through_it() -> None:
+    """1 / (1 - coupling stroke / reach): a positive one lets errors of the model grow."""
+    job = laid()
+    for coupling in (-0.5, 0.0, 0.3):
+        x = row(Stages(coupling=coupling))
+        paths = job._paths(Stages(coupling=coupling))
+        (u,), _, known = job._signals(x)
+        more = 1.0 / (1.0 - known.coupling * job._data.stroke_um / np.ptp(u))
+        plain = job._solved(x, paths).errors_um
+        assert job._errors(x, paths) == pytest.approx(more * plain, rel=1e-9)
+        assert (more > 1.0) == (coupling > 0.0)
+
+
+def test_a_search_is_never_of_more_operators_than_were_asked_for() -> None:
+    assert Size(40, 3, 50, 60).coarse == Size(8, 3, 12, 16)
+    assert Size(4, 0, 6, 5).coarse == Size(4, 0, 6, 5)
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 5])
+def test_lengths_of_drags_rise_by_the_same_factor(count: int) -> None:
+    lengths = search._lengths(count)
+    assert len(lengths) == count
+    assert all(LENGTHS[0] - 1e-12 <= length <= LENGTHS[1] + 1e-12 for length in lengths)
+    if count > 1:
+        factors = np.divide(lengths[1:], lengths[:-1])
+        assert factors == pytest.approx((LENGTHS[1] / LENGTHS[0]) ** (1.0 / (count - 1)))
+
+
+def test_the_least_slope_of_the_first_line_holds_throughout_the_search() -> None:
+    job = FieldSearch(data(), SIZE, 20.0)
+    job._lay(Stages(), SIZE)
+    weights = job._solved(row(Stages()), job._paths(Stages()))
+    assert weights.slopes[0].min() >= 20.0
