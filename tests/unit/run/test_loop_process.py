@@ -4,6 +4,8 @@ import io
 import json
 import os
 import signal
+import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -239,3 +241,14 @@ def test_all_that_it_has_to_say_is_in_the_page(prepared, monkeypatch, raised, co
     assert made.page.outcome() == (OUTCOME if code == 0 else None)
     # A stop comes from the supervisor alone, so that it ends by the ramp.
     assert ignored == dict.fromkeys((signal.SIGINT, signal.SIGTERM, signal.SIGHUP), signal.SIG_IGN)
+
+
+def test_it_has_nothing_that_only_fits_and_figures_need():
+    """All that is imported here is locked in memory, in each run: SciPy's larger parts are 80 MB."""
+    program = (
+        "import sys, hilctl.run.loop_process, hilctl_drivers.simulated.rigs;"
+        "heavy = ('scipy.optimize', 'scipy.signal', 'scipy.sparse', 'matplotlib', 'pandas');"
+        "print([name for name in heavy if name in sys.modules])"
+    )
+    words = [sys.executable, "-P", "-c", program]
+    assert subprocess.run(words, capture_output=True, text=True, check=True).stdout == "[]\n"
