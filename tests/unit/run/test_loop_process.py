@@ -244,7 +244,7 @@ def test_all_that_it_has_to_say_is_in_the_page(prepared, monkeypatch, raised, co
 
 
 def test_it_has_nothing_that_only_fits_and_figures_need():
-    """All that is imported here is locked in memory, in each run: SciPy's larger parts are 80 MB."""
+    """What is imported here is locked in memory in each run: SciPy's larger parts are 80 MB."""
     program = (
         "import sys, hilctl.run.loop_process, hilctl_drivers.simulated.rigs;"
         "heavy = ('scipy.optimize', 'scipy.signal', 'scipy.sparse', 'matplotlib', 'pandas');"
