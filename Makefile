@@ -17,7 +17,6 @@ test: $(VENV)/.ready
 test-slow: $(VENV)/.ready
 	@echo "Takes about 20 minutes: most of them real time, in which runs go on."
 	$(BIN)/pytest -n 2 --dist loadfile -m slow
-	$(BIN)/pytest -n 2 --dist loadfile -m "hypothesis and not slow" --hypothesis-profile thorough
 
 lint: $(VENV)/.ready
 	$(BIN)/ruff check .

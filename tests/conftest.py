@@ -29,7 +29,7 @@ os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 settings.register_profile("local", deadline=None, max_examples=40)
 settings.register_profile("ci", settings.get_profile("local"), derandomize=True)
 settings.load_profile("ci" if os.environ.get("CI") else "local")
-settings.register_profile("thorough", settings(), max_examples=100)  # make test-slow
+settings.register_profile("thorough", settings(), max_examples=100)
 
 
 def pytest_addoption(parser):
