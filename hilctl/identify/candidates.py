@@ -19,7 +19,6 @@ WHOLE: tuple[Mapping[str, Any], ...] = (
 )
 """What is tried on histories."""
 LOOPS: tuple[Mapping[str, Any], ...] = (
-    {"kind": "field"},
     {"kind": "staged"},
     {"kind": "integrated", "offset": True},
 )

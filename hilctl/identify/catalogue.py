@@ -17,6 +17,7 @@ from hilctl.identify.settings import FitKind
 from hilctl.identify.staged.fits import fit_free, fit_staged
 
 ANY = "steady loops, or whole histories"
+HISTORIES = "whole histories"
 LOOPS = "steady loops"
 STAGES = "steady loops at one sample rate; whole histories without lag, structure and delay"
 
@@ -72,7 +73,7 @@ CATALOGUE: Mapping[FitKind, CatalogueEntry] = {
     "field": CatalogueEntry(
         "plays and drags of an effective field, with its losses",
         "densities by non-negative least squares, the stages searched",
-        ANY,
+        HISTORIES,
         fit_field,
     ),
     "straight": CatalogueEntry("straight line: no hysteresis", "least squares", ANY, fit_straight),

@@ -63,6 +63,7 @@ def test_runs_with_little(hilctl, tmp_path, shell, environment):
 def test_output_that_is_no_file_is_refused(hilctl, tmp_path, name):
     """In one message, and nothing stands there afterwards that did not before."""
     os.mkfifo(tmp_path / "fifo")
+    (tmp_path / "e.yaml").touch()  # the experiment, which is written with the command
     before = sorted(tmp_path.iterdir())
     ended = hilctl(output=name)
     assert ended.returncode == 2, ended.stderr

@@ -1,4 +1,4 @@
-"""Fit of the effective-field model to whole histories, loops as well.
+"""Fit of the effective-field model to whole histories.
 
 fits.py      from a job to a model
 prepared.py  records as the fit needs them: thinned in time, displacement without its structure

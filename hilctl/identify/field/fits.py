@@ -2,6 +2,8 @@
 
 import math
 
+from hilctl.base.errors import DataError
+from hilctl.identify.data.records import SteadyLoop
 from hilctl.identify.field.prepared import Prepared
 from hilctl.identify.field.search import FieldEnd, FieldSearch, Size
 from hilctl.identify.field.stages import Stages
@@ -11,7 +13,18 @@ from hilctl.models.staged import StagedModel, Structure
 
 
 def fit_field(job: FitJob) -> FoundModel:
-    """Fit plays and drags of an effective field, losses, coupling, structure and delay."""
+    """Fit plays and drags of an effective field, losses, coupling, structure and delay.
+
+    Raises:
+        DataError: There are steady loops among the data: they leave coupling, curve and losses
+            undetermined, and what is found then depends on rounding.
+    """
+    loops = [record.label for record in job.data.records if isinstance(record, SteadyLoop)]
+    if loops:
+        raise DataError(
+            f"an effective field is found from whole histories, not from steady loops: {loops[0]};"
+            " configs/identify_any.yaml is a campaign for it, --model staged takes loops"
+        )
     settings = job.settings
     data = Prepared(job.data.records)
     size = Size(settings.plays, settings.drags, settings.cells, settings.knots)

@@ -1,9 +1,11 @@
 """A fit of the effective-field model to a history of a model that it is not."""
 
 import numpy as np
+import pytest
 
 from hilctl.base.arrays import F64
-from hilctl.identify.data.records import History
+from hilctl.base.errors import DataError
+from hilctl.identify.data.records import History, SteadyLoop
 from hilctl.identify.fit_model import fit_model
 from hilctl.identify.judge import judge
 from hilctl.identify.settings import FitSettings
@@ -41,3 +43,11 @@ def test_a_history_that_was_not_fitted_is_met() -> None:
     assert judged.peak_percent < 3.0
     # What holds the field back by a constant time is found as that, not as what follows the slope.
     assert 1e-4 < found.parameters["field_s"] < 4e-4
+
+
+def test_steady_loops_are_refused() -> None:
+    """They leave so much open that what is found would differ from processor to processor."""
+    wave = np.sin(2.0 * np.pi * np.arange(64) / 64)
+    loop = SteadyLoop("3 A 10 Hz", 3.0 * wave, 20.0 * wave, 10.0, RATE_HZ)
+    with pytest.raises(DataError, match="not from steady loops: 3 A 10 Hz"):
+        fit_model([loop], FitSettings(kind="field"), lambda: 0.0)
