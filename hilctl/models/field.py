@@ -10,6 +10,7 @@ from hilctl.base.arrays import F64
 from hilctl.base.strict import Strict
 from hilctl.kernels.field import Bank, Losses, field_forward, field_inverse
 from hilctl.models.base import HysteresisModel, Operator, Thresholds, Weights, refuse
+from hilctl.models.preisach import cell_problems
 
 _TOLERANCE_UM = 1e-6
 _EVEN = 1e-3
@@ -103,7 +104,7 @@ class FieldModel(HysteresisModel):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        refuse((*self._operator_problems(), *self._cell_problems()))
+        refuse((*self._operator_problems(), *cell_problems(self.cell, self.slopes)))
         return self
 
     def _operator_problems(self) -> Iterator[str]:
@@ -118,17 +119,6 @@ class FieldModel(HysteresisModel):
                 f"slopes must have one line a threshold and one a length: {len(self.slopes)} for "
                 f"{len(self.thresholds)} and {len(self.lengths)}"
             )
-
-    def _cell_problems(self) -> Iterator[str]:
-        if not self.cell > 0.0:
-            yield f"cell must be > 0: {self.cell!r}"
-        for i, line in enumerate(self.slopes):
-            if len(line) != len(self.slopes[0]) or not line:
-                yield f"every line of slopes must have the same cells: {len(line)} in line {i}"
-            if any(slope < 0.0 for slope in line):
-                yield f"slopes must be >= 0 for the inverse to exist: {min(line)!r} in line {i}"
-        if self.slopes and not all(slope > 0.0 for slope in self.slopes[0]):
-            yield "slopes of the first line must be > 0 for the inverse to exist"
 
     @property
     def operators(self) -> int:

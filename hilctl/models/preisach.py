@@ -1,6 +1,6 @@
 """The Preisach model with weights on a triangle of thresholds (1.1-1.2)."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Literal, Self
 
 import numpy as np
@@ -36,19 +36,10 @@ class PreisachModel(ImplicitModel):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        refuse((*_line_problems(self.thresholds, self.slopes), *self._cell_problems()))
+        refuse(
+            (*_line_problems(self.thresholds, self.slopes), *cell_problems(self.cell, self.slopes))
+        )
         return self
-
-    def _cell_problems(self) -> Iterator[str]:
-        if not self.cell > 0.0:
-            yield f"cell must be > 0: {self.cell!r}"
-        for i, line in enumerate(self.slopes):
-            if len(line) != len(self.slopes[0]) or not line:
-                yield f"every line of slopes must have the same cells: {len(line)} in line {i}"
-            if any(slope < 0.0 for slope in line):
-                yield f"slopes must be >= 0 for the inverse to exist: {min(line)!r} in line {i}"
-        if self.slopes and not all(slope > 0.0 for slope in self.slopes[0]):
-            yield "slopes of the first line must be > 0 for the inverse to exist"
 
     @property
     def operators(self) -> int:
@@ -76,3 +67,16 @@ def _line_problems(thresholds: Thresholds, slopes: tuple[Weights, ...]) -> Itera
         yield f"the first threshold must be 0: {list(thresholds[:1])}"
     if any(np.diff(thresholds) <= 0.0):
         yield f"thresholds must rise: {list(thresholds)}"
+
+
+def cell_problems(cell: float, slopes: Sequence[Weights]) -> Iterator[str]:
+    """Give what keeps lines of slopes over even cells from having an inverse."""
+    if not cell > 0.0:
+        yield f"cell must be > 0: {cell!r}"
+    for i, line in enumerate(slopes):
+        if len(line) != len(slopes[0]) or not line:
+            yield f"every line of slopes must have the same cells: {len(line)} in line {i}"
+        if any(slope < 0.0 for slope in line):
+            yield f"slopes must be >= 0 for the inverse to exist: {min(line)!r} in line {i}"
+    if slopes and not all(slope > 0.0 for slope in slopes[0]):
+        yield "slopes of the first line must be > 0 for the inverse to exist"
