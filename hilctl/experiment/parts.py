@@ -68,6 +68,7 @@ class Timing(Strict):
         hang_s: A loop that gives no sign for this time and two tick periods is killed, and the
             output made safe; while it waits for the device, ``max_late_s`` more. Left out, 80 ms;
             for a simulated device, which has no coil to protect, ``max_late_s`` and half a second.
+            One that is stopped, as by SIGSTOP, has no more than 20 ms where there is a coil.
     """
 
     late_policy: Literal["skip", "catch_up", "slip"] = "skip"

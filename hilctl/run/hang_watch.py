@@ -17,10 +17,13 @@ class SilenceLimits:
     Attributes:
         loop_s: While it runs.
         exchange_s: What is added while it waits for the device.
+        stopped_s: While its process is stopped, as by SIGSTOP: it waits for nothing that could
+            come, and it is no busy machine that keeps it.
     """
 
     loop_s: float
     exchange_s: float
+    stopped_s: float
 
 
 class HangWatch:
@@ -32,8 +35,7 @@ class HangWatch:
     Args:
         page: Shared with the loop.
         limits: Longest that it may be silent.
-        is_stopped: Whether the loop's process is stopped, as by SIGSTOP: then it waits for nothing
-            that could come, and no device's time-out is a reason to be silent.
+        is_stopped: Whether the loop's process is stopped.
     """
 
     def __init__(
@@ -60,9 +62,12 @@ class HangWatch:
             return False
         self._polls += 1
         silent_s = (now_ns - self._seen_ns) * 1e-9
-        if self._polls <= _POLLS or silent_s <= self._limits.loop_s:
+        if self._polls <= _POLLS:
             return False
-        return silent_s > self._limits.loop_s + self._wait_s(phase) or self._is_stopped()
+        if silent_s > self._limits.loop_s + self._wait_s(phase):
+            return True
+        # Last, since it asks the kernel.
+        return silent_s > self._limits.stopped_s and self._is_stopped()
 
     def _wait_s(self, phase: int) -> float:
         """Return how long the loop may be waiting for its device."""

@@ -32,18 +32,25 @@ _ACTING_NS = 60_000_000_000
 _END_S = 1.0
 _SIMULATED_MARGIN_S = 0.5
 _HANG_S = 0.08
+_STOPPED_S = 0.02
 
 
 def silence_limits(checked: Checked) -> SilenceLimits:
     """Return how long the loop of an experiment may be silent."""
     config = checked.loaded.config
     timing = config.timing
+    simulated = checked.loaded.device.info.simulated
     hang_s = timing.hang_s
     if hang_s is None:
-        simulated = checked.loaded.device.info.simulated
         hang_s = timing.max_late_s + _SIMULATED_MARGIN_S if simulated else _HANG_S
-    # A device that takes longer than this makes the next tick too late, which ends the run as well.
-    return SilenceLimits(2.0 * config.tick_s + hang_s, timing.max_late_s)
+    periods_s = 2.0 * config.tick_s
+    return SilenceLimits(
+        loop_s=periods_s + hang_s,
+        # A device that takes longer makes the next tick too late, which ends the run as well.
+        exchange_s=timing.max_late_s,
+        # Without a coil to protect, who stops a loop may be looking into it with a debugger.
+        stopped_s=periods_s + (hang_s if simulated else min(hang_s, _STOPPED_S)),
+    )
 
 
 def _priority(checked: Checked) -> int:

@@ -46,7 +46,7 @@ def guarded(tmp_path):
     made = SimpleNamespace(loop=loop, page=page, device=Device(loop))
 
     def guard(hang_s=60.0):
-        job = GuardianJob("", {}, "", "", 0.25, SilenceLimits(hang_s, 60.0), loop.pid, 1)
+        job = GuardianJob("", {}, "", "", 0.25, SilenceLimits(hang_s, 60.0, hang_s), loop.pid, 1)
         Guardian(page, made.device, job, pidfd).watch()
 
     made.guard = guard
@@ -131,7 +131,7 @@ def test_it_gives_signs_of_life_while_the_device_keeps_it(guarded):
 
 def test_a_device_that_can_not_be_made_is_said_before_the_start(tmp_path):
     page = SampleRing.create(tmp_path / "ring", slots=4, block=1, state_size=1).page
-    ring, limits = str(tmp_path / "ring"), SilenceLimits(1.0, 1.0)
+    ring, limits = str(tmp_path / "ring"), SilenceLimits(1.0, 1.0, 1.0)
     job = GuardianJob("device: {kind: gone}", {}, "", ring, 0.0, limits, 1, 1)
     assert GuardianJob.from_json(job.to_json()) == job
     (tmp_path / "job").write_text(job.to_json(), encoding="utf-8")

@@ -10,7 +10,7 @@ from hilctl.run.hang_watch import HangWatch, SilenceLimits, is_stopped
 from hilctl.run.ring import SampleRing
 from hilctl.run.shared_page import Field, Phase
 
-LIMITS = SilenceLimits(loop_s=1.0, exchange_s=2.0)
+LIMITS = SilenceLimits(loop_s=1.0, exchange_s=2.0, stopped_s=0.4)
 
 
 class Watched:
@@ -67,12 +67,19 @@ def test_a_device_that_keeps_the_loop_waiting_is_no_hang_at_once(watched):
 
 
 @pytest.mark.parametrize("phase", [Phase.RUNNING, Phase.CLOSING])
-def test_a_loop_that_is_stopped_waits_for_no_device(watched, phase):
-    """SIGSTOP hits most loops in an exchange: its time-out is no excuse then."""
-    watched.page.put(Field.EXCHANGING, 1)
+@pytest.mark.parametrize("exchanging", [0, 1])
+def test_a_loop_that_is_stopped_waits_for_no_device(watched, phase, exchanging):
+    """SIGSTOP hits most loops in an exchange: its time-out is no excuse then, nor is the load."""
+    watched.page.put(Field.EXCHANGING, exchanging)
     watched.page.put(Field.PHASE, phase)
     watched.stopped = True
-    assert watched.hangs_after_s() == 1.1
+    assert watched.hangs_after_s() == 0.5
+
+
+def test_a_stop_is_looked_at_several_times(watched):
+    """Where all processes were stopped and go on, this one may be the first of them."""
+    watched.stopped = True
+    assert watched.looks(0.0, 5.0, 5.1, 5.2, 5.3) == [False, False, False, False, True]
 
 
 def test_closing_a_device_has_more_time(watched):

@@ -220,11 +220,13 @@ def test_nothing_starts_before_the_guardian_watches(run):
 
 
 @pytest.mark.parametrize(
-    ("given", "simulated", "loop_s"), [(None, False, 0.1), (None, True, 1.52), (0.5, True, 0.52)]
+    ("given", "simulated", "loop_s", "stopped_s"),
+    [(None, False, 0.1, 0.04), (0.5, False, 0.52, 0.04), (None, True, 1.52, 1.52)],
 )
-def test_how_long_a_loop_may_be_silent(page, monkeypatch, given, simulated, loop_s):
+def test_how_long_a_loop_may_be_silent(page, monkeypatch, given, simulated, loop_s, stopped_s):
     """Two periods, and what the experiment says; simulated coils can wait."""
     run = Run(page, monkeypatch, guarded=False, simulated=simulated)
     run.checked.loaded.config.timing.hang_s = given
     limits = silence_limits(run.checked)
     assert (limits.loop_s, limits.exchange_s) == (pytest.approx(loop_s), 1.0)
+    assert limits.stopped_s == pytest.approx(stopped_s)
