@@ -27,6 +27,14 @@ class CommandEntry(NamedTuple):
 
 
 COMMANDS: dict[str, CommandEntry] = {
+    "demo": CommandEntry(
+        "hilctl.cli.examples:demo",
+        "Run the simulated rig without and with the inverse, and show what it does.",
+    ),
+    "examples": CommandEntry(
+        "hilctl.cli.examples:examples",
+        "List the examples, or copy one and the files it names to where they can be changed.",
+    ),
     "run": CommandEntry(
         "hilctl.cli.running:run",
         "Run an experiment and record it; Ctrl-C ramps to the safe value first.",

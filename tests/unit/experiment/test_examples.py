@@ -1,0 +1,69 @@
+"""Examples: which there are, and copies that stand on their own."""
+
+from pathlib import Path
+
+import pytest
+
+from hilctl.base.errors import InputError
+from hilctl.experiment import examples
+from hilctl.experiment.examples import copy_example, examples_folder, shipped_examples
+from hilctl.experiment.load import load_experiment
+
+CONFIGS = Path(__file__).parents[3] / "configs"
+
+
+def test_a_checkout_has_them_in_configs(tmp_path, monkeypatch):
+    assert examples_folder() == CONFIGS
+    installed = tmp_path / "hilctl" / "examples"
+    installed.mkdir(parents=True)
+    monkeypatch.setattr(examples, "_PACKAGE", tmp_path / "hilctl")
+    assert examples_folder() == installed
+
+
+def test_each_says_what_it_is_for():
+    found = shipped_examples(CONFIGS)
+    assert {example.name for example in found} >= {"demo", "models/terfenol_staged"}
+    assert not [example.name for example in found if not example.description]
+    paths = {example.path for example in found}
+    assert paths == set(CONFIGS.rglob("*.yaml"))
+
+
+@pytest.mark.parametrize("name", ["demo", "modbus_adam_6224"])
+def test_a_copy_stands_on_its_own(tmp_path, name):
+    """Without the folder that it came from: the model stands beside it, and the schema."""
+    own = tmp_path / "new" / "folder"
+    first, *others = copy_example(name, own, CONFIGS)
+    assert first == own / f"{name}.yaml"
+    assert own / "schema.json" in others
+    assert load_experiment(first).config.name == name
+
+
+def test_a_copy_that_is_there_stays_and_one_that_was_changed_is_not_written_over(tmp_path):
+    first, model, schema = copy_example("demo", tmp_path, CONFIGS)
+    assert copy_example("demo", tmp_path, CONFIGS) == (first, model, schema)
+    schema.unlink()
+    model.write_text("mine")
+    with pytest.raises(InputError, match=r"terfenol_staged.yaml: is there already and differs"):
+        copy_example("demo", tmp_path, CONFIGS)
+    assert model.read_text() == "mine"
+    assert not schema.exists()
+
+
+def test_what_can_not_be_had_is_said(tmp_path):
+    with pytest.raises(InputError, match=r"no example 'demox' \(did you mean 'demo'\?\)"):
+        copy_example("demox", tmp_path, CONFIGS)
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match="can't be made: Not a directory"):
+        copy_example("demo", tmp_path / "file" / "there", CONFIGS)
+
+
+def test_examples_may_name_each_other(tmp_path):
+    """A model that is named by two, in a folder of its own."""
+    folder = tmp_path / "shipped"
+    (folder / "models").mkdir(parents=True)
+    (folder / "a.yaml").write_text("base: b.yaml\nothers: [models/m.yaml, {deep: models/m.yaml}]\n")
+    (folder / "b.yaml").write_text("model: models/m.yaml\n")
+    (folder / "models" / "m.yaml").write_text("model: {kind: ppi}\n")
+    copies = copy_example("a", tmp_path / "own", folder)
+    names = [path.relative_to(tmp_path / "own").as_posix() for path in copies]
+    assert names == ["a.yaml", "b.yaml", "models/m.yaml"]
