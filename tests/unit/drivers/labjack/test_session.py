@@ -105,16 +105,16 @@ def test_count_of_the_device_must_be_ours(rig, more):
 class Scripted:
     """A device that answers as told: readings, scans left in it, and values that it still holds.
 
-    Its rest is 0, and readings count up from there. With ``starts`` False it never runs.
+    Readings count up from 0. With ``starts`` False it never runs, and it scans at ``makes_hz``.
     """
 
-    def __init__(self, *answers, starts=True):
-        self.answers, self.starts = list(answers), starts
+    def __init__(self, *answers, starts=True, makes_hz=RATE_HZ):
+        self.answers, self.starts, self.makes_hz = list(answers), starts, makes_hz
         self.given, self.fed, self.calls = 0, 0, 0
 
     def read(self, address, words):
         if address == stream.SCANRATE_HZ:
-            return stream.f32(RATE_HZ)
+            return stream.f32(self.makes_hz)
         if address == stream.OUT_BUFFER_STATUS:
             return stream.u32(CAPACITY - self.fed)
         return stream.u32(int(self.starts))
@@ -143,8 +143,8 @@ class Scene:
 
 @pytest.fixture
 def scene():
-    def of(*answers, queued=100, turnaround_s=0.001, starts=True):
-        device, slept_s = Scripted(*answers, starts=starts), []
+    def of(*answers, queued=100, turnaround_s=0.001, **does):
+        device, slept_s = Scripted(*answers, **does), []
         profile = load_profile("labjack_t7")
         session = StreamSession(
             device, profile.streaming, 0.1, turnaround_s, slept_s.append, lambda: sum(slept_s)
@@ -277,3 +277,12 @@ def test_readings_come_with_values_that_are_fed_while_it_runs(scene):
     assert made.session.level_min == 40
     assert made.session.take(60).size == 60
     assert made.device.calls == 2
+
+
+def test_a_rate_that_the_device_can_not_make_is_refused(scene):
+    """100 ppm are 4 ms in 40 s."""
+    scene(makes_hz=RATE_HZ * (1.0 + 0.9e-4))
+    scene(makes_hz=RATE_HZ * (1.0 - 0.9e-4))
+    for off in (1.2e-4, -1.2e-4):
+        with pytest.raises(DeviceError, match="was set to 1000 Hz, the device makes"):
+            scene(makes_hz=RATE_HZ * (1.0 + off))
