@@ -14,6 +14,8 @@ from hypothesis import settings
 
 from hilctl.base.private import memory_folder
 from hilctl.base.yaml import document
+from hilctl.experiment import registry
+from hilctl_drivers import profile
 
 ROOT = Path(__file__).parents[1]
 HARDWARE = Path(__file__).parent / "hardware"
@@ -24,6 +26,9 @@ SLOW = tuple(Path(__file__).parent / name for name in ("faults", "peers", "simul
 # compiles all modules anew, and that takes longer than the tests.
 sys.dont_write_bytecode = False
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+
+# Seven thousand tests are collected, and none of them is garbage.
+gc.disable()
 
 # A shared machine stalls now and then, and a failure in CI must come back when it is run again.
 settings.register_profile("local", deadline=None, max_examples=40)
@@ -81,6 +86,7 @@ def pytest_collection_finish():
     """Keep what was imported out of every search for garbage: it takes 0.2 s and finds none."""
     gc.collect()
     gc.freeze()
+    gc.enable()
 
 
 def pytest_report_collectionfinish(config, items):
@@ -99,13 +105,16 @@ def memory():
 
 
 @pytest.fixture(scope="session", autouse=True)
-def composed_once():
-    """Scan each YAML text once: what comes of it depends on nothing else, and is only read.
+def read_once():
+    """Read each YAML text, each profile and what is installed once: all that is only read.
 
-    A shipped profile has hundreds of lines and is loaded for hundreds of devices.
+    A shipped profile has hundreds of lines, and hundreds of devices are made of each.
     """
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(document, "compose", lru_cache(maxsize=256)(document.compose))
+        for module, name in (
+            (document, "compose"), (profile, "parse_profile"), (registry, "entry_points"),
+        ):  # fmt: skip
+            patch.setattr(module, name, lru_cache(maxsize=256)(getattr(module, name)))
         yield
 
 

@@ -350,22 +350,18 @@ class TestOtherCommands:
         assert contents(place) == {}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("text", "arguments", "message"),
     [
-        pytest.param(
-            GOOD.replace("60.0]}", "60.0}"), (), "x.yaml:7: is not readable YAML",
-            marks=pytest.mark.slow,
-        ),
+        (GOOD.replace("60.0]}", "60.0}"), (), "x.yaml:7: is not readable YAML"),
         (
-            GOOD.replace("amplitude: 1.0", "amplitude: .nan"),
-            ("--json",),
+            GOOD.replace("amplitude: 1.0", "amplitude: .nan"), ("--json",),
             "x.yaml:5: waveform.amplitude: must be a finite number, got nan",
         ),
-        pytest.param(
+        (
             GOOD, ("--output", "x.yaml/run.mcap"),
             "x.yaml/run.mcap: can't be written: Not a directory",
-            marks=pytest.mark.slow,
         ),
     ],
     ids=["malformed", "not a number, for programs", "unwritable"],

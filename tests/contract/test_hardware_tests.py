@@ -125,6 +125,7 @@ def test_sensor_that_shows_nothing_is_found(suite):
     assert suite.currents_a()[-1] == 0.0
 
 
+@pytest.mark.slow
 def test_without_a_device_nothing_is_run():
     """Without --device the hardware tests are left out, and one line says how to run them."""
     command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "tests/hardware"]

@@ -67,12 +67,14 @@ def experiment(folder: Path, **device: object) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_is_listed(installed):
     """Beside the built-in ones, by the name of its entry point."""
     devices = json.loads(hilctl(installed, "devices", "--json").stdout)["devices"]
     assert devices["spring"] == "own_device.spring:Spring"
 
 
+@pytest.mark.slow
 def test_is_in_the_schema(installed):
     """So that an editor knows its options too."""
     schema = json.loads(hilctl(installed, "schema").stdout)

@@ -1,5 +1,6 @@
 """Replay: the recorded reference, through the code that ran, gives the recorded bits again."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from hilctl.models.files import dump_model
 from hilctl.models.staged import FieldLag, StagedModel, Structure
 from hilctl.recording.data import Recording
 from hilctl.recording.reader import read
+from hilctl.run.result import RunResult
 from hilctl.run.start import checked_experiment, start_run
 from hilctl.run.unpaced import run_unpaced
 from tests.published import terfenol_rdpi
@@ -35,8 +37,22 @@ STAGED = StagedModel.around(
 )
 
 
+def unpaced(path: Path, output: Path) -> RunResult:
+    """Run in this process, as fast as it goes."""
+    return run_unpaced(checked_experiment(path, []), output)
+
+
+def paced(path: Path, output: Path) -> RunResult:
+    """Run as ``hilctl run`` does, in processes of its own."""
+    return start_run(path, [], output, False, lambda progress: None)
+
+
 def record(
-    folder: Path, model: HysteresisModel, duration_s: float, after: Path | None = None
+    folder: Path,
+    model: HysteresisModel,
+    duration_s: float,
+    after: Path | None = None,
+    run: Callable[[Path, Path], RunResult] = unpaced,
 ) -> Recording:
     """Run a compensated sine to its end, perhaps after another run."""
     (folder / "model.yaml").write_text(dump_model(model))
@@ -58,7 +74,7 @@ def record(
     }
     path = folder / "experiment.yaml"
     path.write_text(yaml.safe_dump(experiment))
-    result = start_run(path, [], folder / "run.mcap", False, lambda progress: None)
+    result = run(path, folder / "run.mcap")
     assert result.code == "completed"
     return read(result.path)
 
@@ -66,7 +82,7 @@ def record(
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory) -> Recording:
     """A short compensated run that is stopped by its end, limits untouched."""
-    return record(tmp_path_factory.mktemp("replay"), terfenol_rdpi(), 0.4)
+    return record(tmp_path_factory.mktemp("replay"), terfenol_rdpi(), 0.4, run=paced)
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""Recordings made of formulas, for the tests of what is read off recordings."""
+"""Recordings made of formulas, and pages without drawings, for tests of several rooms."""
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hilctl.analysis import canvas
 from hilctl.base.arrays import F64, I64, U32
 from hilctl.base.events import Event
 from hilctl.base.samples import Flag, Samples
@@ -13,6 +14,13 @@ from hilctl.base.segments import Segment
 from hilctl.recording.data import Recording, Ticks
 
 MakeRecording = Callable[..., Recording]
+WHITE = b"\x89PNG\r\n\x1a\n"
+
+
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave all figures white, for tests of something else: to draw one takes half a second."""
+    monkeypatch.setattr(canvas, "png", lambda figure: WHITE)
 
 
 def _ticks(samples: int, block: int, rate_hz: float) -> Ticks:

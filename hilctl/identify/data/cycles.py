@@ -12,6 +12,8 @@ from hilctl.identify.data.period import find_period
 from hilctl.identify.data.records import FEWEST_POINTS, History, SteadyLoop
 from hilctl.recording.data import Recording
 
+_LARGEST = 1e100  # no reading is; the spline's differences and products stay finite below it
+
 
 def average_cycle(label: str, phase: F64, values: F64, period: float, points: int) -> F64:
     """Average cycles into one, at points evenly spaced in time.
@@ -51,7 +53,7 @@ def average_cycle(label: str, phase: F64, values: F64, period: float, points: in
     offset = np.bincount(index, phase * bins - nearest, bins) / count
     knots = (np.arange(bins) + offset) / bins
     means = np.array([np.bincount(index, row, bins) / count for row in values])
-    if not np.isfinite(means).all():
+    if not (np.abs(means) < _LARGEST).all():
         raise DataError(f"{label}: holds values that are not finite, or too large to be averaged")
     spline = CubicSpline(
         np.append(knots, knots[0] + 1.0), np.hstack([means, means[:, :1]]), 1, bc_type="periodic"

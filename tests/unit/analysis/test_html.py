@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilctl.analysis import canvas
 from hilctl.analysis.html import page, write_html
 from hilctl.analysis.report import summarize
 from hilctl.base.errors import InputError
@@ -17,7 +16,6 @@ from hilctl.base.segments import Segment
 from hilctl.recording.data import Recording
 
 NASTY = """<script>alert("x")</script>&amp;<img src=x onerror='y'>"""
-WHITE = b"\x89PNG\r\n\x1a\n"
 
 
 class Page(HTMLParser):
@@ -70,12 +68,6 @@ def recording(make_recording) -> Recording:
 def shown(recording: Recording) -> str:
     """Return the page of that run; to draw it takes seconds."""
     return page(recording, summarize(recording))
-
-
-@pytest.fixture
-def undrawn(monkeypatch) -> None:
-    """Leave all figures white, for tests of something else."""
-    monkeypatch.setattr(canvas, "png", lambda figure: WHITE)
 
 
 def test_fetches_nothing(shown: str) -> None:
@@ -132,6 +124,7 @@ def test_is_small(make_recording) -> None:
     assert len(page(recording, summarize(recording))) < 1_000_000
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_cut_short_recording_has_a_page(recording: Recording) -> None:
     """What is missing is told in words instead of figures."""
     empty = replace(recording, samples=recording.samples.part(0, 0), end={}, events=())

@@ -14,6 +14,7 @@ EXPERIMENT = """\
 name: rig
 device: {kind: simulated_terfenol, seed: 3}
 sample_rate_hz: 5000
+block: 50
 waveform: {kind: hold, unit: A, level: 0.0, duration_s: 1.0}
 compensator: none
 limits: {peak_current_a: 4.0, slew_a_per_s: 5000.0, stroke_um: [-50.0, 50.0]}

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from hilctl.characterise.page import characterisation_page, write_characterisation
 from hilctl.characterise.results import StepRow
@@ -46,6 +47,7 @@ def test_what_ended_a_campaign_stands_on_top():
     assert "data:image/png" not in page
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_page_is_written_over(tmp_path):
     path = tmp_path / "model.html"
     for _ in range(2):

@@ -42,6 +42,7 @@ def settings(*texts: str) -> IdentifySettings:
     return settings_from("ppi", [*TABLE, "weights=free", "offset=true", *texts])
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_order_and_lag_are_found_and_reported(
     tables: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -19,6 +19,7 @@ from hilctl.models.published import exponential_integrated
 from tests.published import terfenol_rdpi
 
 Loops = Callable[..., list[SteadyLoop]]
+POINTS = 150
 GRID = [(a, f) for a in (2.0, 3.0, 6.0) for f in (10.0, 100.0, 250.0)]
 
 
@@ -28,14 +29,14 @@ def loops(loops_of: Loops) -> list[SteadyLoop]:
         alpha=0.9, gamma_s=2e-4, a_0=3.0, alpha_0=1.4, beta_0=0.3, g_0=1.0, alpha_1=0.08,
         beta_1=0.15, d_p=8.0, alpha_2=0.1, beta_2=0.4, d_n=8.0, plays=6, deadbands_a_side=4,
     )  # fmt: skip
-    return loops_of(omega, GRID)
+    return loops_of(omega, GRID, POINTS)
 
 
 def test_smallest_order_that_is_as_good_is_chosen(loops: list[SteadyLoop]) -> None:
     """Loops of 6 plays on a noisy sensor are not given 28; every order's error is told."""
     rng = np.random.default_rng(2)
     noisy = [
-        replace(loop, displacement_um=loop.displacement_um + rng.normal(0.0, 0.3, 300))
+        replace(loop, displacement_um=loop.displacement_um + rng.normal(0.0, 0.3, POINTS))
         for loop in loops
     ]
     settings = FitSettings(kind="integrated", weights="free")
@@ -51,7 +52,7 @@ def test_smallest_order_that_is_as_good_is_chosen(loops: list[SteadyLoop]) -> No
 
 def test_models_without_deadbands_have_none(loops_of: Loops) -> None:
     """The order of an RDPI is its plays alone."""
-    data = loops_of(terfenol_rdpi(), [(2.3, f) for f in (1.0, 50.0, 100.0, 200.0)])
+    data = loops_of(terfenol_rdpi(), [(2.3, f) for f in (1.0, 50.0, 100.0, 200.0)], POINTS)
     settings = FitSettings(kind="rdpi", weight_by="equal")
     chosen, errors = choose_order(data, settings, one_by_one, ignore_progress)
     assert chosen.plays in {error.plays for error in errors}

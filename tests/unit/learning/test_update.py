@@ -71,15 +71,15 @@ def peaks(state: Learning) -> list[float]:
 @pytest.mark.parametrize(
     "response",
     [
-        Response(),
-        Response(0.8, 5.0 / RATE_HZ),
-        RESONANT,
+        pytest.param(Response(), id="exact", marks=pytest.mark.slow),
+        pytest.param(Response(0.8, 5.0 / RATE_HZ), id="late", marks=pytest.mark.slow),
+        pytest.param(RESONANT, id="resonant"),
         pytest.param(
             Response(1.1, 3.0 / RATE_HZ, 1.0 / (2.0 * np.pi * 480.0) ** 2, 0.12),
+            id="loaded",
             marks=pytest.mark.slow,
         ),
     ],
-    ids=["exact", "late", "resonant", "loaded"],
 )
 @pytest.mark.parametrize("coupling", [pytest.param(0.0, marks=pytest.mark.slow), 0.15])
 def test_the_error_goes_to_the_noise_floor(response, coupling):

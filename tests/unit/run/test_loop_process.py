@@ -244,6 +244,7 @@ def test_all_that_it_has_to_say_is_in_the_page(prepared, monkeypatch, raised, co
     assert ignored == dict.fromkeys((signal.SIGINT, signal.SIGTERM, signal.SIGHUP), signal.SIG_IGN)
 
 
+@pytest.mark.slow
 def test_it_has_nothing_that_only_fits_and_figures_need():
     """What is imported here is locked in memory in each run: SciPy's larger parts are 80 MB."""
     program = (

@@ -69,6 +69,17 @@ def test_a_phase_missing_from_all_cycles_is_refused() -> None:
         average_cycle("run", phase, np.sin(phase)[None, :], 100.0, 300)
 
 
+@pytest.mark.parametrize("reading", [1e308, np.inf, np.nan])
+def test_readings_that_no_spline_can_hold_are_refused(reading: float) -> None:
+    """A recording may hold any number; near the largest, differences overflow."""
+    phase = np.arange(500) / 100
+    values = np.sin(2.0 * np.pi * phase)
+    values[7] = -reading
+    values[8] = reading
+    with pytest.raises(DataError, match="run: holds values that are not finite, or too large"):
+        average_cycle("run", phase, values[None, :], 100.0, 300)
+
+
 def test_a_segment_without_steady_cycle_is_named(recording_of: Callable[..., Recording]) -> None:
     """A step segment or one that is too short can't give a loop."""
     command, segment = sine_segment(10.0, 2)

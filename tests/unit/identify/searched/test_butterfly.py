@@ -38,17 +38,15 @@ def test_errors_are_small_over_one_wing_or_both(loops_of, centre):
     assert found.model.bias == 0.0
 
 
-def test_magnets_are_found(loops_of):
-    """A bias at no command shows in loops over both wings."""
+def test_magnets_are_found_and_what_is_found_can_be_inverted(loops_of):
+    """A bias at no command shows in loops over both wings.
+
+    The range of the model begins where the wings meet, so that there is an inverse.
+    """
     shifted = KNOWN.model_copy(update={"bias": 1.5})
     found = fit(loops_of(shifted, SINES))
     assert found.model.bias == pytest.approx(1.5, rel=0.05)
     assert found.peak_percent < 2.0
-
-
-def test_what_is_found_can_be_inverted(loops_of):
-    """The range of the model begins where the wings meet, so that there is an inverse."""
-    found = fit(loops_of(KNOWN, SINES), turning_um=0.0)
     assert found.model.output_range_um[0] >= found.model.output_offset_um
     found.model.inverse(1000.0)
 
