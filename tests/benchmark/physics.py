@@ -11,6 +11,7 @@ import copy
 import json
 import os
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -22,6 +23,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 from causal_floor import CausalInverse, rods_wanted_um
+from learning import CYCLES, EXPERIMENT, SOFT_S
 from references import RATE_HZ, Row, Stroke, random, references
 
 from hilctl.base.arrays import F64
@@ -34,8 +36,10 @@ from hilctl.identify.fit_model import FittedModel, fit_model
 from hilctl.identify.job import ignore_progress
 from hilctl.identify.settings import FitSettings, IdentifySettings
 from hilctl.identify.workers import one_by_one
+from hilctl.learning.session import Session, unpaced
 from hilctl.loop.compensator import Compensator
 from hilctl.models.base import HysteresisModel
+from hilctl.models.files import dump_model
 from hilctl.waveforms.build import build
 from hilctl_drivers.simulated.rigs import PHYSICS, Physics, TerfenolOptions
 from hilctl_drivers.simulated.terfenol import TerfenolActuator
@@ -43,6 +47,8 @@ from hilctl_drivers.simulated.terfenol import TerfenolActuator
 CAMPAIGN = Path(__file__).parents[2] / "configs" / "identify_any.yaml"
 MARGIN = 0.06  # of the range that a model was identified on, at either end
 MOST_A = 8.0
+LEARNED_HZ = (10.0, 100.0, 250.0)
+LEARNED_GOAL = 0.05
 EXTRAS: Mapping[str, Mapping[str, float]] = {
     "creep": {"share": 0.05},
     "thermal": {"rise_k_per_a2": 0.5, "tau_s": 60.0, "growth_um_per_k": 0.5, "ambient_k": 2.0},
@@ -105,7 +111,8 @@ class Rig:
     def __init__(self, physics: Physics, extras: Sequence[str]) -> None:
         self.physics = physics
         chosen = {name: EXTRAS[name] for name in extras}
-        self._options = TerfenolOptions.model_validate({"physics": physics, **chosen})
+        self.device = {"physics": physics, **chosen}
+        self._options = TerfenolOptions.model_validate(self.device)
         self.parameters = self._options.parameters()
 
     def at_rest(self, *, noise: bool = False, seed: int = 1) -> TerfenolActuator:
@@ -221,6 +228,34 @@ def judge(
     return results
 
 
+def learned(rig: Rig, model: HysteresisModel, inside: Stroke, say: Callable[[str], None]) -> bool:
+    """Learn the full stroke by runs, and say how far that got; return whether it is far enough."""
+    good = True
+    with tempfile.TemporaryDirectory(prefix="learning-") as folder:
+        file = Path(folder) / "model.yaml"
+        file.write_text(dump_model(model))
+        for frequency_hz in LEARNED_HZ:
+            settings = [
+                f"waveform.frequency_hz={frequency_hz}",
+                f"waveform.duration_s={round(2.0 * SOFT_S + (CYCLES + 0.02) / frequency_hz, 5)}",
+                f"waveform.amplitude={inside.half_um}",
+                f"waveform.offset={inside.middle_um}",
+                f"compensator.model={file}",
+                f"limits.peak_current_a={MOST_A}",
+                "limits.stroke_um=[-90.0, 90.0]",
+                *(f"device.{key}={json.dumps(value)}" for key, value in rig.device.items()),
+            ]
+            runs = Path(folder) / f"{frequency_hz:g}"
+            found = Session(EXPERIMENT, settings, runs, unpaced).learn(20, lambda _: None)
+            (check,) = found.check
+            met = check.error_percent <= LEARNED_GOAL
+            good &= met
+            say(f"{rig.physics}, learned at {frequency_hz:g} Hz: {found.rows[0].error_percent:.2f} "
+                f"to {check.error_percent:.3f} % under other noise in {len(found.rows)} runs, "
+                f"noise {check.floor_percent:.3f}{'' if met else '  missed'}")  # fmt: skip
+    return good
+
+
 def cost_us(model: HysteresisModel, reference_um: F64) -> float:
     """Return processor time of the inverse, in us a sample, the best of some."""
     took = []
@@ -275,6 +310,9 @@ def show(rig: Rig, options: argparse.Namespace) -> tuple[dict[str, Any], bool]:
     sums = [summary(results, name) for name in names]
     for text, _ in sums:
         say(f"{rig.physics}, {text}")
+    good = all(met for _, met in sums[: 1 + ("conditioned" in also)])
+    if options.learn:
+        good &= learned(rig, fit.model, inside, say)
     table = {
         "physics": rig.physics,
         "options": list(options.options),
@@ -283,7 +321,7 @@ def show(rig: Rig, options: argparse.Namespace) -> tuple[dict[str, Any], bool]:
         "inverse_us": cost,
         "rows": [result.to_mapping() for result in results],
     }
-    return table, all(met for _, met in sums[: 1 + ("conditioned" in also)])
+    return table, good
 
 
 def wanted(row: Row, parts: Sequence[str]) -> bool:
@@ -300,6 +338,7 @@ def main() -> int:
     parser.add_argument("--options", nargs="*", default=[], choices=list(EXTRAS))
     parser.add_argument("--condition", dest="conditioned", action="store_true")
     parser.add_argument("--floor", action="store_true", help="minutes more")
+    parser.add_argument("--learn", action="store_true", help="learn full strokes as well")
     parser.add_argument("--json", action="store_true", help="tables go to standard error")
     options = parser.parse_args()
     shown = [show(Rig(physics, options.options), options) for physics in options.physics]

@@ -50,6 +50,10 @@ class Stroke:
     def half_um(self) -> float:
         return 0.5 * (self.high_um - self.low_um)
 
+    @property
+    def middle_um(self) -> float:
+        return 0.5 * (self.low_um + self.high_um)
+
     def row(
         self,
         name: str,
@@ -62,7 +66,7 @@ class Stroke:
         """Return a row for a wave of -1 to 1, swollen from rest, and in place of -1 to 1."""
         time_s = np.arange(wave.size) / RATE_HZ
         swelling = 0.5 - 0.5 * np.cos(np.pi * np.clip(time_s / begin_s, 0.0, 1.0))
-        middle_um = 0.5 * (self.low_um + self.high_um) + place * self.half_um
+        middle_um = self.middle_um + place * self.half_um
         judged = np.zeros(wave.size, dtype=np.bool_)
         judged[round(begin_s * RATE_HZ) : -UNJUDGED] = True
         return Row(name, *goals, swelling * (middle_um + self.half_um * wave), judged)
