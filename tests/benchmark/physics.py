@@ -3,119 +3,257 @@
 Run it with ``python tests/benchmark/physics.py``; see README.md beside it. The campaign is
 ``configs/identify_any.yaml``. The rig that the inverse drives has other noise than the one that the
 model was identified on, and starts from rest at each reference; nothing is learned or fed back.
-Errors are percent of the reference's own peak-to-peak, with their mean and without it. The floor is
-what the sensor's noise alone makes of it.
+Errors are percent of the reference's own peak-to-peak.
 """
 
 import argparse
+import copy
+import json
 import os
 import sys
+import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
+from typing import Any, TypeAlias
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
+from causal_floor import CausalInverse, rods_wanted_um
+from learning import CYCLES, EXPERIMENT, SOFT_S
+from references import RATE_HZ, Row, Stroke, random, references
 
 from hilctl.base.arrays import F64
-from hilctl.experiment.load import load_experiment
+from hilctl.experiment.condition import conditioning_of
+from hilctl.experiment.initial_state import InitialState, begin, left_by
+from hilctl.experiment.load import LoadedExperiment, load_experiment
+from hilctl.identify.candidates import choose_kind
 from hilctl.identify.data.records import History
 from hilctl.identify.fit_model import FittedModel, fit_model
-from hilctl.identify.settings import FitKind, FitSettings
+from hilctl.identify.job import ignore_progress
+from hilctl.identify.settings import FitSettings, IdentifySettings
+from hilctl.identify.workers import one_by_one
+from hilctl.learning.session import Session, unpaced
 from hilctl.loop.compensator import Compensator
 from hilctl.models.base import HysteresisModel
+from hilctl.models.files import dump_model
 from hilctl.waveforms.build import build
 from hilctl_drivers.simulated.rigs import PHYSICS, Physics, TerfenolOptions
 from hilctl_drivers.simulated.terfenol import TerfenolActuator
 
-RATE_HZ = 50_000.0
 CAMPAIGN = Path(__file__).parents[2] / "configs" / "identify_any.yaml"
-PARTS = (1.0, 0.5, 0.25, 0.1)
-FREQUENCIES_HZ = (1.0, 50.0, 100.0, 250.0)
-UNJUDGED = 250  # samples at the end, where the reference that an inverse looks ahead to stops
-GOAL, SMALL_GOAL, RANDOM_GOAL = 0.5, 1.0, 1.5
+MARGIN = 0.06  # of the range that a model was identified on, at either end
+MOST_A = 8.0
+LEARNED_HZ = (10.0, 100.0, 250.0)
+LEARNED_GOAL = 0.05
+EXTRAS: Mapping[str, Mapping[str, float]] = {
+    "creep": {"share": 0.05},
+    "thermal": {"rise_k_per_a2": 0.5, "tau_s": 60.0, "growth_um_per_k": 0.5, "ambient_k": 2.0},
+    "second_mode": {"frequency_hz": 1200.0, "damping_ratio": 0.05, "share": 0.03},
+    "amplifier": {"voltage_max_v": 60.0, "resistance_ohm": 2.0, "inductance_h": 5e-3},
+}
+"""Options of the rig and what they are set to, see ``extras.py`` of the simulated rig."""
+
+Drive: TypeAlias = Callable[[Row], tuple[F64, TerfenolActuator]]
+"""Gives the commands for a reference, and the rig as it stands before them."""
 
 
-def driven(physics: Physics, command: F64, seed: int) -> F64:
-    """Return the displacement that a rig at rest answers with."""
-    options = TerfenolOptions(physics=physics)
-    rig = TerfenolActuator(options.parameters(), RATE_HZ, seed=seed)
+@dataclass(frozen=True, slots=True)
+class Figures:
+    """How far a displacement was from its reference, in percent of its peak-to-peak.
+
+    Attributes:
+        peak: Largest error as the sensor reads it.
+        bare: The same less the mean error.
+        rms: Of the sensor's error less its mean.
+        aside: Largest error with the sensor's noise aside, offset included.
+        rms_aside: The same root-mean-square.
+    """
+
+    peak: float
+    bare: float
+    rms: float
+    aside: float
+    rms_aside: float
+
+    def share_of_goal(self, row: Row) -> float:
+        """Return the error over what is asked for; met up to 1."""
+        rms = self.rms_aside / row.rms_goal if row.rms_goal else 0.0
+        return max(self.aside / row.goal, rms)
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """How one reference was followed.
+
+    Attributes:
+        row: The reference.
+        noise: Largest noise of the sensor, in percent of the reference's peak-to-peak.
+        figures: From rest, and by what else was asked for: ``conditioned``, ``floor``.
+    """
+
+    row: Row
+    noise: float
+    figures: Mapping[str, Figures]
+
+    def to_mapping(self) -> dict[str, Any]:
+        row = self.row
+        goals = {"reference": row.name, "goal": row.goal, "rms_goal": row.rms_goal}
+        return goals | {"noise": self.noise} | {k: asdict(v) for k, v in self.figures.items()}
+
+
+class Rig:
+    """The simulated rig of one physics, anew for each run."""
+
+    def __init__(self, physics: Physics, extras: Sequence[str]) -> None:
+        self.physics = physics
+        chosen = {name: EXTRAS[name] for name in extras}
+        self.device = {"physics": physics, **chosen}
+        self._options = TerfenolOptions.model_validate(self.device)
+        self.parameters = self._options.parameters()
+
+    def at_rest(self, *, noise: bool = False, seed: int = 1) -> TerfenolActuator:
+        options = self._options.model_copy(update={"noise": noise})
+        return TerfenolActuator(options.parameters(), RATE_HZ, seed=seed)
+
+
+def driven(rig: TerfenolActuator, command: F64) -> F64:
+    """Return the displacement that a rig answers with."""
     displacement_um, measured = np.empty_like(command), np.empty_like(command)
     rig.step(np.ascontiguousarray(command), displacement_um, measured)
     return displacement_um
 
 
-def swelling(time_s: F64, over_s: float) -> F64:
-    """Return a raised cosine from 0 to 1."""
-    return np.asarray(0.5 - 0.5 * np.cos(np.pi * np.clip(time_s / over_s, 0.0, 1.0)))
-
-
-def sine_um(middle_um: float, amplitude_um: float, frequency_hz: float) -> tuple[F64, int]:
-    """Return a reference, and its first sample that is judged."""
-    begin_s = max(0.04, 1.0 / frequency_hz)
-    samples = round((begin_s + max(0.04, 2.0 / frequency_hz)) * RATE_HZ) + UNJUDGED
-    time_s = np.arange(samples) / RATE_HZ
-    wave = np.sin(2.0 * np.pi * frequency_hz * time_s)
-    return swelling(time_s, begin_s) * (middle_um + amplitude_um * wave), round(begin_s * RATE_HZ)
-
-
-def random_um(middle_um: float, amplitude_um: float, seed: int) -> tuple[F64, int]:
-    """Return a band-limited random reference, 5 to 200 Hz, and its first sample that is judged."""
-    rng = np.random.default_rng(seed)
-    time_s = np.arange(round(0.8 * RATE_HZ)) / RATE_HZ
-    sines = [
-        np.sin(2.0 * np.pi * frequency * time_s + rng.uniform(0.0, 2.0 * np.pi))
-        for frequency in rng.uniform(5.0, 200.0, 40)
-    ]
-    wave = np.sum(sines, axis=0)
-    wave *= amplitude_um / np.max(np.abs(wave))
-    return swelling(time_s, 0.05) * (middle_um + wave), round(0.05 * RATE_HZ)
-
-
-def references(low_um: float, high_um: float) -> Iterator[tuple[str, float, F64, int]]:
-    """Give name, goal, reference and first judged sample of each."""
-    middle, half = 0.5 * (low_um + high_um), 0.5 * (high_um - low_um)
-    for part in PARTS:
-        places = {"": 0.0} if part == 1.0 else {"": 0.0, " low": part - 1.0, " high": 1.0 - part}
-        for name, place in places.items():
-            for frequency_hz in FREQUENCIES_HZ:
-                wave, first = sine_um(middle + place * half, part * half, frequency_hz)
-                goal = GOAL if part == 1.0 else SMALL_GOAL
-                yield f"{100 * part:.0f} %{name}, {frequency_hz:g} Hz", goal, wave, first
-    for part, seed in ((1.0, 5), (0.5, 6)):
-        wave, first = random_um(middle, part * half, seed)
-        yield f"random {100 * part:.0f} %", RANDOM_GOAL, wave, first
-
-
-def judged(
-    physics: Physics, model: HysteresisModel, reference_um: F64, first: int, seed: int
-) -> tuple[float, float, float, float]:
-    """Return peak error with its mean and without, rms, and the noise's peak, in percent."""
-    compensator = Compensator(model, RATE_HZ)
-    compensator.begin(reference_um)
-    command = np.empty_like(reference_um)
-    compensator.process(compensator.ahead(reference_um), command)
-    command = np.clip(command, -8.0, 8.0)
-    error = (driven(physics, command, seed) - reference_um)[first:-UNJUDGED]
-    to_percent = 100.0 / float(np.ptp(reference_um[first:-UNJUDGED]))
-    noise = np.random.default_rng(seed).standard_normal(error.size)
-    floor = TerfenolOptions().parameters().sensor_noise_um * float(np.max(np.abs(noise)))
-    bare = error - float(np.mean(error))
-    figures = np.max(np.abs(error)), np.max(np.abs(bare)), np.std(bare), floor
-    peak, peak_bare, rms, floor = (float(figure) * to_percent for figure in figures)
-    return peak, peak_bare, rms, floor
-
-
-def identified(physics: Physics, kind: FitKind, seed: int) -> tuple[FittedModel, float]:
-    """Return a model of the campaign on one physics, and the processor time it took."""
+def identified(rig: Rig, kind: str, seed: int) -> tuple[FittedModel, float]:
+    """Return a model of the campaign on one rig, and the processor time it took."""
     experiment = load_experiment(CAMPAIGN)
     waveform = build(experiment.config.waveform, RATE_HZ, CAMPAIGN.parent)
     command = np.array(waveform.values)
-    history = History("campaign", command, driven(physics, command, seed), RATE_HZ)
-    begin = time.process_time()
-    fit = fit_model([history], FitSettings(kind=kind), time.process_time)
-    return fit, time.process_time() - begin
+    measured = driven(rig.at_rest(noise=True, seed=seed), command)
+    records = [History("campaign", command, measured, RATE_HZ)]
+    start = time.process_time()
+    if kind == "auto":
+        settings: FitSettings
+        settings, _, _ = choose_kind(
+            records, IdentifySettings(whole=True), "A", one_by_one, ignore_progress
+        )
+    else:
+        settings = FitSettings.model_validate({"kind": kind})
+    fit = fit_model(records, settings, time.process_time)
+    return fit, time.process_time() - start
+
+
+def conditioned(
+    rig: Rig, model: HysteresisModel
+) -> tuple[LoadedExperiment, InitialState, TerfenolActuator]:
+    """Return where a decaying cycle leaves the model, and the rig."""
+    loaded = load_experiment(CAMPAIGN, ["condition={}"])
+    conditioning = conditioning_of(loaded)
+    assert conditioning is not None
+    stands = rig.at_rest()
+    driven(stands, conditioning.command)
+    return loaded, left_by(conditioning.command, model, RATE_HZ), stands
+
+
+def compensated(model: HysteresisModel, reference_um: F64, before: InitialState | None) -> F64:
+    """Return the commands for a reference, as a run has them."""
+    compensator = Compensator(model, RATE_HZ)
+    begun = begin(model, RATE_HZ, reference_um, before)
+    if begun.state is not None:
+        compensator.restore(begun.state)
+    command = np.empty_like(reference_um)
+    compensator.process(begun.input_um, command)
+    return np.clip(command, -MOST_A, MOST_A)
+
+
+def drives(rig: Rig, model: HysteresisModel, also: Sequence[str]) -> dict[str, Drive]:
+    """Return all that drives the rig."""
+
+    def from_rest(row: Row) -> tuple[F64, TerfenolActuator]:
+        return compensated(model, row.reference_um, None), rig.at_rest()
+
+    found: dict[str, Drive] = {"from rest": from_rest}
+    if "conditioned" in also:
+        loaded, left, stands = conditioned(rig, model)
+
+        def after(row: Row) -> tuple[F64, TerfenolActuator]:
+            led = left.lead_in(row.reference_um, loaded.config.lead_in_samples)
+            return compensated(model, led, left), copy.deepcopy(stands)
+
+        found["conditioned"] = after
+    if "floor" in also:
+
+        def best(row: Row) -> tuple[F64, TerfenolActuator]:
+            wanted = rods_wanted_um(rig.parameters, row.reference_um, RATE_HZ)
+            following = np.append(wanted[1:], wanted[-1])
+            return CausalInverse(rig.at_rest(), MOST_A).drive(following), rig.at_rest()
+
+        found["floor"] = best
+    return found
+
+
+def judged(row: Row, drive: Drive, noise_um: F64) -> Figures:
+    """Return how far the rig is from a reference."""
+    command, stands = drive(row)
+    error = (driven(stands, command) - row.reference_um)[row.judged]
+    read = error + noise_um[row.judged]
+    bare = read - float(np.mean(read))
+    to_percent = 100.0 / float(np.ptp(row.reference_um[row.judged]))
+    figures = (
+        np.max(np.abs(read)),
+        np.max(np.abs(bare)),
+        np.std(read),
+        np.max(np.abs(error)),
+        np.sqrt(np.mean(error**2)),
+    )
+    return Figures(*(to_percent * float(figure) for figure in figures))
+
+
+def judge(
+    rows: Sequence[Row], ways: Mapping[str, Drive], shown: Callable[[Result], None]
+) -> list[Result]:
+    """Return how all references were followed, each of them shown as it comes."""
+    results = []
+    noise_rms_um = TerfenolOptions().parameters().sensor_noise_um
+    for i, row in enumerate(rows):
+        noise_um = noise_rms_um * np.random.default_rng(100 + i).standard_normal(row.judged.size)
+        noise = float(np.max(np.abs(noise_um[row.judged])))
+        noise *= 100.0 / float(np.ptp(row.reference_um[row.judged]))
+        figures = {name: judged(row, drive, noise_um) for name, drive in ways.items()}
+        results.append(Result(row, noise, figures))
+        shown(results[-1])
+    return results
+
+
+def learned(rig: Rig, model: HysteresisModel, inside: Stroke, say: Callable[[str], None]) -> bool:
+    """Learn the full stroke by runs, and say how far that got; return whether it is far enough."""
+    good = True
+    with tempfile.TemporaryDirectory(prefix="learning-") as folder:
+        file = Path(folder) / "model.yaml"
+        file.write_text(dump_model(model))
+        for frequency_hz in LEARNED_HZ:
+            settings = [
+                f"waveform.frequency_hz={frequency_hz}",
+                f"waveform.duration_s={round(2.0 * SOFT_S + (CYCLES + 0.02) / frequency_hz, 5)}",
+                f"waveform.amplitude={inside.half_um}",
+                f"waveform.offset={inside.middle_um}",
+                f"compensator.model={file}",
+                f"limits.peak_current_a={MOST_A}",
+                "limits.stroke_um=[-90.0, 90.0]",
+                *(f"device.{key}={json.dumps(value)}" for key, value in rig.device.items()),
+            ]
+            runs = Path(folder) / f"{frequency_hz:g}"
+            found = Session(EXPERIMENT, settings, runs, unpaced).learn(20, lambda _: None)
+            (check,) = found.check
+            met = check.error_percent <= LEARNED_GOAL
+            good &= met
+            say(f"{rig.physics}, learned at {frequency_hz:g} Hz: {found.rows[0].error_percent:.2f} "
+                f"to {check.error_percent:.3f} % under other noise in {len(found.rows)} runs, "
+                f"noise {check.floor_percent:.3f}{'' if met else '  missed'}")  # fmt: skip
+    return good
 
 
 def cost_us(model: HysteresisModel, reference_um: F64) -> float:
@@ -123,40 +261,90 @@ def cost_us(model: HysteresisModel, reference_um: F64) -> float:
     took = []
     for _ in range(5):
         inverse = model.inverse(RATE_HZ)
-        begin = time.process_time()
+        start = time.process_time()
         inverse.process(reference_um.copy())
-        took.append(time.process_time() - begin)
+        took.append(time.process_time() - start)
     return 1e6 * min(took) / reference_um.size
 
 
-def show(physics: Physics, kind: FitKind) -> bool:
-    """Print the table of one physics; return whether every goal is met."""
-    fit, took_s = identified(physics, kind, seed=3)
+def line(result: Result, names: Sequence[str]) -> str:
+    """Return a line of the table."""
+    row, rest = result.row, result.figures["from rest"]
+    text = f"{row.name:20} {rest.peak:7.2f} {rest.bare:8.2f} {rest.rms:6.3f} {result.noise:6.2f}"
+    for name in names:
+        figures = result.figures[name]
+        text += f" | {figures.aside:6.2f} {figures.rms_aside:6.3f}"
+    goals = f"{row.goal:g}" + (f", {row.rms_goal:g} rms" if row.rms_goal else "")
+    missed = [
+        name for name in names if name != "floor" and result.figures[name].share_of_goal(row) > 1.0
+    ]
+    return f"{text} | {goals}" + (f"  missed {', '.join(missed)}" if missed else "")
+
+
+def summary(results: Sequence[Result], name: str) -> tuple[str, bool]:
+    """Return how many goals were met, in words, and whether all were."""
+    shares = [(result.figures[name].share_of_goal(result.row), result.row) for result in results]
+    met = sum(share <= 1.0 for share, _ in shares)
+    worst, row = max(shares, key=lambda each: each[0])
+    text = f"{name}: {met} of {len(shares)} met, worst {worst:.1f} times its goal ({row.name})"
+    return text, met == len(shares)
+
+
+def show(rig: Rig, options: argparse.Namespace) -> tuple[dict[str, Any], bool]:
+    """Print the table of one physics; return it as mappings, and whether every goal is met."""
+    fit, took_s = identified(rig, options.model, seed=3)
     low_um, high_um = fit.model.output_range_um or (-50.0, 35.0)
-    margin = 0.06 * (high_um - low_um)
-    wave, _ = random_um(0.5 * (low_um + high_um), 0.3 * (high_um - low_um), 9)
-    print(f"\n{physics}, {kind}: {took_s:.1f} s of processor time, "
-          f"inverse {cost_us(fit.model, wave):.2f} us a sample")  # fmt: skip
-    print(f"{'reference':22} {'peak %':>7} {'no mean':>8} {'rms %':>7} {'noise':>6}  goal")
-    met = True
-    for i, (name, goal, wave, first) in enumerate(references(low_um + margin, high_um - margin)):
-        peak, bare, rms, floor = judged(physics, fit.model, wave, first, seed=100 + i)
-        good = bare <= max(goal, goal + floor)
-        met &= good
-        mark = "" if good else "  missed"
-        print(f"{name:22} {peak:7.2f} {bare:8.2f} {rms:7.3f} {floor:6.2f}  {goal:g}{mark}",
-              flush=True)  # fmt: skip
-    return met
+    margin = MARGIN * (high_um - low_um)
+    inside = Stroke(low_um + margin, high_um - margin)
+    cost = cost_us(fit.model, inside.row("", (1.0, None), 0.6 * random(9)).reference_um)
+    rows = [row for row in references(inside.low_um, inside.high_um) if wanted(row, options.rows)]
+    also = [name for name in ("conditioned", "floor") if getattr(options, name)]
+    names = ["from rest", *also]
+    say = partial(print, file=sys.stderr if options.json else sys.stdout, flush=True)
+    say(f"\n{rig.physics}, {' '.join(['', *options.options])}{options.model}: "
+        f"{took_s:.1f} s of processor time, inverse {cost:.2f} us a sample")  # fmt: skip
+    say(f"{'reference':20} {'peak %':>7} {'no mean':>8} {'rms %':>6} {'noise':>6}"
+        + "".join(f" | {name:>13}" for name in names) + " | goal")  # fmt: skip
+    ways = drives(rig, fit.model, also)
+    results = judge(rows, ways, lambda result: say(line(result, names)))
+    sums = [summary(results, name) for name in names]
+    for text, _ in sums:
+        say(f"{rig.physics}, {text}")
+    good = all(met for _, met in sums[: 1 + ("conditioned" in also)])
+    if options.learn:
+        good &= learned(rig, fit.model, inside, say)
+    table = {
+        "physics": rig.physics,
+        "options": list(options.options),
+        "model": getattr(fit.model, "kind"),  # noqa: B009
+        "fit_s": took_s,
+        "inverse_us": cost,
+        "rows": [result.to_mapping() for result in results],
+    }
+    return table, good
+
+
+def wanted(row: Row, parts: Sequence[str]) -> bool:
+    """Return whether a row is asked for: all are where no part of a name is given."""
+    return not parts or any(part in row.name for part in parts)
 
 
 def main() -> int:
     """Run the benchmark; the exit code is 1 where a goal is missed."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
     parser.add_argument("--physics", nargs="*", default=list(PHYSICS), choices=list(PHYSICS))
-    parser.add_argument("--model", default="field")
+    parser.add_argument("--model", default="field", help="kind of model, or auto")
+    parser.add_argument("--rows", nargs="*", default=[], help="parts of names of references")
+    parser.add_argument("--options", nargs="*", default=[], choices=list(EXTRAS))
+    parser.add_argument("--condition", dest="conditioned", action="store_true")
+    parser.add_argument("--floor", action="store_true", help="minutes more")
+    parser.add_argument("--learn", action="store_true", help="learn full strokes as well")
+    parser.add_argument("--json", action="store_true", help="tables go to standard error")
     options = parser.parse_args()
-    met = [show(physics, options.model) for physics in options.physics]
-    return int(not all(met))
+    shown = [show(Rig(physics, options.options), options) for physics in options.physics]
+    if options.json:
+        print(json.dumps([table for table, _ in shown], indent=1))
+    return int(not all(met for _, met in shown))
 
 
 if __name__ == "__main__":

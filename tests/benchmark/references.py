@@ -1,0 +1,144 @@
+"""The references that ``physics.py`` judges an inverse on, each with its goals."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from hilctl.base.arrays import F64
+from hilctl.waveforms import spec
+from hilctl.waveforms.shapes import sampled
+
+RATE_HZ = 50_000.0
+UNJUDGED = 250  # samples at the end, where the reference that an inverse looks ahead to stops
+_PARTS = (1.0, 0.5, 0.25, 0.1)
+_FREQUENCIES_HZ = (1.0, 50.0, 100.0, 250.0)
+_GOAL, _SMALL_GOAL = 0.5, 1.0
+_RANDOM_GOALS = 1.5, 0.5
+_SWELL_S = 0.05
+_CORNER_S = 0.5e-3
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """A reference and what is asked of it.
+
+    Attributes:
+        name: What it is.
+        goal: Largest peak error, percent of its peak-to-peak.
+        rms_goal: The same for the rms error; None where only the peak counts.
+        reference_um: float64[n], from 0.
+        judged: bool[n], where it counts.
+    """
+
+    name: str
+    goal: float
+    rms_goal: float | None
+    reference_um: F64
+    judged: npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class Stroke:
+    """Where references may go, in um."""
+
+    low_um: float
+    high_um: float
+
+    @property
+    def half_um(self) -> float:
+        return 0.5 * (self.high_um - self.low_um)
+
+    @property
+    def middle_um(self) -> float:
+        return 0.5 * (self.low_um + self.high_um)
+
+    def row(
+        self,
+        name: str,
+        goals: tuple[float, float | None],
+        wave: F64,
+        begin_s: float = _SWELL_S,
+        *,
+        place: float = 0.0,
+    ) -> Row:
+        """Return a row for a wave of -1 to 1, swollen from rest, and in place of -1 to 1."""
+        time_s = np.arange(wave.size) / RATE_HZ
+        swelling = 0.5 - 0.5 * np.cos(np.pi * np.clip(time_s / begin_s, 0.0, 1.0))
+        middle_um = self.middle_um + place * self.half_um
+        judged = np.zeros(wave.size, dtype=np.bool_)
+        judged[round(begin_s * RATE_HZ) : -UNJUDGED] = True
+        return Row(name, *goals, swelling * (middle_um + self.half_um * wave), judged)
+
+
+def references(low_um: float, high_um: float) -> Iterator[Row]:
+    """Give all rows within a stroke."""
+    stroke = Stroke(low_um, high_um)
+    for part in _PARTS:
+        goal = _GOAL if part == 1.0 else _SMALL_GOAL
+        places = {"": 0.0} if part == 1.0 else {"": 0.0, " low": part - 1.0, " high": 1.0 - part}
+        for name, place in places.items():
+            for frequency_hz in _FREQUENCIES_HZ:
+                begin_s = max(0.04, 1.0 / frequency_hz)
+                label = f"{100 * part:.0f} %{name}, {frequency_hz:g} Hz"
+                wave = part * _sine(frequency_hz, begin_s)
+                yield stroke.row(label, (goal, None), wave, begin_s, place=place)
+    for low_hz in (50.0, 100.0):
+        label = f"complex {low_hz:g}/{2 * low_hz:g} Hz"
+        yield stroke.row(label, (_SMALL_GOAL, None), _complex(low_hz))
+    yield _triangle(stroke)
+    for part, seed in ((1.0, 5), (0.5, 6)):
+        percent = f"{100 * part:.0f} %"
+        yield stroke.row(f"random {percent}", _RANDOM_GOALS, part * random(seed))
+        yield stroke.row(f"multisine {percent}", _RANDOM_GOALS, part * _multisine())
+        yield stroke.row(f"chirp {percent}", _RANDOM_GOALS, part * _chirp())
+
+
+def random(seed: int) -> F64:
+    """Return a band-limited random wave, 5 to 200 Hz, of -1 to 1."""
+    rng = np.random.default_rng(seed)
+    time_s = np.arange(round(0.8 * RATE_HZ)) / RATE_HZ
+    sines = [
+        np.sin(2.0 * np.pi * frequency * time_s + rng.uniform(0.0, 2.0 * np.pi))
+        for frequency in rng.uniform(5.0, 200.0, 40)
+    ]
+    wave = np.sum(sines, axis=0)
+    return np.asarray(wave / np.max(np.abs(wave)))
+
+
+def _sine(frequency_hz: float, begin_s: float) -> F64:
+    samples = round((begin_s + max(0.04, 2.0 / frequency_hz)) * RATE_HZ) + UNJUDGED
+    return np.asarray(np.sin(2.0 * np.pi * frequency_hz * np.arange(samples) / RATE_HZ))
+
+
+def _complex(low_hz: float) -> F64:
+    """Return the published one, a part at the lower frequency and five at the upper."""
+    parts = tuple(
+        spec.Harmonic(amplitude=amplitude, frequency_hz=frequency_hz)
+        for amplitude, frequency_hz in ((1.0, low_hz), (5.0, 2.0 * low_hz))
+    )
+    shape = spec.ComplexHarmonic(kind="complex_harmonic", components=parts, duration_s=0.16)
+    wave = sampled(shape, RATE_HZ)
+    return wave / float(np.max(np.abs(wave)))
+
+
+def _triangle(stroke: Stroke) -> Row:
+    """Return 100 Hz, judged away from its corners, which no structure with a mass follows."""
+    shape = spec.Triangle(kind="triangle", amplitude=1.0, frequency_hz=100.0, duration_s=0.13)
+    row = stroke.row("triangle 100 Hz", (_SMALL_GOAL, None), sampled(shape, RATE_HZ))
+    turns = np.mod(100.0 * np.arange(row.judged.size) / RATE_HZ - 0.25, 0.5)
+    row.judged[np.minimum(turns, 0.5 - turns) < 100.0 * _CORNER_S] = False
+    return row
+
+
+def _multisine() -> F64:
+    shape = spec.Multisine(
+        kind="multisine", amplitude=1.0, first_hz=5.0, last_hz=200.0, step_hz=5.0, duration_s=0.6
+    )
+    return sampled(shape, RATE_HZ)
+
+
+def _chirp() -> F64:
+    shape = spec.Chirp(kind="chirp", amplitude=1.0, start_hz=5.0, stop_hz=250.0, duration_s=0.8)
+    return sampled(shape, RATE_HZ)
