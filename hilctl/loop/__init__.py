@@ -2,6 +2,7 @@
 
 loop.py         block after block until the waveform ends, or something goes wrong
 plan.py         what a run does, and how it ended
+beginning.py    what comes before the waveform: ramp, and conditioning.py with the resting offset
 host.py         what the loop needs of its host: time, room for blocks, supervision
 block.py        one block of samples, in its slot from birth to answer
 pacer.py        absolute deadlines and the policy for late ticks
