@@ -9,6 +9,7 @@ pacer.py        absolute deadlines and the policy for late ticks
 tuning.py       gain and offset of a running reference
 compensator.py  the inverse of a model, in the loop's terms
 feedback.py     a controller around the compensator, sample by sample; integral.py, by blocks
+adaptation.py   offset, gain and weights of the model, adapted by the tracking error
 limiter.py      range and slew of every command: last before the device
 interlocks.py   what ends a run, checked in every answer
 """

@@ -4,6 +4,7 @@ A ramp from where the output was to the safe value, then the conditioning where 
 then the waveform, whose input is without the offset that was measured at rest.
 """
 
+import math
 from typing import TypeAlias
 
 from hilctl.base.arrays import F64
@@ -76,6 +77,11 @@ class Beginning:
         resting.take_out(offset_um)
         text = f"{rests}: {offset_um:.4g} um are taken out of the compensator's input"
         return text, values, False
+
+    @property
+    def noise_um(self) -> float:
+        """Standard deviation of the displacement at rest; NaN where it has not rested."""
+        return math.nan if self._resting is None else self._resting.noise_um
 
     def correct(self, input_um: F64, start: int) -> None:
         """Take the measured offset out of the input (float64[n]) from ``start`` of the waveform."""

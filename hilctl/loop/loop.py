@@ -131,6 +131,7 @@ class Loop:
                 self._hold()
         except DeviceError as error:
             return self._lost_device(error)
+        self._record_adapted(ended=True)
         return Outcome(self._code, self._reason, self._ended_at, True, self._dropped)
 
     def _tick(self) -> bool:
@@ -152,6 +153,9 @@ class Loop:
         if self._phase is _Phase.CONDITIONING and self._next_sample >= self._before.waveform_at:
             self._begin(_Phase.FOLLOWING)
             self._take_offset_out()
+            if self._plan.adaptation is not None:
+                self._plan.adaptation.take_noise(self._before.noise_um)
+        self._record_adapted()
         return done
 
     def _hold(self) -> None:
@@ -200,6 +204,8 @@ class Loop:
         self._before.correct(passed, start - at)
         if plan.feedback is not None:
             passed += plan.feedback.correction_um
+        if plan.adaptation is not None:
+            plan.adaptation.follow(passed, passed.size)
         self._compensator.process(passed, np.empty_like(passed))
 
     def _supervise(self) -> None:
@@ -231,6 +237,14 @@ class Loop:
     def _record_condition(self) -> None:
         event = self._before.condition_event()
         if event is not None:
+            self._host.record_event(event)
+
+    def _record_adapted(self, *, ended: bool = False) -> None:
+        adaptation = self._plan.adaptation
+        if adaptation is None:
+            return
+        sample = max(0, self._ended_at - 1) if ended else self._next_sample
+        if event := adaptation.event(sample, ended=ended):
             self._host.record_event(event)
 
     def _take_offset_out(self) -> None:
@@ -333,6 +347,9 @@ class Loop:
         self._before.correct(input_um, start)
         if plan.feedback is not None:
             plan.feedback.follow(block, input_um)
+        # Last: what it makes of the input is the model's own, and what it learns from.
+        if plan.adaptation is not None:
+            plan.adaptation.follow(input_um, plan.block)
         self._compensator.process(input_um, wanted)
         return self._limiter.limit(wanted, command, flags)
 
@@ -371,6 +388,8 @@ class Loop:
         # Before it is recorded: from then on its slot may be another block's.
         if self._plan.feedback is not None:
             self._plan.feedback.take(block)
+        if self._plan.adaptation is not None:
+            self._plan.adaptation.take(block)
         # Recorded before the run leaves for it: the event refers to samples that are there.
         self._record(block)
         if trip is not None and block.guarded:
@@ -406,4 +425,5 @@ class Loop:
                 block.displacement_um[:] = block.measured[:] = np.nan
                 block.flags |= (Flag.SENSOR_INVALID | Flag.UNANSWERED).value
                 self._record(block)
+        self._record_adapted(ended=True)
         return Outcome("fault", text, self._ended_at, safe, self._dropped)
