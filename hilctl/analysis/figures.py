@@ -103,6 +103,8 @@ class RunReport(Figures):
         lateness_us: ``p50``, ``p90``, ``p99``, ``p99.9`` and ``max`` of how late ticks woke; empty
             without ticks.
         lateness_by_minute: The same of each minute, with ``minute`` from 0 and its ``ticks``.
+        adapted: What adaptation made of the model by the end, by name, see
+            :data:`hilctl.base.events.ADAPTED`; empty without it.
         exchange_us: The same of how long exchanges with the device took.
         segments: Figures of each segment.
     """
@@ -134,6 +136,7 @@ class RunReport(Figures):
     lateness_us: dict[str, float]
     lateness_by_minute: list[dict[str, float]]
     exchange_us: dict[str, float]
+    adapted: dict[str, float]
     segments: tuple[SegmentReport, ...]
 
     def to_mapping(self) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from hilctl.analysis import metrics, timing
 from hilctl.analysis.figures import RunReport, SegmentReport
 from hilctl.analysis.steady import steady_part
 from hilctl.base.arrays import F64
+from hilctl.base.events import ADAPTED
 from hilctl.base.samples import NO_WAVEFORM, Flag
 from hilctl.base.segments import Segment
 from hilctl.recording.data import Recording
@@ -37,6 +38,7 @@ def summarize(recording: Recording) -> RunReport:
         **_counts(recording),
         **_worst(segments),
         **_timing(recording),
+        adapted=_adapted(recording),
         segments=segments,
     )
 
@@ -122,6 +124,11 @@ def _counts(recording: Recording) -> dict[str, Any]:
 def _extremes(column: F64) -> tuple[float | None, float | None]:
     finite = column[np.isfinite(column)]
     return (float(finite.min()), float(finite.max())) if finite.size else (None, None)
+
+
+def _adapted(recording: Recording) -> dict[str, float]:
+    found = [event.values for event in recording.events if event.code == ADAPTED]
+    return dict(found[-1]) if found else {}
 
 
 def _timing(recording: Recording) -> dict[str, Any]:

@@ -1,6 +1,7 @@
 """A report for people, as rows of text."""
 
 from hilctl.analysis.figures import RunReport, SegmentReport
+from hilctl.base.events import adapted_text
 from hilctl.base.printable import printable
 
 MISSING = "-"
@@ -48,6 +49,7 @@ def run_rows(report: RunReport) -> list[tuple[str, str]]:
         ("invalid readings", f"{report.sensor_invalid_samples:,}"),
         ("ticks", f"{_count(report.late_ticks)} late, {_count(report.skipped_ticks)} skipped"),
         *([("timing", report.deadline_misses)] if report.deadline_misses else []),
+        *([("adapted", adapted_text(report.adapted))] if report.adapted else []),
         ("lateness", _percentiles(report.lateness_us)),
         ("exchange", _percentiles(report.exchange_us)),
     ]

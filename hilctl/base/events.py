@@ -18,6 +18,14 @@ first sample.
 Its values are ``offset_um``, and the displacements at rest, ``resting_um`` and ``model_um``.
 """
 
+ADAPTED = "adapted"
+"""Code of the event of what adaptation has made of the model: once a second where it has moved, and
+at the end of the run.
+
+Its values are what the actuator does beside its model: ``offset_um`` and ``gain`` on the whole, and
+the operator exactly, see ``loop/adaptation.py``.
+"""
+
 
 @dataclass(frozen=True, slots=True)
 class Event:
@@ -41,3 +49,11 @@ class Event:
     values: Mapping[str, float] = field(default_factory=dict)
     time_ns: int = 0
     before: Samples | None = None
+
+
+def adapted_text(parameters: Mapping[str, float]) -> str:
+    """Return the values of an :data:`ADAPTED` event in words."""
+    weights = [f"{value:+.4f}" for name, value in parameters.items() if name.startswith("weight")]
+    named = {"offset_um": "offset {:+.4g} um", "gain": "gain {:.4f}"}
+    parts = [text.format(parameters[name]) for name, text in named.items() if name in parameters]
+    return ", ".join([*parts, *([f"weights {', '.join(weights)}"] if weights else [])])

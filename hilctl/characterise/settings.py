@@ -33,8 +33,7 @@ def without_reference(experiment: Path, settings: Sequence[str]) -> list[str]:
     """
     document = _document(experiment, settings)
     found = ["compensator=none"]
-    if document.holds(("feedback",)):
-        found.append("feedback=null")
+    found += [f"{key}=null" for key in ("feedback", "adaptation") if document.holds((key,))]
     return found + [
         f"limits.{key}=null" for key in _tracking_keys() if document.holds(("limits", key))
     ]

@@ -12,6 +12,7 @@ from rich.text import Text
 
 from hilctl.analysis.figures import RunReport
 from hilctl.analysis.report import summarize
+from hilctl.base.events import adapted_text
 from hilctl.cli.console import console
 from hilctl.cli.report_view import render
 from hilctl.experiment.check import Checked
@@ -105,6 +106,7 @@ def run_mapping(result: RunResult, report: RunReport | None) -> dict[str, Any]:
         "reason": result.reason,
         "output_safe": result.safe,
         "deadline_misses": result.deadline_misses,
+        "adapted": dict(result.adapted),
     }
 
 
@@ -121,6 +123,8 @@ def print_run(result: RunResult, report: RunReport | None) -> None:
         terminal.print("no sample was recorded")
     elif report is not None:
         terminal.print(render(report))
+    elif result.adapted:
+        terminal.print(f"adapted: {adapted_text(result.adapted)}")
     terminal.print(f"recorded: {result.path}", soft_wrap=True)
     path = shlex.quote(str(result.path))
     terminal.print(f"  hilctl report {path} --html run.html", soft_wrap=True)

@@ -7,7 +7,7 @@ initial_state.py  what the run before left in the actuator
 check.py          the whole run worked out beforehand, held against device, model and limits
 model_range.py    whether the reference stays within what the model was identified on
 forecast.py       what a run will do; tuned.py  what it would with another gain and offset
-interlocks.py     interlocks and feedback.py feedback, from the file's keys
+interlocks.py     interlocks, feedback.py feedback and adaptation.py adaptation, by the file's keys
 device.py         the device that it names; registry.py  devices by name
 inventory.py      what there is on this machine
 schema.py         the file's JSON schema

@@ -12,6 +12,7 @@ import numpy as np
 
 from hilctl.base.arrays import F64
 from hilctl.base.errors import ConfigError, DataError, InputError, ModelError, Problem
+from hilctl.experiment.adaptation import adaptation_problems, at_worst, worst_inputs
 from hilctl.experiment.condition import condition_problems, conditioning_of, measures_offset
 from hilctl.experiment.feedback import feedback_problems
 from hilctl.experiment.forecast import Forecast, forecast_of
@@ -62,7 +63,8 @@ class Checked:
         """Whether the compensator's input is recorded: not where it is the reference itself."""
         own = self.begun.input_um is not self.reference.values
         config = self.loaded.config
-        return own or config.feedback is not None or measures_offset(config)
+        moves = config.feedback is not None or config.adaptation is not None
+        return own or moves or measures_offset(config)
 
     def conditioning(self) -> Conditioning | None:
         """Return what comes before the waveform; None where nothing does."""
@@ -102,14 +104,27 @@ def check(loaded: LoadedExperiment, folder: Path | None = None) -> Checked:
         if not measures_offset(config):
             begun = replace(begun, stands_um=None)
         problems += feedback_problems(loaded, begun.preview)
+        problems += adaptation_problems(loaded, begun.preview)
         forecast = forecast_of(loaded, reference, begun, conditioned)
     except ModelError as error:
         problems.append(_problem(loaded, "compensator.model", str(error)))
         raise ConfigError(problems) from None
     problems += _start_problems(loaded, begun, forecast) or command_problems(loaded, forecast)
+    problems = problems or _adapted_problems(loaded, reference, begun, conditioned)
     if problems:
         raise ConfigError(problems)
     return Checked(loaded, reference, forecast, begun, findings.warnings)
+
+
+def _adapted_problems(
+    loaded: LoadedExperiment, reference: Reference, begun: Begun, conditioned: F64
+) -> list[Problem]:
+    """Return which limits the run would leave with its adaptation at the bounds."""
+    for input_um in worst_inputs(loaded.config, reference.values, begun.input_um):
+        worst = forecast_of(loaded, reference, replace(begun, input_um=input_um), conditioned)
+        if found := command_problems(loaded, worst):
+            return [at_worst(each) for each in found]
+    return []
 
 
 def _findings(loaded: LoadedExperiment, reference: Reference) -> RangeFindings:

@@ -48,14 +48,25 @@ def make_feedback(
     if wanted is None:
         return None
     rate_hz = config.sample_rate_hz
-    due_after = round(wanted.sensor_delay_s * rate_hz) + (0 if compensator.preview else 1)
-    shown_after = due_after + compensator.preview
+    due_after, shown_after = delays(wanted.sensor_delay_s, rate_hz, compensator.preview)
     if isinstance(wanted, IntegralFeedbackConfig):
         gain = 2.0 * math.pi * wanted.bandwidth_hz * config.tick_s
         blocks = latency_blocks + LOOP_DELAY + math.ceil(shown_after / config.block)
         return IntegralFeedback(gain, wanted.limit_um, due_after, blocks)
     gains = _gains(wanted, rate_hz)
     return Feedback(gains, rate_hz, wanted.limit_um, due_after, shown_after + LOOP_DELAY)
+
+
+def delays(sensor_delay_s: float, rate_hz: float, preview: int) -> tuple[int, int]:
+    """Return the samples from a reference, and from the input, to the displacement that shows it.
+
+    Args:
+        sensor_delay_s: What the sensor and its line add.
+        rate_hz: Samples a second.
+        preview: Samples by which the compensator's input runs ahead of its commands.
+    """
+    due_after = round(sensor_delay_s * rate_hz) + (0 if preview else 1)
+    return due_after, due_after + preview
 
 
 def feedback_problems(loaded: LoadedExperiment, preview: int) -> list[Problem]:

@@ -6,7 +6,14 @@ from pydantic import BeforeValidator, Field
 
 from hilctl.base.strict import Strict
 from hilctl.experiment.limits import Limits
-from hilctl.experiment.parts import Condition, FeedbackConfig, Name, RecordingConfig, Timing
+from hilctl.experiment.parts import (
+    AdaptationConfig,
+    Condition,
+    FeedbackConfig,
+    Name,
+    RecordingConfig,
+    Timing,
+)
 from hilctl.loop.limiter import CommandLimits
 from hilctl.machine.settings import Realtime
 from hilctl.waveforms.spec import AnyWaveform
@@ -76,6 +83,7 @@ class Experiment(Strict):
         condition: What the actuator goes through before the waveform, so that it begins in a state
             that does not depend on what was before; None for nothing.
         feedback: A controller around the compensator; None where there is none.
+        adaptation: How the compensator's model is adapted while it runs; None where it is not.
         limits: What the run is held to.
         safe: The safe value, and the safe ramp to it.
         timing: What happens to late ticks.
@@ -97,6 +105,7 @@ class Experiment(Strict):
     ]
     condition: Condition | None = None
     feedback: FeedbackConfig | None = None
+    adaptation: AdaptationConfig | None = None
     limits: Limits
     safe: Safe = Field(default_factory=Safe)
     timing: Timing = Field(default_factory=Timing)

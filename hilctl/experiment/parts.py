@@ -188,6 +188,28 @@ class IntegralFeedbackConfig(_AnyFeedback):
     bandwidth_hz: Annotated[float, Field(gt=0.0)]
 
 
+class AdaptationConfig(Strict):
+    """Slow adaptation of the compensator's model by the tracking error: see loop/adaptation.py.
+
+    Attributes:
+        time_constant_s: Time in which what is wrong with the model falls to 1/e.
+        offset_um: Largest offset that is adapted; left out, a tenth of ``limits.stroke_um``, or 0
+            with feedback, which takes the offset out itself.
+        gain: Largest change of the gain, as a share of the identified one.
+        weight: Largest weight of each of the plays after the model, as such a share.
+        noise_um: Standard deviation of the sensor's noise, for the dead zone; left out, that of the
+            rest before the waveform, which ``condition`` or ``compensator.offset: measured`` gives.
+        sensor_delay_s: See ``feedback``.
+    """
+
+    time_constant_s: Annotated[float, Field(gt=0.0, le=3600.0)] = 1.0
+    offset_um: Annotated[float, Field(ge=0.0)] | None = None
+    gain: Annotated[float, Field(ge=0.0, le=0.3)] = 0.1
+    weight: Annotated[float, Field(ge=0.0, le=0.1)] = 0.02
+    noise_um: Annotated[float, Field(ge=0.0)] | None = None
+    sensor_delay_s: Annotated[float, Field(ge=0.0)] = 0.0
+
+
 def _pi_where_not_said(value: Any) -> Any:
     return {"kind": "pi", **value} if isinstance(value, dict) else value
 

@@ -48,6 +48,7 @@ class RestingOffset:
         first, stop = conditioning.rest
         self._first, self._stop = begins_at + first, begins_at + stop
         self._sum_um, self._count = 0.0, 0
+        self._about_um, self._square_um2 = math.nan, 0.0
         self._offset_um = 0.0
         way = np.arange(1, conditioning.lead_in + 1) / conditioning.lead_in
         self._rise: F64 = 0.5 * (1.0 - np.cos(np.pi * way))
@@ -58,12 +59,24 @@ class RestingOffset:
         if low < displacement_um.size and high > 0:
             resting = displacement_um[max(low, 0) : high]
             self._sum_um += float(resting.sum())
+            if not self._count:
+                self._about_um = resting.item(0)
+            # About the first of them: squares of the displacement itself would hide the noise.
+            self._square_um2 += float(np.square(resting - self._about_um).sum())
             self._count += resting.size
 
     @property
     def resting_um(self) -> float:
         """Mean displacement at rest; NaN where none has come."""
         return self._sum_um / self._count if self._count else math.nan
+
+    @property
+    def noise_um(self) -> float:
+        """Standard deviation of the displacement at rest; NaN where none has come."""
+        if not self._count:
+            return math.nan
+        mean_um = self.resting_um - self._about_um
+        return math.sqrt(max(0.0, self._square_um2 / self._count - mean_um**2))
 
     def take_out(self, offset_um: float) -> None:
         """Take an offset out of the input from now on."""

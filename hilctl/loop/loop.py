@@ -21,8 +21,8 @@ from hilctl.base.device import Device
 from hilctl.base.errors import DeviceError
 from hilctl.base.events import OFFSET, TUNED, Event
 from hilctl.base.samples import Flag, Head
+from hilctl.loop.beginning import Beginning
 from hilctl.loop.block import Block
-from hilctl.loop.conditioning import RestingOffset
 from hilctl.loop.host import Host, Tuning
 from hilctl.loop.interlocks import Interlocks
 from hilctl.loop.limiter import Limiter
@@ -73,8 +73,7 @@ class Loop:
         self._start_ns = 0
         self._next_sample = 0
         self._ended_at = 0
-        self._condition_at = self._waveform_at = 0
-        self._resting: RestingOffset | None = None
+        self._before = Beginning(None, 0)
         self._end = plan.reference.size
         self._on_ramp = False
         self._missing = 0
@@ -101,18 +100,15 @@ class Loop:
         self._limiter.last = output
         self._interlocks.begin_at(output)
         block, conditioning = self._plan.block, self._plan.conditioning
-        self._condition_at = -(-self._limiter.ramp_samples // block) * block
-        self._waveform_at = self._condition_at
-        if conditioning is not None:
-            self._waveform_at += conditioning.command.size
-            self._resting = RestingOffset(conditioning, self._condition_at)
-        self._end = self._waveform_at + self._plan.reference.size
-        if self._condition_at:
+        ramp_samples = -(-self._limiter.ramp_samples // block) * block
+        self._before = before = Beginning(conditioning, ramp_samples)
+        self._end = before.waveform_at + self._plan.reference.size
+        if ramp_samples:
             self._phase = _Phase.STARTING
             self._pacer.policy = self._plan.ramp_policy
         elif conditioning is not None:
             self._phase = _Phase.CONDITIONING
-        return self._waveform_at
+        return before.waveform_at
 
     def run(self, start_ns: int) -> Outcome:
         """Run until the end, ramp to the safe value, and say how it went.
@@ -123,12 +119,10 @@ class Loop:
         self._start_ns = start_ns
         self._pacer.begin(start_ns)
         if self._phase is _Phase.STARTING:
-            output, samples = self._limiter.last, self._condition_at
-            text = f"output was at {output:g}: ramp to {self._limiter.limits.safe:g} first"
-            values = {"output": output, "samples": float(samples)}
-            self._host.record_event(Event(0, "info", "start_ramp", text, values))
+            ramp = self._before.ramp_event(self._limiter.last, self._limiter.limits.safe)
+            self._host.record_event(ramp)
         elif self._phase is _Phase.CONDITIONING:
-            self._say_condition()
+            self._record_condition()
         try:
             while not self._tick():
                 pass
@@ -137,6 +131,7 @@ class Loop:
                 self._hold()
         except DeviceError as error:
             return self._lost_device(error)
+        self._record_adapted(ended=True)
         return Outcome(self._code, self._reason, self._ended_at, True, self._dropped)
 
     def _tick(self) -> bool:
@@ -153,11 +148,14 @@ class Loop:
         feedback = self._plan.feedback
         if feedback is not None and feedback.against:
             self._leave("fault", "feedback_sign", feedback.against)
-        if self._phase is _Phase.STARTING and self._next_sample >= self._condition_at:
+        if self._phase is _Phase.STARTING and self._next_sample >= self._before.condition_at:
             self._begin(_Phase.CONDITIONING if self._plan.conditioning else _Phase.FOLLOWING)
-        if self._phase is _Phase.CONDITIONING and self._next_sample >= self._waveform_at:
+        if self._phase is _Phase.CONDITIONING and self._next_sample >= self._before.waveform_at:
             self._begin(_Phase.FOLLOWING)
             self._take_offset_out()
+            if self._plan.adaptation is not None:
+                self._plan.adaptation.take_noise(self._before.noise_um)
+        self._record_adapted()
         return done
 
     def _hold(self) -> None:
@@ -172,7 +170,8 @@ class Loop:
         pacer, block_samples = self._pacer, self._plan.block
         most = None
         if self._phase in _BEFORE:  # their last tick is not skipped: what comes next waits
-            ends = self._condition_at if self._phase is _Phase.STARTING else self._waveform_at
+            before = self._before
+            ends = before.condition_at if self._phase is _Phase.STARTING else before.waveform_at
             most = (ends - self._next_sample) // block_samples - 1
         skipped = pacer.wait(most) * block_samples
         # Before the block is claimed: its number and the state kept with it are those after it.
@@ -197,20 +196,21 @@ class Loop:
         self._next_sample += skipped
         if self._phase is not _Phase.FOLLOWING:
             return
-        at = self._waveform_at
+        at = self._before.waveform_at
         passed = plan.input_um[start - at : self._next_sample - at].copy()
         factors = self._tuner.advance(passed.size)
         if factors is not None:
             tune(factors, passed, passed)
-        if self._resting is not None:
-            self._resting.apply(passed, start - at)
+        self._before.correct(passed, start - at)
         if plan.feedback is not None:
             passed += plan.feedback.correction_um
+        if plan.adaptation is not None:
+            plan.adaptation.follow(passed, passed.size)
         self._compensator.process(passed, np.empty_like(passed))
 
     def _supervise(self) -> None:
         """Write the heartbeat, and follow what is requested of the run."""
-        position = max(self._next_sample - self._waveform_at, 0)
+        position = max(self._next_sample - self._before.waveform_at, 0)
         stop = self._host.heartbeat(position, self._pacer.counters.late_ticks)
         # The end of the waveform first: a stop or a late tick after it changes nothing any more.
         if self._next_sample >= self._end:
@@ -232,35 +232,30 @@ class Loop:
             reason = "the way to the safe value before the waveform was late: timing not kept"
             self._leave("fault", "late", reason)
         elif phase is _Phase.CONDITIONING:
-            self._say_condition()
+            self._record_condition()
 
-    def _say_condition(self) -> None:
-        conditioning = self._plan.conditioning
-        if conditioning is not None and conditioning.cycle_samples:
-            cycle, rest = conditioning.cycle_samples, conditioning.command.size
-            text = f"conditioning cycle of {cycle} samples, {rest} with the rest after it"
-            values = {"cycle_samples": float(cycle), "samples": float(rest)}
-            event = Event(self._condition_at, "info", "condition", text, values)
+    def _record_condition(self) -> None:
+        event = self._before.condition_event()
+        if event is not None:
+            self._host.record_event(event)
+
+    def _record_adapted(self, *, ended: bool = False) -> None:
+        adaptation = self._plan.adaptation
+        if adaptation is None:
+            return
+        sample = max(0, self._ended_at - 1) if ended else self._next_sample
+        if event := adaptation.event(sample, ended=ended):
             self._host.record_event(event)
 
     def _take_offset_out(self) -> None:
-        """Hold the resting displacement against the model's; beyond the limit the run ends."""
-        conditioning, resting = self._plan.conditioning, self._resting
-        assert conditioning is not None
-        assert resting is not None
-        stands_um, measured_um = conditioning.stands_um, resting.resting_um
-        if stands_um is None or self._phase is not _Phase.FOLLOWING:
+        """Take out how far the sensor stands from the model; beyond the limit the run ends."""
+        if self._phase is not _Phase.FOLLOWING:
             return
-        offset_um = measured_um - stands_um
-        rests = f"at rest the sensor shows {measured_um:.4g} um, the model {stands_um:.4g} um"
-        if not abs(offset_um) <= conditioning.largest_um:
-            limit = f"an offset beyond {conditioning.largest_um:.4g} um"
-            self._leave("fault", OFFSET, f"{rests}: {limit}: identify the model anew")
-            return
-        resting.take_out(offset_um)
-        values = {"offset_um": offset_um, "resting_um": measured_um, "model_um": stands_um}
-        text = f"{rests}: {offset_um:.4g} um are taken out of the compensator's input"
-        self._host.record_event(Event(self._next_sample, "info", OFFSET, text, values))
+        text, values, refused = self._before.take_offset_out()
+        if refused:
+            self._leave("fault", OFFSET, text)
+        elif text:
+            self._host.record_event(Event(self._next_sample, "info", OFFSET, text, values))
 
     def _tune(self, tuning: Tuning) -> None:
         self._tuner.move(tuning)
@@ -323,10 +318,8 @@ class Loop:
 
     def _condition(self, block: Block) -> int:
         """Fill a block of the conditioning; return the first wish that is not finite, or -1."""
-        assert self._plan.conditioning is not None
-        start = self._next_sample - self._condition_at
         block.reference[:] = block.input_um[:] = np.nan
-        block.wanted[:] = self._plan.conditioning.command[start : start + self._plan.block]
+        self._before.condition(block.wanted, self._next_sample)
         block.flags |= _CONDITION
         return self._limiter.limit(block.wanted, block.command, block.flags)
 
@@ -341,7 +334,7 @@ class Loop:
     ) -> int:
         """Fill what comes of the reference; return the first wish that is not finite, or -1."""
         plan = self._plan
-        start = self._next_sample - self._waveform_at
+        start = self._next_sample - self._before.waveform_at
         stop = start + wanted.size
         factors = self._tuner.advance(wanted.size)
         if factors is None:
@@ -351,10 +344,12 @@ class Loop:
         else:
             tune(factors, plan.reference[start:stop], reference)
             tune(factors, plan.input_um[start:stop], input_um)
-        if self._resting is not None:
-            self._resting.apply(input_um, start)
+        self._before.correct(input_um, start)
         if plan.feedback is not None:
             plan.feedback.follow(block, input_um)
+        # Last: what it makes of the input is the model's own, and what it learns from.
+        if plan.adaptation is not None:
+            plan.adaptation.follow(input_um, plan.block)
         self._compensator.process(input_um, wanted)
         return self._limiter.limit(wanted, command, flags)
 
@@ -389,11 +384,12 @@ class Loop:
             block.measured,
             block.flags,
         )
-        if self._resting is not None:
-            self._resting.take(block.head[_FIRST_SAMPLE], block.displacement_um)
+        self._before.take(block.head[_FIRST_SAMPLE], block.displacement_um)
         # Before it is recorded: from then on its slot may be another block's.
         if self._plan.feedback is not None:
             self._plan.feedback.take(block)
+        if self._plan.adaptation is not None:
+            self._plan.adaptation.take(block)
         # Recorded before the run leaves for it: the event refers to samples that are there.
         self._record(block)
         if trip is not None and block.guarded:
@@ -429,4 +425,5 @@ class Loop:
                 block.displacement_um[:] = block.measured[:] = np.nan
                 block.flags |= (Flag.SENSOR_INVALID | Flag.UNANSWERED).value
                 self._record(block)
+        self._record_adapted(ended=True)
         return Outcome("fault", text, self._ended_at, safe, self._dropped)

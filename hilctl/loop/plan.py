@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 from typing import Literal, TypeAlias
 
 from hilctl.base.arrays import F64
+from hilctl.loop.adaptation import Adaptation
 from hilctl.loop.compensator import Compensator
 from hilctl.loop.conditioning import Conditioning
 from hilctl.loop.feedback import Controller
@@ -52,6 +53,7 @@ class Plan:
         ramp_policy: The same on the ramps before and after the waveform.
         late_rules: From when a tick counts as late, and when lateness ends the run.
         feedback: Corrects the compensator's input; None where nothing does.
+        adaptation: Adapts the compensator's model; None where nothing does.
         conditioning: What comes before the waveform; None where nothing does.
         keep_all: Whether a block that finds no room in the ring ends the run.
     """
@@ -69,5 +71,6 @@ class Plan:
     ramp_policy: LatePolicy = "skip"
     late_rules: LateRules = field(default_factory=LateRules)
     feedback: Controller | None = None
+    adaptation: Adaptation | None = None
     conditioning: Conditioning | None = None
     keep_all: bool = True

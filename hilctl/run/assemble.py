@@ -4,6 +4,7 @@ import math
 
 from hilctl.base.arrays import F64
 from hilctl.base.device import DeviceInfo
+from hilctl.experiment.adaptation import make_adaptation
 from hilctl.experiment.feedback import make_feedback
 from hilctl.experiment.file import Experiment
 from hilctl.experiment.interlocks import interlock_context
@@ -58,6 +59,7 @@ def assemble(
         ramp_policy=policy if not paced or info.buffered or info.latency_blocks else "skip",
         late_rules=_late_rules(config, reference.size) if paced else LateRules(),
         feedback=make_feedback(config, compensator, info.latency_blocks),
+        adaptation=make_adaptation(config, reference, compensator),
         conditioning=conditioning,
         keep_all=config.recording.on_failure == "stop",
     )

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from hilctl.base.errors import InputError
-from hilctl.base.events import Event
+from hilctl.base.events import ADAPTED, Event
 from hilctl.base.samples import Batch, Head, Samples
 from hilctl.experiment.check import Checked
 from hilctl.experiment.correction import dump_correction
@@ -44,6 +44,8 @@ class Recorder:
         self.error = ""
         self.notes: list[str] = []
         """What was done to the file while it was written, for people."""
+        self.adapted: Mapping[str, float] = {}
+        """Values of the newest event of adaptation."""
         self._next_sample = 0
         self._flushed = self._had_bytes = 0
         self._checked = checked
@@ -102,6 +104,8 @@ class Recorder:
 
     def event(self, event: Event) -> None:
         """Write an event of the loop, with the samples that led to it."""
+        if event.code == ADAPTED:
+            self.adapted = event.values
         led_there = replace(event, before=self._tail.up_to(event.sample))
         self._write(partial(self._begun.event, led_there))
 

@@ -1,6 +1,7 @@
 """Where a run stands, and how it ended, for those who show it."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from hilctl.base.samples import Batch
@@ -20,6 +21,8 @@ class RunResult:
         missing: Samples counted as dropped, skipped or lost.
         late_ticks: Ticks that woke late.
         deadline_misses: How many were skipped of all, for people; empty where none was.
+        adapted: What adaptation made of the model by the end, by name, see
+            :data:`hilctl.base.events.ADAPTED`; empty without it.
     """
 
     path: Path
@@ -31,6 +34,7 @@ class RunResult:
     missing: int
     late_ticks: int
     deadline_misses: str = ""
+    adapted: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)

@@ -241,4 +241,5 @@ class Supervisor:
             missing=recorder.missing,
             late_ticks=ring.page.get(Field.LATE_TICKS),
             deadline_misses=deadline_misses(skipped, due, self._config.timing.max_missed_share),
+            adapted=recorder.adapted,
         )

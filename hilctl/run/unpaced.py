@@ -143,6 +143,7 @@ def run_unpaced(checked: Checked, output: Path, *, overwrite: bool = False) -> R
         samples=recorder.samples,
         missing=recorder.missing,
         late_ticks=lateness.late_ticks,
+        adapted=recorder.adapted,
     )
 
 

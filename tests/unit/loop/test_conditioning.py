@@ -162,3 +162,13 @@ class TestOffset:
         for first in range(0, 220, size):
             resting.take(first, shown[first : first + size])
         assert resting.resting_um == np.arange(160.0, 180.0).mean()
+
+    @pytest.mark.parametrize("size", [1, 7, 200])
+    def test_noise_of_the_rest(self, size):
+        """The standard deviation of the window's samples, also far from 0; NaN of none."""
+        shown = 1e5 + np.random.default_rng(1).normal(0.0, 0.03, 220)
+        resting = RestingOffset(conditioning(), 40)
+        assert math.isnan(resting.noise_um)
+        for first in range(0, 220, size):
+            resting.take(first, shown[first : first + size])
+        assert resting.noise_um == pytest.approx(shown[160:180].std(), rel=1e-6)

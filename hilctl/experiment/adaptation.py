@@ -1,0 +1,134 @@
+"""Adaptation from an experiment: its bounds, what it can't be without, and the worst it may do."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from hilctl.base.arrays import F64
+from hilctl.base.errors import Problem
+from hilctl.experiment.feedback import LOOP_DELAY, delays
+from hilctl.experiment.file import Experiment
+from hilctl.experiment.load import LoadedExperiment
+from hilctl.loop.adaptation import Adaptation, AdaptationBounds, DisplacementOperator
+from hilctl.loop.compensator import Compensator
+
+_OFFSET_SHARE = 0.1  # of the stroke's limits, where no bound is given
+_SLOWER = 5.0
+"""Time constant over the loop's delay times the number of parameters, which may all be moved by the
+same samples: with it the phase margin is above 60 degrees."""
+
+
+def adaptation_bounds(config: Experiment) -> AdaptationBounds:
+    """Return how far a run may adapt its model; all 0 where it does not.
+
+    Feedback takes the offset out by itself; and while a correction of learning is used, gain and
+    weights rest: it has what they would change, and only for the model as it was.
+    """
+    wanted, compensator = config.adaptation, config.compensator
+    if wanted is None or compensator is None:
+        return AdaptationBounds(0.0, 0.0, 0.0)
+    low_um, high_um = config.limits.stroke_um
+    offset_um = wanted.offset_um
+    if config.feedback is not None:
+        offset_um = 0.0
+    elif offset_um is None:
+        offset_um = _OFFSET_SHARE * (high_um - low_um)
+    shape = 0.0 if compensator.correction else 1.0
+    return AdaptationBounds(offset_um, shape * wanted.gain, shape * wanted.weight)
+
+
+def make_adaptation(
+    config: Experiment, reference_um: F64, compensator: Compensator
+) -> Adaptation | None:
+    """Return the adaptation of a run, or None where nothing is adapted.
+
+    Args:
+        config: The experiment.
+        reference_um: float64[n].
+        compensator: What it adapts.
+    """
+    wanted, bounds = config.adaptation, adaptation_bounds(config)
+    if wanted is None or not bounds.array.any():
+        return None
+    return Adaptation(
+        DisplacementOperator(reference_um, bounds),
+        wanted.time_constant_s,
+        config.sample_rate_hz,
+        *delays(wanted.sensor_delay_s, config.sample_rate_hz, compensator.preview),
+        wanted.noise_um,
+    )
+
+
+def adaptation_problems(loaded: LoadedExperiment, preview: int) -> list[Problem]:
+    """Return why an experiment can't have the adaptation that it asks for.
+
+    Args:
+        loaded: The experiment.
+        preview: Samples by which its compensator looks ahead.
+    """
+    config, wanted = loaded.config, loaded.config.adaptation
+    if wanted is None:
+        return []
+    found: list[tuple[str, str, str, str]] = []
+    if config.compensator is None:
+        found.append(("adaptation", "needs a compensator: it adapts the model of one", "", ""))
+    if config.feedback is not None and wanted.offset_um:
+        hint = "leave it out: both would take out the same offset"
+        rule = "must be 0 with feedback"
+        found.append(("adaptation.offset_um", rule, f"{wanted.offset_um:g}", hint))
+    rests = config.condition is not None or (
+        config.compensator is not None and config.compensator.offset == "measured"
+    )
+    if wanted.noise_um is None and not rests:
+        rule = "is needed where there is no rest before the waveform that shows it"
+        hint = "give it, or a condition, or compensator.offset: measured"
+        found.append(("adaptation.noise_um", rule, "", hint))
+    shortest_s = _shortest_s(loaded, preview)
+    if wanted.time_constant_s < shortest_s:
+        rule = f"must be >= {shortest_s:.3g} s, by the delay of the loop"
+        hint = "a smaller block or a higher rate makes the delay shorter"
+        found.append(("adaptation.time_constant_s", rule, f"{wanted.time_constant_s:g}", hint))
+    return [
+        Problem(loaded.document.where(tuple(key.split("."))), key, rule, value, hint)
+        for key, rule, value, hint in found
+    ]
+
+
+def _shortest_s(loaded: LoadedExperiment, preview: int) -> float:
+    config, wanted = loaded.config, loaded.config.adaptation
+    assert wanted is not None
+    _, shown_after = delays(wanted.sensor_delay_s, config.sample_rate_hz, preview)
+    ticks = loaded.device.info.latency_blocks + LOOP_DELAY
+    delay_s = ticks * config.tick_s + shown_after / config.sample_rate_hz
+    return _SLOWER * np.count_nonzero(adaptation_bounds(config).array) * delay_s
+
+
+def worst_inputs(config: Experiment, reference_um: F64, input_um: F64) -> Iterator[F64]:
+    """Give the compensator's input with the adaptation at its bounds, where they make it largest.
+
+    Args:
+        config: The experiment.
+        reference_um: float64[n].
+        input_um: float64[n], the input without adaptation.
+    """
+    bounds = adaptation_bounds(config)
+    if not bounds.array.any():
+        return
+    operator = DisplacementOperator(reference_um, bounds)
+    # As far as they go in a run: over its lead-in, and no faster.
+    led = min(config.lead_in_samples, input_um.size)
+    for sign in (1.0, -1.0) if bounds.offset_um else (1.0,):
+        worst = operator.form(
+            -operator.bounds * np.array([sign, *[1.0] * (operator.bounds.size - 1)])
+        )
+        out, memory = np.array(input_um), operator.at_rest(float(input_um[0]))
+        operator.invert(out[:led], led, np.zeros_like(worst), worst, memory)
+        operator.invert(out[led:], out.size, worst, worst, memory)
+        yield out
+
+
+def at_worst(problem: Problem) -> Problem:
+    """Return a problem that only the bounds of the adaptation make."""
+    hint = f"{problem.hint}; or smaller bounds of adaptation"
+    return replace(problem, rule=f"with adaptation at its bounds, {problem.rule}", hint=hint)

@@ -1,0 +1,273 @@
+"""An operator of plays after a model, inverted sample by sample, and the step of its parameters.
+
+The operator is x + g (x - c) + sum w_i (P_i[x] - c_i), in um, of a model's output and an offset, x:
+what the actuator does beside its model. The offset comes before it, so that x stays where the
+references are, wherever the offset is. It is a Prandtl-Ishlinskii operator, with an exact inverse
+as long as 1 + g and all sums 1 + g + w_1 + ... + w_i are above 0: K. Kuhnen and H. Janocha,
+"Adaptive inverse control of piezoelectric actuators with hysteresis operators", Proc. European
+Control Conference (1999).
+
+The parameters that are adapted are not o, g and w_i, whose regressors are much alike: each has the
+part of its regressor that those before it have not. So a step or a bound of one is none of another.
+"""
+
+import math
+
+from hilctl.base.arrays import F64, I64, U32
+from hilctl.kernels.jit import kernel
+
+OFFSET, GAIN, WEIGHTS = range(3)  # places of the parameters; the weights go on from there
+BOUND, CENTRE, POWER = range(3)  # rows of what belongs to each, see the functions
+MIDDLE_UM, HALF_UM, LARGEST_UM, DEAD_UM2, RATE, SMOOTHING, LEAK, COUNT = range(8)
+SETTINGS = 8
+VALUE, FORM, GRADIENT, FOUND, TOTAL = range(5)  # rows of the state
+
+_FURTHEST = 4.0  # half spans from the middle: an input beyond is none that the steps are made for
+
+
+@kernel(
+    "float64(float64, float64, float64[::1], float64[::1], float64[::1], float64[::1])", inline=True
+)
+def _inverted(
+    target: float, part: float, before: F64, after: F64, thresholds: F64, memory: F64
+) -> float:
+    """Return u with (1 + g) u + sum w_i P_i(u) = target, from the plays' memory [z_1..., u].
+
+    The plays that move with the input are engaged one after the other in the order of their
+    thresholds, and each adds its weight to the slope from there on.
+    """
+    n = thresholds.size
+    last: float = memory[n]
+    slope: float = 1.0 + before[GAIN] + part * (after[GAIN] - before[GAIN])
+    left = target - slope * last
+    for i in range(n):
+        low, high = before[WEIGHTS + i], after[WEIGHTS + i]
+        left -= (low + part * (high - low)) * memory[i]
+    sign = math.copysign(1.0, left)
+    left, way = abs(left), 0.0
+    for i in range(n):
+        low, high = before[WEIGHTS + i], after[WEIGHTS + i]
+        gap = max(thresholds[i] + sign * (memory[i] - last) - way, 0.0)
+        go = min(left / slope, gap)
+        way += go
+        left -= go * slope
+        slope += low + part * (high - low)
+    return last + sign * (way + left / slope)
+
+
+@kernel("float64(float64, float64[::1], float64[::1])", inline=True)
+def _played(u: float, thresholds: F64, memory: F64) -> float:
+    """Move the plays to an input; return it."""
+    n = thresholds.size
+    for i in range(n):
+        memory[i] = max(u - thresholds[i], min(u + thresholds[i], memory[i]))
+    memory[n] = u
+    return u
+
+
+@kernel(
+    "void(float64[::1], int64, float64[::1], float64[::1], float64[::1], float64[:, ::1],"
+    " float64[::1], float64[::1])"
+)
+def adapted_input(
+    input_um: F64,
+    size: int,
+    before: F64,
+    after: F64,
+    settings: F64,
+    table: F64,
+    thresholds: F64,
+    memory: F64,
+) -> None:
+    """Turn the displacements wanted into a model's input, in place, by the operator's inverse.
+
+    Args:
+        input_um: float64[n]; what is not finite is left, and no play moves by it.
+        size: Samples over which these go from ``before`` to ``after`` in a line, >= n.
+        before: float64[m], o, g and w_i before the first sample.
+        after: float64[m], the same after ``size`` samples.
+        settings: float64[8], see the names above.
+        table: float64[3, m], see :func:`adapt_block`.
+        thresholds: float64[m - 2], rising, in half spans.
+        memory: float64[m - 1], outputs of the plays and the input before, in half spans.
+    """
+    middle, half = settings[MIDDLE_UM], settings[HALF_UM]
+    for k in range(input_um.size):
+        wanted = input_um[k]
+        if abs(wanted) < math.inf:
+            part = (k + 1.0) / size
+            target = wanted - middle
+            for j in range(GAIN, before.size):
+                target += (before[j] + part * (after[j] - before[j])) * table[CENTRE, j]
+            u = _inverted(target / half, part, before, after, thresholds, memory)
+            offset = before[OFFSET] + part * (after[OFFSET] - before[OFFSET])
+            input_um[k] = middle + half * _played(u, thresholds, memory) - offset
+
+
+@kernel(
+    "void(float64, float64[::1], float64[:, ::1], float64[:, ::1], float64[::1], float64[::1],"
+    " float64[::1])",
+    inline=True,
+)
+def _regressors(
+    x_um: float, settings: F64, table: F64, shape: F64, thresholds: F64, memory: F64, out: F64
+) -> None:
+    """Fill ``out`` (float64[m], um) with what the adapted parameters multiply."""
+    half = settings[HALF_UM]
+    u = _played((x_um - settings[MIDDLE_UM]) / half, thresholds, memory)
+    out[OFFSET] = 1.0
+    out[GAIN] = half * u - table[CENTRE, GAIN]
+    for i in range(thresholds.size):
+        out[WEIGHTS + i] = half * memory[i] - table[CENTRE, WEIGHTS + i]
+    for j in range(out.size - 1, -1, -1):  # from the last: those before it are still themselves
+        total = out[j]
+        for i in range(j):
+            total += shape[j, i] * out[i]
+        out[j] = total
+
+
+@kernel(
+    "void(float64[::1], float64[::1], float64[:, ::1], float64[:, ::1], float64[::1],"
+    " float64[::1], float64[::1], float64[::1], float64[:, ::1])"
+)
+def regressor_sums(
+    input_um: F64,
+    settings: F64,
+    table: F64,
+    shape: F64,
+    thresholds: F64,
+    memory: F64,
+    found: F64,
+    sums: F64,
+    products: F64,
+) -> None:
+    """Add up the regressors of an input, and their products.
+
+    Args:
+        input_um: float64[n].
+        settings: float64[8].
+        table: float64[3, m].
+        shape: float64[m, m].
+        thresholds: float64[m - 2].
+        memory: float64[m - 1].
+        found: float64[m], scratch.
+        sums: float64[m], added to.
+        products: float64[m, m], added to.
+    """
+    for k in range(input_um.size):
+        _regressors(input_um[k], settings, table, shape, thresholds, memory, found)
+        for i in range(found.size):
+            sums[i] += found[i]
+            for j in range(found.size):
+                products[i, j] += found[i] * found[j]
+
+
+@kernel("float64(float64, float64[::1], int64[::1], int64)", inline=True)
+def _delayed(value: float, line: F64, places: I64, which: int) -> float:
+    """Put a value into a line, and return the oldest one in it: itself where there is one place."""
+    at = places[which]
+    line[at] = value
+    at = (at + 1) % line.size
+    places[which] = at
+    oldest: float = line[at]
+    return oldest
+
+
+@kernel("float64(float64[::1], float64[:, ::1], float64)", inline=True)
+def _excess(found: F64, table: F64, count: float) -> float:
+    """Return how much larger than on average the regressors are, squared; 1 where they are not."""
+    total = 0.0
+    for j in range(found.size):
+        total += found[j] * found[j] / table[POWER, j]
+    return max(1.0, total / count)
+
+
+@kernel("void(int64, float64[::1], float64[:, ::1], float64[:, ::1], float64[:, ::1])", inline=True)
+def _step(size: int, settings: F64, table: F64, shape: F64, state: F64) -> None:
+    """Move the parameters by ``size`` samples of the smoothed gradient, within their bounds.
+
+    The dead zone is of what a gradient explains of the squared error: below it, that may be noise.
+    """
+    pace, dead = size * settings[RATE], settings[DEAD_UM2]
+    for j in range(state.shape[1]):
+        bound, gradient = table[BOUND, j], state[GRADIENT, j]
+        explained = gradient * gradient / table[POWER, j]
+        share = 1.0 - math.sqrt(dead / max(explained, dead, 1e-300))
+        most = pace * bound
+        step = min(most, max(-most, pace * share * gradient / table[POWER, j]))
+        kept = 1.0 - pace * settings[LEAK] * min(j, 1)  # not of the offset, which always shows
+        state[VALUE, j] = min(bound, max(-bound, kept * state[VALUE, j] + step))
+    for i in range(state.shape[1]):
+        form = state[VALUE, i]
+        for j in range(i + 1, state.shape[1]):
+            form += shape[j, i] * state[VALUE, j]
+        state[FORM, i] = form
+
+
+@kernel(
+    "int64(float64[::1], float64[::1], float64[::1], uint32[::1], float64[::1], float64[:, ::1],"
+    " float64[:, ::1], float64[::1], float64[::1], float64[::1], int64[::1], float64[::1],"
+    " float64[:, ::1])"
+)
+def adapt_block(
+    reference_um: F64,
+    input_um: F64,
+    displacement_um: F64,
+    flags: U32,
+    settings: F64,
+    table: F64,
+    shape: F64,
+    thresholds: F64,
+    due: F64,
+    shown: F64,
+    places: I64,
+    memory: F64,
+    state: F64,
+) -> int:
+    """Hold a block's displacements against the references due, and step the parameters by them.
+
+    A sample whose error is larger than the parameters can make is left out: that is no change of
+    the actuator. By a block in which none is left nothing changes.
+
+    Args:
+        reference_um: float64[n].
+        input_um: float64[n], the model's input.
+        displacement_um: float64[n].
+        flags: uint32[n]: where one is set, the actuator was not given what the samples ask for.
+        settings: float64[8].
+        table: float64[3, m]: bound of each parameter, centre of its regressor before the others are
+            taken out, and mean square after that; infinite where it is not adapted.
+        shape: float64[m, m], lower triangle: how much of the others each regressor is given.
+        thresholds: float64[m - 2], rising, in half spans.
+        due: float64[d + 1], a line of references, to the displacement that is to show them.
+        shown: float64[e + 1], a line of inputs, to the displacement that shows them.
+        places: int64[2], where both lines stand.
+        memory: float64[m - 1], of the plays.
+        state: float64[5, m], parameters, the same as o, g and w_i, smoothed gradient, scratch.
+
+    Returns:
+        Samples that were taken.
+    """
+    found, total = state[FOUND], state[TOTAL]
+    size, last, taken, usable = reference_um.size, memory.size - 1, 0, 1.0
+    total[:] = 0.0
+    for k in range(size):
+        usable = math.nan if flags[k] else usable
+    for k in range(size):
+        # What is not usable is not shown later either.
+        error = displacement_um[k] * usable - _delayed(reference_um[k] * usable, due, places, 0)
+        x_um = _delayed(input_um[k] * usable, shown, places, 1) + state[VALUE, OFFSET]
+        near = abs(x_um - settings[MIDDLE_UM]) <= _FURTHEST * settings[HALF_UM]
+        good = near and abs(error) <= settings[LARGEST_UM]
+        held_um = settings[MIDDLE_UM] + settings[HALF_UM] * memory[last]
+        _regressors(x_um if near else held_um, settings, table, shape, thresholds, memory, found)
+        error = error / _excess(found, table, settings[COUNT]) if good else 0.0
+        taken += good
+        for j in range(total.size):
+            total[j] += found[j] * error
+    if taken:
+        part = size * settings[SMOOTHING] / (1.0 + size * settings[SMOOTHING])
+        for j in range(total.size):
+            state[GRADIENT, j] += (total[j] / size - state[GRADIENT, j]) * part
+        _step(size, settings, table, shape, state)
+    return taken

@@ -1,0 +1,281 @@
+"""Adaptation of the compensator's model while it runs: offset, gain and the weights of some plays.
+
+What the actuator does beside its model is an operator of few parameters (kernels/adaptation.py),
+whose inverse stands before the model's: one for every kind of model, and its output is recorded as
+the compensator's input, so that a run replays as any other.
+
+The parameters follow the gradient of the squared tracking error. The regressors are those of the
+input that a displacement shows, as much earlier as compensator, sensor and device take. They are
+made orthogonal over the reference, which is known before, so that all parameters take the same time
+and none of them makes up for another (B. Widrow and S. D. Stearns, "Adaptive Signal Processing",
+1985, chapter 8; B. Widrow and E. Walach, "Adaptive Inverse Control", 1996). Four things keep it
+bounded whatever the displacements are: normalisation, a dead zone, leakage, and projection on the
+bounds (P. A. Ioannou and J. Sun, "Robust Adaptive Control", 1996, chapter 8); and its pace is
+limited.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from hilctl.base.arrays import F64
+from hilctl.base.errors import InputError
+from hilctl.base.events import ADAPTED, Event, adapted_text
+from hilctl.kernels import adaptation as kernel
+from hilctl.loop.block import Block
+
+THRESHOLDS = (0.15, 0.4, 0.7)
+"""Thresholds of the plays, as shares of half the reference's span."""
+_SMOOTHED = 0.1  # time constant of the smoothed gradient, as a share of that of the parameters
+_LEAK = 0.01  # pace of leakage, as a share of theirs: 1 % of gain and weights is left out
+_DEAD = 3.0  # standard deviations of the noise's part of the gradient
+_ALIKE = 1e-4  # of a mean square: regressors that differ by less are the same
+_RIDGE = 0.02  # of the mean squares, so that regressors that hardly differ are told apart slowly
+_LEAST_SLOPE = 0.3
+_EVENT_S = 1.0
+_WORTH_SAYING = 0.1  # of a bound
+
+
+@dataclass(frozen=True, slots=True)
+class AdaptationBounds:
+    """How far parameters may go from those identified, either way; 0 leaves one as it is.
+
+    Attributes:
+        offset_um: Offset.
+        gain: Gain, as a share.
+        weight: Weight of each play, as a share of the gain.
+    """
+
+    offset_um: float
+    gain: float
+    weight: float
+
+    def __post_init__(self) -> None:
+        if not min(self.offset_um, self.gain, self.weight) >= 0.0:
+            raise InputError(f"must be >= 0: {self.offset_um}, {self.gain}, {self.weight}")
+
+    @property
+    def array(self) -> F64:
+        """The bounds in the parameters' order: float64[m]."""
+        return np.array([self.offset_um, self.gain, *[self.weight] * len(THRESHOLDS)])
+
+
+class DisplacementOperator:
+    """What the actuator does beside its model, over a reference.
+
+    Args:
+        reference_um: float64[n], n > 0: the plays and the centre are those of its span.
+        bounds: How far the parameters may go.
+
+    Raises:
+        InputError: With parameters within these bounds the operator might have no inverse.
+    """
+
+    def __init__(self, reference_um: F64, bounds: AdaptationBounds) -> None:
+        low, high = float(reference_um.min()), float(reference_um.max())
+        still = not high > low
+        self.bounds = bounds.array
+        if still:  # nothing but the offset shows in what stands still
+            self.bounds[kernel.GAIN :] = 0.0
+        m = self.bounds.size
+        self.thresholds = np.array(THRESHOLDS)
+        self.settings = np.zeros(kernel.SETTINGS)
+        self.settings[kernel.MIDDLE_UM] = 0.5 * (low + high)
+        self.settings[kernel.HALF_UM] = 1.0 if still else 0.5 * (high - low)
+        self.table = np.stack([self.bounds, np.zeros(m), np.full(m, math.inf)])
+        self.shape = np.eye(m)
+        self._take_apart(reference_um)
+        least = self._least_slope()
+        if not least >= _LEAST_SLOPE:
+            raise InputError(f"the slope must stay above {_LEAST_SLOPE} with all bounds: {least:g}")
+
+    def at_rest(self, input_um: float) -> F64:
+        """Return the plays' memory where the input has come to rest: float64[m - 1]."""
+        u = (input_um - self.settings[kernel.MIDDLE_UM]) / self.settings[kernel.HALF_UM]
+        return np.append(np.clip(0.0, u - self.thresholds, u + self.thresholds), u)
+
+    def invert(self, input_um: F64, size: int, before: F64, after: F64, memory: F64) -> None:
+        """Turn displacements wanted into the model's input, see ``kernels.adaptation``."""
+        kernel.adapted_input(
+            input_um, size, before, after, self.settings, self.table, self.thresholds, memory
+        )
+
+    def form(self, values: F64) -> F64:
+        """Return o, g and w_i (float64[m]) of adapted parameters."""
+        formed: F64 = self.shape.T @ values
+        return formed
+
+    @property
+    def largest_um(self) -> float:
+        """Largest error that the parameters can make between them, in um."""
+        offset_um, shares = self.bounds[kernel.OFFSET], self.bounds[kernel.GAIN :].sum()
+        return float(offset_um + 2.0 * shares * self.settings[kernel.HALF_UM])
+
+    def _take_apart(self, reference_um: F64) -> None:
+        """Have each regressor without what those before it have: Gram and Schmidt's way."""
+        m, n = self.bounds.size, reference_um.size
+        sums, products = np.zeros(m), np.zeros((m, m))
+        kernel.regressor_sums(
+            np.array(reference_um),
+            self.settings,
+            self.table,
+            self.shape,
+            self.thresholds,
+            self.at_rest(float(reference_um[0])),
+            np.zeros(m),
+            sums,
+            products,
+        )
+        mean = sums / n
+        self.table[kernel.CENTRE, kernel.GAIN :] = mean[kernel.GAIN :]
+        products = products / n - np.outer(mean, mean)
+        products[kernel.OFFSET, kernel.OFFSET] = 1.0
+        for j in np.flatnonzero(self.bounds):
+            before = np.arange(kernel.GAIN, j)
+            if before.size:
+                near = products[np.ix_(before, before)]
+                ridge = _ALIKE * np.diag(np.diag(near))
+                self.shape[j, before] = -np.linalg.solve(near + ridge, products[before, j])
+            power = float(self.shape[j] @ products @ self.shape[j])
+            self.table[kernel.POWER, j] = power + _RIDGE * products[j, j]
+
+    def _least_slope(self) -> float:
+        """Return the least slope that the operator may have anywhere, by the bounds."""
+        engaged = np.cumsum(self.shape[:, kernel.GAIN :], axis=1)
+        return float(1.0 - (self.bounds @ np.abs(engaged)).max())
+
+
+class Adaptation:
+    """The adaptation of one run; called in every tick, it never waits and never gives a NaN.
+
+    Args:
+        operator: What is adapted.
+        time_constant_s: Of the parameters' way to where the error is least, > 0.
+        rate_hz: Samples a second.
+        due_after: Samples from a reference to the displacement that is to show it.
+        shown_after: Samples from an input to the displacement that shows it.
+        noise_um: Standard deviation of the sensor's noise; None where :meth:`take_noise` says it,
+            before which nothing is adapted.
+    """
+
+    def __init__(
+        self,
+        operator: DisplacementOperator,
+        time_constant_s: float,
+        rate_hz: float,
+        due_after: int,
+        shown_after: int,
+        noise_um: float | None,
+    ) -> None:
+        if not 0.0 < time_constant_s < math.inf:
+            raise InputError(f"time_constant_s must be > 0: {time_constant_s}")
+        m = operator.bounds.size
+        self._operator = operator
+        self._settings = operator.settings
+        self._settings[kernel.LARGEST_UM] = operator.largest_um
+        self._settings[kernel.RATE] = 1.0 / (time_constant_s * rate_hz)
+        self._settings[kernel.SMOOTHING] = self._settings[kernel.RATE] / _SMOOTHED
+        self._settings[kernel.LEAK] = _LEAK
+        self._settings[kernel.COUNT] = max(1, int(np.count_nonzero(operator.bounds)))
+        self._averaged = max(1.0, 2.0 / self._settings[kernel.SMOOTHING])
+        self._due, self._shown = np.full(due_after + 1, np.nan), np.full(shown_after + 1, np.nan)
+        self._places = np.zeros(2, dtype=np.int64)
+        self._state = np.zeros((kernel.TOTAL + 1, m))
+        self._before = np.zeros(m)
+        self._fed: F64 | None = None
+        self._seen: F64 | None = None
+        self._event_after = math.ceil(_EVENT_S * rate_hz)
+        self._said, self._said_at = np.zeros(m), 0
+        self._ready = False
+        if noise_um is not None:
+            self.take_noise(noise_um)
+
+    def take_noise(self, noise_um: float) -> None:
+        """Begin, with a dead zone of what noise of that standard deviation makes of the gradient.
+
+        Nothing changes once it is known; where it is not a number, nothing is adapted.
+        """
+        if self._ready or not math.isfinite(noise_um):
+            return
+        self._ready = True
+        self._settings[kernel.DEAD_UM2] = (_DEAD * noise_um) ** 2 / self._averaged
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """What the actuator does beside its model, by name, see :data:`hilctl.base.events.ADAPTED`.
+
+        With v the model's output and ``offset_um`` less ``middle_um``, the displacement is
+        ``middle_um`` + ``constant_um`` + ``direct`` v + sum ``weight_i`` P_i[v], and each play P_i
+        has its ``threshold_um_i``.
+        """
+        operator, form = self._operator, self._state[kernel.FORM]
+        offset_um, gain = self._state[kernel.VALUE, : kernel.WEIGHTS].tolist()
+        constant_um = -float(form @ operator.table[kernel.CENTRE])
+        found = {"offset_um": offset_um, "gain": 1.0 + gain, "constant_um": constant_um}
+        found |= {"middle_um": float(self._settings[kernel.MIDDLE_UM])}
+        found |= {"direct": 1.0 + float(form[kernel.GAIN])}
+        half_um = float(self._settings[kernel.HALF_UM])
+        for i, share in enumerate(THRESHOLDS, start=1):
+            found[f"weight_{i}"] = float(form[kernel.GAIN + i])
+            found[f"threshold_um_{i}"] = share * half_um
+        return found
+
+    def follow(self, input_um: F64, size: int) -> None:
+        """Turn the input of a block of ``size`` samples (float64[n], n <= size) into the model's.
+
+        The parameters move in a line over the block: a step of them would come out of a
+        compensator with a lead as a spike of the command.
+        """
+        if self._fed is None:
+            self._fed = self._operator.at_rest(input_um.item(0))
+            self._seen = self._fed.copy()
+        self._operator.invert(input_um, size, self._before, self._state[kernel.FORM], self._fed)
+        self._before[:] = self._state[kernel.FORM]
+
+    def take(self, block: Block) -> None:
+        """Adapt by a block whose displacements have come, whatever the phase of the run.
+
+        Nothing moves by a block with any flag: an interlock, the limiter, skipped ticks, a ramp or
+        conditioning; nor by what shows the inputs of one.
+        """
+        if block.skipped:
+            self._due[:] = self._shown[:] = np.nan
+        if self._seen is None or not self._ready:
+            return
+        kernel.adapt_block(
+            block.reference,
+            block.input_um,
+            block.displacement_um,
+            block.flags,
+            self._settings,
+            self._operator.table,
+            self._operator.shape,
+            self._operator.thresholds,
+            self._due,
+            self._shown,
+            self._places,
+            self._seen,
+            self._state,
+        )
+
+    def event(self, sample: int, *, ended: bool = False) -> Event | None:
+        """Return what the parameters have come to, where that is worth an event now.
+
+        Args:
+            sample: Next sample of the run.
+            ended: Whether the run is over: then it always is.
+        """
+        values, bounds = self._state[kernel.VALUE], self._operator.bounds
+        if not ended:
+            if sample - self._said_at < self._event_after:
+                return None
+            self._said_at = sample
+            if not (np.abs(values - self._said) > _WORTH_SAYING * bounds).any():
+                return None
+        self._said[:] = values
+        at_bound = (bounds > 0.0) & (np.abs(values) >= bounds)
+        names = ["offset_um", "gain", *(f"weight_{i + 1}" for i in range(len(THRESHOLDS)))]
+        held = ", ".join(name for name, there in zip(names, at_bound, strict=True) if there)
+        text = adapted_text(self.parameters) + (f"; at its bound: {held}" if held else "")
+        return Event(sample, "warning" if held else "info", ADAPTED, text, self.parameters)
