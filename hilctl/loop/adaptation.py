@@ -33,6 +33,7 @@ _DEAD = 3.0  # standard deviations of the noise's part of the gradient
 _ALIKE = 1e-4  # of a mean square: regressors that differ by less are the same
 _RIDGE = 0.02  # of the mean squares, so that regressors that hardly differ are told apart slowly
 _LEAST_SLOPE = 0.3
+_CHUNK = 100_000
 _EVENT_S = 1.0
 _WORTH_SAYING = 0.1  # of a bound
 
@@ -115,18 +116,21 @@ class DisplacementOperator:
     def _take_apart(self, reference_um: F64) -> None:
         """Have each regressor without what those before it have: Gram and Schmidt's way."""
         m, n = self.bounds.size, reference_um.size
-        sums, products = np.zeros(m), np.zeros((m, m))
-        kernel.regressor_sums(
-            np.array(reference_um),
-            self.settings,
-            self.table,
-            self.shape,
-            self.thresholds,
-            self.at_rest(float(reference_um[0])),
-            np.zeros(m),
-            sums,
-            products,
-        )
+        sums, products, found = np.zeros(m), np.zeros((m, m)), np.zeros(m)
+        memory = self.at_rest(float(reference_um[0]))
+        for start in range(0, n, _CHUNK):
+            kernel.regressor_sums(
+                # A copy: compiled code refuses read-only arrays, and references may be long.
+                np.array(reference_um[start : start + _CHUNK]),
+                self.settings,
+                self.table,
+                self.shape,
+                self.thresholds,
+                memory,
+                found,
+                sums,
+                products,
+            )
         mean = sums / n
         self.table[kernel.CENTRE, kernel.GAIN :] = mean[kernel.GAIN :]
         products = products / n - np.outer(mean, mean)

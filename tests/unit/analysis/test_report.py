@@ -8,8 +8,10 @@ import pytest
 
 from hilctl.analysis.figures import RunReport
 from hilctl.analysis.report import summarize, worst_segment
+from hilctl.analysis.table import run_rows
 from hilctl.base.arrays import F64
 from hilctl.base.errors import DataError
+from hilctl.base.events import ADAPTED, Event
 from hilctl.base.samples import Flag
 from hilctl.base.segments import Segment
 from hilctl.recording.data import Recording, Ticks
@@ -236,6 +238,15 @@ class TestCutShort:
 
 
 class TestWholeRun:
+    def test_what_was_adapted_in_the_end(self, lagging) -> None:
+        """The newest event counts; without any there is nothing."""
+        events = [Event(k, "info", ADAPTED, "", {"gain": 1.0 + k / 1e4}) for k in (500, 900)]
+        events.append(Event(999, "info", "other", ""))
+        report = summarize(replace(lagging(), events=tuple(events)))
+        assert report.adapted == {"gain": 1.09}
+        assert ("adapted", "gain 1.0900") in run_rows(report)
+        assert summarize(lagging()).adapted == {}
+
     def test_worst_segment_counts(self, make_recording) -> None:
         """Percentages of the run are the largest of its segments; cycles are summed."""
         reference_um = np.tile(wave(1000.0, 4), 2)

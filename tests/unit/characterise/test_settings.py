@@ -13,6 +13,7 @@ sample_rate_hz: 5000
 waveform: {kind: sine, unit: um, amplitude: 4.0, frequency_hz: 2.0, duration_s: 1.0}
 compensator: {model: nowhere.yaml}
 feedback: {limit_um: 1.0, bandwidth_hz: 10.0}
+adaptation: {noise_um: 0.1}
 limits:
   {peak_current_a: 4.0, slew_a_per_s: 5000.0, stroke_um: [-50.0, 50.0], tracking_error_um: 5.0,
    tracking_s: 0.1, frozen_s: 1.0}
@@ -28,6 +29,7 @@ def test_what_needs_a_reference_is_taken_out(tmp_path, limits):
     loaded = load_experiment(path, [*settings, waveform_setting(keys)])
     assert loaded.model is None
     assert loaded.config.feedback is None
+    assert loaded.config.adaptation is None
     assert loaded.config.limits.tracking_error_um is None
     assert loaded.config.limits.tracking_s is None
     assert loaded.config.limits.frozen_s == 1.0
