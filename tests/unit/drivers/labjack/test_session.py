@@ -303,6 +303,19 @@ def test_a_stream_is_set_up_by_its_registers(scene):
     ]  # fmt: skip
 
 
+def test_a_stream_is_started_and_stopped_by_one_register(scene):
+    """It is stopped only where it runs."""
+    made = scene()
+    made.device.written.clear()
+    made.session.start()
+    assert made.device.written == [(4990, "00000001")]
+    made.session.stop()
+    assert made.device.written[1:] == [(4990, "00000000")]
+    made.device.starts = False
+    made.session.stop()
+    assert len(made.device.written) == 2
+
+
 def test_a_new_session_has_nothing():
     session = StreamSession(Scripted(), load_profile("labjack_t7").streaming, 0.1, 0.001)
     assert not session.running
