@@ -11,7 +11,7 @@ run: $(VENV)/.ready
 	$(BIN)/hilctl run configs/demo.yaml
 
 test: $(VENV)/.ready
-	@echo "Takes 5 to 6 minutes of processor time, shared by up to 4 cores; whole runs: make test-slow."
+	@echo "Takes 3 to 4 minutes of processor time, shared by up to 4 cores; whole runs: make test-slow."
 	$(BIN)/pytest -n auto --maxprocesses 4 --dist loadfile -m "not slow"
 
 test-slow: $(VENV)/.ready

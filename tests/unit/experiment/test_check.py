@@ -11,8 +11,10 @@ from pydantic import ConfigDict
 from hilctl.base.arrays import F64
 from hilctl.base.device import DeviceInfo, DeviceOptions
 from hilctl.base.errors import ConfigError
+from hilctl.base.segments import Segment
 from hilctl.base.yaml.document import Document
 from hilctl.experiment.check import Checked, check
+from hilctl.experiment.correction import Correction, LearnedCycle, model_sha256, signature
 from hilctl.experiment.load import LoadedExperiment, resolve
 from hilctl.models.base import HysteresisModel, IdentifiedRange, Operator, Provenance
 from hilctl.models.plays import RdpiModel
@@ -439,3 +441,50 @@ def test_a_reference_that_begins_beside_the_rest_position_is_moved_not_hurried()
     assert "slew" not in str(problem)
     there = ("waveform.offset=24.5", "waveform.soft_start_s=0")
     assert check(loaded(DISPLACEMENT, *there, model=moved))
+
+
+def learned(made: Checked, waveform: Segment) -> Correction:
+    """Return a correction for one segment of an experiment that was checked without."""
+    wanted = signature(made.reference.values, waveform)
+    coefficients = np.array([0.0, 0.2 - 0.1j, 0.0, 0.05j])
+    cycle = LearnedCycle.from_coefficients(waveform.label, waveform.period, wanted, coefficients)
+    return Correction(
+        sample_rate_hz=made.reference.sample_rate_hz,
+        model_sha256=model_sha256(made.loaded.model),
+        cycles=(cycle,),
+    )
+
+
+def test_what_was_learned_is_added_to_the_compensator_s_input() -> None:
+    """And to nothing else; it is recorded then, as it is not the reference."""
+    plain = checked(DISPLACEMENT, model=terfenol_rdpi())
+    assert not plain.records_input
+    assert plain.begun.input_um is plain.reference.values
+    correction = learned(plain, plain.reference.segments[0])
+    found = check(replace(plain.loaded, correction=correction))
+    assert found.records_input
+    np.testing.assert_array_equal(found.reference.values, plain.reference.values)
+    added = found.begun.input_um - plain.reference.values
+    np.testing.assert_allclose(
+        added, correction.samples(plain.reference, plain.loaded.model), atol=1e-14
+    )
+    assert 0.1 < np.abs(added).max() < 1.0
+
+
+def test_what_was_learned_on_another_motion_is_refused() -> None:
+    plain = checked(DISPLACEMENT, model=terfenol_rdpi())
+    faster = checked(DISPLACEMENT, "waveform.frequency_hz=20", model=terfenol_rdpi())
+    correction = learned(plain, plain.reference.segments[0])
+    with pytest.raises(ConfigError) as caught:
+        check(replace(faster.loaded, correction=correction))
+    (problem,) = caught.value.problems
+    assert problem.key == "compensator.correction"
+    assert problem.hint == "learn again with 'hilctl learn', or take it out"
+
+
+def test_each_block_keeps_the_memory_and_the_command_before() -> None:
+    """So that a recording replays from any block on."""
+    model = terfenol_rdpi()
+    kept = model.inverse(10_000.0).state().size
+    assert checked(DISPLACEMENT, model=model).state_size == kept + 1
+    assert checked(CURRENT).state_size == 1

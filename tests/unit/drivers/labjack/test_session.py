@@ -111,6 +111,7 @@ class Scripted:
     def __init__(self, *answers, starts=True, makes_hz=RATE_HZ):
         self.answers, self.starts, self.makes_hz = list(answers), starts, makes_hz
         self.given, self.fed, self.calls = 0, 0, 0
+        self.written = []
 
     def read(self, address, words):
         if address == stream.SCANRATE_HZ:
@@ -121,6 +122,7 @@ class Scripted:
 
     def call(self, frames):
         written = [each for each in frames if isinstance(each, WriteFrame)]
+        self.written += [(each.address, each.data.hex()) for each in written]
         self.fed += sum(len(w.data) // 4 for w in written if w.address == stream.OUT_BUFFER_F32)
         if frames[0] is not stream.READ_FRAMES[0]:
             return []
@@ -286,3 +288,35 @@ def test_a_rate_that_the_device_can_not_make_is_refused(scene):
     for off in (1.2e-4, -1.2e-4):
         with pytest.raises(DeviceError, match="was set to 1000 Hz, the device makes"):
             scene(makes_hz=RATE_HZ * (1.0 + off))
+
+
+def test_a_stream_is_set_up_by_its_registers(scene):
+    """Stream-out 0 off, target, buffer of 16 KiB, its last value repeated, on; then the scan list.
+
+    One input and the output, at 1 kHz, for ever, fetched by reading; nothing starts it.
+    """
+    one, none = "00000001", "00000000"
+    assert scene(queued=0).device.written == [
+        (4090, none), (4040, "000003e8"), (4050, "00004000"), (4060, one), (4090, one),
+        (4002, "447a0000"), (4004, "00000002"), (4008, none), (4010, none), (4012, "00004000"),
+        (4016, "00000010"), (4018, none), (4020, none), (4100, "00000000" "000012c0"),
+    ]  # fmt: skip
+
+
+def test_a_stream_is_started_and_stopped_by_one_register(scene):
+    """It is stopped only where it runs."""
+    made = scene()
+    made.device.written.clear()
+    made.session.start()
+    assert made.device.written == [(4990, "00000001")]
+    made.session.stop()
+    assert made.device.written[1:] == [(4990, "00000000")]
+    made.device.starts = False
+    made.session.stop()
+    assert len(made.device.written) == 2
+
+
+def test_a_new_session_has_nothing():
+    session = StreamSession(Scripted(), load_profile("labjack_t7").streaming, 0.1, 0.001)
+    assert not session.running
+    assert (session.capacity, session.margin, session.level_min) == (0, 0, 0)
