@@ -103,6 +103,28 @@ def _followed(y: float, w: float, target: float, band: Band) -> tuple[float, flo
     return w, by_y
 
 
+@kernel(
+    "void(float64, int64, Tuple((float64, float64, int64, int64, float64, float64)),"
+    " float64[:, :, ::1], float64[::1])",
+    inline=True,
+)
+def _share_out(
+    gain: float,
+    way: int,
+    found: tuple[float, float, int, int, float, float],
+    slopes: F64,
+    by_node: F64,
+) -> None:
+    """Add what a field gains by a slope to what it gains by the logarithms of four nodes."""
+    _, _, i, j, a, b = found
+    stride = slopes.shape[2]
+    node = (way * slopes.shape[1] + i) * stride + j
+    by_node[node] += gain * (1.0 - a) * (1.0 - b) * slopes[way, i, j]
+    by_node[node + 1] += gain * (1.0 - a) * b * slopes[way, i, j + 1]
+    by_node[node + stride] += gain * a * (1.0 - b) * slopes[way, i + 1, j]
+    by_node[node + stride + 1] += gain * a * b * slopes[way, i + 1, j + 1]
+
+
 @kernel(f"void(float64[::1], float64, float64, {_BAND}, int64[::1], float64[::1], float64[:, ::1])")
 def duhem_columns(
     y: F64, start_y: float, start_w: float, band: Band, rows: I64, w: F64, out: F64
@@ -119,7 +141,6 @@ def duhem_columns(
         out: float64[N, m], filled; no columns where m is 0.
     """
     slopes, steps, lines, grid = band
-    nodes, stride = slopes[0].size, slopes.shape[2]
     by_node = np.zeros(out.shape[1])
     row = 0
     for k in range(y.size):
@@ -127,33 +148,27 @@ def duhem_columns(
         way = 0 if y[k] >= last else 1
         going, part = True, 0
         while going:
-            off = field - _along(last, lines, 0, grid)
-            first, first_by, i, j, _, _ = _slope(last, off, way, slopes, grid)
-            rest = y[k] - last
-            going = abs(rest) > steps[way, i, j] and part < _MOST_STEPS
-            dy = math.copysign(steps[way, i, j], rest) if going else rest
+            first = _slope(last, field - _along(last, lines, 0, grid), way, slopes, grid)
+            rest, longest = y[k] - last, steps[way, first[2], first[3]]
+            going = abs(rest) > longest and part < _MOST_STEPS
+            dy = math.copysign(longest, rest) if going else rest
             middle = last + 0.5 * dy
-            off = field + 0.5 * dy / first - _along(middle, lines, 0, grid)
-            g, by_off, i, j, a, b = _slope(middle, off, way, slopes, grid)
+            off = field + 0.5 * dy / first[0] - _along(middle, lines, 0, grid)
+            half = _slope(middle, off, way, slopes, grid)
             if part == _MOST_STEPS:
-                g = first
+                half = first
             last = last + dy if going else y[k]
             centre = _along(last, lines, 0, grid)
-            free = field + dy / g
-            left = max(0.0, 1.0 - dy / g**2 * by_off * (1.0 - 0.5 * dy / first**2 * first_by))
+            free = field + dy / half[0]
             field = min(max(free, centre - grid[2]), centre + grid[2])
             part += 1
             if by_node.size:
-                gain = -dy / g**2
-                if field != free:  # the edge of the band forgets
-                    gain = left = 0.0
-                by_node *= left
-                node = way * nodes + i * stride + j
-                by_node[node] += gain * (1.0 - a) * (1.0 - b) * slopes[way, i, j]
-                by_node[node + 1] += gain * (1.0 - a) * b * slopes[way, i, j + 1]
-                node += stride
-                by_node[node] += gain * a * (1.0 - b) * slopes[way, i + 1, j]
-                by_node[node + 1] += gain * a * b * slopes[way, i + 1, j + 1]
+                inside = 1.0 if field == free else 0.0  # the edge of the band forgets
+                gain = -inside * dy / half[0] ** 2
+                to_half = -0.5 * dy / first[0] ** 2
+                by_node *= inside + gain * half[1] * (1.0 + to_half * first[1])
+                _share_out(gain, way, half, slopes, by_node)
+                _share_out(gain * half[1] * to_half, way, first, slopes, by_node)
         w[k] = field
         if row < rows.size and rows[row] == k:
             out[row] = by_node
