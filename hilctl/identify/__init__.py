@@ -20,5 +20,6 @@ data           loops and histories, from recordings and tables
 searched       thresholds searched from several starts
 staged         free weights and stages, without a search for what is linear
 field          plays and drags of an effective field, from whole histories
+generalised_duhem  slopes by place and direction, from whole histories
 literature     the other models of the literature
 """

@@ -15,6 +15,7 @@ from hilctl.identify.workers import Map
 WHOLE: tuple[Mapping[str, Any], ...] = (
     {"kind": "field"},
     {"kind": "field", "drags": 0},
+    {"kind": "generalised_duhem"},
     {"kind": "integrated", "offset": True},
 )
 """What is tried on histories."""

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from hilctl.base.errors import InputError
 from hilctl.base.yaml.messages import did_you_mean
 from hilctl.identify.field.fits import fit_field
+from hilctl.identify.generalised_duhem.fits import fit_generalised_duhem
 from hilctl.identify.job import FitJob, FoundModel
 from hilctl.identify.literature.asymmetric import fit_asymmetric
 from hilctl.identify.literature.differential import fit_bouc_wen, fit_duhem
@@ -75,6 +76,12 @@ CATALOGUE: Mapping[FitKind, CatalogueEntry] = {
         "densities by non-negative least squares, the stages searched",
         HISTORIES,
         fit_field,
+    ),
+    "generalised_duhem": CatalogueEntry(
+        "generalised Duhem: slopes by place and direction, with losses",
+        "slopes and stages together, held smooth",
+        HISTORIES,
+        fit_generalised_duhem,
     ),
     "straight": CatalogueEntry("straight line: no hysteresis", "least squares", ANY, fit_straight),
 }

@@ -23,6 +23,8 @@ from hilctl.models.butterfly import ButterflyModel
 from hilctl.models.integrated import IntegratedModel
 from hilctl.models.plays import PlayModel
 
+# A lag needs every sample: models with one would take the others for a rest.
+_EVERY_SAMPLE = {"staged", "field", "generalised_duhem"}
 PERIODS = 3
 """Periods of a loop that a model of any kind is run through; the last is judged. Differential
 models forget slowly."""
@@ -48,8 +50,7 @@ def search_data(records: Records, kind: str, unit: CommandUnit) -> "FitData":
     Raises:
         DataError: There are none.
     """
-    # A lag needs every sample: models with one would take the others for a rest.
-    return FitData(records if kind in {"staged", "field"} else thinned(records), unit)
+    return FitData(records if kind in _EVERY_SAMPLE else thinned(records), unit)
 
 
 class FitData:

@@ -16,6 +16,7 @@ from hilctl.base.strict import Strict
 FitKind: TypeAlias = Literal[
     "integrated", "staged", "rdpi", "asymmetric", "ppi", "spi", "generalised", "preisach", "kp",
     "bouc_wen", "duhem", "butterfly", "straight", "field",
+    "generalised_duhem",
 ]  # fmt: skip
 Choices: TypeAlias = Mapping[str, Any]
 
@@ -33,6 +34,7 @@ PUBLISHED: Mapping[str, Choices] = {
     "preisach": {"lines": 16},
     "butterfly": {"plays": 16},
     "field": {"plays": 16},
+    "generalised_duhem": {"cells": 16},
 }
 """Defaults of a kind that are not those of all; sections 3.4.2 (PPI), 5.3 (RDPI), 6.4."""
 
@@ -81,7 +83,19 @@ class FitSettings(Strict):
     )
     drags: int = _of("field", default=3, ge=0, le=12, description="Drags, whose small loops creep.")
     cells: int = _of(
-        "field", default=24, ge=2, le=60, description="Cells of each table of plays and drags."
+        "field",
+        "generalised_duhem",
+        default=24,
+        ge=2,
+        le=60,
+        description="Cells of each table, along the effective field or the displacement.",
+    )
+    across: int = _of(
+        "generalised_duhem",
+        default=10,
+        ge=2,
+        le=60,
+        description="Cells of a table of slopes across its band.",
     )
     knots: int = _of(
         "field", default=24, ge=2, le=60, description="Pieces of the curve after them."
@@ -234,7 +248,7 @@ class IdentifySettings(FitSettings):
     @classmethod
     def _histories(cls, given: Any) -> Any:
         """Whole histories for a kind whose small loops remember the large ones before them."""
-        if isinstance(given, dict) and given.get("kind") == "field":
+        if isinstance(given, dict) and given.get("kind") in {"field", "generalised_duhem"}:
             return {"whole": True, **given}
         return given
 

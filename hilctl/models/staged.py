@@ -30,12 +30,13 @@ from hilctl.kernels.dynamics import (
 from hilctl.models.base import HysteresisModel, Operator, Provenance, refuse
 from hilctl.models.chain import Chain, between, delayed, smoothing_weights
 from hilctl.models.field import FieldModel
+from hilctl.models.generalised_duhem import GeneralisedDuhemModel
 from hilctl.models.integrated import IntegratedModel
 from hilctl.models.plays import PpiModel, RdpiModel
 from hilctl.models.preisach import PreisachModel
 
 AnyHysteresis = Annotated[
-    PpiModel | RdpiModel | IntegratedModel | PreisachModel | FieldModel,
+    PpiModel | RdpiModel | IntegratedModel | PreisachModel | FieldModel | GeneralisedDuhemModel,
     Field(discriminator="kind"),
 ]
 _WHOLE = 1e-6

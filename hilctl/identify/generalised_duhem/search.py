@@ -1,0 +1,213 @@
+"""Table and stages together, by damped Gauss-Newton steps on the error of the inverse.
+
+The inverse is what is fitted: fed with the measured displacement, it is to give the field that the
+command leaves. It forgets, as the loops do, so that an error of one place does not run on through
+all the rest; and its fields depend on the table by the same equation, with the same forgetting.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+
+from hilctl.base.arrays import F64, I64
+from hilctl.identify.field.prepared import Prepared
+from hilctl.identify.field.stages import Physical
+from hilctl.identify.field.weights import Curve
+from hilctl.identify.generalised_duhem.signals import (
+    FIRST,
+    HIGHEST,
+    LOWEST,
+    NAMES,
+    STEPS,
+    Path,
+    Signals,
+)
+from hilctl.identify.generalised_duhem.tables import STEEPEST, Layout, laid_over, prior
+from hilctl.identify.job import OnProgress
+from hilctl.kernels.generalised_duhem import duhem_columns
+
+COARSE_WAY, FINE_WAY = 0.03, 0.02  # of the span: furthest way between two points of a path
+COARSE_ROWS, FINE_ROWS = 4000, 8000
+COARSE = (12, 8)  # cells of the first table
+TABLE_ALONE = 3  # first steps, with the stages as they are
+STEPS_COARSE, STEPS_FINE = 15, 12
+COARSE_GAIN, FINE_GAIN = 1e-2, 1e-4  # of the error's square in a step: less ends the search
+TRIALS = 6
+FIRST_DAMPING, LEAST_DAMPING = 1e-6, 1e-9
+DIFFERENCE = 0.2  # of a stage's step, for its slope
+HELD = 1e-3  # weight of a stage's way from where it began, percent of the stroke for a step
+
+
+@dataclass(frozen=True, slots=True)
+class DuhemEnd:
+    """What was found.
+
+    Attributes:
+        known: The stages.
+        layout: The table's nodes.
+        logs: float64[2, k, l], logarithms of the slopes.
+        flux: By displacement.
+        offset_um: Displacement at rest.
+        x: The stages in a row.
+    """
+
+    known: Physical
+    layout: Layout
+    logs: F64
+    flux: Curve
+    offset_um: float
+    x: F64
+
+
+class DuhemSearch:
+    """Table and stages.
+
+    Args:
+        data: The records.
+        cells: Cells of y.
+        across: Cells across the band.
+        least: Smallest slope, um per command unit.
+    """
+
+    def __init__(self, data: Prepared, cells: int, across: int, least: float) -> None:
+        self._stroke_um = data.stroke_um
+        self._signals = Signals(data)
+        self._size = cells, across
+        mean = np.log(data.stroke_um / (2.0 * data.reach))
+        self._log_range = float(np.log(least)), float(mean + STEEPEST)
+        self._rows: tuple[I64, ...] = ()
+
+    def find(self, progress: OnProgress) -> DuhemEnd:
+        """Search with a coarse table, then with one of the size that is wanted."""
+        x = FIRST.copy()
+        paths = self._chosen(x, COARSE_WAY, COARSE_ROWS)
+        self._lay(laid_over(paths, *COARSE))
+        self._first_um = self._rest_um(paths[0])
+        logs = self._layout.first_logs()
+        x, logs = self._descend(x, logs, TABLE_ALONE, 0.0, stages=False)
+        progress(0.1, "a coarse table")
+        x, logs = self._descend(x, logs, STEPS_COARSE, COARSE_GAIN)
+        progress(0.5, "the table")
+        coarse = self._layout
+        self._lay(laid_over(self._chosen(x, FINE_WAY, FINE_ROWS), *self._size))
+        x, logs = self._descend(x, self._layout.moved(logs, coarse), STEPS_FINE, FINE_GAIN)
+        offset_um = self._signals.offset_um(x, self._first_um)
+        return DuhemEnd(
+            self._signals.known(x), self._layout, logs, self._signals.flux(x), offset_um, x
+        )
+
+    def _chosen(self, x: F64, way: float, rows: int) -> list[Path]:
+        self._signals.choose(x, way)
+        paths = self._signals.paths(x)
+        every = max(1, sum(path.field.size for path in paths) // rows)
+        self._rows = tuple(
+            np.arange(path.judged, path.field.size, every, dtype=np.int64) for path in paths
+        )
+        return paths
+
+    def _lay(self, layout: Layout) -> None:
+        self._layout, self._prior = layout, prior(layout)
+
+    def _rest_um(self, path: Path) -> float:
+        """Return the displacement at no field, by the first point and the centre line."""
+        layout = self._layout
+        ends = np.interp([path.field[0], 0.0], layout.centre, layout.nodes_um)
+        return float(path.displacement_um[0] + ends[1] - ends[0])
+
+    def _descend(
+        self, x: F64, logs: F64, most: int, enough: float, *, stages: bool = True
+    ) -> tuple[F64, F64]:
+        """Take steps until there are ``most``, or one gains no more than ``enough``."""
+        errors, damping = self._errors(x, logs), FIRST_DAMPING
+        cost = self._cost(x, logs, errors)
+        for _ in range(most):
+            normal, down = self._normal(x, logs, errors, stages=stages)
+            for _ in range(TRIALS):
+                step = _bounded_step(normal, down, damping, logs.size, x)
+                to_x, to_logs = self._stepped(x, logs, step)
+                to_errors = self._errors(to_x, to_logs)
+                to_cost = self._cost(to_x, to_logs, to_errors)
+                if to_cost < cost:
+                    break
+                damping = 10.0 * damping
+            else:
+                break
+            gained, damping = 1.0 - to_cost / cost, max(0.2 * damping, LEAST_DAMPING)
+            x, logs, errors, cost = to_x, to_logs, to_errors, to_cost
+            if gained <= enough:
+                break
+        return x, logs
+
+    def _stepped(self, x: F64, logs: F64, step: F64) -> tuple[F64, F64]:
+        table = logs + np.clip(step[: logs.size], -1.0, 1.0).reshape(logs.shape)
+        stages = x + step[logs.size :] * STEPS if step.size > logs.size else x
+        return np.clip(stages, LOWEST, HIGHEST), np.clip(table, *self._log_range)
+
+    def _cost(self, x: F64, logs: F64, errors: F64) -> float:
+        held = self._prior @ logs.ravel()
+        return float(errors @ errors + held @ held + HELD**2 * np.sum(((x - FIRST) / STEPS) ** 2))
+
+    def _normal(self, x: F64, logs: F64, errors: F64, *, stages: bool) -> tuple[F64, F64]:
+        """Return the normal equations of a step, table first, and the way down."""
+        size = logs.size
+        slopes = np.empty((errors.size, size + (len(NAMES) if stages else 0)))
+        self._errors(x, logs, slopes[:, :size])
+        for k in range(size, slopes.shape[1]):
+            there, stage = x.copy(), k - size
+            step = DIFFERENCE * STEPS[stage]
+            there[stage] += step if x[stage] + step <= HIGHEST[stage] else -step
+            change = self._errors(there, logs) - errors
+            slopes[:, k] = change * (STEPS[stage] / (there[stage] - x[stage]))
+        normal, down = slopes.T @ slopes, -(slopes.T @ errors)
+        normal[:size, :size] += self._prior.T @ self._prior
+        down[:size] -= self._prior.T @ (self._prior @ logs.ravel())
+        if stages:
+            normal[range(size, len(normal)), range(size, len(normal))] += HELD**2
+            down[size:] -= HELD**2 * (x - FIRST) / STEPS
+        return normal, down
+
+    def _errors(self, x: F64, logs: F64, slopes: F64 | None = None) -> F64:
+        """Return errors in percent of the stroke, over the square root of their number.
+
+        Args:
+            x: The stages.
+            logs: float64[2, k, l].
+            slopes: float64[N, 2 k l], filled with what the errors grow by with these.
+        """
+        layout, first = self._layout, 0
+        start_um = self._signals.offset_um(x, self._first_um)
+        flux = np.arange(layout.centre.size, dtype=np.float64)  # of which nothing here depends
+        band = layout.band(logs, flux)
+        to_percent = 100.0 / self._stroke_um / np.sqrt(sum(rows.size for rows in self._rows))
+        middles = layout.nodes_um[:-1] + 0.5 * layout.cell_um
+        parts = []
+        for path, rows in zip(self._signals.paths(x), self._rows, strict=True):
+            columns = np.empty((rows.size, 0 if slopes is None else logs.size))
+            w = np.empty_like(path.field)
+            duhem_columns(path.displacement_um, start_um, 0.0, band, rows, w, columns)
+            scale = to_percent * np.interp(path.displacement_um[rows], middles, layout.slopes)
+            parts.append(scale * (w[rows] - path.field[rows]))
+            if slopes is not None:
+                slopes[first : first + rows.size] = columns * scale[:, None]
+            first += rows.size
+        return np.concatenate(parts)
+
+
+def _bounded_step(normal: F64, down: F64, damping: float, table: int, x: F64) -> F64:
+    """Return the step of damped normal equations, with stages that it would take too far held."""
+    damped = normal.copy()
+    damped[np.diag_indices_from(damped)] += damping
+    step = np.asarray(cho_solve(cho_factor(damped), down))
+    if step.size == table:
+        return step
+    wanted = x + step[table:] * STEPS
+    held = table + np.flatnonzero((wanted < LOWEST) | (wanted > HIGHEST))
+    if held.size:
+        fixed = np.zeros(step.size)
+        fixed[held] = ((np.clip(wanted, LOWEST, HIGHEST) - x) / STEPS)[held - table]
+        free = np.setdiff1d(np.arange(step.size), held)
+        rest = (down - damped @ fixed)[free]
+        step = fixed
+        step[free] = cho_solve(cho_factor(damped[np.ix_(free, free)]), rest)
+    return step

@@ -1,0 +1,101 @@
+"""Stages in a row for the search, and the field and displacement that they leave of a record."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hilctl.base.arrays import F64, I64
+from hilctl.identify.field.columns import turning_points
+from hilctl.identify.field.prepared import Prepared
+from hilctl.identify.field.stages import HIGH, LOW, STEP, Physical, Stages, physical, signals
+from hilctl.identify.field.weights import Curve
+
+STAGES = ("field", "output", "decay", "growth", "bend", "excess", "radian", "damping", "delay")
+NAMES = (*STAGES, "flux_slope", "flux_bend", "offset")
+"""Of the row; the flux is exp(flux_slope n + flux_bend n^2) steep, n from -1 to 1 over the stroke,
+and the offset, in half strokes, is of the displacement at rest from what the first samples say."""
+_FLUX, _OFFSET = 2.0, 0.5  # bounds
+_FLUX_NODES = 33
+
+
+def _row(stages: Stages, flux: float, offset: float) -> F64:
+    return np.array([*(getattr(stages, name) for name in STAGES), flux, flux, offset])
+
+
+LOWEST = _row(LOW, -_FLUX, -_OFFSET)
+HIGHEST = _row(HIGH, _FLUX, _OFFSET)
+STEPS = _row(STEP, 0.05, 0.005)
+FIRST = _row(Stages(), 0.0, 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Path:
+    """What is left of a record: points far enough apart, and all turning points.
+
+    Attributes:
+        field: float64[n], w.
+        displacement_um: float64[n], y before structure and delay.
+        judged: First point that counts.
+    """
+
+    field: F64
+    displacement_um: F64
+    judged: int
+
+
+class Signals:
+    """Field and displacement of all records.
+
+    Args:
+        data: The records.
+    """
+
+    def __init__(self, data: Prepared) -> None:
+        self._data = data
+        self._kept: tuple[I64, ...] = ()
+        measured = np.concatenate([run.derivatives[0] for run in data.runs])
+        self._middle_um = 0.5 * float(measured.max() + measured.min())
+        self._half_um = 0.5 * float(np.ptp(measured))
+
+    def known(self, x: F64) -> Physical:
+        """Return the stages of a row in s, um and the unit of the command."""
+        given = dict(zip(STAGES, x.tolist(), strict=False))
+        return physical(replace(Stages(), coupling=0.0, **given), self._data)
+
+    def flux(self, x: F64) -> Curve:
+        """Return the flux of a row, in um, by the displacement."""
+        place = np.linspace(-1.0, 1.0, _FLUX_NODES)
+        steep = np.exp(x[-3] * place + x[-2] * place**2)
+        flux = np.concatenate(([0.0], np.cumsum(steep[1:] + steep[:-1])))
+        flux *= 2.0 * self._half_um / flux[-1]
+        return Curve(flux, self._middle_um + self._half_um * place)
+
+    def offset_um(self, x: F64, first_um: float) -> float:
+        """Return the displacement at rest, from a first guess and what a row adds to it."""
+        return first_um + float(x[-1]) * self._half_um
+
+    def choose(self, x: F64, way: float) -> None:
+        """Choose the points of all paths, at most ``way`` of the command's span apart."""
+        kept = []
+        for field, _ in self._whole(x):
+            out = np.empty(field.size, dtype=np.int64)
+            count = turning_points(field, way * 2.0 * self._data.reach, out)
+            kept.append(out[:count].copy())
+        self._kept = tuple(kept)
+
+    def paths(self, x: F64) -> list[Path]:
+        """Return what a row leaves of each record."""
+        return [
+            Path(
+                np.ascontiguousarray(field[kept]),
+                np.ascontiguousarray(y[kept]),
+                int(np.searchsorted(kept, run.judged)),
+            )
+            for (field, y), kept, run in zip(
+                self._whole(x), self._kept, self._data.runs, strict=True
+            )
+        ]
+
+    def _whole(self, x: F64) -> list[tuple[F64, F64]]:
+        known, flux = self.known(x), self.flux(x)
+        return [signals(run, known, flux, 2.0 * self._data.reach) for run in self._data.runs]

@@ -1,0 +1,269 @@
+"""A generalised Duhem operator: slopes of rising and of falling branches all over a band.
+
+Notation: ``v`` is a command, ``w`` the field that is left of it, ``y`` a displacement, ``T`` the
+sample period. The operator is the differential equation
+
+    dy/dw = g_up(y, w - c(y)) where y rises, g_down(y, w - c(y)) where it falls,  |w - c(y)| <= b,
+
+with positive slopes g that are bilinear between the nodes of a grid, and a centre line c that
+rises. At the edge of the band w goes along with the centre. It is worked out by the midpoint rule
+in steps of y, short enough where each begins for w to rise with y throughout: so each displacement
+has one field, and each field one displacement.
+
+The command is ahead of the field by what the losses take, in the mean over a sample::
+
+    v = w + z,  z + tau_b z' = h(e),  e = tau_0 w' + tau_1 m(y)',
+    h(e) = e (1 + b |e| + c e^2 + x / sqrt(|e| + e_0))
+
+with a flux m that rises with y. Memory, float64[4]: y, w and z, then the previous input; NaN means
+that there is none yet. It is updated in place, so any cut into blocks gives the same bits.
+
+Sources: B. D. Coleman and M. L. Hodgdon, "A constitutive relation for rate-independent hysteresis
+in ferromagnetically soft materials", Int. J. Eng. Sci. 24 (1986) 897; J. Oh and D. S. Bernstein,
+"Semilinear Duhem model for rate-independent and rate-dependent hysteresis", IEEE Trans. Autom.
+Control 50 (2005) 631 (the generalised model, of which the equations of Jiles and Atherton are a
+case); G. Bertotti, "Hysteresis in Magnetism", Academic Press 1998, chapter 12 (the losses).
+"""
+
+import math
+from typing import TypeAlias
+
+import numpy as np
+
+from hilctl.base.arrays import F64, I64
+from hilctl.kernels.jit import kernel
+
+Band: TypeAlias = tuple[F64, F64, F64, F64]
+"""Slopes float64[2, k, l], rising then falling, at k nodes of y and l across the band; longest step
+of y that begins in each cell, float64[2, k - 1, l - 1]; centre line and flux at these y, float64[2,
+k]; lowest y, distance of nodes of y, half the band's width b, distance of nodes across it."""
+Losses: TypeAlias = tuple[float, float, float, float, float, float, float]
+"""tau_0 / T, tau_1 / T, what is left of z after a sample, b, c, x, e_0."""
+
+_STEPS = 100
+_MOST_STEPS = 1000  # of y in a sample; the rest of a jump goes by the slope that it begins with
+_NEAR_UM = 1e-9
+_BAND = "Tuple((float64[:, :, ::1], float64[:, :, ::1], float64[:, ::1], float64[::1]))"
+_LOSSES = "UniTuple(float64, 7)"
+
+
+@kernel("int64(float64, float64)", inline=True)
+def _cell(place: float, cells: float) -> int:
+    """Return the cell that a place lies in, or the one at the end that it is beyond."""
+    # A place that is not a number, from a memory that is none, must not become an index.
+    return int(min(place, cells - 1.0)) if place > 0.0 else 0
+
+
+@kernel("float64(float64, float64[:, ::1], int64, float64[::1])", inline=True)
+def _along(y: float, lines: F64, line: int, grid: F64) -> float:
+    """Return the centre (line 0) or the flux (line 1) at a y; the ends go on straight."""
+    place = (y - grid[0]) / grid[1]
+    i = _cell(place, lines.shape[1] - 1.0)
+    return float(lines[line, i] + (lines[line, i + 1] - lines[line, i]) * (place - i))
+
+
+@kernel(
+    "Tuple((float64, float64, int64, int64, float64, float64))(float64, float64, int64,"
+    " float64[:, :, ::1], float64[::1])",
+    inline=True,
+)
+def _slope(
+    y: float, d: float, way: int, slopes: F64, grid: F64
+) -> tuple[float, float, int, int, float, float]:
+    """Return g and its slope across the band, and where that lies: its cells, how far through."""
+    place, across = (y - grid[0]) / grid[1], (d + grid[2]) / grid[3]
+    i, j = _cell(place, slopes.shape[1] - 1.0), _cell(across, slopes.shape[2] - 1.0)
+    a, b = min(max(place - i, 0.0), 1.0), min(max(across - j, 0.0), 1.0)
+    low = slopes[way, i, j] + a * (slopes[way, i + 1, j] - slopes[way, i, j])
+    high = slopes[way, i, j + 1] + a * (slopes[way, i + 1, j + 1] - slopes[way, i, j + 1])
+    return low + b * (high - low), (high - low) / grid[3], i, j, a, b
+
+
+@kernel(f"UniTuple(float64, 2)(float64, float64, float64, {_BAND})", inline=True)
+def _followed(y: float, w: float, target: float, band: Band) -> tuple[float, float]:
+    """Return the field after y has gone to ``target``, and dw/dy of the last step."""
+    slopes, steps, lines, grid = band
+    way = 0 if target >= y else 1
+    by_y, going, k = 0.0, True, 0
+    while going:
+        # Whole steps, then what is left: so that the field at the end is continuous in the target.
+        first, _, i, j, _, _ = _slope(y, w - _along(y, lines, 0, grid), way, slopes, grid)
+        rest = target - y
+        going = abs(rest) > steps[way, i, j] and k < _MOST_STEPS
+        dy = math.copysign(steps[way, i, j], rest) if going else rest
+        middle = y + 0.5 * dy
+        off = w + 0.5 * dy / first - _along(middle, lines, 0, grid)
+        by_y = 1.0 / _slope(middle, off, way, slopes, grid)[0]
+        if k == _MOST_STEPS:
+            by_y = 1.0 / first  # of a step as long as this only Euler's w rises with y throughout
+        y = y + dy if going else target
+        centre = _along(y, lines, 0, grid)
+        w = min(max(w + dy * by_y, centre - grid[2]), centre + grid[2])
+        k += 1
+    return w, by_y
+
+
+@kernel(
+    "void(float64, int64, Tuple((float64, float64, int64, int64, float64, float64)),"
+    " float64[:, :, ::1], float64[::1])",
+    inline=True,
+)
+def _share_out(
+    gain: float,
+    way: int,
+    found: tuple[float, float, int, int, float, float],
+    slopes: F64,
+    by_node: F64,
+) -> None:
+    """Add what a field gains by a slope to what it gains by the logarithms of four nodes."""
+    _, _, i, j, a, b = found
+    stride = slopes.shape[2]
+    node = (way * slopes.shape[1] + i) * stride + j
+    by_node[node] += gain * (1.0 - a) * (1.0 - b) * slopes[way, i, j]
+    by_node[node + 1] += gain * (1.0 - a) * b * slopes[way, i, j + 1]
+    by_node[node + stride] += gain * a * (1.0 - b) * slopes[way, i + 1, j]
+    by_node[node + stride + 1] += gain * a * b * slopes[way, i + 1, j + 1]
+
+
+@kernel(f"void(float64[::1], float64, float64, {_BAND}, int64[::1], float64[::1], float64[:, ::1])")
+def duhem_columns(
+    y: F64, start_y: float, start_w: float, band: Band, rows: I64, w: F64, out: F64
+) -> None:
+    """Follow a path, and work out how the fields depend on the logarithm of each slope.
+
+    Args:
+        y: float64[n], the path.
+        start_y: y before the first of them.
+        start_w: w there.
+        band: The operator.
+        rows: int64[N], points that are filled in, rising.
+        w: float64[n], filled with the field.
+        out: float64[N, m], filled; no columns where m is 0.
+    """
+    slopes, steps, lines, grid = band
+    by_node = np.zeros(out.shape[1])
+    row = 0
+    for k in range(y.size):
+        last, field = y[k - 1] if k else start_y, w[k - 1] if k else start_w
+        way = 0 if y[k] >= last else 1
+        going, part = True, 0
+        while going:
+            first = _slope(last, field - _along(last, lines, 0, grid), way, slopes, grid)
+            rest, longest = y[k] - last, steps[way, first[2], first[3]]
+            going = abs(rest) > longest and part < _MOST_STEPS
+            dy = math.copysign(longest, rest) if going else rest
+            middle = last + 0.5 * dy
+            off = field + 0.5 * dy / first[0] - _along(middle, lines, 0, grid)
+            half = _slope(middle, off, way, slopes, grid)
+            if part == _MOST_STEPS:
+                half = first
+            last = last + dy if going else y[k]
+            centre = _along(last, lines, 0, grid)
+            free = field + dy / half[0]
+            field = min(max(free, centre - grid[2]), centre + grid[2])
+            part += 1
+            if by_node.size:
+                inside = 1.0 if field == free else 0.0  # the edge of the band forgets
+                gain = -inside * dy / half[0] ** 2
+                to_half = -0.5 * dy / first[0] ** 2
+                by_node *= inside + gain * half[1] * (1.0 + to_half * first[1])
+                _share_out(gain, way, half, slopes, by_node)
+                _share_out(gain * half[1] * to_half, way, first, slopes, by_node)
+        w[k] = field
+        if row < rows.size and rows[row] == k:
+            out[row] = by_node
+            row += 1
+
+
+@kernel(f"UniTuple(float64, 2)(float64, {_LOSSES})", inline=True)
+def _lost(e: float, losses: Losses) -> tuple[float, float]:
+    """Return h(e) and its slope."""
+    size = abs(e)
+    root = math.sqrt(size + losses[6])
+    more = losses[3] * size + losses[4] * size * size
+    slope = 1.0 + 2.0 * more + losses[4] * size * size
+    bend = losses[5] / root * (1.0 - 0.5 * size / (size + losses[6]))
+    return e * (1.0 + more + losses[5] / root), slope + bend
+
+
+@kernel(f"UniTuple(float64, 4)(float64, float64[::1], {_BAND}, {_LOSSES})", inline=True)
+def _moved(y: float, memory: F64, band: Band, losses: Losses) -> tuple[float, float, float, float]:
+    """Return w, z and the command after a sample that ends at y, and the command's slope."""
+    lines, grid = band[2], band[3]
+    w, by_y = _followed(memory[0], memory[1], y, band)
+    flux = _along(y, lines, 1, grid) - _along(memory[0], lines, 1, grid)
+    lost, steeper = _lost(losses[0] * (w - memory[1]) + losses[1] * flux, losses)
+    z = losses[2] * memory[2] + (1.0 - losses[2]) * lost
+    i = _cell((y - grid[0]) / grid[1], lines.shape[1] - 1.0)
+    e_by_y = losses[0] * by_y + losses[1] * (lines[1, i + 1] - lines[1, i]) / grid[1]
+    return w, z, 0.5 * (w + memory[1]) + z, 0.5 * by_y + (1.0 - losses[2]) * steeper * e_by_y
+
+
+@kernel(f"float64(float64, float64[::1], {_BAND}, {_LOSSES})")
+def _root(command: float, memory: F64, band: Band, losses: Losses) -> float:
+    """Return the y that takes a command; one that takes it as its field where none came before.
+
+    Newton's steps within the bounds that the signs so far have set, or halfway between these where
+    a step leaves them.
+    """
+    fresh = not abs(memory[3]) >= 0.0
+    low, high = -math.inf, math.inf
+    y = float(memory[0])
+    for _ in range(_STEPS):
+        w, _, value, slope = _moved(y, memory, band, losses)
+        if fresh:
+            value, slope = w, _followed(memory[0], memory[1], y, band)[1]
+        short = command - value
+        if short > 0.0:
+            low = y
+        else:
+            high = y
+        step = short / slope
+        if low < y + step < high:
+            y += step
+        elif abs(low) < math.inf and abs(high) < math.inf:
+            step = 0.5 * (low + high) - y
+            y += step
+        if not abs(step) > _NEAR_UM:
+            break
+    return y
+
+
+@kernel(f"void(float64[::1], {_BAND}, {_LOSSES}, float64[::1], float64[::1])")
+def duhem_forward(v: F64, band: Band, losses: Losses, memory: F64, out: F64) -> None:
+    """Run the model.
+
+    Args:
+        v: float64[n], commands, each held through the sample that ends with its output. One that is
+            not a number gives an output that is none, and leaves no trace.
+        band: The operator.
+        losses: See :data:`Losses`.
+        memory: See the module's docstring.
+        out: float64[n], filled with y.
+    """
+    for k in range(v.size):
+        if abs(v[k]) < math.inf:
+            y = _root(v[k], memory, band, losses)
+            w, z, _, _ = _moved(y, memory, band, losses)
+            memory[2] = z if abs(memory[3]) >= 0.0 else 0.0
+            memory[0], memory[1], memory[3] = y, w, v[k]
+            out[k] = y
+        else:
+            out[k] = np.nan
+
+
+@kernel(f"void(float64[::1], {_BAND}, {_LOSSES}, float64[::1], float64[::1])")
+def duhem_inverse(y: F64, band: Band, losses: Losses, memory: F64, out: F64) -> None:
+    """Run the inverse; arguments as for :func:`duhem_forward`, with y in and commands out.
+
+    It is explicit: no root is looked for.
+    """
+    for k in range(y.size):
+        if abs(y[k]) < math.inf:
+            w, z, command, _ = _moved(y[k], memory, band, losses)
+            if not abs(memory[3]) >= 0.0:  # it counts as having stood there for ever
+                z, command = 0.0, w
+            memory[0], memory[1], memory[2], memory[3] = y[k], w, z, y[k]
+            out[k] = command
+        else:
+            out[k] = np.nan

@@ -1,0 +1,183 @@
+"""A generalised Duhem operator in a table, with the losses that follow the permeability."""
+
+from collections.abc import Iterator
+from typing import Literal, Self, TypeAlias
+
+import numpy as np
+from pydantic import model_validator
+
+from hilctl.base.arrays import F64
+from hilctl.kernels.generalised_duhem import Band, Losses, duhem_forward, duhem_inverse
+from hilctl.models.base import HysteresisModel, Operator, Weights, refuse
+from hilctl.models.field import FieldLosses, even_excess
+
+Slopes: TypeAlias = tuple[Weights, ...]
+_LEAST_STEPS = 2.0  # steps of y from node to node, at least
+_NUMBERS = 3  # of the memory, before the previous input
+
+
+class GeneralisedDuhemModel(HysteresisModel):
+    """dy/dw = g_up(y, w - c(y)) rising, g_down(y, w - c(y)) falling; losses before it.
+
+    The slope depends on where the actuator stands and on which way it goes, on nothing else. So
+    small loops neither close at once nor look alike wherever they lie: they move towards what
+    Jiles and Atherton call the anhysteretic, which a sum of plays has no means to. What it can't
+    do is remember a turn that it has gone past. See :mod:`hilctl.kernels.generalised_duhem`.
+
+    Outputs come a sample after the commands of a run, as those of a lag do: put it into a
+    :class:`~hilctl.models.staged.StagedModel`.
+
+    Attributes:
+        lowest_um: First node of y.
+        cell_um: Distance of the nodes of y, > 0.
+        centre: c at each node of y, rising, in the input unit; the ends go on straight.
+        flux: m at each, rising, in um; what eddy currents follow.
+        half_width: Of the band around the centre, in the input unit, > |c(0)|: at rest y and w are
+            0. Nodes across it are as far from each other.
+        rising: For each node of y, g_up at each node across the band, um per input unit, > 0.
+        falling: The same, g_down.
+        losses: What the command is ahead by.
+    """
+
+    kind: Literal["generalised_duhem"] = "generalised_duhem"
+    lowest_um: float
+    cell_um: float
+    centre: Weights
+    flux: Weights
+    half_width: float
+    rising: Slopes
+    falling: Slopes
+    losses: FieldLosses = FieldLosses()
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        refuse(self._problems())
+        if not abs(self._centre_at_rest()) <= self.half_width:
+            raise ValueError(
+                f"half_width must be at least |c(0)|, {abs(self._centre_at_rest()):g}, for rest to "
+                f"lie in the band: {self.half_width!r}"
+            )
+        return self
+
+    def _problems(self) -> Iterator[str]:
+        if not self.cell_um > 0.0:
+            yield f"cell_um must be > 0: {self.cell_um!r}"
+        nodes = len(self.centre)
+        for name in ("centre", "flux"):
+            line = getattr(self, name)
+            if len(line) != nodes or nodes < 2:
+                yield f"{name} needs as many values as centre, and two at least: {len(line)}"
+            if any(np.diff(line) <= 0.0):
+                yield f"{name} must rise for the inverse to exist: {list(line)}"
+        across = len(self.rising[0]) if self.rising else 0
+        for name in ("rising", "falling"):
+            table = getattr(self, name)
+            if len(table) != nodes or any(len(row) != across for row in table) or across < 2:
+                yield (
+                    f"{name} needs a row for each value of centre, all of one length, two at least:"
+                    f" {[len(row) for row in table]} for {nodes}"
+                )
+            elif least := [value for row in table for value in row if not value > 0.0]:
+                yield f"{name} must be > 0 for the inverse to exist: {least[0]!r}"
+
+    def _centre_at_rest(self) -> float:
+        place = -self.lowest_um / self.cell_um
+        i = int(min(max(np.floor(place), 0), len(self.centre) - 2))
+        rise = self.centre[i + 1] - self.centre[i]
+        return self.centre[i] + rise * (place - i)
+
+    @property
+    def operators(self) -> int:
+        """Number of states: where it stands in the band."""
+        return 1
+
+    def _band(self) -> Band:
+        slopes = np.array([self.rising, self.falling])
+        lines = np.array([self.centre, self.flux])
+        return band_of(slopes, lines, self.lowest_um, self.cell_um, self.half_width)
+
+    def _losses(self, sample_rate_hz: float) -> Losses:
+        lost = self.losses
+        left = float(np.exp(-1.0 / (lost.decay_s * sample_rate_hz))) if lost.decay_s > 0.0 else 0.0
+        return (
+            lost.field_s * sample_rate_hz,
+            lost.output_s * sample_rate_hz,
+            left,
+            lost.growth,
+            lost.bend,
+            lost.excess,
+            even_excess(self.centre[-1] - self.centre[0]),
+        )
+
+    def forward(self, sample_rate_hz: float) -> Operator:
+        """Return the operator from command to um, at rest."""
+        band, losses = self._band(), self._losses(sample_rate_hz)
+
+        def run(v: F64, memory: F64, out: F64) -> None:
+            duhem_forward(v, band, losses, memory, out)
+
+        return Operator(run, _NUMBERS, output_offset=self.output_offset_um)
+
+    def inverse(self, sample_rate_hz: float) -> Operator:
+        """Return the operator from um to command, at rest."""
+        band, losses = self._band(), self._losses(sample_rate_hz)
+
+        def run(y: F64, memory: F64, out: F64) -> None:
+            duhem_inverse(y, band, losses, memory, out)
+
+        return Operator(run, _NUMBERS, input_offset=-self.output_offset_um)
+
+
+def band_of(slopes: F64, lines: F64, lowest_um: float, cell_um: float, half_width: float) -> Band:
+    """Return an operator as its kernels take it.
+
+    Args:
+        slopes: float64[2, k, l], > 0.
+        lines: float64[2, k], centre and flux.
+        lowest_um: First node of y.
+        cell_um: Distance of the nodes of y.
+        half_width: Of the band.
+    """
+    apart = 2.0 * half_width / (slopes.shape[2] - 1)
+    steps = longest_steps(slopes, lines[0], cell_um, apart)
+    return slopes, steps, lines, np.array([lowest_um, cell_um, half_width, apart])
+
+
+def longest_steps(slopes: F64, centre: F64, cell_um: float, apart: float) -> F64:
+    """Return the longest steps of y for which w rises with y whatever the step's length.
+
+    A step s takes dw = s / g at its middle, which rises with s where
+    g > s / 2 (dg/dy + dg/dw (1 / g - c')). Each cell is taken with the lowest slope of it and its
+    neighbours, and a step with all the cells that its middle may lie in, which are these.
+
+    Args:
+        slopes: float64[2, k, l].
+        centre: float64[k].
+        cell_um: Distance of the nodes of y.
+        apart: Distance of the nodes across the band.
+
+    Returns:
+        float64[2, k - 1, l - 1], by the cell that a step begins in.
+    """
+    by_y = np.abs(np.diff(slopes, axis=1)) / cell_um
+    by_w = np.abs(np.diff(slopes, axis=2)) / apart
+    by_y = np.maximum(by_y[:, :, :-1], by_y[:, :, 1:])
+    by_w = np.maximum(by_w[:, :-1], by_w[:, 1:])
+    least = _of_neighbours(-_of_corners(-slopes), np.minimum)
+    centre_slope = (np.diff(centre) / cell_um)[None, :, None]
+    off_by_y = np.maximum(1.0 / least, centre_slope)
+    worst = np.maximum((by_y + by_w * off_by_y) / least, 0.5 * off_by_y / apart)
+    return np.minimum(cell_um / _LEAST_STEPS, 1.0 / _of_neighbours(worst, np.maximum))
+
+
+def _of_corners(nodes: F64) -> F64:
+    """Return the largest of each cell's four corners."""
+    across = np.maximum(nodes[:, :, :-1], nodes[:, :, 1:])
+    return np.asarray(np.maximum(across[:, :-1], across[:, 1:]))
+
+
+def _of_neighbours(cells: F64, extreme: np.ufunc) -> F64:
+    """Return the extreme of each cell and the eight around it."""
+    padded = np.pad(cells, ((0, 0), (1, 1), (1, 1)), mode="edge")
+    lines = extreme(extreme(padded[:, :-2], padded[:, 1:-1]), padded[:, 2:])
+    return np.asarray(extreme(extreme(lines[:, :, :-2], lines[:, :, 1:-1]), lines[:, :, 2:]))

@@ -1,0 +1,110 @@
+"""Steps of the search: their slopes, their bounds, and what makes no difference."""
+
+import numpy as np
+import pytest
+
+from hilctl.base.arrays import F64
+from hilctl.identify.data.records import History
+from hilctl.identify.field.prepared import Prepared
+from hilctl.identify.field.stages import HIGH, LOW, STEP, Stages
+from hilctl.identify.generalised_duhem.search import DuhemSearch, _bounded_step
+from hilctl.identify.generalised_duhem.signals import (
+    FIRST,
+    HIGHEST,
+    LOWEST,
+    NAMES,
+    STAGES,
+    STEPS,
+    Signals,
+)
+from hilctl.identify.generalised_duhem.tables import laid_over
+from tests.unit.identify.generalised_duhem.test_duhem_fits import RATE_HZ, command, truth
+
+
+def data(unit: float = 1.0, um: float = 1.0) -> Prepared:
+    """Return a record in other units of the command and the displacement."""
+    v = command(1)[:6000]
+    y = truth().forward(RATE_HZ).process(v)
+    return Prepared([History("random", unit * v, um * y, RATE_HZ)])
+
+
+def ready() -> tuple[DuhemSearch, F64]:
+    """Return a search with a table laid, and its first logarithms."""
+    job = DuhemSearch(data(), 8, 6, 0.05)
+    job._lay(laid_over(job._chosen(FIRST, 0.03, 500), 8, 6))
+    job._first_um = 0.7
+    return job, job._layout.first_logs()
+
+
+def test_the_row_is_made_of_the_stages_that_the_field_has() -> None:
+    for row, stages in ((FIRST, Stages()), (LOWEST, LOW), (HIGHEST, HIGH), (STEPS, STEP)):
+        assert row.size == len(NAMES)
+        assert dict(zip(NAMES, row, strict=True)) | {
+            name: getattr(stages, name) for name in STAGES
+        } == dict(zip(NAMES, row, strict=True))
+    assert (FIRST >= LOWEST).all()
+    assert (FIRST <= HIGHEST).all()
+
+
+def test_the_flux_rises_over_the_stroke_whatever_its_row() -> None:
+    signals = Signals(data())
+    for flux_slope, flux_bend in ((2.0, 2.0), (-2.0, -2.0), (0.0, 0.0)):
+        x = FIRST.copy()
+        x[-3:-1] = flux_slope, flux_bend
+        curve = signals.flux(x)
+        assert (np.diff(curve.operators) > 0.0).all()
+        assert np.ptp(curve.operators) == pytest.approx(np.ptp(curve.displacement_um))
+
+
+def test_slopes_are_those_of_the_errors() -> None:
+    job, logs = ready()
+    errors = job._errors(FIRST, logs)
+    slopes = np.empty((errors.size, logs.size))
+    job._errors(FIRST, logs, slopes)
+    way = np.random.default_rng(1).standard_normal(logs.shape)
+    change = (job._errors(FIRST, logs + 1e-5 * way) - errors) / 1e-5
+    assert slopes @ way.ravel() == pytest.approx(change, abs=0.01 * np.abs(change).max())
+
+
+def test_a_step_goes_down_and_lessens_the_error() -> None:
+    job, logs = ready()
+    x, better = job._descend(FIRST, logs, 2, 0.0)
+    first, last = (job._errors(*at) for at in ((FIRST, logs), (x, better)))
+    assert last @ last < 0.5 * (first @ first)
+
+
+def test_stages_stay_within_their_bounds_and_the_others_make_up_for_it() -> None:
+    """As the least of the quadratic on that bound has it."""
+    rng = np.random.default_rng(2)
+    size = 5 + len(NAMES)
+    root = rng.standard_normal((3 * size, size))
+    normal, down = root.T @ root, rng.standard_normal(size)
+    wanted = np.zeros(len(NAMES))
+    wanted[0] = 10.0 * (LOWEST - FIRST)[0] / STEPS[0]
+    down[5] += 1e4 * wanted[0]
+    step = _bounded_step(normal, down, 0.0, 5, FIRST)
+    at = FIRST + step[5:] * STEPS
+    assert at[0] == pytest.approx(LOWEST[0])
+    held = np.isclose(at, LOWEST) | np.isclose(at, HIGHEST)
+    free = [*range(5), *(5 + np.flatnonzero(~held))]
+    assert (normal @ step - down)[free] == pytest.approx(0.0, abs=1e-6)
+
+
+def test_units_make_no_difference() -> None:
+    def ends(unit: float, um: float) -> tuple[F64, F64]:
+        job = DuhemSearch(data(unit, um), 8, 6, 0.05 * um / unit)
+        job._lay(laid_over(job._chosen(FIRST, 0.03, 500), 8, 6))
+        job._first_um = 0.7 * um
+        x, logs = job._descend(FIRST, job._layout.first_logs(), 3, 0.0)
+        return x, logs - np.log(um / unit)
+
+    one, other = ends(1.0, 1.0), ends(4.0, 2.0)
+    assert other[0] == pytest.approx(one[0], abs=1e-4)
+    assert other[1] == pytest.approx(one[1], abs=1e-2)
+
+
+def test_progress_rises_below_1() -> None:
+    seen: list[float] = []
+    DuhemSearch(data(), 6, 4, 0.05).find(lambda part, _: seen.append(part))
+    assert seen == sorted(set(seen))
+    assert 0.0 < seen[0] < seen[-1] < 1.0

@@ -1,0 +1,136 @@
+"""The generalised Duhem model: conditions, forward and inverse."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from hilctl.base.arrays import F64
+from hilctl.models.field import FieldLosses
+from hilctl.models.files import dump_model, parse_model
+from hilctl.models.generalised_duhem import GeneralisedDuhemModel
+from hilctl.models.staged import StagedModel, Structure
+
+RATE_HZ = 50_000.0
+LOSSES = FieldLosses(field_s=1e-4, output_s=2e-6, decay_s=3e-5, growth=0.1, bend=0.02, excess=0.05)
+ACROSS = np.linspace(-1.0, 1.0, 5)
+
+
+def duhem_model(**changes: Any) -> GeneralisedDuhemModel:
+    """Return a small model with everything in it."""
+    middle = np.array([3.0, 6.0, 7.0, 6.0, 4.0])
+    rising = middle[:, None] * np.exp(0.7 * ACROSS)
+    given: dict[str, Any] = {
+        "lowest_um": -50.0,
+        "cell_um": 25.0,
+        "centre": (-6.5, -2.4, -0.2, 1.9, 5.4),
+        "flux": (-60.0, -27.0, 0.0, 24.0, 45.0),
+        "half_width": 1.2,
+        "rising": tuple(map(tuple, rising.tolist())),
+        "falling": tuple(map(tuple, rising[:, ::-1].tolist())),
+        "losses": LOSSES,
+        "output_offset_um": 0.7,
+    }
+    return GeneralisedDuhemModel(**(given | changes))
+
+
+def reference_um(seed: int) -> F64:
+    """Return a smooth, aperiodic reference from rest: float64[n]."""
+    t = np.arange(4000) / RATE_HZ
+    rng = np.random.default_rng(seed)
+    sines = sum(np.sin(2 * np.pi * f * t + rng.uniform(0, 6)) for f in (11.0, 57.0, 143.0, 231.0))
+    return np.ascontiguousarray(0.7 + 9.0 * np.minimum(t / 0.02, 1.0) * sines)
+
+
+def test_inverse_undoes_the_model() -> None:
+    wanted_um = reference_um(1)
+    command = duhem_model().inverse(RATE_HZ).process(wanted_um)
+    assert duhem_model().forward(RATE_HZ).process(command) == pytest.approx(wanted_um, abs=1e-7)
+    assert np.ptp(command) > 2.0
+
+
+def test_any_cut_into_blocks_gives_the_same_bits() -> None:
+    wanted_um = reference_um(2)
+    for operator in (duhem_model().inverse, duhem_model().forward):
+        whole = operator(RATE_HZ).process(wanted_um)
+        parts, starts = operator(RATE_HZ), range(0, wanted_um.size, 37)
+        cut = [parts.process(wanted_um[start : start + 37].copy()) for start in starts]
+        assert np.array_equal(np.concatenate(cut), whole)
+
+
+def test_a_restored_state_goes_on_as_the_old_one_did() -> None:
+    wanted_um = reference_um(3)
+    first, second = (duhem_model().inverse(RATE_HZ) for _ in range(2))
+    first.process(wanted_um[:900].copy())
+    second.restore(first.state())
+    assert np.array_equal(second.process(wanted_um[900:]), first.process(wanted_um[900:]))
+
+
+def test_rest_is_no_command_at_the_offset() -> None:
+    assert duhem_model().inverse(RATE_HZ).process(np.array([0.7])) == pytest.approx(0.0, abs=1e-12)
+    assert duhem_model().forward(RATE_HZ).process(np.zeros(3)) == pytest.approx(0.7, abs=1e-9)
+
+
+def test_small_biased_loops_creep_down_from_the_falling_branch() -> None:
+    """Less from loop to loop: no memory of turns holds them."""
+    loop = [*np.linspace(1.0, 1.2), *np.linspace(1.2, 1.0)]
+    turns = np.concatenate([np.linspace(0.0, 4.0), np.linspace(4.0, 1.0), np.tile(loop, 6)])
+    out = duhem_model(losses=FieldLosses()).forward(RATE_HZ).process(turns)
+    ends = out[99::100]
+    assert (np.diff(ends) < 0.0).all()
+    assert (np.diff(ends, 2) > 0.0).all()
+    assert ends[0] - ends[-1] > 0.5
+
+
+def test_a_loop_is_the_wider_the_faster_it_is() -> None:
+    def area(frequency_hz: float) -> float:
+        t = np.arange(round(2 * RATE_HZ / frequency_hz)) / RATE_HZ
+        v = 4.0 * np.sin(2 * np.pi * frequency_hz * t)
+        half = v.size // 2
+        y = duhem_model().forward(RATE_HZ).process(v)
+        return abs(float(np.trapezoid(y[half:], v[half:])))
+
+    assert area(200.0) > 1.1 * area(5.0)
+
+
+def test_every_finite_reference_gives_a_finite_command() -> None:
+    wild_um = np.array([0.0, 1e3, -1e3, 1e9, -1e9, 0.0, 1e-9])
+    inverse = duhem_model().inverse(RATE_HZ)
+    assert np.isfinite(inverse.process(wild_um)).all()
+    calm_um = reference_um(5)
+    again = inverse.process(np.concatenate([[0.0], calm_um]))
+    assert np.abs(again[200:]).max() < 20.0  # it has come back
+
+
+def test_between_stages_and_through_a_file() -> None:
+    structure = Structure(natural_hz=2300.0, damping_ratio=0.12)
+    staged = StagedModel.around(duhem_model(), structure=structure, delay_s=3e-5)
+    back = parse_model("model", dump_model(staged))
+    assert back == staged
+    inverse, wanted_um = back.inverse(RATE_HZ), reference_um(4)
+    ahead = np.append(wanted_um[inverse.preview :], np.full(inverse.preview, wanted_um[-1]))
+    got_um = back.forward(RATE_HZ).process(inverse.process(ahead))
+    assert np.max(np.abs(got_um - wanted_um)[500:-500]) < 0.005 * np.ptp(wanted_um)
+
+
+ROWS = ((1.0, 2.0),) * 5
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"cell_um": 0.0}, "cell_um must be > 0"),
+        ({"centre": (-6.5, -2.4, -2.4, 1.9, 5.4)}, "centre must rise"),
+        ({"flux": (-6.5, -2.4, -2.4, 1.9, 5.4)}, "flux must rise"),
+        ({"flux": (-6.5, 5.4)}, "flux needs as many values"),
+        ({"rising": ROWS[:4], "falling": ROWS}, "rising needs a row for each value of centre"),
+        ({"rising": ROWS, "falling": ((1.0, 2.0, 3.0),) * 5}, "all of one length"),
+        ({"rising": ((1.0, 0.0),) * 5, "falling": ROWS}, "rising must be > 0"),
+        ({"rising": ROWS, "falling": ((1.0, -1.0),) * 5}, "falling must be > 0"),
+        ({"half_width": 0.1}, "half_width must be at least"),
+    ],
+)
+def test_conditions(changes: dict[str, Any], words: str) -> None:
+    with pytest.raises(ValidationError, match=words):
+        duhem_model(**changes)
