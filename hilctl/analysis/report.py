@@ -84,6 +84,7 @@ def _identity(recording: Recording) -> dict[str, Any]:
     return {
         "path": str(recording.path),
         "name": recording.run.get("name", ""),
+        "labels": recording.labels,
         "device": recording.run.get("device", ""),
         "simulated": recording.run.get("simulated") == "true",
         "reason": recording.end.get("reason", "") if recording.end else cut_short,

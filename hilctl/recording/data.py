@@ -1,8 +1,9 @@
 """A recording in memory: arrays and facts, however they were stored."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
+from typing import TypeAlias
 
 from hilctl.base.arrays import F64, I64
 from hilctl.base.device import CommandUnit
@@ -12,6 +13,13 @@ from hilctl.base.segments import Segment
 
 HOLDS_FACT = "holds"
 """Fact of a run, by which later ones know its device: JSON list of what it holds while open."""
+LABELS_FACT = "labels"
+"""Fact of a run: its labels as a JSON object."""
+RECORDINGS = "recordings"
+"""Folder of recordings, relative to where hilctl runs, where no other is given."""
+
+LabelValue: TypeAlias = str | int | float
+"""A label says text or a number."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +39,7 @@ class Ticks:
     exchange_ns: I64
 
 
-TICK_COLUMNS = tuple(field.name for field in fields(Ticks))
+TICK_COLUMNS = tuple(each.name for each in fields(Ticks))
 """Their names, which are those of a block's head as well."""
 
 
@@ -70,6 +78,7 @@ class Recording:
         model_yaml: The compensator's model, or empty.
         starts: Where a replay can begin.
         correction_yaml: What had been learned and was added to the reference, or empty.
+        labels: What the run is found by.
     """
 
     path: Path
@@ -87,3 +96,4 @@ class Recording:
     model_yaml: str
     starts: tuple[ReplayStart, ...] = ()
     correction_yaml: str = ""
+    labels: Mapping[str, LabelValue] = field(default_factory=dict)

@@ -19,6 +19,7 @@ from hilctl.recording.checks import (
     RATES_HZ,
     SoundMessages,
     count_of,
+    labels_of,
     number_of,
     segments_of,
     short,
@@ -231,6 +232,7 @@ class _Contents:
             model_yaml=self._texts.get("model.yaml", ""),
             correction_yaml=self._texts.get("correction.yaml", ""),
             starts=tuple(self._starts),
+            labels=labels_of(self.run),
         )
 
     def _dropped(self) -> int:

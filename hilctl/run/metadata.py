@@ -17,13 +17,15 @@ import numpy as np
 
 from hilctl import __version__
 from hilctl.base.samples import COLUMNS
+from hilctl.base.yaml.plain import dump
 from hilctl.loop.pacer import Lateness
 from hilctl.loop.plan import Outcome
 from hilctl.machine.diagnosis import machine_facts
-from hilctl.recording.data import HOLDS_FACT
+from hilctl.recording.data import HOLDS_FACT, LABELS_FACT
 
 if TYPE_CHECKING:
     from hilctl.experiment.check import Checked
+    from hilctl.experiment.load import LoadedExperiment
 
 
 def run_facts(checked: "Checked", started: str, model_yaml: str) -> dict[str, str]:
@@ -41,6 +43,7 @@ def run_facts(checked: "Checked", started: str, model_yaml: str) -> dict[str, st
         "run_id": str(uuid.uuid4()),
         "name": config.name,
         "description": config.description,
+        LABELS_FACT: json.dumps(config.labels, ensure_ascii=False),
         "started": started,
         "hilctl": __version__,
         "python": sys.version.split()[0],
@@ -59,7 +62,7 @@ def run_facts(checked: "Checked", started: str, model_yaml: str) -> dict[str, st
         "initial_state": checked.begun.begins,
         "initial_state_run_id": checked.begun.run_id,
         HOLDS_FACT: json.dumps(list(info.holds)),
-        "experiment_sha256": _sha256(loaded.yaml_text),
+        "experiment_sha256": experiment_sha256(loaded),
         "model_sha256": _sha256(model_yaml) if model_yaml else "",
         "limits": config.limits.model_dump_json(exclude_none=True),
         "safe_value": repr(config.safe.value),
@@ -68,6 +71,15 @@ def run_facts(checked: "Checked", started: str, model_yaml: str) -> dict[str, st
     }
     facts |= machine_facts(config.realtime, Path(config.recording.folder))
     return facts | {f"device.{key}": value for key, value in info.details.items()}
+
+
+def experiment_sha256(loaded: "LoadedExperiment") -> str:
+    """Return the SHA-256 of an experiment as it runs, by which a run of it is known as done.
+
+    Without its labels: who stands beside the rig does not change what it does.
+    """
+    data = {key: value for key, value in loaded.document.data.items() if key != LABELS_FACT}
+    return _sha256(dump(data))
 
 
 def _sha256(text: str) -> str:
