@@ -1,6 +1,5 @@
 """What a recording says: figures of merit, tables, plots and a page.
 
-metrics.py  pure: folding onto one cycle, peak hysteresis, loop area, errors, sensor noise
 timing.py   pure: lateness percentiles, late ticks
 steady.py   which part of a recording is judged, and its average cycle
 figures.py  what a report holds

@@ -5,9 +5,10 @@ from typing import Any
 
 import numpy as np
 
-from hilctl.analysis import metrics, timing
+from hilctl.analysis import timing
 from hilctl.analysis.figures import RunReport, SegmentReport
 from hilctl.analysis.steady import steady_part
+from hilctl.base import metrics
 from hilctl.base.arrays import F64
 from hilctl.base.samples import NO_WAVEFORM, Flag
 from hilctl.base.segments import Segment

@@ -15,6 +15,14 @@ HOLDS_FACT = "holds"
 """Fact of a run, by which later ones know its device: JSON list of what it holds while open."""
 LABELS_FACT = "labels"
 """Fact of a run: its labels as a JSON object."""
+END_FIGURES = (
+    "peak_hysteresis_percent",
+    "loop_area",
+    "peak_to_peak_um",
+    "peak_error_percent",
+    "rms_error_percent",
+)
+"""Facts of the end of a run: the worst figure of its segments, where any has it; as in a report."""
 RECORDINGS = "recordings"
 """Folder of recordings, relative to where hilctl runs, where no other is given."""
 

@@ -9,6 +9,7 @@ import json
 import platform
 import sys
 import uuid
+from collections.abc import Iterator
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -26,6 +27,7 @@ from hilctl.recording.data import HOLDS_FACT, LABELS_FACT
 if TYPE_CHECKING:
     from hilctl.experiment.check import Checked
     from hilctl.experiment.load import LoadedExperiment
+    from hilctl.waveforms.spec import AnyWaveform
 
 
 def run_facts(checked: "Checked", started: str, model_yaml: str) -> dict[str, str]:
@@ -69,8 +71,16 @@ def run_facts(checked: "Checked", started: str, model_yaml: str) -> dict[str, st
         "max_missed_share": repr(config.timing.max_missed_share),
         "units": json.dumps({"t_rel": "s"} | {each.name: each.unit for each in recorded}),
     }
+    facts |= {f"waveform.{key}": text for key, text in _scalars(config.waveform)}
     facts |= machine_facts(config.realtime, Path(config.recording.folder))
     return facts | {f"device.{key}": value for key, value in info.details.items()}
+
+
+def _scalars(waveform: "AnyWaveform") -> Iterator[tuple[str, str]]:
+    """Yield the keys of a waveform that hold one text or number, and those as text."""
+    for key, value in waveform:
+        if isinstance(value, str | int | float):
+            yield key, str(value)
 
 
 def experiment_sha256(loaded: "LoadedExperiment") -> str:
