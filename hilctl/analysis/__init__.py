@@ -11,4 +11,6 @@ loops.py    the hysteresis loop
 html.py     one self-contained page
 replay.py   the same commands again
 export.py   CSV, Parquet, NPZ, MAT
+catalogue.py  the recordings below a folder, over catalogue_cache.py; run_entry.py  what is known
+            of each; where.py  conditions on them
 """

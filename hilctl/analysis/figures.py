@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from hilctl.base.device import CommandUnit
-from hilctl.recording.data import LabelValue
+from hilctl.recording.facts import LabelValue
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,7 +8,7 @@ from typing import Annotated, Any, TypeAlias
 from pydantic import AfterValidator, BeforeValidator, Field, WithJsonSchema
 
 from hilctl.base.errors import ConfigError, Problem
-from hilctl.recording.data import LabelValue
+from hilctl.recording.facts import LabelValue
 
 MOST_LABELS = 32
 LONGEST_TEXT = 500

@@ -12,7 +12,7 @@ from pydantic import (
 )
 
 from hilctl.base.strict import Strict
-from hilctl.recording.data import RECORDINGS
+from hilctl.recording.facts import RECORDINGS
 
 _NAME = "[A-Za-z0-9][A-Za-z0-9_.-]{0,79}"
 

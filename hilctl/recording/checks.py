@@ -21,7 +21,8 @@ from hilctl.base.samples import COLUMNS, Batch, Head
 from hilctl.base.segments import SHORTEST_PERIOD, Segment
 from hilctl.base.strict import Strict
 from hilctl.recording import schema
-from hilctl.recording.data import LABELS_FACT, TICK_COLUMNS, LabelValue
+from hilctl.recording.data import TICK_COLUMNS
+from hilctl.recording.facts import LABELS_FACT, LabelValue
 
 LAST_SAMPLE = 2**40
 """No index reaches it: a hundred million samples, and a safe ramp of an hour at 1 MHz."""

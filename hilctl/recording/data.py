@@ -3,31 +3,13 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import TypeAlias
 
 from hilctl.base.arrays import F64, I64
 from hilctl.base.device import CommandUnit
 from hilctl.base.events import Event
 from hilctl.base.samples import Samples
 from hilctl.base.segments import Segment
-
-HOLDS_FACT = "holds"
-"""Fact of a run, by which later ones know its device: JSON list of what it holds while open."""
-LABELS_FACT = "labels"
-"""Fact of a run: its labels as a JSON object."""
-END_FIGURES = (
-    "peak_hysteresis_percent",
-    "loop_area",
-    "peak_to_peak_um",
-    "peak_error_percent",
-    "rms_error_percent",
-)
-"""Facts of the end of a run: the worst figure of its segments, where any has it; as in a report."""
-RECORDINGS = "recordings"
-"""Folder of recordings, relative to where hilctl runs, where no other is given."""
-
-LabelValue: TypeAlias = str | int | float
-"""A label says text or a number."""
+from hilctl.recording.facts import LabelValue
 
 
 @dataclass(frozen=True, slots=True)

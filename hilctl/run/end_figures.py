@@ -21,7 +21,7 @@ from hilctl.base.metrics import (
 )
 from hilctl.base.samples import NO_WAVEFORM, Flag, Samples
 from hilctl.base.segments import Segment
-from hilctl.recording.data import END_FIGURES
+from hilctl.recording.facts import END_FIGURES
 
 _LEFT_OUT = NO_WAVEFORM | Flag.SENSOR_INVALID
 

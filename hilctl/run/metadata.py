@@ -22,7 +22,7 @@ from hilctl.base.yaml.plain import dump
 from hilctl.loop.pacer import Lateness
 from hilctl.loop.plan import Outcome
 from hilctl.machine.diagnosis import machine_facts
-from hilctl.recording.data import HOLDS_FACT, LABELS_FACT
+from hilctl.recording.facts import HOLDS_FACT, LABELS_FACT
 
 if TYPE_CHECKING:
     from hilctl.experiment.check import Checked

@@ -11,7 +11,7 @@ from hilctl.analysis.report import summarize
 from hilctl.base.events import TUNED, Event
 from hilctl.base.samples import Flag
 from hilctl.base.segments import Segment
-from hilctl.recording.data import END_FIGURES
+from hilctl.recording.facts import END_FIGURES
 from hilctl.recording.reader import read
 from hilctl.run.end_figures import EndFigures
 

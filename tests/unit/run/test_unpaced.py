@@ -12,7 +12,7 @@ from hilctl.analysis.report import summarize
 from hilctl.base.errors import InputError
 from hilctl.base.events import Event
 from hilctl.base.samples import Flag, Head
-from hilctl.recording.data import END_FIGURES
+from hilctl.recording.facts import END_FIGURES
 from hilctl.recording.reader import read
 from hilctl.run.assemble import assemble
 from hilctl.run.start import checked_experiment
