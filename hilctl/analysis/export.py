@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any, BinaryIO, TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 
 from hilctl.base.errors import DataError, InputError
 from hilctl.base.files import check_writable, write_file
@@ -19,7 +18,7 @@ from hilctl.base.samples import COLUMNS
 from hilctl.recording.checks import LAST_SAMPLE
 from hilctl.recording.data import Recording
 
-Columns: TypeAlias = Mapping[str, npt.NDArray[Any]]
+Columns: TypeAlias = Mapping[str, Any]
 Facts: TypeAlias = Mapping[str, str]
 Write: TypeAlias = Callable[[BinaryIO, Columns, Facts], None]
 
@@ -148,22 +147,37 @@ def _write_mat(stream: BinaryIO, table: Columns, facts: Facts) -> None:
     savemat(target, {**table, **facts}, oned_as="column")
 
 
-def _write_parquet(stream: BinaryIO, table: Columns, facts: Facts) -> None:
+def write_parquet(stream: BinaryIO, table: Columns, facts: Facts) -> None:
+    """Write columns, of NumPy or of Arrow, and facts as the file's metadata.
+
+    Raises:
+        InputError: pyarrow is missing.
+    """
+    pa = arrow()
+    from pyarrow import parquet
+
+    metadata = {f"hilctl.{name}": text for name, text in facts.items()}
+    parquet.write_table(pa.table(dict(table)).replace_schema_metadata(metadata), stream)
+
+
+def arrow() -> Any:
+    """Return the module pyarrow.
+
+    Raises:
+        InputError: It is not installed.
+    """
     try:
         import pyarrow as pa
-        from pyarrow import parquet
     except ImportError:
         raise InputError(
             "writing .parquet needs pyarrow, which is not installed (pip install 'hilctl[parquet]')"
         ) from None
-    metadata = {f"hilctl.{name}": text for name, text in facts.items()}
-    arrow = pa.table(dict(table)).replace_schema_metadata(metadata)
-    parquet.write_table(arrow, stream)
+    return pa
 
 
 _FORMATS: dict[str, Write] = {
     ".csv": _write_csv,
     ".npz": _write_npz,
-    ".parquet": _write_parquet,
+    ".parquet": write_parquet,
     ".mat": _write_mat,
 }

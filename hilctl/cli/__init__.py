@@ -18,10 +18,10 @@ machine.py     this computer and its devices; machine_view.py and probe_view.py
 console.py     the console that tables go to, and what replay prints; progress.py  a progress bar
 streams.py     standard output and error, which all text passes: no control character goes through
 
-Exit codes: 0 done; 1 a replay that differs, a rate that this machine does not keep, or a model
-that is none of the actuator; 2 the input can't be used, nothing has moved; 3 a run that ended by a
-fault, a device that answers what can't be, or a rig that can't be characterised; 128 + n a run
-stopped by signal n.
+Exit codes: 0 done; 1 a replay that differs, an export that left recordings out, a rate that this
+machine does not keep, or a model that is none of the actuator; 2 the input can't be used, nothing
+has moved; 3 a run that ended by a fault, a device that answers what can't be, or a rig that can't
+be characterised; 128 + n a run stopped by signal n.
 """
 
 import logging

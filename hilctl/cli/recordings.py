@@ -1,11 +1,14 @@
 """Commands about recordings: report, recover, replay, identify, export."""
 
 import json
+import sys
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from hilctl.base.errors import InputError
 from hilctl.cli.comparing import check_page
 from hilctl.cli.options import AsJson, Overwrite, RecordingFile
 from hilctl.cli.output import finish_orphans, print_json
@@ -177,8 +180,13 @@ def _column(text: str | None) -> str | int | None:
 
 
 def export(
-    recording: RecordingFile,
-    output: Annotated[Path, typer.Argument(help=".csv, .npz, .parquet or .mat file to write.")],
+    recording: Annotated[Path, typer.Argument(help="Recording (MCAP), or a folder of them.")],
+    output: Annotated[
+        Path, typer.Argument(help=".csv, .npz, .parquet or .mat file to write, or a folder.")
+    ],
+    every: Annotated[
+        bool, typer.Option("--all", help="All recordings of a folder, as Hive-style Parquet.")
+    ] = False,
     t0: Annotated[float | None, typer.Option(help="From this time, in s.")] = None,
     t1: Annotated[float | None, typer.Option(help="Up to this time, in s.")] = None,
     overwrite: Overwrite = False,
@@ -189,8 +197,29 @@ def export(
     from hilctl.recording.reader import read
 
     finish_orphans()
+    if every:
+        if overwrite or t0 is not None or t1 is not None:
+            raise InputError("--all: writes whole recordings, and replaces none")
+        _export_all(recording, output, as_json=as_json)
+        return
     rows = write(read(recording), output, t0=t0, t1=t1, overwrite=overwrite)
     if as_json:
         print_json({"output": str(output), "rows": rows})
     else:
         print(f"{output}: {rows} samples")
+
+
+def _export_all(folder: Path, output: Path, *, as_json: bool) -> None:
+    from hilctl.analysis.export_all import export_all
+    from hilctl.cli.progress import shown_progress
+
+    with shown_progress("export", quiet=as_json) as progress:
+        done = export_all(folder, output, progress)
+    if as_json:
+        print_json({"output": str(output), **asdict(done)})
+    else:
+        print(f"{output}: {done.written} recordings written, {done.there} were there already")
+        for path, why in done.left_out.items():
+            print(f"hilctl: {path}: is left out: {why}", file=sys.stderr)
+    if done.left_out:
+        raise typer.Exit(1)
