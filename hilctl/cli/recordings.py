@@ -4,14 +4,17 @@ import json
 import sys
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from hilctl.base.errors import InputError
 from hilctl.cli.comparing import check_page
-from hilctl.cli.options import AsJson, Overwrite, RecordingFile
+from hilctl.cli.options import AsJson, FromS, Overwrite, RecordingFile, ToS
 from hilctl.cli.output import finish_orphans, print_json
+
+if TYPE_CHECKING:
+    from hilctl.recording.stretch import Stretch
 
 IdentifyInput = Annotated[list[Path], typer.Argument(help="Recordings (MCAP) or text tables.")]
 TableUnit = Annotated[str | None, typer.Option(help="Unit of a table's command, A or V.")]
@@ -37,6 +40,8 @@ FitTexts = Annotated[
 def report(
     recording: RecordingFile,
     html: Annotated[Path | None, typer.Option(help="Page with figures to write.")] = None,
+    from_s: FromS = None,
+    to_s: ToS = None,
     overwrite: Overwrite = False,
     as_json: AsJson = False,
 ) -> None:
@@ -47,7 +52,7 @@ def report(
     from hilctl.recording.reader import read
 
     finish_orphans()
-    contents = read(recording)
+    contents = read(recording, _stretch(from_s, to_s))
     summary = summarize(contents)
     if html is not None:
         from hilctl.analysis.html import write_html
@@ -187,8 +192,8 @@ def export(
     every: Annotated[
         bool, typer.Option("--all", help="All recordings of a folder, as Hive-style Parquet.")
     ] = False,
-    t0: Annotated[float | None, typer.Option(help="From this time, in s.")] = None,
-    t1: Annotated[float | None, typer.Option(help="Up to this time, in s.")] = None,
+    from_s: FromS = None,
+    to_s: ToS = None,
     overwrite: Overwrite = False,
     as_json: AsJson = False,
 ) -> None:
@@ -198,15 +203,21 @@ def export(
 
     finish_orphans()
     if every:
-        if overwrite or t0 is not None or t1 is not None:
+        if overwrite or from_s is not None or to_s is not None:
             raise InputError("--all: writes whole recordings, and replaces none")
         _export_all(recording, output, as_json=as_json)
         return
-    rows = write(read(recording), output, t0=t0, t1=t1, overwrite=overwrite)
+    rows = write(read(recording, _stretch(from_s, to_s)), output, overwrite=overwrite)
     if as_json:
         print_json({"output": str(output), "rows": rows})
     else:
         print(f"{output}: {rows} samples")
+
+
+def _stretch(from_s: float | None, to_s: float | None) -> "Stretch | None":
+    from hilctl.recording.stretch import Stretch
+
+    return None if from_s is None and to_s is None else Stretch(from_s, to_s)
 
 
 def _export_all(folder: Path, output: Path, *, as_json: bool) -> None:
