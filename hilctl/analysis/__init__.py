@@ -1,6 +1,5 @@
 """What a recording says: figures of merit, tables, plots and a page.
 
-metrics.py  pure: folding onto one cycle, peak hysteresis, loop area, errors, sensor noise
 timing.py   pure: lateness percentiles, late ticks
 steady.py   which part of a recording is judged, and its average cycle
 figures.py  what a report holds
@@ -11,5 +10,7 @@ plots.py    plots over time: history, error, lateness
 loops.py    the hysteresis loop
 html.py     one self-contained page
 replay.py   the same commands again
-export.py   CSV, Parquet, NPZ, MAT
+export.py   CSV, Parquet, NPZ, MAT; export_all.py  all recordings of a folder as one data set
+catalogue.py  the recordings below a folder, over catalogue_cache.py; run_entry.py  what is known
+            of each; where.py  conditions on them
 """

@@ -5,36 +5,25 @@ place for the facts of the run.
 """
 
 import json
-import math
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO, TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 
 from hilctl.base.errors import DataError, InputError
 from hilctl.base.files import check_writable, write_file
 from hilctl.base.samples import COLUMNS
-from hilctl.recording.checks import LAST_SAMPLE
 from hilctl.recording.data import Recording
 
-Columns: TypeAlias = Mapping[str, npt.NDArray[Any]]
+Columns: TypeAlias = Mapping[str, Any]
 Facts: TypeAlias = Mapping[str, str]
 Write: TypeAlias = Callable[[BinaryIO, Columns, Facts], None]
 
 _ROWS_AT_ONCE = 20_000
-_FAR = float(LAST_SAMPLE)
 
 
-def export(
-    recording: Recording,
-    path: Path,
-    t0: float | None = None,
-    t1: float | None = None,
-    *,
-    overwrite: bool = False,
-) -> int:
+def export(recording: Recording, path: Path, *, overwrite: bool = False) -> int:
     """Write samples to a file whose suffix says the format; it appears whole or not at all.
 
     Columns are ``sample``, ``t_s`` (since the start of the run), those of
@@ -45,8 +34,6 @@ def export(
     Args:
         recording: The run.
         path: File to write: ``.csv``, ``.npz``, ``.parquet`` or ``.mat``.
-        t0: First time to write, in s since the start of the run; the beginning where not given.
-        t1: Time to stop before; the end where not given.
         overwrite: Replace a file of that name.
 
     Returns:
@@ -55,41 +42,33 @@ def export(
     Raises:
         InputError: Unknown suffix, a file of that name exists, it can't be written, or pyarrow is
             missing.
-        DataError: There is no sample between ``t0`` and ``t1``.
+        DataError: There is no sample.
     """
     write = _FORMATS.get(path.suffix.lower())
     if write is None:
         known = ", ".join(_FORMATS)
         raise InputError(f"{path}: the suffix must be one of {known}: got {path.suffix!r}")
     check_writable(path, overwrite=overwrite)
-    table = columns(recording, t0, t1)
+    table = columns(recording)
     write_file(path, lambda stream: write(stream, table, facts(recording)), overwrite=overwrite)
     return int(table["sample"].size)
 
 
-def columns(recording: Recording, t0: float | None = None, t1: float | None = None) -> Columns:
+def columns(recording: Recording) -> Columns:
     """Return the columns that :func:`export` writes, by name.
 
     Raises:
-        DataError: There is no sample between ``t0`` and ``t1``.
+        DataError: There is no sample.
     """
-    rate_hz = recording.sample_rate_hz
-    index = recording.samples.index
-    first, end = (int(index[0]), int(index[-1]) + 1) if index.size else (0, 0)
-    start = first if t0 is None else _first_at_or_after(t0, rate_hz)
-    stop = end if t1 is None else _first_at_or_after(t1, rate_hz)
-    samples = recording.samples.part(start, stop)
+    samples = recording.samples
     if samples.index.size == 0:
-        raise DataError(
-            f"{recording.path}: holds no sample from {_seconds(t0, 'its start')} to "
-            f"{_seconds(t1, 'its end')}; it has {first / rate_hz:g} s to {end / rate_hz:g} s"
-        )
+        raise DataError(f"{recording.path}: holds no sample")
     named = {
         COLUMNS[name].field(recording.command_unit).name: values
         for name, values in samples.columns().items()
         if values.size
     }
-    times_s = samples.index / rate_hz
+    times_s = samples.index / recording.sample_rate_hz
     return {"sample": samples.index, "t_s": times_s, **named, "flags": samples.flags}
 
 
@@ -109,18 +88,6 @@ def facts(recording: Recording) -> Facts:
         "experiment_yaml": recording.experiment_yaml,
         "model_yaml": recording.model_yaml,
     }
-
-
-def _first_at_or_after(t_s: float, rate_hz: float) -> int:
-    """Return the index of the first sample at ``t_s`` or later, rounding errors forgiven."""
-    if not math.isfinite(t_s):
-        raise DataError(f"a time must be a finite number of seconds: {t_s!r}")
-    place = min(max(t_s * rate_hz, -_FAR), _FAR)  # beyond it there is no sample
-    return math.ceil(place - 1e-6)
-
-
-def _seconds(t_s: float | None, otherwise: str) -> str:
-    return otherwise if t_s is None else f"{t_s:g} s"
 
 
 def _write_csv(stream: BinaryIO, table: Columns, _facts: Facts) -> None:
@@ -148,22 +115,37 @@ def _write_mat(stream: BinaryIO, table: Columns, facts: Facts) -> None:
     savemat(target, {**table, **facts}, oned_as="column")
 
 
-def _write_parquet(stream: BinaryIO, table: Columns, facts: Facts) -> None:
+def write_parquet(stream: BinaryIO, table: Columns, facts: Facts) -> None:
+    """Write columns, of NumPy or of Arrow, and facts as the file's metadata.
+
+    Raises:
+        InputError: pyarrow is missing.
+    """
+    pa = arrow()
+    from pyarrow import parquet
+
+    metadata = {f"hilctl.{name}": text for name, text in facts.items()}
+    parquet.write_table(pa.table(dict(table)).replace_schema_metadata(metadata), stream)
+
+
+def arrow() -> Any:
+    """Return the module pyarrow.
+
+    Raises:
+        InputError: It is not installed.
+    """
     try:
         import pyarrow as pa
-        from pyarrow import parquet
     except ImportError:
         raise InputError(
             "writing .parquet needs pyarrow, which is not installed (pip install 'hilctl[parquet]')"
         ) from None
-    metadata = {f"hilctl.{name}": text for name, text in facts.items()}
-    arrow = pa.table(dict(table)).replace_schema_metadata(metadata)
-    parquet.write_table(arrow, stream)
+    return pa
 
 
 _FORMATS: dict[str, Write] = {
     ".csv": _write_csv,
     ".npz": _write_npz,
-    ".parquet": _write_parquet,
+    ".parquet": write_parquet,
     ".mat": _write_mat,
 }

@@ -5,10 +5,12 @@ reference displacement.
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
 from hilctl.base.device import CommandUnit
+from hilctl.recording.facts import LabelValue
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,6 +77,7 @@ class RunReport(Figures):
     Attributes:
         path: File that was read.
         name: Name of the experiment.
+        labels: What the run is found by.
         device: Name of the device.
         simulated: Whether that is a simulation.
         reason: Why the run ended, or that its record is cut short.
@@ -111,6 +114,7 @@ class RunReport(Figures):
 
     path: str
     name: str
+    labels: Mapping[str, LabelValue]
     device: str
     simulated: bool
     reason: str

@@ -5,9 +5,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from hilctl.analysis import metrics
 from hilctl.analysis.canvas import DISPLACEMENT, MARK, REFERENCE, STYLE
 from hilctl.analysis.steady import SteadyPart, steady_part
+from hilctl.base import metrics
 from hilctl.base.arrays import F64
 from hilctl.base.printable import short_name
 from hilctl.recording.data import Recording

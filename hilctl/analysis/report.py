@@ -5,9 +5,10 @@ from typing import Any
 
 import numpy as np
 
-from hilctl.analysis import metrics, timing
+from hilctl.analysis import timing
 from hilctl.analysis.figures import RunReport, SegmentReport
 from hilctl.analysis.steady import steady_part
+from hilctl.base import metrics
 from hilctl.base.arrays import F64
 from hilctl.base.events import ADAPTED
 from hilctl.base.samples import NO_WAVEFORM, Flag
@@ -86,6 +87,7 @@ def _identity(recording: Recording) -> dict[str, Any]:
     return {
         "path": str(recording.path),
         "name": recording.run.get("name", ""),
+        "labels": recording.labels,
         "device": recording.run.get("device", ""),
         "simulated": recording.run.get("simulated") == "true",
         "reason": recording.end.get("reason", "") if recording.end else cut_short,

@@ -4,9 +4,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hilctl.analysis.metrics import Fold, fold
 from hilctl.base.arrays import F64
 from hilctl.base.events import TUNED
+from hilctl.base.metrics import Fold, fold
 from hilctl.base.samples import NO_WAVEFORM, Flag, Samples
 from hilctl.base.segments import Segment
 from hilctl.recording.data import Recording

@@ -33,7 +33,9 @@ def run_rows(report: RunReport) -> list[tuple[str, str]]:
     simulated = f" ({SIMULATED})" if report.simulated else ""
     held_against = "reference" if report.compensated else "command: nothing compensated"
     reason = printable(report.reason) or MISSING
+    labels = ", ".join(f"{key} {value}" for key, value in report.labels.items())
     return [
+        *([("labels", printable(labels))] if labels else []),
         ("device", f"{printable(report.device) or MISSING}{simulated}"),
         ("ended", f"{reason}{'' if report.complete else ' (NOT complete)'}"),
         (

@@ -9,6 +9,7 @@ private.py   folders that belong to one user alone
 samples.py   a sample's columns and flags, and blocks of samples
 events.py    what a run records beside its samples
 segments.py  which samples of a run are judged
+metrics.py   pure: folding onto one cycle, peak hysteresis, loop area, errors, sensor noise
 printable.py texts from files as people may be shown them
 text_table.py  columns of CSV and its relatives, mistakes with their line
 yaml/        plain YAML in, with the line of every value and all problems at once

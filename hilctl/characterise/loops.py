@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hilctl.analysis import metrics
 from hilctl.analysis.steady import steady_part
+from hilctl.base import metrics
 from hilctl.base.arrays import F64
 from hilctl.base.errors import DataError
 from hilctl.base.segments import Segment

@@ -7,7 +7,7 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from hilctl.analysis import metrics
+from hilctl.base import metrics
 from hilctl.base.arrays import F64
 from hilctl.base.segments import Segment
 from hilctl.characterise.gaps import without_gaps

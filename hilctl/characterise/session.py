@@ -4,7 +4,6 @@ The recordings are the checkpoint. A whole one, of the very experiment that a st
 that step done: a campaign that was killed goes on where it was, and loses one step.
 """
 
-import hashlib
 import json
 import shutil
 import time
@@ -28,6 +27,7 @@ from hilctl.experiment.load import load_experiment
 from hilctl.models.files import dump_model
 from hilctl.recording.data import Recording
 from hilctl.recording.reader import read
+from hilctl.run.metadata import experiment_sha256
 from hilctl.run.result import Progress, RunResult
 from hilctl.run.start import checked_experiment, start_run
 from hilctl.run.unpaced import run_unpaced
@@ -284,8 +284,8 @@ class Campaign:
             recording = read(path)
         except DataError:  # cut short before its first sample: the step is run again
             return None
-        text = load_experiment(self._experiment, settings).yaml_text
-        same = recording.run.get("experiment_sha256") == hashlib.sha256(text.encode()).hexdigest()
+        wanted = experiment_sha256(load_experiment(self._experiment, settings))
+        same = recording.run.get("experiment_sha256") == wanted
         return recording if same and recording.end.get("code") == "completed" else None
 
     def _cool(self, step: CampaignStep, pause_s: float) -> None:

@@ -8,6 +8,7 @@ commands.py    which commands there are, and where each one's function is
 options.py     options that they share; output.py  JSON, and what all of them say
 running.py     start and check runs; shown by run_view.py
 steering.py    status, set and stop, in a tenth of a second; shown by status_view.py
+listing.py     recordings below a folder, found by what they say
 recordings.py  judge, replay, export and recover them, identify models;
                identify_view.py and report_view.py
 comparing.py   models against one another; compare_view.py
@@ -17,15 +18,16 @@ machine.py     this computer and its devices; machine_view.py and probe_view.py
 console.py     the console that tables go to, and what replay prints; progress.py  a progress bar
 streams.py     standard output and error, which all text passes: no control character goes through
 
-Exit codes: 0 done; 1 a replay that differs, a rate that this machine does not keep, or a model
-that is none of the actuator; 2 the input can't be used, nothing has moved; 3 a run that ended by a
-fault, a device that answers what can't be, or a rig that can't be characterised; 128 + n a run
-stopped by signal n.
+Exit codes: 0 done; 1 a replay that differs, an export that left recordings out, a rate that this
+machine does not keep, or a model that is none of the actuator; 2 the input can't be used, nothing
+has moved; 3 a run that ended by a fault, a device that answers what can't be, or a rig that can't
+be characterised; 128 + n a run stopped by signal n.
 """
 
 import logging
 import signal
 import sys
+from collections.abc import Sequence
 from importlib import import_module
 from typing import Any, NoReturn
 
@@ -34,6 +36,8 @@ from hilctl.cli.output import print_json
 from hilctl.cli.streams import plain_streams
 
 STEERING = ("status", "set", "stop")
+"""Commands about runs that are going on."""
+QUICK = (*STEERING, "list")
 """Commands that nobody wants to wait for: they go past the application, which takes longer to
 import than they take to run."""
 
@@ -62,13 +66,22 @@ def main() -> None:
 
 
 def _command() -> None:
-    if len(sys.argv) > 1 and sys.argv[1] in STEERING:
-        from hilctl.cli.steering import steer
-
-        raise SystemExit(steer(sys.argv[1], sys.argv[2:]))
+    if len(sys.argv) > 1 and sys.argv[1] in QUICK:
+        raise SystemExit(quick(sys.argv[1], sys.argv[2:]))
     from hilctl.cli.application import app
 
     app()
+
+
+def quick(name: str, words: Sequence[str]) -> int:
+    """Run one of the commands in :data:`QUICK`, and return its exit code."""
+    if name in STEERING:
+        from hilctl.cli.steering import steer
+
+        return steer(name, words)
+    from hilctl.cli.listing import list_recordings
+
+    return list_recordings(words)
 
 
 def _machine_refused(error: Exception) -> str:

@@ -10,7 +10,7 @@ import typer
 
 from hilctl.base.errors import InputError, RunError
 from hilctl.base.files import check_writable
-from hilctl.cli.options import AsJson, ExperimentFile, Overwrite, Settings
+from hilctl.cli.options import AsJson, ExperimentFile, LabelTexts, Overwrite, Settings, with_labels
 from hilctl.cli.output import finish_orphans, print_json
 
 if TYPE_CHECKING:
@@ -29,6 +29,7 @@ def characterise(
         Path | None, typer.Option(help="Where each run is kept; OUTPUT-runs where not given.")
     ] = None,
     settings: Settings = None,
+    labels: LabelTexts = None,
     highest_hz: Annotated[
         float | None, typer.Option(help="Highest frequency of loops; else from the sample rate.")
     ] = None,
@@ -52,7 +53,7 @@ def characterise(
     chosen = folder or output.with_name(f"{output.stem}-runs")
     with shown_progress("characterise", quiet=as_json) as on_progress:
         host = _host(on_progress, fast=fast, quiet=as_json)
-        campaign = Campaign(experiment, settings or [], chosen, highest_hz, host)
+        campaign = Campaign(experiment, with_labels(settings, labels), chosen, highest_hz, host)
         plan = campaign.plan
         if dry_run:
             print_json(plan_mapping(plan)) if as_json else print_plan(plan, chosen)

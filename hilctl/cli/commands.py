@@ -11,7 +11,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from hilctl.base.errors import InputError
-from hilctl.cli import STEERING
+from hilctl.cli import QUICK, quick
 
 
 class CommandEntry(NamedTuple):
@@ -56,6 +56,10 @@ COMMANDS: dict[str, CommandEntry] = {
     "safe": CommandEntry(
         "hilctl.cli.running:safe",
         "Put a device at its safe value by hand, where no run holds it.",
+    ),
+    "list": CommandEntry(
+        "hilctl.cli.listing:list_recordings",
+        "List the recordings below a folder, by what their first and last bytes say.",
     ),
     "report": CommandEntry(
         "hilctl.cli.recordings:report", "Judge a recording: hysteresis, error, noise, lateness."
@@ -127,7 +131,7 @@ class CommandTable(TyperGroup):
         return name, line and load(line.name or ""), rest
 
 
-class _Steering(TyperCommand):
+class _Quick(TyperCommand):
     """A command that reads its own arguments, for whoever comes by the application all the same."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
@@ -137,9 +141,7 @@ class _Steering(TyperCommand):
 
     def invoke(self, ctx: Any) -> Any:
         """Run it."""
-        from hilctl.cli.steering import steer
-
-        raise typer.Exit(steer(str(self.name), ctx.args))
+        raise typer.Exit(quick(str(self.name), ctx.args))
 
 
 def load(name: str) -> Any:
@@ -153,8 +155,8 @@ def load(name: str) -> Any:
         found = getattr(import_module(module_name), attribute)
     except (ImportError, AttributeError) as error:
         raise InputError(f"{name} can't be loaded: {error}") from error
-    if name in STEERING:
-        return _Steering(name, help=found.__doc__)
+    if name in QUICK:
+        return _Quick(name, help=found.__doc__)
     if isinstance(found, typer.Typer):
         group = typer.main.get_group(found)
         group.name = name

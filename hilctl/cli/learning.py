@@ -9,7 +9,7 @@ import typer
 
 from hilctl.base.errors import InputError
 from hilctl.base.files import check_writable
-from hilctl.cli.options import AsJson, ExperimentFile, Overwrite, Settings
+from hilctl.cli.options import AsJson, ExperimentFile, LabelTexts, Overwrite, Settings, with_labels
 from hilctl.cli.output import finish_orphans, print_json
 
 if TYPE_CHECKING:
@@ -26,6 +26,7 @@ def learn(
         Path | None, typer.Option(help="Where each run is kept; OUTPUT-runs where not given.")
     ] = None,
     settings: Settings = None,
+    labels: LabelTexts = None,
     fast: Annotated[
         bool, typer.Option("--fast", help="Do not wait for real time; simulated devices only.")
     ] = False,
@@ -41,7 +42,7 @@ def learn(
     if not overwrite and any(chosen.glob("run-*.mcap")):
         raise InputError(f"{chosen}: holds runs already: give another --folder, or --overwrite")
     finish_orphans()
-    session = Session(experiment, settings or [], chosen, unpaced if fast else paced)
+    session = Session(experiment, with_labels(settings, labels), chosen, unpaced if fast else paced)
     learned = session.learn(cycles, (lambda rows: None) if as_json else _print_rows)
     write_correction(output, learned.correction, overwrite=overwrite)
     if as_json:

@@ -13,5 +13,25 @@ Settings = Annotated[
     list[str] | None,
     typer.Option("--set", help="Set dotted.key=value over the file; may be repeated."),
 ]
+LabelTexts = Annotated[
+    list[str] | None,
+    typer.Option("--label", help="key=value that the run is found by; may be repeated."),
+]
+FromS = Annotated[float | None, typer.Option("--from", help="From this time of the run, in s.")]
+ToS = Annotated[float | None, typer.Option("--to", help="Up to this time of the run, in s.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object for programs.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace the file if it exists.")]
+
+
+def with_labels(settings: list[str] | None, labels: list[str] | None) -> list[str]:
+    """Return the settings of a command, and its labels as more of them.
+
+    Raises:
+        ConfigError: A label is not key=value.
+    """
+    chosen = list(settings or [])
+    if labels:
+        from hilctl.experiment.labels import label_settings
+
+        chosen += label_settings(labels)
+    return chosen

@@ -1,14 +1,20 @@
 """Commands about recordings: report, recover, replay, identify, export."""
 
 import json
+import sys
+from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from hilctl.base.errors import InputError
 from hilctl.cli.comparing import check_page
-from hilctl.cli.options import AsJson, Overwrite, RecordingFile
+from hilctl.cli.options import AsJson, FromS, Overwrite, RecordingFile, ToS
 from hilctl.cli.output import finish_orphans, print_json
+
+if TYPE_CHECKING:
+    from hilctl.recording.stretch import Stretch
 
 IdentifyInput = Annotated[list[Path], typer.Argument(help="Recordings (MCAP) or text tables.")]
 TableUnit = Annotated[str | None, typer.Option(help="Unit of a table's command, A or V.")]
@@ -34,6 +40,8 @@ FitTexts = Annotated[
 def report(
     recording: RecordingFile,
     html: Annotated[Path | None, typer.Option(help="Page with figures to write.")] = None,
+    from_s: FromS = None,
+    to_s: ToS = None,
     overwrite: Overwrite = False,
     as_json: AsJson = False,
 ) -> None:
@@ -44,7 +52,7 @@ def report(
     from hilctl.recording.reader import read
 
     finish_orphans()
-    contents = read(recording)
+    contents = read(recording, _stretch(from_s, to_s))
     summary = summarize(contents)
     if html is not None:
         from hilctl.analysis.html import write_html
@@ -178,10 +186,15 @@ def _column(text: str | None) -> str | int | None:
 
 
 def export(
-    recording: RecordingFile,
-    output: Annotated[Path, typer.Argument(help=".csv, .npz, .parquet or .mat file to write.")],
-    t0: Annotated[float | None, typer.Option(help="From this time, in s.")] = None,
-    t1: Annotated[float | None, typer.Option(help="Up to this time, in s.")] = None,
+    recording: Annotated[Path, typer.Argument(help="Recording (MCAP), or a folder of them.")],
+    output: Annotated[
+        Path, typer.Argument(help=".csv, .npz, .parquet or .mat file to write, or a folder.")
+    ],
+    every: Annotated[
+        bool, typer.Option("--all", help="All recordings of a folder, as Hive-style Parquet.")
+    ] = False,
+    from_s: FromS = None,
+    to_s: ToS = None,
     overwrite: Overwrite = False,
     as_json: AsJson = False,
 ) -> None:
@@ -190,8 +203,35 @@ def export(
     from hilctl.recording.reader import read
 
     finish_orphans()
-    rows = write(read(recording), output, t0=t0, t1=t1, overwrite=overwrite)
+    if every:
+        if overwrite or from_s is not None or to_s is not None:
+            raise InputError("--all: writes whole recordings, and replaces none")
+        _export_all(recording, output, as_json=as_json)
+        return
+    rows = write(read(recording, _stretch(from_s, to_s)), output, overwrite=overwrite)
     if as_json:
         print_json({"output": str(output), "rows": rows})
     else:
         print(f"{output}: {rows} samples")
+
+
+def _stretch(from_s: float | None, to_s: float | None) -> "Stretch | None":
+    from hilctl.recording.stretch import Stretch
+
+    return None if from_s is None and to_s is None else Stretch(from_s, to_s)
+
+
+def _export_all(folder: Path, output: Path, *, as_json: bool) -> None:
+    from hilctl.analysis.export_all import export_all
+    from hilctl.cli.progress import shown_progress
+
+    with shown_progress("export", quiet=as_json) as progress:
+        done = export_all(folder, output, progress)
+    if as_json:
+        print_json({"output": str(output), **asdict(done)})
+    else:
+        print(f"{output}: {done.written} recordings written, {done.there} were there already")
+        for path, why in done.left_out.items():
+            print(f"hilctl: {path}: is left out: {why}", file=sys.stderr)
+    if done.left_out:
+        raise typer.Exit(1)

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from hilctl.base.errors import HilctlError
-from hilctl.cli.options import AsJson, ExperimentFile, Overwrite, Settings
+from hilctl.cli.options import AsJson, ExperimentFile, LabelTexts, Overwrite, Settings, with_labels
 from hilctl.cli.output import finish_orphans, print_json
 
 
@@ -16,6 +16,7 @@ def run(
     experiment: ExperimentFile,
     output: Annotated[Path | None, typer.Option(help="Recording to write.")] = None,
     settings: Settings = None,
+    labels: LabelTexts = None,
     overwrite: Overwrite = False,
     detach: Annotated[
         bool, typer.Option("--detach", help="Run in the background; see status, set and stop.")
@@ -26,17 +27,18 @@ def run(
     as_json: AsJson = False,
 ) -> None:
     """Run an experiment and record it; Ctrl-C ramps to the safe value first."""
+    settings = with_labels(settings, labels)
     if require_rt:
-        settings = [*(settings or []), "realtime.require=true"]
+        settings.append("realtime.require=true")
     if detach:
-        _detach(experiment, output, settings or [], overwrite=overwrite, as_json=as_json)
+        _detach(experiment, output, settings, overwrite=overwrite, as_json=as_json)
         return
     from hilctl.cli.run_view import LiveView, print_run, report_of, run_mapping
     from hilctl.run.start import start_run
 
     finish_orphans()
     with LiveView(quiet=as_json) as view:
-        result = start_run(experiment, settings or [], output, overwrite, view.update)
+        result = start_run(experiment, settings, output, overwrite, view.update)
         if result.stop_signal:  # impatience must not cost the result of a run that has ended
             signal.signal(result.stop_signal, signal.SIG_IGN)
     report, unread = None, ""

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hilctl.analysis import metrics
+from hilctl.base import metrics
 from hilctl.base.arrays import F64, U32
 from hilctl.base.errors import DeviceError, InputError
 from hilctl.base.samples import Flag

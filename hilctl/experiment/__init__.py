@@ -1,6 +1,7 @@
 """The experiment: its file, what the file refers to, and whether it may start. Moves nothing.
 
 file.py           pydantic models of the file; parts.py and limits.py its parts
+labels.py         what a lab finds a run by
 load.py           from a file to the experiment with all that it refers to
 correction.py     what learning has added to the compensator's input
 initial_state.py  what the run before left in the actuator

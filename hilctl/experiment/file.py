@@ -5,6 +5,7 @@ from typing import Annotated, Any, Literal, TypeVar
 from pydantic import BeforeValidator, Field
 
 from hilctl.base.strict import Strict
+from hilctl.experiment.labels import Labels
 from hilctl.experiment.limits import Limits
 from hilctl.experiment.parts import (
     AdaptationConfig,
@@ -75,6 +76,7 @@ class Experiment(Strict):
     Attributes:
         name: Short name, part of the recording's file name.
         description: What it is for.
+        labels: What the run is found by: operator, sample, temperature and the like.
         device: ``kind`` and the device's own options.
         sample_rate_hz: Samples a second.
         block: Samples exchanged in one tick; more than 1 needs a device with a FIFO.
@@ -93,6 +95,7 @@ class Experiment(Strict):
 
     name: Name
     description: str = ""
+    labels: Labels = Field(default_factory=dict)
     device: dict[str, Any]
     sample_rate_hz: Annotated[float, Field(ge=1e-3, le=1e6)]
     block: Annotated[int, Field(ge=1, le=4096)] = 1

@@ -12,7 +12,7 @@ from pathlib import Path
 from hilctl.base.errors import DataError
 from hilctl.experiment.initial_state import InitialState, initial_state_after
 from hilctl.experiment.load import LoadedExperiment
-from hilctl.recording.data import HOLDS_FACT
+from hilctl.recording.facts import HOLDS_FACT
 from hilctl.recording.reader import read_run_facts
 
 _LARGEST_BYTES = 256 << 20  # some minutes at 50 kHz: more would keep the start waiting

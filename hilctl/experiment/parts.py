@@ -12,6 +12,7 @@ from pydantic import (
 )
 
 from hilctl.base.strict import Strict
+from hilctl.recording.facts import RECORDINGS
 
 _NAME = "[A-Za-z0-9][A-Za-z0-9_.-]{0,79}"
 
@@ -93,7 +94,7 @@ class RecordingConfig(Strict):
             ``stop`` by its safe ramp, or ``go_on`` and count what is lost.
     """
 
-    folder: str = "recordings"
+    folder: str = RECORDINGS
     flush_s: Annotated[float, Field(gt=0.0, le=10.0)] = 2.0
     scope_rate_hz: Annotated[float, Field(gt=0.0, le=1000.0)] = 1000.0
     ring_s: Annotated[float, Field(ge=1.0, le=60.0)] = 10.0

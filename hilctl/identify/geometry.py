@@ -4,9 +4,9 @@ from typing import Literal
 
 import numpy as np
 
-from hilctl.analysis.metrics import peak_hysteresis_percent
 from hilctl.base.arrays import F64
 from hilctl.base.errors import DataError
+from hilctl.base.metrics import peak_hysteresis_percent
 from hilctl.identify.data.records import Records, SteadyLoop
 
 

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from hilctl.analysis.metrics import loop_area
 from hilctl.base.arrays import F64
+from hilctl.base.metrics import loop_area
 from hilctl.identify.data.records import Record, Records, SteadyLoop
 from hilctl.identify.fit_data import PERIODS, FitData
 from hilctl.identify.staged.fit_data import StagedFitData

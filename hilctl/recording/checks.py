@@ -22,6 +22,7 @@ from hilctl.base.segments import SHORTEST_PERIOD, Segment
 from hilctl.base.strict import Strict
 from hilctl.recording import schema
 from hilctl.recording.data import TICK_COLUMNS
+from hilctl.recording.facts import LABELS_FACT, LabelValue
 
 LAST_SAMPLE = 2**40
 """No index reaches it: a hundred million samples, and a safe ramp of an hour at 1 MHz."""
@@ -233,6 +234,28 @@ def _segment_problems(segments: Iterable[Segment]) -> Iterator[str]:
         if 0.0 < each.period < SHORTEST_PERIOD:
             yield f"{number}: a period of {each.period!r} samples can't be"
         end = each.stop
+
+
+def labels_of(facts: Mapping[str, str]) -> dict[str, LabelValue]:
+    """Return the labels of a run from the fact that holds them; none where it is missing.
+
+    Raises:
+        ValueError: They are no JSON object of texts and finite numbers.
+    """
+    text = facts.get(LABELS_FACT, "{}")
+    try:
+        labels = json.loads(text)
+    except (ValueError, RecursionError):
+        labels = None
+    if not isinstance(labels, dict) or not all(map(_is_label, labels.values())):
+        raise ValueError(f"{LABELS_FACT} must be texts and numbers by name, got {short(text)}")
+    return labels
+
+
+def _is_label(value: object) -> bool:
+    if isinstance(value, int | float):
+        return not isinstance(value, bool) and abs(value) < math.inf
+    return isinstance(value, str)
 
 
 def number_of(facts: Mapping[str, str], name: str, low: float, high: float) -> float:

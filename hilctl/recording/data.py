@@ -1,7 +1,7 @@
 """A recording in memory: arrays and facts, however they were stored."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 
 from hilctl.base.arrays import F64, I64
@@ -9,9 +9,7 @@ from hilctl.base.device import CommandUnit
 from hilctl.base.events import Event
 from hilctl.base.samples import Samples
 from hilctl.base.segments import Segment
-
-HOLDS_FACT = "holds"
-"""Fact of a run, by which later ones know its device: JSON list of what it holds while open."""
+from hilctl.recording.facts import LabelValue
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +29,7 @@ class Ticks:
     exchange_ns: I64
 
 
-TICK_COLUMNS = tuple(field.name for field in fields(Ticks))
+TICK_COLUMNS = tuple(each.name for each in fields(Ticks))
 """Their names, which are those of a block's head as well."""
 
 
@@ -70,6 +68,7 @@ class Recording:
         model_yaml: The compensator's model, or empty.
         starts: Where a replay can begin.
         correction_yaml: What had been learned and was added to the reference, or empty.
+        labels: What the run is found by.
     """
 
     path: Path
@@ -87,3 +86,4 @@ class Recording:
     model_yaml: str
     starts: tuple[ReplayStart, ...] = ()
     correction_yaml: str = ""
+    labels: Mapping[str, LabelValue] = field(default_factory=dict)

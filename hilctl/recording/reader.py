@@ -19,12 +19,14 @@ from hilctl.recording.checks import (
     RATES_HZ,
     SoundMessages,
     count_of,
+    labels_of,
     number_of,
     segments_of,
     short,
 )
 from hilctl.recording.data import TICK_COLUMNS, Recording, ReplayStart, Ticks
 from hilctl.recording.salvage import Salvage
+from hilctl.recording.stretch import Stretch
 from hilctl.recording.writer import is_being_recorded
 
 _log = logging.getLogger(__name__)
@@ -34,21 +36,25 @@ _NUMBER_BYTES = 8
 _EVENT_BYTES = 2048  # what Python itself takes for a message that is kept
 
 
-def read(path: Path) -> Recording:
+def read(path: Path, stretch: Stretch | None = None) -> Recording:
     """Read a recording; of one that was cut short or damaged, all that is whole.
 
     Nothing is written. That something is missing is logged as a warning, in one line. All that is
     given out is of one shape and rises where it must, whatever the file says; time and memory stay
-    in proportion to its size.
+    in proportion to its size, or memory to that of a stretch of it.
+
+    Args:
+        path: The recording.
+        stretch: What to keep of it; all where None.
 
     Raises:
-        DataError: The file can't be read, is not an MCAP file, or holds what hilctl can't have
-            written.
+        DataError: The file can't be read, is not an MCAP file, holds what hilctl can't have
+            written, or no sample of the stretch.
     """
     try:
         with path.open("rb") as stream:
             salvage = Salvage(stream)
-            contents = _Contents(salvage.allowance)
+            contents = _Contents(salvage.allowance, stretch)
             for record in salvage.records():
                 contents.take(record)
             live = not salvage.sound and is_being_recorded(stream)
@@ -64,7 +70,7 @@ def read(path: Path) -> Recording:
     recording = contents.recording(path)
     if not salvage.sound:
         _warn(recording, "is still being recorded" if live else salvage.describe(), live=live)
-    return recording
+    return stretch.cut(recording) if stretch else recording
 
 
 def read_run_facts(path: Path) -> Mapping[str, str]:
@@ -135,10 +141,13 @@ class _Contents:
 
     Args:
         allowance: Counts what is kept.
+        stretch: Blocks and ticks that lie elsewhere are not kept.
     """
 
-    def __init__(self, allowance: Allowance) -> None:
+    def __init__(self, allowance: Allowance, stretch: Stretch | None) -> None:
         self._allowance = allowance
+        self._stretch = stretch
+        self._bounds: tuple[int, int] | None = None
         self._sound = SoundMessages()
         self.run: dict[str, str] = {}
         self.end: dict[str, str] = {}
@@ -177,15 +186,27 @@ class _Contents:
         if problem:
             raise DataError(f"{problem} ('hilctl recover' leaves such messages out)")
         topic = self._sound.topic(record.channel_id)
-        if topic == "/samples":
+        if topic == "/samples" and self._within(decoded.tick0, decoded.tick0 + decoded.n):
             self._block(decoded)
-        elif topic == "/ticks":
+        elif topic == "/ticks" and self._within(*_reach(decoded)):
             self._allowance.keep(_NUMBER_BYTES * len(decoded.late_ns) * len(TICK_COLUMNS))
             for name, values in self._ticks.items():
                 values.extend(getattr(decoded, name))
         elif topic == "/events":
             self._allowance.keep(_EVENT_BYTES + len(record.data))
             self._events.append((record.log_time, decoded))
+
+    def _within(self, start: int, stop: int) -> bool:
+        """Return whether samples from ``start`` up to ``stop`` are of the stretch in part."""
+        if self._stretch is None:
+            return True
+        if self._bounds is None:
+            try:
+                rate_hz = number_of(self.run, "sample_rate_hz", *RATES_HZ)
+            except ValueError as error:
+                raise DataError(f"metadata hilctl.run: missing or damaged: {error}") from None
+            self._bounds = self._stretch.samples(rate_hz)
+        return start < self._bounds[1] and self._bounds[0] < stop
 
     def _block(self, block: Any) -> None:
         self._allowance.keep(_NUMBER_BYTES * block.n * len(COLUMNS))
@@ -231,11 +252,17 @@ class _Contents:
             model_yaml=self._texts.get("model.yaml", ""),
             correction_yaml=self._texts.get("correction.yaml", ""),
             starts=tuple(self._starts),
+            labels=labels_of(self.run),
         )
 
     def _dropped(self) -> int:
         gaps = self._sound.next_sample - len(self._index)
         return max(gaps, count_of(self.end, "missing_samples"))
+
+
+def _reach(ticks: Any) -> tuple[int, int]:
+    first = ticks.first_sample
+    return min(first, default=0), max(first, default=-1) + 1
 
 
 def _unit(run: Mapping[str, str]) -> CommandUnit:

@@ -11,6 +11,7 @@ import json
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from io import FileIO
 from pathlib import Path
 from typing import BinaryIO
 
@@ -171,7 +172,7 @@ def lock(stream: BinaryIO, kind: int) -> None:
             raise
 
 
-def is_being_recorded(stream: BinaryIO) -> bool:
+def is_being_recorded(stream: BinaryIO | FileIO) -> bool:
     """Return whether a run is recording to an open file; where there are no locks, False."""
     try:
         fcntl.flock(stream, fcntl.LOCK_SH | fcntl.LOCK_NB)

@@ -11,7 +11,8 @@ guardian.py        a process that makes the output safe where the loop can't; sa
 loop_process.py    the loop's process; host.py  its side of the shared memory
 starting.py        where the output is before a run
 ring.py            sample blocks in shared memory, behind shared_page.py
-recorder.py        into the recording; metadata.py what it says of the run
+recorder.py        into the recording; metadata.py what it says of the run, end_figures.py of
+                   what came out
 kept_file.py       a file that somebody takes away while it is written
 ring_recorder.py   from the ring into it, in a thread of its own; progress.py  for who looks on
 run_folder.py      runs that are going on, and who holds a device

@@ -9,6 +9,7 @@ import json
 import platform
 import sys
 import uuid
+from collections.abc import Iterator
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,13 +18,16 @@ import numpy as np
 
 from hilctl import __version__
 from hilctl.base.samples import COLUMNS
+from hilctl.base.yaml.plain import dump
 from hilctl.loop.pacer import Lateness
 from hilctl.loop.plan import Outcome
 from hilctl.machine.diagnosis import machine_facts
-from hilctl.recording.data import HOLDS_FACT
+from hilctl.recording.facts import HOLDS_FACT, LABELS_FACT
 
 if TYPE_CHECKING:
     from hilctl.experiment.check import Checked
+    from hilctl.experiment.load import LoadedExperiment
+    from hilctl.waveforms.spec import AnyWaveform
 
 
 def run_facts(checked: "Checked", started: str, model_yaml: str) -> dict[str, str]:
@@ -41,6 +45,7 @@ def run_facts(checked: "Checked", started: str, model_yaml: str) -> dict[str, st
         "run_id": str(uuid.uuid4()),
         "name": config.name,
         "description": config.description,
+        LABELS_FACT: json.dumps(config.labels, ensure_ascii=False),
         "started": started,
         "hilctl": __version__,
         "python": sys.version.split()[0],
@@ -59,15 +64,32 @@ def run_facts(checked: "Checked", started: str, model_yaml: str) -> dict[str, st
         "initial_state": checked.begun.begins,
         "initial_state_run_id": checked.begun.run_id,
         HOLDS_FACT: json.dumps(list(info.holds)),
-        "experiment_sha256": _sha256(loaded.yaml_text),
+        "experiment_sha256": experiment_sha256(loaded),
         "model_sha256": _sha256(model_yaml) if model_yaml else "",
         "limits": config.limits.model_dump_json(exclude_none=True),
         "safe_value": repr(config.safe.value),
         "max_missed_share": repr(config.timing.max_missed_share),
         "units": json.dumps({"t_rel": "s"} | {each.name: each.unit for each in recorded}),
     }
+    facts |= {f"waveform.{key}": text for key, text in _scalars(config.waveform)}
     facts |= machine_facts(config.realtime, Path(config.recording.folder))
     return facts | {f"device.{key}": value for key, value in info.details.items()}
+
+
+def _scalars(waveform: "AnyWaveform") -> Iterator[tuple[str, str]]:
+    """Yield the keys of a waveform that hold one text or number, and those as text."""
+    for key, value in waveform:
+        if isinstance(value, str | int | float):
+            yield key, str(value)
+
+
+def experiment_sha256(loaded: "LoadedExperiment") -> str:
+    """Return the SHA-256 of an experiment as it runs, by which a run of it is known as done.
+
+    Without its labels: who stands beside the rig does not change what it does.
+    """
+    data = {key: value for key, value in loaded.document.data.items() if key != LABELS_FACT}
+    return _sha256(dump(data))
 
 
 def _sha256(text: str) -> str:

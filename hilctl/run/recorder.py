@@ -18,6 +18,7 @@ from hilctl.experiment.correction import dump_correction
 from hilctl.models.files import dump_model
 from hilctl.recording.messages import RecordingLayout
 from hilctl.recording.writer import OutputFile, RecordingWriter, RunFacts
+from hilctl.run.end_figures import EndFigures
 from hilctl.run.kept_file import is_emptied, put_back
 from hilctl.run.metadata import run_facts
 
@@ -53,6 +54,7 @@ class Recorder:
         self._unix_ns = steady_unix_ns()
         self._tail = Tail(_SAMPLES_BEFORE)
         self._run: RunFacts | None = None
+        self._figures: EndFigures | None = None
         try:
             self._file = OutputFile(path, overwrite=overwrite)
         except FileExistsError:
@@ -81,12 +83,17 @@ class Recorder:
         try:
             # Before the file is opened for writing: that empties one which stood there.
             self._run = self._facts(start_unix_ns, set_up, waveform_at)
-            self._writer = RecordingWriter(self._file.begin(), self._run)
+            self._start_anew(self._run)
         except OSError as error:
             raise self._unwritable(error) from None
         self.flush()  # what was taken away since it was claimed is noticed before anything moves
         if self.error:
             raise InputError(self.error)
+
+    def _start_anew(self, run: RunFacts) -> None:
+        self._writer = RecordingWriter(self._file.begin(), run)
+        compensated = self._checked.loaded.model is not None
+        self._figures = EndFigures(run.segments, compensated=compensated)
 
     def give_back(self) -> None:
         """Leave no file behind where there was none: the run does not start."""
@@ -101,11 +108,13 @@ class Recorder:
             # The file says itself what is missing before its first sample.
             batch.heads[0, Head.DROPPED_BEFORE] = batch.heads[0, Head.FIRST_SAMPLE]
         self._write(partial(self._begun.batch, batch))
+        self._gathered.add(batch.samples())
 
     def event(self, event: Event) -> None:
         """Write an event of the loop, with the samples that led to it."""
         if event.code == ADAPTED:
             self.adapted = event.values
+        self._gathered.event(event)
         led_there = replace(event, before=self._tail.up_to(event.sample))
         self._write(partial(self._begun.event, led_there))
 
@@ -143,7 +152,7 @@ class Recorder:
         """Begin again in a file that somebody has emptied, as nothing in it can be read."""
         assert self._run is not None
         lost = self._flushed
-        self._writer = RecordingWriter(self._file.begin(), self._run)
+        self._start_anew(self._run)
         self._tail = Tail(_SAMPLES_BEFORE)
         self._flushed = self._had_bytes = 0
         text = f"somebody has emptied the recording: {lost} samples that were in it are lost"
@@ -166,9 +175,10 @@ class Recorder:
         now_ns = self._unix_ns()
         level = "info" if end["code"] == "completed" else "error"
         last = max(0, ended_at - 1)
+        facts = {**end, **self._gathered.facts(), "ended": iso_time(now_ns)}
         event = Event(last, level, "run_ended", end["reason"], time_ns=now_ns)
         self._write(partial(self._begun.event, event))
-        self._write(partial(self._begun.finish, {**end, "ended": iso_time(now_ns)}, ended_at))
+        self._write(partial(self._begun.finish, facts, ended_at))
         if self.error:
             with suppress(OSError):  # the disk's refusal is known already
                 self._file.stream.close()
@@ -194,6 +204,11 @@ class Recorder:
     def _begun(self) -> RecordingWriter:
         assert self._writer is not None
         return self._writer
+
+    @property
+    def _gathered(self) -> EndFigures:
+        assert self._figures is not None
+        return self._figures
 
     def _write(self, write: Callable[[], None]) -> None:
         if self.error:

@@ -15,6 +15,7 @@ WITHOUT = {
     "drivers/labjack/last_write": "two messages; labjack/test_device.py sees what becomes of them",
     "loop/host": "a contract and a record; loop/test_loop.py runs the loop on a double of it",
     "loop/plan": "two records of plain values; loop/test_loop.py fills and reads all of them",
+    "recording/facts": "names; analysis/test_run_entry.py reads all of them",
     "recording/data": "records of plain values; recording/test_reader.py fills them",
 }
 """Modules without a file of their own, and where they are tested instead."""

@@ -9,6 +9,7 @@ import pytest
 import typer
 
 from hilctl.analysis import replay as replaying
+from hilctl.base.errors import InputError
 from hilctl.cli.recordings import _column, export, recover, replay, report
 
 GOLDEN = Path(__file__).parents[3] / "recordings" / "golden" / "terfenol_uncompensated.mcap"
@@ -52,3 +53,19 @@ def test_a_replay_that_differs_ends_with_one(recording, monkeypatch):
 @pytest.mark.parametrize(("text", "column"), [("3", 3), ("drive", "drive"), (None, None)])
 def test_a_column_is_a_number_or_a_name(text, column):
     assert _column(text) == column
+
+
+def test_all_recordings_of_a_folder_are_exported(tmp_path, monkeypatch, capsys):
+    """What is left out is said, and ends with one."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    folder = Path(shutil.copytree(GOLDEN.parent, tmp_path / "recordings"))
+    export(folder, tmp_path / "out", every=True)
+    assert "3 recordings written, 0 were there already" in capsys.readouterr().out
+    (folder / "no.mcap").write_text("hello")
+    with pytest.raises(typer.Exit) as ended:
+        export(folder, tmp_path / "out", every=True, as_json=True)
+    assert ended.value.exit_code == 1
+    found = printed(capsys)
+    assert (found["written"], found["there"], list(found["left_out"])) == (0, 3, ["no.mcap"])
+    with pytest.raises(InputError, match="--all: writes whole recordings"):
+        export(folder, tmp_path / "out", every=True, overwrite=True)

@@ -14,7 +14,7 @@ from hilctl.experiment.check import check
 from hilctl.experiment.history import left_by_last_run
 from hilctl.experiment.load import resolve
 from hilctl.models.files import dump_model
-from hilctl.recording.data import HOLDS_FACT
+from hilctl.recording.facts import HOLDS_FACT
 from tests.unit.experiment.test_initial_state import COMMAND, OMEGA, record
 
 HOLDS = ("tcp:10.0.0.5:502",)

@@ -14,7 +14,14 @@ from hilctl.base.events import TUNED, Event
 from hilctl.base.samples import Head
 from hilctl.base.segments import Segment
 from hilctl.recording import schema
-from hilctl.recording.checks import LAST_SAMPLE, count_of, number_of, segments_of, sound_blocks
+from hilctl.recording.checks import (
+    LAST_SAMPLE,
+    count_of,
+    labels_of,
+    number_of,
+    segments_of,
+    sound_blocks,
+)
 from hilctl.recording.messages import RecordingLayout
 from hilctl.recording.reader import read
 from hilctl.recording.recover import recover_recording
@@ -226,3 +233,16 @@ def test_what_a_dying_process_left_is_looked_at(tmp_path, make):
     assert back.samples.index.tolist() == [*range(200), *range(250, 300)]
     assert recovered.missing_samples == 50
     assert [event.code for event in back.events] == ["run_ended", "recovered"]
+
+
+@pytest.mark.parametrize(
+    "text", ["", "[]", "3", '{"a": true}', '{"a": null}', '{"a": {}}', '{"a": NaN}', "[" * 100_000]
+)
+def test_labels_that_are_none_are_refused(text):
+    with pytest.raises(ValueError, match="labels must be texts and numbers by name"):
+        labels_of({"labels": text})
+
+
+def test_a_recording_without_labels_has_none():
+    """Older ones have not."""
+    assert labels_of({}) == {}

@@ -7,7 +7,8 @@ from pathlib import Path
 from hilctl.base.samples import COLUMNS
 from hilctl.loop.pacer import Lateness
 from hilctl.loop.plan import Outcome
-from hilctl.run.metadata import end_facts, run_facts
+from hilctl.recording.checks import labels_of
+from hilctl.run.metadata import end_facts, experiment_sha256, run_facts
 from hilctl.run.shared_page import SIZE, SharedPage
 from hilctl.run.start import checked_experiment
 
@@ -42,3 +43,14 @@ def test_every_column_has_its_unit() -> None:
     assert set(units) == {"t_rel", *(column.field("A").name for column in COLUMNS.values())}
     assert (units["current_a"], units["displacement_um"]) == ("A", "um")
     assert len(facts["model_sha256"]) == 64
+
+
+def test_labels_are_recorded_and_change_no_identity() -> None:
+    """A campaign that goes on with another operator measures nothing twice."""
+    plain = checked_experiment(EXPERIMENT, [])
+    labelled = checked_experiment(EXPERIMENT, ["labels={sample: A7, t: 21.5}"])
+    facts = run_facts(labelled, "2000-01-01T00:00:00", "")
+    assert labels_of(facts) == {"sample": "A7", "t": 21.5}
+    assert facts["experiment_sha256"] == experiment_sha256(plain.loaded)
+    other = checked_experiment(EXPERIMENT, ["waveform.phase_deg=1.0"])
+    assert experiment_sha256(other.loaded) != experiment_sha256(plain.loaded)

@@ -12,6 +12,7 @@ from hilctl.analysis.report import summarize
 from hilctl.base.errors import InputError
 from hilctl.base.events import Event
 from hilctl.base.samples import Flag, Head
+from hilctl.recording.facts import END_FIGURES
 from hilctl.recording.reader import read
 from hilctl.run.assemble import assemble
 from hilctl.run.start import checked_experiment
@@ -148,3 +149,16 @@ def test_in_memory_and_in_a_file_it_is_the_same_run(tmp_path):
     assert samples.command.tobytes() == recorded.command.tobytes()
     assert samples.displacement_um.tobytes() == recorded.displacement_um.tobytes()
     assert samples.flags.tobytes() == recorded.flags.tobytes()
+
+
+@pytest.mark.parametrize("name", ["terfenol_sine_6a_uncompensated", "terfenol_sine_6a"])
+def test_the_end_of_a_recording_says_what_came_out(tmp_path, name):
+    """As a report does, so that nobody has to read the samples for it."""
+    soft = [f"waveform.soft_{end}_s=0.05" for end in ("start", "end")]
+    checked = checked_experiment(UNCOMPENSATED.with_stem(name), [*SHORT, *soft])
+    recording = read(run_unpaced(checked, tmp_path / "run.mcap").path)
+    report = summarize(recording).to_mapping()
+    found = {key: float(recording.end[key]) for key in END_FIGURES if key in recording.end}
+    assert found == pytest.approx({key: report[key] for key in END_FIGURES if report[key]})
+    assert recording.run["waveform.kind"] == "sine"
+    assert float(recording.run["waveform.frequency_hz"]) == 100.0

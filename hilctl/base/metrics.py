@@ -58,13 +58,54 @@ class Fold:
         return float(steps.max()) <= max(_WIDEST_HOLE, 2.5 / bins)
 
 
-def fold(index: I64, period: float, signals: Sequence[F64] | F64, max_bins: int = MAX_BINS) -> Fold:
-    """Average cycles of paired signals on bins of phase.
+class Folding:
+    """Averages cycles of paired signals on bins of phase, as their samples come.
 
     A sample's phase is its index modulo the period, so that gaps and periods that are not whole
     numbers of samples do no harm. All signals of a sample go to the same bin: their means stay
     paired. There is at most one bin a sample of a period; empty bins are left out, and so are
     samples of which a signal is not finite.
+
+    Args:
+        period: Samples in one period, > 0, not necessarily whole.
+        signals: How many.
+        max_bins: Most bins.
+    """
+
+    def __init__(self, period: float, signals: int, max_bins: int = MAX_BINS) -> None:
+        bins = max(1, min(max_bins, int(period + 1e-9)))
+        self._period = period
+        self._counts = np.zeros(bins, dtype=np.int64)
+        self._sums = np.zeros((signals + 1, bins))
+
+    def add(self, index: I64, signals: F64) -> None:
+        """Take more samples.
+
+        Args:
+            index: int64[n], sample index; phase 0 is where it is a multiple of the period.
+            signals: float64[k, n].
+        """
+        finite = np.isfinite(signals).all(axis=0)
+        if not finite.all():
+            index, signals = index[finite], signals[:, finite]
+        bins = self._counts.size
+        phase = np.mod(index.astype(np.float64), self._period)
+        # Multiply first: phase * bins is exact for whole periods, so that samples of one phase
+        # can't be torn apart by rounding.
+        bin_of = np.minimum((phase * bins / self._period).astype(np.int64), bins - 1)
+        self._counts += np.bincount(bin_of, minlength=bins)
+        self._sums += [np.bincount(bin_of, row, bins) for row in (phase, *signals)]
+
+    def fold(self) -> Fold:
+        """Return the average cycle; of no bin where nothing is finite."""
+        filled = self._counts > 0
+        counts = self._counts[filled]
+        means = self._sums[:, filled] / counts
+        return Fold(means[0] / self._period, counts, means[1:])
+
+
+def fold(index: I64, period: float, signals: Sequence[F64] | F64, max_bins: int = MAX_BINS) -> Fold:
+    """Average cycles of paired signals on bins of phase, see :class:`Folding`.
 
     Args:
         index: int64[n], sample index; phase 0 is where it is a multiple of ``period``.
@@ -76,19 +117,9 @@ def fold(index: I64, period: float, signals: Sequence[F64] | F64, max_bins: int 
         The average cycle, of at most ``max_bins`` bins; of none where nothing is finite.
     """
     stacked = np.asarray(signals, dtype=np.float64)
-    finite = np.isfinite(stacked).all(axis=0)
-    if not finite.all():
-        index, stacked = index[finite], stacked[:, finite]
-    bins = max(1, min(max_bins, int(period + 1e-9)))
-    phase = np.mod(index.astype(np.float64), period)
-    # Multiply first: phase * bins is exact for whole periods, so that samples of one phase can't
-    # be torn apart by rounding.
-    bin_of = np.minimum((phase * bins / period).astype(np.int64), bins - 1)
-    counts = np.bincount(bin_of, minlength=bins)
-    filled = counts > 0
-    counts = counts[filled]
-    means = [np.bincount(bin_of, row, bins)[filled] / counts for row in (phase, *stacked)]
-    return Fold(means[0] / period, counts, np.array(means[1:]))
+    folding = Folding(period, stacked.shape[0], max_bins)
+    folding.add(index, stacked)
+    return folding.fold()
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hilctl.analysis import metrics
+from hilctl.base import metrics
 from hilctl.base.arrays import F64
 from hilctl.models.plays import PpiModel
 

@@ -1,0 +1,136 @@
+"""What the first and the last bytes of a recording say of its run; samples are not looked at."""
+
+import os
+import stat
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from io import FileIO
+from pathlib import Path
+
+from mcap.opcode import Opcode
+from mcap.records import Footer, McapRecord, Metadata, MetadataIndex, SummaryOffset
+from mcap.writer import MCAP0_MAGIC as MAGIC
+
+from hilctl.base.errors import DataError
+from hilctl.recording.records import FRAME, LARGEST_BYTES, parse
+from hilctl.recording.writer import is_being_recorded
+
+_HEAD_BYTES = 8192
+_TAIL_BYTES = 4096
+_FOOTER_BYTES = FRAME.size + 20 + len(MAGIC)
+_MOST_BEFORE = 8  # records that may stand before the facts of the run: hilctl writes a header
+
+
+@dataclass(frozen=True, slots=True)
+class RecordingEnds:
+    """Facts of a run from both ends of its file.
+
+    Attributes:
+        run: Facts of its start.
+        end: Facts of its end; empty where the file is not finished.
+        state: ``finished``; ``recording`` where a run is writing to it; ``unfinished`` where it was
+            cut short. What lies between the ends is not known to be sound.
+    """
+
+    run: Mapping[str, str]
+    end: Mapping[str, str]
+    state: str
+
+
+def read_ends(path: Path) -> RecordingEnds:
+    """Read what a recording says of its run at its start and at its end.
+
+    Raises:
+        DataError: The file can't be read, is not an MCAP file, or does not begin with a run.
+    """
+    try:
+        # Not to wait for whoever writes to a pipe of that name.
+        with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb", buffering=0) as stream:
+            return _ends(stream)
+    except OSError as error:
+        raise DataError(f"{path}: can't be read: {error.strerror}") from None
+    except DataError as error:
+        raise DataError(f"{path}: {error}") from None
+
+
+def _ends(stream: FileIO) -> RecordingEnds:
+    found = os.fstat(stream.fileno())
+    if not stat.S_ISREG(found.st_mode):
+        raise DataError("is not a file")
+    file = _Bytes(stream.fileno(), found.st_size)
+    run, end = _run_facts(file), _end_facts(file)
+    if end is not None:
+        return RecordingEnds(run, end, "finished")
+    return RecordingEnds(run, {}, "recording" if is_being_recorded(stream) else "unfinished")
+
+
+class _Bytes:
+    """A file of which head and tail are read once."""
+
+    def __init__(self, descriptor: int, size: int) -> None:
+        self._descriptor = descriptor
+        self.size = size
+        self._tail_at = max(0, size - _TAIL_BYTES)
+        self._parts = {0: os.pread(descriptor, _HEAD_BYTES, 0)}
+        if size > _HEAD_BYTES:
+            self._parts[self._tail_at] = os.pread(descriptor, _TAIL_BYTES, self._tail_at)
+
+    def at(self, start: int, size: int) -> bytes:
+        """Return bytes of the file; fewer at its end, none of a place or size that can't be."""
+        if not 0 <= start < self.size or not 0 < size <= LARGEST_BYTES:
+            return b""
+        for at, part in self._parts.items():
+            if at <= start and start + size <= at + len(part):
+                return part[start - at : start - at + size]
+        return os.pread(self._descriptor, size, start)
+
+    def records(self, start: int, stop: int) -> Iterator[McapRecord]:
+        """Yield whole records, up to the first that is none or is of messages."""
+        while start + FRAME.size <= stop:
+            frame = self.at(start, FRAME.size)
+            if len(frame) < FRAME.size:  # an offset that leads out of the file
+                return
+            opcode, length = FRAME.unpack(frame)
+            start += FRAME.size
+            if length > stop - start or opcode in {Opcode.CHUNK, Opcode.MESSAGE}:
+                return
+            record = parse(opcode, self.at(start, length))
+            if record is None:
+                return
+            yield record
+            start += length
+
+
+def _run_facts(file: _Bytes) -> Mapping[str, str]:
+    if file.at(0, len(MAGIC)) != MAGIC:
+        raise DataError("is not an MCAP file, or its start is lost")
+    for record, _ in zip(file.records(len(MAGIC), file.size), range(_MOST_BEFORE), strict=False):
+        if isinstance(record, Metadata) and record.name == "hilctl.run":
+            return record.metadata
+    raise DataError("holds no run of hilctl (metadata hilctl.run is missing)")
+
+
+def _end_facts(file: _Bytes) -> Mapping[str, str] | None:
+    """Return the facts of the end by way of footer and index; None where those are not there."""
+    footer_at = file.size - _FOOTER_BYTES
+    if file.at(file.size - len(MAGIC), len(MAGIC)) != MAGIC:
+        return None
+    footer = next(file.records(footer_at, file.size - len(MAGIC)), None)
+    if not isinstance(footer, Footer):
+        return None
+    found: Mapping[str, str] = {}
+    for index in _metadata_indexes(file, footer.summary_offset_start or footer_at, footer_at):
+        if index.name == "hilctl.end":
+            record = next(file.records(index.offset, index.offset + index.length), None)
+            found = record.metadata if isinstance(record, Metadata) else found
+    return found
+
+
+def _metadata_indexes(file: _Bytes, start: int, stop: int) -> Iterator[MetadataIndex]:
+    """Yield the index of metadata by way of the offsets in a summary, however long that is."""
+    for group in file.records(start, stop):
+        if isinstance(group, SummaryOffset) and group.group_opcode == Opcode.METADATA_INDEX:
+            end = min(group.group_start + group.group_length, stop)
+            for index in file.records(group.group_start, end):
+                if isinstance(index, MetadataIndex):
+                    yield index

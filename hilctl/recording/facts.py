@@ -1,0 +1,21 @@
+"""Names of facts in a recording that more than one module goes by; importing it costs nothing."""
+
+from typing import TypeAlias
+
+HOLDS_FACT = "holds"
+"""Fact of a run, by which later ones know its device: JSON list of what it holds while open."""
+LABELS_FACT = "labels"
+"""Fact of a run: its labels as a JSON object."""
+END_FIGURES = (
+    "peak_hysteresis_percent",
+    "loop_area",
+    "peak_to_peak_um",
+    "peak_error_percent",
+    "rms_error_percent",
+)
+"""Facts of the end of a run: the worst figure of its segments, where any has it; as in a report."""
+RECORDINGS = "recordings"
+"""Folder of recordings, relative to where hilctl runs, where no other is given."""
+
+LabelValue: TypeAlias = str | int | float
+"""A label says text or a number."""

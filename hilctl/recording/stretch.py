@@ -1,0 +1,87 @@
+"""A stretch of a run, by time: only its samples are kept in memory, however long the run was."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, fields, replace
+
+from hilctl.base.errors import DataError
+from hilctl.base.segments import Segment
+from hilctl.recording.checks import LAST_SAMPLE
+from hilctl.recording.data import Recording, Ticks
+
+_OF_ANY_PART = {"code", "reason", "output_safe", "ended", "recovered"}
+"""Facts of the end that hold for every part of a run; the others count the whole of it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Stretch:
+    """From one time of a run to another.
+
+    Attributes:
+        from_s: First time, in s since the start of the run; None for its start.
+        to_s: Time to stop before; None for its end.
+    """
+
+    from_s: float | None = None
+    to_s: float | None = None
+
+    def samples(self, sample_rate_hz: float) -> tuple[int, int]:
+        """Return the index of the first sample at ``from_s`` or later, and of that at ``to_s``.
+
+        Raises:
+            DataError: A time is not a finite number.
+        """
+        start = 0 if self.from_s is None else _first_at_or_after(self.from_s, sample_rate_hz)
+        stop = LAST_SAMPLE if self.to_s is None else _first_at_or_after(self.to_s, sample_rate_hz)
+        return start, stop
+
+    def cut(self, recording: Recording) -> Recording:
+        """Return what a recording holds of it, with all events.
+
+        Segments are cut to what lies within. Counters of the whole run are left out; samples that
+        are missing are those between the first and the last that are there.
+
+        Raises:
+            DataError: The recording holds no sample of it.
+        """
+        rate_hz = recording.sample_rate_hz
+        start, stop = self.samples(rate_hz)
+        samples = recording.samples.part(start, stop)
+        index = samples.index
+        if index.size == 0:
+            whole = "its samples are elsewhere" if recording.samples.index.size else "it has none"
+            raise DataError(f"{recording.path}: holds no sample from {self}: {whole}")
+        ticks = recording.ticks
+        within = (ticks.first_sample >= start) & (ticks.first_sample < stop)
+        return replace(
+            recording,
+            samples=samples,
+            segments=tuple(_cut(recording.segments, int(index[0]), int(index[-1]) + 1)),
+            ticks=Ticks(**{each.name: getattr(ticks, each.name)[within] for each in fields(ticks)}),
+            starts=tuple(each for each in recording.starts if start <= each.sample < stop),
+            dropped=int(index[-1]) + 1 - int(index[0]) - index.size,
+            end={name: text for name, text in recording.end.items() if name in _OF_ANY_PART},
+        )
+
+    def __str__(self) -> str:
+        start = "its start" if self.from_s is None else f"{self.from_s:g} s"
+        return f"{start} to {'its end' if self.to_s is None else f'{self.to_s:g} s'}"
+
+
+def _cut(segments: tuple[Segment, ...], start: int, stop: int) -> Iterator[Segment]:
+    """Yield what lies within; a segment keeps its first sample, which its phase is counted from."""
+    for each in segments:
+        end = min(each.stop, stop)
+        steady_start = min(max(each.steady_start, start), end)
+        if start < each.stop and each.start < stop:
+            steady_stop = max(steady_start, min(each.steady_stop, end))
+            yield replace(each, stop=end, steady_start=steady_start, steady_stop=steady_stop)
+
+
+def _first_at_or_after(t_s: float, rate_hz: float) -> int:
+    """Return the index of the first sample at ``t_s`` or later, rounding errors forgiven."""
+    if not math.isfinite(t_s):
+        raise DataError(f"a time must be a finite number of seconds: {t_s!r}")
+    far = float(LAST_SAMPLE)
+    place = min(max(t_s * rate_hz, -far), far)  # beyond it there is no sample
+    return math.ceil(place - 1e-6)
