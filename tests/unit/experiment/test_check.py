@@ -380,7 +380,8 @@ class TestWatchdog:
     """Where the device's own watchdog would put the output."""
 
     @pytest.mark.parametrize(
-        ("command", "reason", "safe"), [(0.0, "", 0.0), (1.5, "", 1.5), (1.5, "holds a load", 0.0)]
+        ("command", "reason", "safe"),
+        [(0.0, "", 0.0), (1e-10, "", 0.0), (1.5, "", 1.5), (1.5, "holds a load", 0.0)],
     )
     def test_safe_value_or_a_reason(self, command: float, reason: str, safe: float) -> None:
         """It goes where the run itself would go, or somebody says why not."""
