@@ -380,7 +380,15 @@ class TestWatchdog:
     """Where the device's own watchdog would put the output."""
 
     @pytest.mark.parametrize(
-        ("command", "reason", "safe"), [(0.0, "", 0.0), (1.5, "", 1.5), (1.5, "holds a load", 0.0)]
+        ("command", "reason", "safe"),
+        [
+            (0.0, "", 0.0),
+            (1e-10, "", 0.0),
+            (1.5, "", 1.5),
+            (1.5, "holds a load", 0.0),
+            (7.0, "at the limit", 0.0),
+            (-7.0, "at the limit", 0.0),
+        ],
     )
     def test_safe_value_or_a_reason(self, command: float, reason: str, safe: float) -> None:
         """It goes where the run itself would go, or somebody says why not."""
@@ -441,6 +449,15 @@ def test_a_reference_that_begins_beside_the_rest_position_is_moved_not_hurried()
     assert "slew" not in str(problem)
     there = ("waveform.offset=24.5", "waveform.soft_start_s=0")
     assert check(loaded(DISPLACEMENT, *there, model=moved))
+
+
+def test_a_faster_change_further_on_is_what_is_told() -> None:
+    """Where to begin is no remedy then."""
+    moved = terfenol_rdpi().model_copy(update={"output_offset_um": 24.5})
+    holds = ", ".join(f"{{kind: hold, level: {um}, duration_s: 0.2}}" for um in (22.0, 18.0))
+    steps = f"waveform={{kind: sequence, unit: A, parts: [{holds}]}}"
+    (found,) = refusals(DISPLACEMENT, steps, "limits.slew_a_per_s=1000.0", model=moved)
+    assert found.startswith("x.yaml: limits.slew_a_per_s: the run must change no faster than")
 
 
 def learned(made: Checked, waveform: Segment) -> Correction:
