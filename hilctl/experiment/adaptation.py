@@ -7,6 +7,7 @@ import numpy as np
 
 from hilctl.base.arrays import F64
 from hilctl.base.errors import Problem
+from hilctl.base.segments import Segment
 from hilctl.experiment.feedback import LOOP_DELAY, delays
 from hilctl.experiment.file import Experiment
 from hilctl.experiment.load import LoadedExperiment
@@ -93,6 +94,27 @@ def adaptation_problems(loaded: LoadedExperiment, preview: int) -> list[Problem]
         Problem(loaded.document.where(tuple(key.split("."))), key, rule, value, hint)
         for key, rule, value, hint in found
     ]
+
+
+def adaptation_warnings(config: Experiment, segments: tuple[Segment, ...]) -> tuple[str, ...]:
+    """Return what keeps the adaptation of a run from doing what it may be there for.
+
+    Args:
+        config: The experiment.
+        segments: Those of its reference.
+    """
+    wanted = config.adaptation
+    if wanted is None:
+        return ()
+    if not adaptation_bounds(config).array.any():
+        return ("nothing is adapted: feedback has the offset, and a correction or bounds the rest",)
+    longest_s = max((each.period for each in segments), default=0.0) / config.sample_rate_hz
+    if longest_s <= wanted.time_constant_s:
+        return ()
+    periods = (
+        f"{wanted.time_constant_s:g} s is less than a period of the waveform, {longest_s:.3g} s"
+    )
+    return (f"adaptation.time_constant_s: {periods}: parameters will follow each of them",)
 
 
 def _shortest_s(loaded: LoadedExperiment, preview: int) -> float:

@@ -12,7 +12,12 @@ import numpy as np
 
 from hilctl.base.arrays import F64
 from hilctl.base.errors import ConfigError, DataError, InputError, ModelError, Problem
-from hilctl.experiment.adaptation import adaptation_problems, at_worst, worst_inputs
+from hilctl.experiment.adaptation import (
+    adaptation_problems,
+    adaptation_warnings,
+    at_worst,
+    worst_inputs,
+)
 from hilctl.experiment.condition import condition_problems, conditioning_of, measures_offset
 from hilctl.experiment.feedback import feedback_problems
 from hilctl.experiment.forecast import Forecast, forecast_of
@@ -113,7 +118,8 @@ def check(loaded: LoadedExperiment, folder: Path | None = None) -> Checked:
     problems = problems or _adapted_problems(loaded, reference, begun, conditioned)
     if problems:
         raise ConfigError(problems)
-    return Checked(loaded, reference, forecast, begun, findings.warnings)
+    warnings = findings.warnings + adaptation_warnings(config, reference.segments)
+    return Checked(loaded, reference, forecast, begun, warnings)
 
 
 def _adapted_problems(

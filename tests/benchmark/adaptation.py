@@ -2,9 +2,9 @@
 
 Run it with ``python tests/benchmark/adaptation.py``. On each physics of the simulated rig, with
 creep, a model is identified; the rig then goes through ten minutes of other runs, in a room 10 K
-warmer or colder, and every reference runs on it: as it is, with an integrator, with adaptation, and
-with both. Each is held against the same run on the fresh rig without any of them. Errors are those
-of the displacement itself: the sensor has its noise, but that is not judged.
+warmer or colder, and every reference runs on it: as it is, with an integrator, and with adaptation.
+Each is held against the same run on the fresh rig with neither. Errors are those of the
+displacement itself: the sensor has its noise, but that is not judged.
 """
 
 import argparse
@@ -46,7 +46,7 @@ OTHER_RUNS_S = 600.0
 SEGMENT_S = 5.0
 AMBIENT_K = (10.0, -10.0)
 ROOM_UM = 9.0  # left at both ends of the identified range, for what the actuator moves by
-RUN_S, JUDGED_S = 4.0, 1.0
+RUN_S, JUDGED_S = 3.0, 0.8
 GOAL = 1.5
 MOST_US_A_SAMPLE, MOST_US_A_TICK = 1.0, 10.0
 ADAPTATION = (
@@ -54,8 +54,7 @@ ADAPTATION = (
     f"noise_um: {NOISE_UM}}}"
 )
 INTEGRAL = "feedback={kind: integral, bandwidth_hz: 2.0, limit_um: 9.0}"
-BOTH = ADAPTATION.replace("offset_um: 9.0, ", "")
-WAYS = {"as it is": (), "integral": (INTEGRAL,), "adapted": (ADAPTATION,), "both": (INTEGRAL, BOTH)}
+WAYS = {"as it is": (), "integral": (INTEGRAL,), "adapted": (ADAPTATION,)}
 
 
 def options_of(physics: Physics, ambient_k: float) -> TerfenolOptions:
@@ -130,7 +129,7 @@ def waveforms(low_um: float, high_um: float) -> Iterator[tuple[str, str]]:
     """Give name and ``key=value`` text of each reference."""
     middle, half = 0.5 * (low_um + high_um), 0.5 * (high_um - low_um)
     common = f"unit: um, offset: {middle:.6g}, duration_s: {RUN_S}, soft_start_s: 0.3"
-    for part, hz in ((1.0, 10.0), (1.0, 100.0), (0.5, 50.0), (0.25, 50.0)):
+    for part, hz in ((1.0, 10.0), (0.5, 100.0), (0.25, 50.0)):
         sine = f"kind: sine, amplitude: {part * half:.6g}, frequency_hz: {hz}"
         yield f"sine {100 * part:.0f} %, {hz:g} Hz", f"waveform={{{sine}, {common}}}"
     parts = ", ".join(
@@ -150,7 +149,9 @@ def loaded_run(model: Path, *settings: str) -> LoadedExperiment:
     """Return the experiment of a run."""
     setting = f"compensator={{model: {model.resolve()}}}"
     limits = "limits={peak_current_a: 10.0, slew_a_per_s: 60000.0, stroke_um: [-120.0, 120.0]}"
-    return load_experiment(CAMPAIGN, [setting, limits, "condition={}", *settings])
+    return load_experiment(
+        CAMPAIGN, [setting, limits, "condition={cycles: 8, decay: 0.6}", *settings]
+    )
 
 
 def peak_um(loaded: LoadedExperiment, device: UsedRig) -> tuple[float, float]:
@@ -193,7 +194,7 @@ def show(physics: Physics, folder: Path) -> bool:
             ]
             best[way] = max(ratios)
             cells.append(" / ".join(f"{ratio:.2f}" for ratio in ratios))
-        good = min(best["integral"], best["adapted"], best["both"]) <= GOAL
+        good = min(best["integral"], best["adapted"]) <= GOAL
         met &= good
         print(f"{name:20} {100.0 * base_um / span_um:8.2f}"
               + "".join(f" {cell:>15}" for cell in cells)

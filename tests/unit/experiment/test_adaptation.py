@@ -84,6 +84,16 @@ def test_bounds_follow_from_what_else_acts(load):
     assert make_adaptation(both, np.ones(3), compensator) is None
 
 
+def test_what_adaptation_can_not_do_is_said(load):
+    """A time constant below a period; nothing that is left to adapt; else nothing."""
+    assert check(load("adaptation={noise_um: 0.03}")).warnings == ()
+    (text,) = check(load("adaptation={noise_um: 0.03, time_constant_s: 0.09}")).warnings
+    assert "0.09 s is less than a period of the waveform, 0.1 s" in text
+    nothing = "adaptation={noise_um: 0.03, gain: 0.0, weight: 0.0}"
+    (text,) = check(load(nothing, INTEGRAL)).warnings
+    assert text.startswith("nothing is adapted")
+
+
 def test_the_limits_hold_with_the_bounds_at_their_worst(load):
     """A run within them is refused where adaptation might leave them, and says so."""
     settings = ("limits.peak_current_a=2.0", "waveform.amplitude=10.0")
