@@ -34,7 +34,6 @@ PUBLISHED: Mapping[str, Choices] = {
     "preisach": {"lines": 16},
     "butterfly": {"plays": 16},
     "field": {"plays": 16},
-    "generalised_duhem": {"cells": 16},
 }
 """Defaults of a kind that are not those of all; sections 3.4.2 (PPI), 5.3 (RDPI), 6.4."""
 
@@ -92,7 +91,7 @@ class FitSettings(Strict):
     )
     across: int = _of(
         "generalised_duhem",
-        default=10,
+        default=16,
         ge=2,
         le=60,
         description="Cells of a table of slopes across its band.",

@@ -6,14 +6,17 @@ import pytest
 from hilctl.base.samples import Flag
 from hilctl.loop.limiter import CommandLimits
 from hilctl.models.files import load_model
+from hilctl.models.staged import StagedModel
 from tests.fakes import FakeClock
 from tests.unit.loop.test_loop import CONFIGS, RATE_HZ, Rig
 from tests.unit.models.test_base import MODELS as PLAYS
+from tests.unit.models.test_generalised_duhem import duhem_model
 from tests.unit.models.test_numeric_inverse import BOUC_WEN, DUHEM, KP, PREISACH
 
 COMPARED = {"preisach": PREISACH, "kp": KP, "bouc_wen": BOUC_WEN, "duhem": DUHEM}
 SHIPPED = {path.stem: load_model(path) for path in sorted(CONFIGS.glob("*.yaml"))}
-KINDS = PLAYS | COMPARED | SHIPPED
+TABLED = {"generalised_duhem": StagedModel.around(duhem_model())}
+KINDS = PLAYS | COMPARED | TABLED | SHIPPED
 WIDE = CommandLimits(low=-200.0, high=200.0, slew_per_s=2e5, safe=0.0, ramp_per_s=2e4)
 FREE = {"limits": WIDE, "stroke_um": (-1e4, 1e4)}
 

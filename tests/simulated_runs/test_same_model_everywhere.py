@@ -18,7 +18,7 @@ import scipy
 from hilctl.base.arrays import F64
 from hilctl.identify.catalogue import CATALOGUE, HISTORIES
 from hilctl.identify.data.cycles import average_cycle
-from hilctl.identify.data.records import SteadyLoop
+from hilctl.identify.data.records import History, SteadyLoop
 from hilctl.identify.fit_model import fit_model
 from hilctl.identify.settings import FitSettings
 from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
@@ -27,7 +27,7 @@ RATE_HZ = 50_000.0
 POINTS = 64
 TONES = [(a, f) for a in (3.0, 7.0) for f in (10.0, 100.0, 200.0)]
 FITS = {
-    **{kind: {"kind": kind} for kind in CATALOGUE if CATALOGUE[kind].data != HISTORIES},
+    **{kind: {"kind": kind} for kind in CATALOGUE if kind != "field"},
     "rdpi, exponential": {"kind": "rdpi", "weights": "exponential", "weight_by": "equal"},
     "rdpi, peak": {"kind": "rdpi", "offset": True, "peak_goal_percent": 4.0},
     "integrated, free": {"kind": "integrated", "weights": "free"},
@@ -59,6 +59,20 @@ def measured(amplitude_a: float, frequency_hz: float) -> SteadyLoop:
     return SteadyLoop(label, v, y, frequency_hz, RATE_HZ)
 
 
+def history() -> History:
+    """Return what the rig does with a random command from rest, small parts after large ones."""
+    rng = np.random.default_rng(4)
+    time = np.arange(round(0.5 * RATE_HZ)) / RATE_HZ
+    sines = [np.sin(2 * np.pi * f * time + rng.uniform(0, 6)) for f in rng.uniform(4.0, 200.0, 12)]
+    command = np.sum(sines, axis=0) * np.minimum(time / 0.02, 1.0)
+    command = np.ascontiguousarray(6.0 * command / np.abs(command).max())
+    displacement_um, current_a = np.empty_like(command), np.empty_like(command)
+    TerfenolActuator(TerfenolParameters(), RATE_HZ, seed=5).step(
+        command, displacement_um, current_a
+    )
+    return History("random", command, displacement_um, RATE_HZ)
+
+
 def kernels_in_use() -> list[str]:
     """Return the kernels that NumPy's and SciPy's OpenBLAS have taken, as they say themselves."""
     names = []
@@ -76,13 +90,13 @@ def kernels_in_use() -> list[str]:
 
 def fit_all() -> None:
     """Fit every kind and print all models: what the processes of this test do."""
-    loops = [measured(*tone) for tone in TONES]
-    models = {
-        name: fit_model(loops, FitSettings(**choices), lambda: 0.0).model.model_dump(
-            mode="json", exclude={"provenance"}
-        )
-        for name, choices in FITS.items()
-    }
+    loops, whole = [measured(*tone) for tone in TONES], [history()]
+    models = {}
+    for name, choices in FITS.items():
+        settings = FitSettings(**choices)
+        records = whole if CATALOGUE[settings.kind].data == HISTORIES else loops
+        model = fit_model(records, settings, lambda: 0.0).model
+        models[name] = model.model_dump(mode="json", exclude={"provenance"})
     print(json.dumps(models))
 
 

@@ -28,13 +28,15 @@ from hilctl.identify.job import OnProgress
 from hilctl.kernels.generalised_duhem import duhem_columns
 
 COARSE_WAY, FINE_WAY = 0.03, 0.02  # of the span: furthest way between two points of a path
-COARSE_ROWS, FINE_ROWS = 4000, 8000
+COARSE_ROWS, FINE_ROWS = 4000, 7000
 COARSE = (12, 8)  # cells of the first table
 TABLE_ALONE = 3  # first steps, with the stages as they are
-STEPS_COARSE, STEPS_FINE = 15, 12
-COARSE_GAIN, FINE_GAIN = 1e-2, 1e-4  # of the error's square in a step: less ends the search
-TRIALS = 6
-FIRST_DAMPING, LEAST_DAMPING = 1e-6, 1e-9
+STEPS_COARSE, STEPS_FINE = 18, 8
+COARSE_GAIN, FINE_GAIN = 3e-2, 3e-3  # of the error's square in a step: less ends the search
+SHORT_GAIN = 0.03  # of these, for a step that was not the first to be tried
+TRIALS = 7
+FIRST_DAMPING, LEAST_DAMPING = 1e-4, 1e-9
+REFUSED_DAMPING = 1e-5  # after a step that did not lessen the error, at least
 DIFFERENCE = 0.2  # of a stage's step, for its slope
 HELD = 1e-3  # weight of a stage's way from where it began, percent of the stroke for a step
 
@@ -107,7 +109,9 @@ class DuhemSearch:
         return paths
 
     def _lay(self, layout: Layout) -> None:
-        self._layout, self._prior = layout, prior(layout)
+        self._layout = layout
+        rows = prior(layout)
+        self._prior = rows.T @ rows
 
     def _rest_um(self, path: Path) -> float:
         """Return the displacement at no field, by the first point and the centre line."""
@@ -118,11 +122,12 @@ class DuhemSearch:
     def _descend(
         self, x: F64, logs: F64, most: int, enough: float, *, stages: bool = True
     ) -> tuple[F64, F64]:
-        """Take steps until there are ``most``, or one gains no more than ``enough``."""
+        """Take steps until there are ``most``, or a whole one gains no more than ``enough``."""
         errors, damping = self._errors(x, logs), FIRST_DAMPING
         cost = self._cost(x, logs, errors)
         for _ in range(most):
             normal, down = self._normal(x, logs, errors, stages=stages)
+            first = damping
             for _ in range(TRIALS):
                 step = _bounded_step(normal, down, damping, logs.size, x)
                 to_x, to_logs = self._stepped(x, logs, step)
@@ -130,13 +135,15 @@ class DuhemSearch:
                 to_cost = self._cost(to_x, to_logs, to_errors)
                 if to_cost < cost:
                     break
-                damping = 10.0 * damping
+                damping = max(10.0 * damping, REFUSED_DAMPING)
             else:
                 break
-            gained, damping = 1.0 - to_cost / cost, max(0.2 * damping, LEAST_DAMPING)
+            gained = 1.0 - to_cost / cost
             x, logs, errors, cost = to_x, to_logs, to_errors, to_cost
-            if gained <= enough:
+            # A short step, after others that did not do, says little of how much there is to gain.
+            if gained <= (enough if damping == first else SHORT_GAIN * enough):
                 break
+            damping = max(0.1 * damping, LEAST_DAMPING)
         return x, logs
 
     def _stepped(self, x: F64, logs: F64, step: F64) -> tuple[F64, F64]:
@@ -145,8 +152,8 @@ class DuhemSearch:
         return np.clip(stages, LOWEST, HIGHEST), np.clip(table, *self._log_range)
 
     def _cost(self, x: F64, logs: F64, errors: F64) -> float:
-        held = self._prior @ logs.ravel()
-        return float(errors @ errors + held @ held + HELD**2 * np.sum(((x - FIRST) / STEPS) ** 2))
+        held = logs.ravel() @ self._prior @ logs.ravel()
+        return float(errors @ errors + held + HELD**2 * np.sum(((x - FIRST) / STEPS) ** 2))
 
     def _normal(self, x: F64, logs: F64, errors: F64, *, stages: bool) -> tuple[F64, F64]:
         """Return the normal equations of a step, table first, and the way down."""
@@ -160,8 +167,8 @@ class DuhemSearch:
             change = self._errors(there, logs) - errors
             slopes[:, k] = change * (STEPS[stage] / (there[stage] - x[stage]))
         normal, down = slopes.T @ slopes, -(slopes.T @ errors)
-        normal[:size, :size] += self._prior.T @ self._prior
-        down[:size] -= self._prior.T @ (self._prior @ logs.ravel())
+        normal[:size, :size] += self._prior
+        down[:size] -= self._prior @ logs.ravel()
         if stages:
             normal[range(size, len(normal)), range(size, len(normal))] += HELD**2
             down[size:] -= HELD**2 * (x - FIRST) / STEPS

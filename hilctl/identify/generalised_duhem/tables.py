@@ -16,7 +16,8 @@ WIDER = 1.1  # band, of what the data take up
 BINS = 60
 FLATTEST = 0.02  # slope of the centre, of its mean
 TILT = 0.6  # a first guess: logarithm of the slope, from the centre to the edge of the band
-BENT, TILTED = 0.02, 0.002  # weights of second and first differences, percent of the stroke
+BENT, TILTED = 0.01, 0.001  # weights of second and first differences, percent of the stroke
+SHORTEST = 0.125  # of a cell: steps of a search
 STEEPEST = 5.0  # logarithm of the largest slope, of the mean
 
 
@@ -56,7 +57,11 @@ class Layout:
     def band(self, logs: F64, flux: F64) -> Band:
         """Return the operator of logarithms of slopes, float64[2, k, l], with a flux."""
         lines = np.array([self.centre, flux])
-        return band_of(np.exp(logs), lines, self.lowest_um, self.cell_um, self.half_width)
+        slopes, steps, lines, grid = band_of(
+            np.exp(logs), lines, self.lowest_um, self.cell_um, self.half_width
+        )
+        # A search needs no inverse, so that steps may be longer than those of a model.
+        return slopes, np.maximum(steps, SHORTEST * self.cell_um), lines, grid
 
     def first_logs(self) -> F64:
         """Return slopes that bring every loop towards the edges: float64[2, k, l]."""
