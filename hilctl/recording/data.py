@@ -14,6 +14,10 @@ HOLDS_FACT = "holds"
 """Fact of a run, by which later ones know its device: JSON list of what it holds while open."""
 
 
+HEAT_FACT = "coil_heat_a2"
+"""Fact of a run and of its end: heat of the coil then, the running mean square of its current."""
+
+
 @dataclass(frozen=True, slots=True)
 class Ticks:
     """Timing of every tick.

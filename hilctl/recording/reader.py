@@ -1,13 +1,17 @@
 """From an MCAP file to a recording in memory."""
 
 import logging
+import struct
 from array import array
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from mcap.exceptions import McapError
+from mcap.reader import make_reader
 from mcap.records import Attachment, McapRecord, Message, Metadata
+from mcap.stream_reader import StreamReader
 
 from hilctl.base.arrays import F64, I64, U32
 from hilctl.base.device import CommandUnit
@@ -83,6 +87,27 @@ def read_run_facts(path: Path) -> Mapping[str, str]:
     except OSError as error:
         raise DataError(f"{path}: can't be read: {error.strerror}") from None
     raise DataError(f"{path}: holds no run of hilctl")
+
+
+def read_end_facts(path: Path) -> Mapping[str, str]:
+    """Read what a recording says of its end, by its index; empty where it is cut short.
+
+    Raises:
+        DataError: The file can't be read.
+    """
+    try:
+        with path.open("rb") as stream:
+            summary = make_reader(stream).get_summary()
+            for place in summary.metadata_indexes if summary else ():
+                if place.name == "hilctl.end":
+                    stream.seek(place.offset)
+                    record = next(StreamReader(stream, skip_magic=True).records)
+                    return record.metadata if isinstance(record, Metadata) else {}
+    except OSError as error:
+        raise DataError(f"{path}: can't be read: {error.strerror}") from None
+    except (McapError, ValueError, StopIteration, struct.error):
+        pass  # whoever asks reads the whole of it then
+    return {}
 
 
 def _warn(recording: Recording, problem: str, *, live: bool) -> None:

@@ -15,7 +15,9 @@ from hilctl.base.events import Event
 from hilctl.base.samples import Batch, Head, Samples
 from hilctl.experiment.check import Checked
 from hilctl.experiment.correction import dump_correction
+from hilctl.experiment.heat import CoilHeat
 from hilctl.models.files import dump_model
+from hilctl.recording.data import HEAT_FACT
 from hilctl.recording.messages import RecordingLayout
 from hilctl.recording.writer import OutputFile, RecordingWriter, RunFacts
 from hilctl.run.kept_file import is_emptied, put_back
@@ -50,6 +52,8 @@ class Recorder:
         self._writer: RecordingWriter | None = None
         self._unix_ns = steady_unix_ns()
         self._tail = Tail(_SAMPLES_BEFORE)
+        config = checked.loaded.config
+        self._heat = CoilHeat(config.limits, config.sample_rate_hz, checked.heat_a2)
         self._run: RunFacts | None = None
         try:
             self._file = OutputFile(path, overwrite=overwrite)
@@ -95,6 +99,7 @@ class Recorder:
         # Before it is written: what a failing write loses is counted all the same.
         self._next_sample = int(batch.heads[-1, Head.FIRST_SAMPLE]) + batch.flags.shape[1]
         self._tail.add(batch)
+        self._heat.follow(batch.samples())
         if self._begun.samples == 0:
             # The file says itself what is missing before its first sample.
             batch.heads[0, Head.DROPPED_BEFORE] = batch.heads[0, Head.FIRST_SAMPLE]
@@ -164,7 +169,8 @@ class Recorder:
         last = max(0, ended_at - 1)
         event = Event(last, level, "run_ended", end["reason"], time_ns=now_ns)
         self._write(partial(self._begun.event, event))
-        self._write(partial(self._begun.finish, {**end, "ended": iso_time(now_ns)}, ended_at))
+        facts = {**end, "ended": iso_time(now_ns), HEAT_FACT: repr(self._heat.heat_a2)}
+        self._write(partial(self._begun.finish, facts, ended_at))
         if self.error:
             with suppress(OSError):  # the disk's refusal is known already
                 self._file.stream.close()
@@ -203,12 +209,15 @@ class Recorder:
         loaded = self._checked.loaded
         config, info = loaded.config, loaded.device.info
         model_yaml = dump_model(loaded.model) if loaded.model else ""
+        correction_yaml = dump_correction(loaded.correction) if loaded.correction else ""
+        started = iso_time(start_unix_ns)
+        facts = run_facts(self._checked, started, model_yaml, correction_yaml)
         return RunFacts(
-            facts={**run_facts(self._checked, iso_time(start_unix_ns), model_yaml), **set_up},
+            facts={**facts, **set_up},
             segments=tuple(each.shifted(waveform_at) for each in self._checked.reference.segments),
             experiment_yaml=loaded.yaml_text,
             model_yaml=model_yaml,
-            correction_yaml=dump_correction(loaded.correction) if loaded.correction else "",
+            correction_yaml=correction_yaml,
             layout=RecordingLayout(
                 sample_rate_hz=config.sample_rate_hz,
                 command_unit=info.command_unit,

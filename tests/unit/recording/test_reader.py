@@ -14,7 +14,7 @@ from hypothesis.strategies import floats
 from hilctl.base.errors import DataError
 from hilctl.base.events import Event
 from hilctl.base.samples import COLUMNS, Head
-from hilctl.recording.reader import read
+from hilctl.recording.reader import read, read_end_facts
 
 
 def same_samples(found, expected):
@@ -120,3 +120,16 @@ def test_other_files_are_refused(tmp_path, content):
         read(path)
     with pytest.raises(DataError, match="no such file"):
         read(tmp_path / "y.mcap")
+
+
+def test_the_end_is_read_by_the_index(recorded, tmp_path):
+    """And is not there in a file that was cut short, nor in one of anything else."""
+    path, _ = recorded
+    assert read_end_facts(path) == read(path).end
+    content = path.read_bytes()
+    path.write_bytes(content[: len(content) // 2])
+    assert read_end_facts(path) == {}
+    path.write_text("no recording")
+    assert read_end_facts(path) == {}
+    with pytest.raises(DataError, match="can't be read"):
+        read_end_facts(tmp_path / "absent.mcap")
