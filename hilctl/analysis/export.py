@@ -148,7 +148,12 @@ def _write_mat(stream: BinaryIO, table: Columns, facts: Facts) -> None:
     savemat(target, {**table, **facts}, oned_as="column")
 
 
-def _write_parquet(stream: BinaryIO, table: Columns, facts: Facts) -> None:
+def write_parquet(stream: BinaryIO, table: Mapping[str, Any], facts: Facts) -> None:
+    """Write columns, arrays or lists, as Parquet, with facts beside them.
+
+    Raises:
+        InputError: pyarrow is missing.
+    """
     try:
         import pyarrow as pa
         from pyarrow import parquet
@@ -164,6 +169,6 @@ def _write_parquet(stream: BinaryIO, table: Columns, facts: Facts) -> None:
 _FORMATS: dict[str, Write] = {
     ".csv": _write_csv,
     ".npz": _write_npz,
-    ".parquet": _write_parquet,
+    ".parquet": write_parquet,
     ".mat": _write_mat,
 }
