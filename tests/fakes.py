@@ -239,6 +239,7 @@ class RigInterlocks:
     unit: str = "A"
     safe: float = 0.0
     frozen_travel: float = math.inf
+    heat_a2: float = 0.0
     frozen_s: float | None = None
     frozen_um: float | None = None
     measured_deviation_a: float | None = None

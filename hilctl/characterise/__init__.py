@@ -8,7 +8,6 @@ response.py    pure: small-signal response; gain, delay, lag and resonance that 
 loops.py       pure: loops, reversal curves, what repeats, and how far amplitudes may grow
 gaps.py        what a run has skipped, filled in
 problem.py     what ends a campaign, each with what to do about it
-heat.py        the coil's heat from run to run, and how long to wait for it
 modelling.py   the model, and how far it is from a reference that it has not seen
 settings.py    what a step sets over the experiment file
 results.py     all that was found, and the verdict

@@ -13,9 +13,9 @@ from functools import cached_property
 from pathlib import Path
 from typing import TypeAlias
 
+from hilctl.base.arrays import F64
 from hilctl.base.errors import DataError, InputError, RunError
 from hilctl.base.files import check_writable, write_text
-from hilctl.characterise.heat import CampaignHeat
 from hilctl.characterise.limits import CampaignLimits, limits_of
 from hilctl.characterise.modelling import identified, judged
 from hilctl.characterise.problem import RigProblemError
@@ -23,17 +23,15 @@ from hilctl.characterise.results import Characterisation, Measured, StepRow
 from hilctl.characterise.settings import unit_of, waveform_setting, without_reference
 from hilctl.characterise.steps import STEPS, CampaignStep
 from hilctl.characterise.waveforms import Keys, at_rest, within
+from hilctl.experiment.heat import CoolingCoil, RunHeat
+from hilctl.experiment.history import heat_before
 from hilctl.experiment.load import load_experiment
 from hilctl.models.files import dump_model
 from hilctl.recording.data import Recording
 from hilctl.recording.reader import read
-from hilctl.run.metadata import experiment_sha256
-from hilctl.run.result import Progress, RunResult
-from hilctl.run.start import checked_experiment, start_run
-from hilctl.run.unpaced import run_unpaced
-
-OnPart: TypeAlias = Callable[[float], None]
-"""Called with how much of a run is done, from 0 to 1."""
+from hilctl.run.result import RunResult
+from hilctl.run.start import checked_experiment
+from hilctl.run.step import OnPart, RunKey, StepStoppedError, paced, unpaced
 
 StepRunner: TypeAlias = Callable[[Path, Sequence[str], Path, OnPart], RunResult]
 """Runs an experiment file with settings into a recording, over one that stands there."""
@@ -41,33 +39,6 @@ StepRunner: TypeAlias = Callable[[Path, Sequence[str], Path, OnPart], RunResult]
 _BYTES_A_SAMPLE = 45.0
 _SPARE = 1.2
 _NAME_LENGTH = 80
-
-
-def paced(path: Path, settings: Sequence[str], output: Path, on_part: OnPart) -> RunResult:
-    """Run as ``hilctl run`` does."""
-
-    def show(progress: Progress) -> None:
-        on_part(progress.samples / max(progress.total, 1))
-
-    return start_run(path, settings, output, overwrite=True, on_progress=show)
-
-
-def unpaced(path: Path, settings: Sequence[str], output: Path, on_part: OnPart) -> RunResult:
-    """Run a simulated device as fast as it goes."""
-    del on_part
-    return run_unpaced(checked_experiment(path, settings), output, overwrite=True)
-
-
-class StoppedCampaignError(RunError):
-    """Somebody stopped a step; the steps before it stand.
-
-    Attributes:
-        signal: Number of the signal.
-    """
-
-    def __init__(self, text: str, number: int) -> None:
-        super().__init__(text)
-        self.signal = number
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,7 +127,7 @@ class Campaign:
             )
         # What does not depend on the waveform is refused here, before anything moves.
         checked_experiment(experiment, [*self._settings, waveform_setting(at_rest(self.limits))])
-        self._heat = CampaignHeat(self._loaded.config, 0.0)
+        self._coil = CoolingCoil(self._loaded.config, 0.0, 0.0)
         self._measured = Measured()
         self._rows: list[StepRow] = []
         self._recordings: dict[str, Path] = {}
@@ -164,17 +135,17 @@ class Campaign:
     @cached_property
     def plan(self) -> CampaignPlan:
         """What there is to do, at full amplitude."""
-        heat, now_s, pauses_s = CampaignHeat(self._loaded.config, 0.0), 0.0, 0.0
+        coil, now_s, pauses_s = CoolingCoil(self._loaded.config, 0.0, 0.0), 0.0, 0.0
         rows = []
         for step in STEPS:
             keys = step.waveform(self.limits, Measured())
             if keys is None:
                 continue
             _, command = within(self.limits, keys)
-            pause_s = heat.pause_s(command, now_s)
-            seconds = command.size / self.limits.sample_rate_hz
+            heat = self._heat(command)
+            pause_s, seconds = coil.pause_s(heat, now_s), heat.seconds
             now_s += pause_s + seconds
-            heat.run(command, now_s)
+            coil.ran(heat, now_s)
             pauses_s += pause_s
             megabytes = command.size * _BYTES_A_SAMPLE / 1e6
             rows.append(StepRow(step.name, step.purpose, seconds, megabytes))
@@ -182,6 +153,9 @@ class Campaign:
         return CampaignPlan(
             self.limits, tuple(rows), pauses_s, shutil.disk_usage(around).free / 1e6
         )
+
+    def _heat(self, command: F64) -> RunHeat:
+        return RunHeat().then(command, self._loaded.config.limits, self.limits.sample_rate_hz)
 
     def discard(self) -> None:
         """Remove the recordings of steps that stand in the folder, so that all begins anew."""
@@ -197,7 +171,7 @@ class Campaign:
 
         Raises:
             InputError: A file can't be written, or there is no room; nothing has moved.
-            StoppedCampaignError: Somebody stopped a step.
+            StepStoppedError: Somebody stopped a step.
             RunError: A step ended by a fault that no measurement explains.
         """
         check_writable(output, overwrite=overwrite)
@@ -240,13 +214,13 @@ class Campaign:
         path = self._path(number, step)
         settings = self._step_settings(number, step, keys)
         recording = self._kept(path, settings)
-        kept = recording is not None
+        kept, heat = recording is not None, self._heat(command)
         if recording is None:
-            self._cool(step, self._heat.pause_s(command, self._host.now_s()))
+            self._cool(step, self._pause_s(heat))
             recording = self._recorded(number, step, settings, path)
         now_s = self._host.now_s()
         # One that was kept has cooled the coil since.
-        self._heat.run(command, min(path.stat().st_mtime, now_s) if kept else now_s)
+        self._coil.ran(heat, min(path.stat().st_mtime, now_s) if kept else now_s)
         self._recordings[step.name] = path
         seconds = command.size / self.limits.sample_rate_hz
         row = StepRow(
@@ -271,7 +245,7 @@ class Campaign:
                 raise
             raise RunError(f"{step.name} is refused: {error}") from None
         if result.stop_signal:
-            raise StoppedCampaignError(f"{step.name}: {result.reason}", result.stop_signal)
+            raise StepStoppedError(f"{step.name}: {result.reason}", result.stop_signal)
         if result.code != "completed":
             raise _fault(step, result, read(path))
         return read(path)
@@ -284,9 +258,16 @@ class Campaign:
             recording = read(path)
         except DataError:  # cut short before its first sample: the step is run again
             return None
-        wanted = experiment_sha256(load_experiment(self._experiment, settings))
-        same = recording.run.get("experiment_sha256") == wanted
+        key = RunKey.of(load_experiment(self._experiment, settings))
+        same = RunKey.of_facts(recording.run) == key
         return recording if same and recording.end.get("code") == "completed" else None
+
+    def _pause_s(self, heat: RunHeat) -> float:
+        """Return how long the coil must cool, by the steps here and by the device's last run."""
+        now_s = self._host.now_s()
+        last_a2 = heat_before(self._loaded, self._folder, now_s)
+        last = CoolingCoil(self._loaded.config, last_a2, now_s)
+        return max(coil.pause_s(heat, now_s) for coil in (self._coil, last))
 
     def _cool(self, step: CampaignStep, pause_s: float) -> None:
         """Let the coil cool; a run that need not keep real time is one of a rig without a coil."""

@@ -13,6 +13,7 @@ recordings.py  judge, replay, export and recover them, identify models;
                identify_view.py and report_view.py
 comparing.py   models against one another; compare_view.py
 learning.py    corrections from run to run
+campaigning.py  many runs of one experiment; campaign_view.py
 characterising.py  a model of a wired actuator; characterise_view.py
 machine.py     this computer and its devices; machine_view.py and probe_view.py
 console.py     the console that tables go to, and what replay prints; progress.py  a progress bar

@@ -72,19 +72,20 @@ def characterise(
 def _host(
     on_progress: "Callable[[float, str], None]", *, fast: bool, quiet: bool
 ) -> "CampaignHost":
-    from hilctl.characterise.session import CampaignHost, paced, unpaced
+    from hilctl.characterise.session import CampaignHost
     from hilctl.cli.characterise_view import print_step
+    from hilctl.run.step import paced, unpaced
 
     host = CampaignHost(run=unpaced if fast else paced, on_progress=on_progress)
     return host if quiet else replace(host, on_step=print_step)
 
 
 def _characterised(campaign: "Campaign", output: Path, *, overwrite: bool) -> "Characterisation":
-    from hilctl.characterise.session import StoppedCampaignError
+    from hilctl.run.step import StepStoppedError
 
     try:
         return campaign.characterise(output, overwrite=overwrite)
-    except (StoppedCampaignError, KeyboardInterrupt) as error:
+    except (StepStoppedError, KeyboardInterrupt) as error:
         number = getattr(error, "signal", signal.SIGINT)
         print(f"hilctl: stopped: {error or 'Ctrl-C'}; {_GOES_ON}", file=sys.stderr)
         raise typer.Exit(128 + number) from None

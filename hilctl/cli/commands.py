@@ -88,6 +88,14 @@ COMMANDS: dict[str, CommandEntry] = {
         "hilctl.cli.characterising:characterise",
         "Find a model of a wired actuator: measure within its limits, identify, judge.",
     ),
+    "campaign": CommandEntry(
+        "hilctl.cli.campaigning:campaign",
+        "Run an experiment again and again with other values of its keys; goes on where it was.",
+    ),
+    "sweep": CommandEntry(
+        "hilctl.cli.campaigning:sweep",
+        "Run an experiment with several values of one or more of its keys: a campaign in one line.",
+    ),
     "learn": CommandEntry(
         "hilctl.cli.learning:learn",
         "Learn a correction for a reference that repeats: run, correct, and run again.",

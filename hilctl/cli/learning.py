@@ -35,7 +35,8 @@ def learn(
 ) -> None:
     """Learn a correction for a reference that repeats: run, correct, and run again."""
     from hilctl.experiment.correction import write_correction
-    from hilctl.learning.session import Session, paced, unpaced
+    from hilctl.learning.session import Session
+    from hilctl.run.step import paced, unpaced
 
     check_writable(output, overwrite=overwrite)
     chosen = folder or output.with_name(f"{output.stem}-runs")

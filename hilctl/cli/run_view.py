@@ -157,7 +157,9 @@ def print_forecast(checked: Checked) -> None:
     if note := checked.loaded.device.info.safe_note:
         rows["safe value"] = note
     if forecast.heating_rms_a is not None:
-        rows["heating"] = f"{forecast.heating_rms_a:.4g} A rms (limit {limits.rms_current_a:g})"
+        begins = f"begins at {forecast.begins_rms_a or 0.0:.3g} A rms"
+        most = f"{forecast.heating_rms_a:.4g} A rms (limit {limits.rms_current_a:g})"
+        rows["heating"] = f"{most}, {begins}"
     for name, text in rows.items():
         table.add_row(name, text)
     terminal = console()

@@ -5,6 +5,7 @@ labels.py         what a lab finds a run by
 load.py           from a file to the experiment with all that it refers to
 correction.py     what learning has added to the compensator's input
 initial_state.py  what the run before left in the actuator
+heat.py           the coil's heat, from run to run; history.py  what the last run left
 check.py          the whole run worked out beforehand, held against device, model and limits
 model_range.py    whether the reference stays within what the model was identified on
 forecast.py       what a run will do; tuned.py  what it would with another gain and offset

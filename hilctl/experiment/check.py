@@ -5,6 +5,7 @@ by the same compensator that will run, and held against the limits.
 """
 
 import math
+import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -21,7 +22,8 @@ from hilctl.experiment.adaptation import (
 from hilctl.experiment.condition import condition_problems, conditioning_of, measures_offset
 from hilctl.experiment.feedback import feedback_problems
 from hilctl.experiment.forecast import Forecast, forecast_of
-from hilctl.experiment.history import left_by_last_run
+from hilctl.experiment.heat import CoolingCoil
+from hilctl.experiment.history import heat_before, left_by_last_run
 from hilctl.experiment.initial_state import (
     Begun,
     InitialState,
@@ -50,6 +52,7 @@ class Checked:
         forecast: What it will do.
         begun: What the compensator is given, and what it begins with.
         warnings: What keeps it from doing as well as its model promises.
+        heat_a2: Heat of the coil before it, the running mean square of its current in A^2.
     """
 
     loaded: LoadedExperiment
@@ -57,6 +60,7 @@ class Checked:
     forecast: Forecast
     begun: Begun
     warnings: tuple[str, ...] = ()
+    heat_a2: float = 0.0
 
     @property
     def state_size(self) -> int:
@@ -76,13 +80,20 @@ class Checked:
         return conditioning_of(self.loaded, self.begun.stands_um)
 
 
-def check(loaded: LoadedExperiment, folder: Path | None = None) -> Checked:
+def check(
+    loaded: LoadedExperiment,
+    folder: Path | None = None,
+    heat_a2: float = 0.0,
+    now_s: float | None = None,
+) -> Checked:
     """Work out the whole run and hold it against device, model and limits.
 
     Args:
         loaded: The experiment.
         folder: Folder that the run is written to, where that is not ``recording.folder``: the last
             run of its device may have been, too.
+        heat_a2: Heat that its coil has at least, in A^2, whatever the last run of it says.
+        now_s: Unix time in s at which the run starts; the present where None.
 
     Raises:
         ConfigError: The run must not start; all reasons are listed, each saying by how much.
@@ -110,7 +121,9 @@ def check(loaded: LoadedExperiment, folder: Path | None = None) -> Checked:
             begun = replace(begun, stands_um=None)
         problems += feedback_problems(loaded, begun.preview)
         problems += adaptation_problems(loaded, begun.preview)
-        forecast = forecast_of(loaded, reference, begun, conditioned)
+        now_s = time.time() if now_s is None else now_s
+        heat_a2 = max(heat_a2, heat_before(loaded, folder, now_s))
+        forecast = forecast_of(loaded, reference, begun, conditioned, heat_a2)
     except ModelError as error:
         problems.append(_problem(loaded, "compensator.model", str(error)))
         raise ConfigError(problems) from None
@@ -119,7 +132,7 @@ def check(loaded: LoadedExperiment, folder: Path | None = None) -> Checked:
     if problems:
         raise ConfigError(problems)
     warnings = findings.warnings + adaptation_warnings(config, reference.segments)
-    return Checked(loaded, reference, forecast, begun, warnings)
+    return Checked(loaded, reference, forecast, begun, warnings, heat_a2)
 
 
 def _adapted_problems(
@@ -342,4 +355,8 @@ def _budget_problems(loaded: LoadedExperiment, forecast: Forecast) -> list[Probl
     excess = f"{highest_a - rms_a:.3g} A too much"
     by = "condition" if used_s < forecast.before_s else "waveform"
     hint = f"{excess}, and {when}: lower the {by}'s amplitude, or shorten the run"
+    begins_a = forecast.begins_rms_a or 0.0
+    pause_s = CoolingCoil(loaded.config, begins_a**2, 0.0).pause_s(forecast.heat, 0.0)
+    if pause_s > 0.0 and forecast.heat.hottest_a2 > loaded.config.safe.value**2:
+        hint = f"it begins at {begins_a:.3g} A rms, left by the last run: wait {pause_s:.0f} s"
     return [_problem(loaded, key, rule, f"{highest_a:.4g} A", hint)]

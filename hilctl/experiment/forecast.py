@@ -8,11 +8,10 @@ import numpy as np
 
 from hilctl.base.arrays import F64
 from hilctl.experiment.file import Experiment
+from hilctl.experiment.heat import CoilHeat, RunHeat
 from hilctl.experiment.initial_state import Begun
 from hilctl.experiment.load import LoadedExperiment
-from hilctl.kernels.interlock import heat_block
 from hilctl.loop.compensator import Compensator
-from hilctl.loop.interlocks import warming
 from hilctl.waveforms.build import Reference
 
 _CHUNK = 1_000_000
@@ -35,6 +34,9 @@ class Forecast:
         command_min: Lowest command.
         command_max: Highest command.
         slew_per_s: Fastest change of the command.
+        heat: What it does to the heat of the coil, whatever that is before.
+        begins_rms_a: Running rms of the coil current that it begins with, by what the last run of
+            the device left; None where there is no budget.
         heating_rms_a: Highest running rms of the coil current, as the thermal budget has it; None
             where there is no budget.
         budget_used_s: Time after which the thermal budget is overdrawn; None where it is kept.
@@ -53,6 +55,8 @@ class Forecast:
     command_min: float
     command_max: float
     slew_per_s: float
+    heat: RunHeat
+    begins_rms_a: float | None
     heating_rms_a: float | None
     budget_used_s: float | None
     recording_mb: float
@@ -61,7 +65,9 @@ class Forecast:
 
     def to_mapping(self) -> dict[str, Any]:
         """Return the fields as plain values."""
-        return asdict(self)
+        mapping = asdict(self)
+        del mapping["heat"]  # a part of a campaign's sums, of no meaning by itself
+        return mapping
 
 
 def forecast_of(
@@ -69,6 +75,7 @@ def forecast_of(
     reference: Reference,
     begun: Begun,
     conditioned: F64,
+    heat_a2: float = 0.0,
 ) -> Forecast:
     """Run the compensator on its input, and note what comes of it.
 
@@ -77,6 +84,7 @@ def forecast_of(
         reference: Every sample of its waveform.
         begun: The compensator's input, and its memory at the start.
         conditioned: float64[m], commands that come before the waveform's.
+        heat_a2: Running mean square of the coil current before all of them, in A^2.
 
     Raises:
         ModelError: The model has no inverse.
@@ -86,9 +94,13 @@ def forecast_of(
     if begun.state is not None:
         compensator.restore(begun.state)
     input_um = begun.input_um
-    figures = CommandFigures(config, config.safe.value, config.safe.value**2)
+    heat_a2 = max(heat_a2, config.safe.value**2)
+    limits, rate_hz = config.limits, config.sample_rate_hz
+    figures = CommandFigures(config, config.safe.value, heat_a2)
+    heat = RunHeat()
     if conditioned.size:
         figures.add(conditioned)
+        heat = heat.then(conditioned, limits, rate_hz)
     values = reference.values
     wanted = np.empty(min(_CHUNK, input_um.size))
     for start in range(0, input_um.size, _CHUNK):
@@ -96,6 +108,7 @@ def forecast_of(
         out = wanted[: part.size]
         compensator.process(part, out)
         figures.add(out)
+        heat = heat.then(out, limits, rate_hz)
     byte_count = _BYTES_A_SAMPLE + (0.0 if input_um is reference.values else _BYTES_OF_INPUT)
     return Forecast(
         samples=values.size,
@@ -108,6 +121,8 @@ def forecast_of(
         command_min=figures.low,
         command_max=figures.high,
         slew_per_s=figures.slew_per_s,
+        heat=heat,
+        begins_rms_a=None if figures.heat.rms_a is None else math.sqrt(heat_a2),
         heating_rms_a=figures.heat.rms_a,
         budget_used_s=figures.heat.used_s,
         recording_mb=(values.size + conditioned.size) * byte_count / 1e6,
@@ -135,7 +150,7 @@ class CommandFigures:
         self.last = last
         self.low = math.inf if last is None else last
         self.high = -math.inf if last is None else last
-        self.heat = CoilHeat(config, heat_a2)
+        self.heat = CoilHeat(config.limits, config.sample_rate_hz, heat_a2)
         self._rate_hz = config.sample_rate_hz
         self._step = 0.0
 
@@ -154,63 +169,3 @@ class CommandFigures:
     def slew_per_s(self) -> float:
         """Fastest change."""
         return self._step * self._rate_hz
-
-
-class CoilHeat:
-    """Follows the thermal budget of the coil through the commands of a run.
-
-    Args:
-        config: The experiment.
-        heat_a2: Running mean square of the current before them, in A^2.
-
-    Attributes:
-        highest_a2: Highest running mean square so far, in A^2.
-        used_s: Time of the commands after which the budget is overdrawn; None where it is kept.
-    """
-
-    def __init__(self, config: Experiment, heat_a2: float) -> None:
-        limits = config.limits
-        self._rate_hz = config.sample_rate_hz
-        self._budget_a2 = (limits.rms_current_a or math.inf) ** 2
-        self._tau_s = limits.thermal_time_constant_s
-        self._heat = self.highest_a2 = heat_a2
-        self._samples = 0
-        self.used_s: float | None = None
-
-    def add(self, command: F64) -> None:
-        """Go on with the next commands: float64[n], in A."""
-        if self._tau_s is None:
-            return
-        heat = np.empty(command.size)
-        self._heat = heat_block(command, warming(self._tau_s, self._rate_hz), self._heat, heat)
-        over = np.flatnonzero(heat > self._budget_a2)
-        if self.used_s is None and over.size:
-            self.used_s = (self._samples + int(over[0])) / self._rate_hz
-        self.highest_a2 = max(self.highest_a2, float(heat.max()))
-        self._samples += command.size
-
-    def repeat(self, cycle: F64, times: int) -> None:
-        """Go on with a cycle (float64[n], in A) again and again."""
-        if self._tau_s is None or times < 1:
-            return
-        before = self._heat
-        self.add(cycle)
-        # A cycle maps the heat before it to kept * heat + a constant: the rest is a geometric row.
-        kept = math.exp(-cycle.size / (self._tau_s * self._rate_hz))
-        final = before + (self._heat - before) / (1.0 - kept)
-        self._heat = final + (before - final) * kept ** (times - 1)
-        self._samples += (times - 2) * cycle.size
-        self.add(
-            cycle
-        )  # from cycle to cycle it rises or falls: the highest is in the first or last
-
-    def expect(self, heat_a2: float) -> None:
-        """Take a heat that was not worked out command by command for what is to come."""
-        self.highest_a2 = max(self.highest_a2, heat_a2)
-        if self.used_s is None and heat_a2 > self._budget_a2:
-            self.used_s = self._samples / self._rate_hz
-
-    @property
-    def rms_a(self) -> float | None:
-        """Highest running rms of the current so far, in A; None without a thermal budget."""
-        return None if self._tau_s is None else math.sqrt(self.highest_a2)

@@ -60,7 +60,7 @@ def bounded_and_free(
         inside = basis.T @ table
         table -= basis @ inside
     # Not SciPy's: that hands out the zeros below the triangle too, a row for each sample.
-    triangle: F64 = np.linalg.qr(table, mode="r")
+    triangle: F64 = np.asarray(np.linalg.qr(table, mode="r"))
     extra, _ = nnls(triangle[:, :size], triangle[:, size])
     if not others:
         return least + extra, np.zeros(0)

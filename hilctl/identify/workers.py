@@ -23,6 +23,16 @@ class Map(Protocol):
         ...
 
 
+class Stream(Protocol):
+    """Runs a function on each task and yields the results in the tasks' order, as they come."""
+
+    def __call__(
+        self, function: Callable[[Task], Result], tasks: Sequence[Task], /
+    ) -> Iterator[Result]:
+        """Yield ``function(task) for task in tasks``; the first error is raised."""
+        ...
+
+
 def one_by_one(function: Callable[[Task], Result], tasks: Sequence[Task], /) -> list[Result]:
     """Run tasks one after the other."""
     return [function(task) for task in tasks]
@@ -30,7 +40,21 @@ def one_by_one(function: Callable[[Task], Result], tasks: Sequence[Task], /) -> 
 
 @contextmanager
 def workers(scheduler: str = "none") -> Iterator[Map]:
-    """Give a :class:`Map`; results do not depend on which.
+    """Give a :class:`Map`; see :func:`streams`."""
+    if scheduler == "none":
+        yield one_by_one
+        return
+    with streams(scheduler) as stream:
+
+        def run(function: Callable[[Any], Any], tasks: Sequence[Any], /) -> list[Any]:
+            return list(stream(function, tasks))
+
+        yield run
+
+
+@contextmanager
+def streams(scheduler: str = "none") -> Iterator[Stream]:
+    """Give a :class:`Stream`; results do not depend on which.
 
     Args:
         scheduler: ``none`` for one after the other, ``threads`` or ``processes`` on this machine,
@@ -41,14 +65,10 @@ def workers(scheduler: str = "none") -> Iterator[Map]:
         InputError: The scheduler is unknown, can't be reached, or Dask is not installed.
     """
     if scheduler == "none":
-        yield one_by_one
+        yield map
     elif scheduler in SCHEDULERS:
         with _local(scheduler) as executor:
-
-            def run(function: Callable[[Any], Any], tasks: Sequence[Any], /) -> list[Any]:
-                return list(executor.map(function, tasks))
-
-            yield run
+            yield executor.map
     elif "://" in scheduler:
         with _dask(scheduler) as distributed:
             yield distributed
@@ -65,7 +85,7 @@ def _local(scheduler: str) -> Executor:
 
 
 @contextmanager
-def _dask(address: str) -> Iterator[Map]:
+def _dask(address: str) -> Iterator[Stream]:
     try:
         from distributed import Client
     except ImportError:
@@ -78,7 +98,7 @@ def _dask(address: str) -> Iterator[Map]:
         raise InputError(f"no Dask scheduler answers at {address}: {error}") from None
     with client:
 
-        def run(function: Callable[[Any], Any], tasks: Sequence[Any], /) -> list[Any]:
-            return list(client.gather(client.map(function, list(tasks), pure=False)))
+        def run(function: Callable[[Any], Any], tasks: Sequence[Any], /) -> Iterator[Any]:
+            return (each.result() for each in client.map(function, list(tasks), pure=False))
 
         yield run

@@ -25,35 +25,17 @@ from hilctl.learning.results import Learned, Row, row_of
 from hilctl.learning.update import learn, refused
 from hilctl.recording.reader import read
 from hilctl.run.result import RunResult
-from hilctl.run.start import checked_experiment, start_run
-from hilctl.run.unpaced import run_unpaced
+from hilctl.run.start import checked_experiment
+from hilctl.run.step import StepStoppedError, paced
 
 Runner: TypeAlias = Callable[[Path, Sequence[str], Path], RunResult]
 """Runs an experiment file with settings into a recording."""
-
-
-def paced(path: Path, settings: Sequence[str], output: Path) -> RunResult:
-    """Run as ``hilctl run`` does."""
-    return start_run(path, settings, output, overwrite=True, on_progress=lambda progress: None)
-
-
-def unpaced(path: Path, settings: Sequence[str], output: Path) -> RunResult:
-    """Run a simulated device as fast as it goes."""
-    return run_unpaced(checked_experiment(path, settings), output, overwrite=True)
 
 
 def correction_setting(file: Path) -> str:
     """Return the ``key=value`` text that has an experiment use a correction, whatever its name."""
     # Quoted: "lab #3" would end at the space, and "a: b" be a mapping.
     return f"compensator.correction={json.dumps(str(file.resolve()), ensure_ascii=False)}"
-
-
-class _StoppedError(Exception):
-    """Somebody stopped a run; what has been learned before stands."""
-
-    def __init__(self, text: str, number: int) -> None:
-        super().__init__(text)
-        self.signal = number
 
 
 class Session:
@@ -99,10 +81,11 @@ class Session:
         try:
             reason = self._runs_until_done(cycles, on_rows)
             check = self._check()
-        except (_StoppedError, KeyboardInterrupt, HilctlError) as error:
+        except (KeyboardInterrupt, HilctlError) as error:
             if not self._rows:
                 raise
-            fault = isinstance(error, HilctlError)
+            stopped = isinstance(error, StepStoppedError | KeyboardInterrupt)
+            fault = not stopped
             stop_signal = 0 if fault else getattr(error, "signal", signal.SIGINT)
             reason = "; ".join(filter(None, (reason, str(error) or "stopped by Ctrl-C")))
         if self._refusals:
@@ -144,7 +127,7 @@ class Session:
         settings += self._other_noise(number)
         result = self._run(self._experiment, settings, self._folder / f"{name}.mcap")
         if result.stop_signal and self._rows:
-            raise _StoppedError(f"run {number}: {result.reason}", result.stop_signal)
+            raise StepStoppedError(f"run {number}: {result.reason}", result.stop_signal)
         if result.code != "completed":
             raise RunError(f"run {number}: {result.reason}")
         return result.path

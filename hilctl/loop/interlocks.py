@@ -69,8 +69,8 @@ class InterlockSettings(Strict):
 
     rms_current_a: Annotated[_Positive | None, Needs("A", "thermal_time_constant_s")] = Field(
         default=None,
-        description="largest running rms of the coil current, commanded or measured, A; every run"
-        " starts with the coil at the heat of the safe value, or of the output that it finds",
+        description="largest running rms of the coil current, commanded or measured, A; a run"
+        " begins with what the last run of its device has left of the coil's heat",
     )
     thermal_time_constant_s: Annotated[_Positive | None, Needs("A", "rms_current_a")] = Field(
         default=None, description="time constant of the coil's heating, s"
@@ -116,6 +116,8 @@ class InterlockContext:
         unit: Unit of commands.
         safe: Command at which the output rests before the run.
         frozen_travel: Travel of the command after which a reading must have changed, in ``unit``.
+        heat_a2: Heat of the coil before the run, its running mean square of the current in A^2;
+            that of the safe value where it is less.
     """
 
     stroke_um: tuple[float, float]
@@ -123,6 +125,7 @@ class InterlockContext:
     unit: CommandUnit = "A"
     safe: float = 0.0
     frozen_travel: float = math.inf
+    heat_a2: float = 0.0
 
     def __post_init__(self) -> None:
         if not self.frozen_travel > 0.0:
@@ -150,7 +153,7 @@ class Interlocks:
         self._memory = np.zeros(kernels.MEMORY)
         self._memory[kernels.READING] = math.nan
         self._memory[kernels.COMMAND] = context.safe
-        self._memory[kernels.HEAT] = context.safe**2
+        self._memory[kernels.HEAT] = max(context.heat_a2, context.safe**2)
         self._next_sample = 0
 
     def begin_at(self, command: float) -> None:

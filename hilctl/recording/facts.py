@@ -4,6 +4,8 @@ from typing import TypeAlias
 
 HOLDS_FACT = "holds"
 """Fact of a run, by which later ones know its device: JSON list of what it holds while open."""
+HEAT_FACT = "coil_heat_a2"
+"""Fact of a run and of its end: heat of the coil then, the running mean square of its current."""
 LABELS_FACT = "labels"
 """Fact of a run: its labels as a JSON object."""
 END_FIGURES = (

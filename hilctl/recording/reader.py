@@ -73,24 +73,6 @@ def read(path: Path, stretch: Stretch | None = None) -> Recording:
     return stretch.cut(recording) if stretch else recording
 
 
-def read_run_facts(path: Path) -> Mapping[str, str]:
-    """Read what a recording says of its run before the first sample, and no further.
-
-    Raises:
-        DataError: The file can't be read, or holds no run.
-    """
-    try:
-        with path.open("rb") as stream:
-            for record in Salvage(stream).records():
-                if isinstance(record, Metadata) and record.name == "hilctl.run":
-                    return record.metadata
-                if isinstance(record, Message):  # the facts come before the first of them
-                    break
-    except OSError as error:
-        raise DataError(f"{path}: can't be read: {error.strerror}") from None
-    raise DataError(f"{path}: holds no run of hilctl")
-
-
 def _warn(recording: Recording, problem: str, *, live: bool) -> None:
     advice = "" if live else " ('hilctl recover' makes it a whole file again, and keeps this one)"
     samples = recording.samples.index.size

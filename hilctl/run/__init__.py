@@ -1,6 +1,7 @@
 """Three processes round one loop: shared memory, recording, requests, recovery.
 
 start.py           from an experiment file to a finished run
+step.py            one run of several, and by what its recording is known
 architecture.py    processors that a run may be on
 job.py             the experiment as it goes to the loop's process
 assemble.py        from a checked experiment to the plan of its loop

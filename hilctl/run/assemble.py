@@ -1,6 +1,7 @@
 """From a checked experiment to the plan of its loop: one way for every host."""
 
 import math
+from dataclasses import replace
 
 from hilctl.base.arrays import F64
 from hilctl.base.device import DeviceInfo
@@ -26,6 +27,7 @@ def assemble(
     conditioning: Conditioning | None = None,
     *,
     paced: bool = True,
+    heat_a2: float = 0.0,
 ) -> Plan:
     """Return what a run does; its compensator is warmed up.
 
@@ -36,6 +38,7 @@ def assemble(
         state: The compensator's memory before the first sample; at rest where None.
         conditioning: What comes before the waveform; None for nothing.
         paced: Whether the run keeps real time; else no tick is late.
+        heat_a2: Heat of the coil before it, in A^2.
     """
     config, info = loaded.config, loaded.device.info
     rate_hz = config.sample_rate_hz
@@ -52,7 +55,7 @@ def assemble(
         sample_rate_hz=rate_hz,
         compensator=compensator,
         limits=config.command_limits(),
-        interlocks=interlock_context(config, info),
+        interlocks=replace(interlock_context(config, info), heat_a2=heat_a2),
         interlock_settings=config.limits,
         late_policy=policy,
         # By time, not by ticks: a device that takes its time for each would be at it for long.

@@ -29,6 +29,7 @@ class Job:
         reference: File of the reference samples.
         input_um: File of the compensator's input.
         state: The compensator's memory before the first sample; None where it is at rest.
+        heat_a2: Heat of the coil before the run, in A^2.
         stands_um: Displacement there by the model, where the sensor is held against it.
         supervisor: The supervisor's process number.
         silence_s: Longest that it may be silent.
@@ -41,6 +42,7 @@ class Job:
     reference: str
     input_um: str
     state: list[float] | None
+    heat_a2: float
     stands_um: float | None
     supervisor: int
     silence_s: float
@@ -66,6 +68,7 @@ class Job:
             reference=str(reference),
             input_um=str(input_um),
             state=None if begun.state is None else begun.state.tolist(),
+            heat_a2=checked.heat_a2,
             stands_um=begun.stands_um,
             supervisor=supervisor,
             silence_s=silence_s,

@@ -59,7 +59,8 @@ def run_job(job: Job, ring: SampleRing, loaded: LoadedExperiment) -> Outcome:
     config, device, page = loaded.config, loaded.device, ring.page
     host = RingHost(ring, SystemClock(), job.supervisor, job.silence_s)
     conditioning = conditioning_of(loaded, job.stands_um)
-    loop = Loop(assemble(loaded, *job.arrays(), job.memory, conditioning), device, host)
+    plan = assemble(loaded, *job.arrays(), job.memory, conditioning, heat_a2=job.heat_a2)
+    loop = Loop(plan, device, host)
     # After the warm-up, so that all it has mapped gets locked; before the device is opened, so that
     # a refusal moves nothing.
     steps = prepare(config.realtime)

@@ -22,7 +22,7 @@ from hilctl.base.yaml.plain import dump
 from hilctl.loop.pacer import Lateness
 from hilctl.loop.plan import Outcome
 from hilctl.machine.diagnosis import machine_facts
-from hilctl.recording.facts import HOLDS_FACT, LABELS_FACT
+from hilctl.recording.facts import HEAT_FACT, HOLDS_FACT, LABELS_FACT
 
 if TYPE_CHECKING:
     from hilctl.experiment.check import Checked
@@ -30,13 +30,16 @@ if TYPE_CHECKING:
     from hilctl.waveforms.spec import AnyWaveform
 
 
-def run_facts(checked: "Checked", started: str, model_yaml: str) -> dict[str, str]:
+def run_facts(
+    checked: "Checked", started: str, model_yaml: str, correction_yaml: str = ""
+) -> dict[str, str]:
     """Return identity, versions, device and units, as text; the layout says the rates.
 
     Args:
         checked: The experiment that runs.
         started: Scheduled time of sample 0, ISO 8601.
         model_yaml: The compensator's model, or empty.
+        correction_yaml: What has been learned and is added to the reference, or empty.
     """
     loaded = checked.loaded
     config, info = loaded.config, loaded.device.info
@@ -65,7 +68,9 @@ def run_facts(checked: "Checked", started: str, model_yaml: str) -> dict[str, st
         "initial_state_run_id": checked.begun.run_id,
         HOLDS_FACT: json.dumps(list(info.holds)),
         "experiment_sha256": experiment_sha256(loaded),
-        "model_sha256": _sha256(model_yaml) if model_yaml else "",
+        "model_sha256": sha256_of(model_yaml),
+        "correction_sha256": sha256_of(correction_yaml),
+        HEAT_FACT: repr(checked.heat_a2),
         "limits": config.limits.model_dump_json(exclude_none=True),
         "safe_value": repr(config.safe.value),
         "max_missed_share": repr(config.timing.max_missed_share),
@@ -89,11 +94,12 @@ def experiment_sha256(loaded: "LoadedExperiment") -> str:
     Without its labels: who stands beside the rig does not change what it does.
     """
     data = {key: value for key, value in loaded.document.data.items() if key != LABELS_FACT}
-    return _sha256(dump(data))
+    return sha256_of(dump(data))
 
 
-def _sha256(text: str) -> str:
-    return hashlib.sha256(text.encode()).hexdigest()
+def sha256_of(text: str) -> str:
+    """Return the SHA-256 of a text that a run is made of; empty where it has none."""
+    return hashlib.sha256(text.encode()).hexdigest() if text else ""
 
 
 def end_facts(outcome: Outcome, counters: Lateness, lost_events: int = 0) -> dict[str, str]:

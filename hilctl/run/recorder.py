@@ -15,7 +15,9 @@ from hilctl.base.events import ADAPTED, Event
 from hilctl.base.samples import Batch, Head, Samples
 from hilctl.experiment.check import Checked
 from hilctl.experiment.correction import dump_correction
+from hilctl.experiment.heat import CoilHeat
 from hilctl.models.files import dump_model
+from hilctl.recording.facts import HEAT_FACT
 from hilctl.recording.messages import RecordingLayout
 from hilctl.recording.writer import OutputFile, RecordingWriter, RunFacts
 from hilctl.run.end_figures import EndFigures
@@ -53,6 +55,8 @@ class Recorder:
         self._writer: RecordingWriter | None = None
         self._unix_ns = steady_unix_ns()
         self._tail = Tail(_SAMPLES_BEFORE)
+        config = checked.loaded.config
+        self._heat = CoilHeat(config.limits, config.sample_rate_hz, checked.heat_a2)
         self._run: RunFacts | None = None
         self._figures: EndFigures | None = None
         try:
@@ -104,6 +108,7 @@ class Recorder:
         # Before it is written: what a failing write loses is counted all the same.
         self._next_sample = int(batch.heads[-1, Head.FIRST_SAMPLE]) + batch.flags.shape[1]
         self._tail.add(batch)
+        self._heat.follow(batch.samples())
         if self._begun.samples == 0:
             # The file says itself what is missing before its first sample.
             batch.heads[0, Head.DROPPED_BEFORE] = batch.heads[0, Head.FIRST_SAMPLE]
@@ -176,6 +181,7 @@ class Recorder:
         level = "info" if end["code"] == "completed" else "error"
         last = max(0, ended_at - 1)
         facts = {**end, **self._gathered.facts(), "ended": iso_time(now_ns)}
+        facts[HEAT_FACT] = repr(self._heat.heat_a2)
         event = Event(last, level, "run_ended", end["reason"], time_ns=now_ns)
         self._write(partial(self._begun.event, event))
         self._write(partial(self._begun.finish, facts, ended_at))
@@ -222,12 +228,15 @@ class Recorder:
         loaded = self._checked.loaded
         config, info = loaded.config, loaded.device.info
         model_yaml = dump_model(loaded.model) if loaded.model else ""
+        correction_yaml = dump_correction(loaded.correction) if loaded.correction else ""
+        started = iso_time(start_unix_ns)
+        facts = run_facts(self._checked, started, model_yaml, correction_yaml)
         return RunFacts(
-            facts={**run_facts(self._checked, iso_time(start_unix_ns), model_yaml), **set_up},
+            facts={**facts, **set_up},
             segments=tuple(each.shifted(waveform_at) for each in self._checked.reference.segments),
             experiment_yaml=loaded.yaml_text,
             model_yaml=model_yaml,
-            correction_yaml=dump_correction(loaded.correction) if loaded.correction else "",
+            correction_yaml=correction_yaml,
             layout=RecordingLayout(
                 sample_rate_hz=config.sample_rate_hz,
                 command_unit=info.command_unit,

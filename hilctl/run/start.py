@@ -16,19 +16,22 @@ from hilctl.run.supervisor import Supervisor
 _log = logging.getLogger(__name__)
 
 
-def checked_experiment(path: Path, settings: Sequence[str], output: Path | None = None) -> Checked:
+def checked_experiment(
+    path: Path, settings: Sequence[str], output: Path | None = None, heat_a2: float = 0.0
+) -> Checked:
     """Load an experiment and hold it against device, model and limits.
 
     Args:
         path: Experiment file.
         settings: ``key=value`` texts over it.
         output: Recording to write; None where it goes to the experiment's folder.
+        heat_a2: Heat that its coil has at least, in A^2.
 
     Raises:
         InputError: It can't be used, all problems are listed; or this machine can't run any.
     """
     require_ordered_memory()
-    return check(load_experiment(path, settings), output.parent if output else None)
+    return check(load_experiment(path, settings), output.parent if output else None, heat_a2)
 
 
 def output_of(checked: Checked, output: Path | None) -> Path:
@@ -53,6 +56,7 @@ def start_run(
     output: Path | None,
     overwrite: bool,
     on_progress: Callable[[Progress], None],
+    heat_a2: float = 0.0,
 ) -> RunResult:
     """Run an experiment file to its end.
 
@@ -62,12 +66,13 @@ def start_run(
         output: Recording to write; a name in the experiment's folder where None.
         overwrite: Whether an existing recording may be replaced.
         on_progress: Called with each batch of samples.
+        heat_a2: Heat that the coil has at least, in A^2, whatever the last run of it says.
 
     Raises:
         InputError: Nothing has moved, and no file is left.
         RunError: The device could not be opened; nothing has moved, and no file is left.
     """
-    checked = checked_experiment(path, settings, output)
+    checked = checked_experiment(path, settings, output, heat_a2)
     # Of a device with a past: nobody should have to look into the recording for what was taken.
     if checked.begun.begins and checked.loaded.device.info.holds:
         _log.warning("the compensator begins %s", checked.begun.begins)

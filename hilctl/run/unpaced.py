@@ -150,7 +150,10 @@ def run_unpaced(checked: Checked, output: Path, *, overwrite: bool = False) -> R
 def _run(checked: Checked, recorder: Recorder) -> tuple[Outcome, Lateness]:
     loaded, begun = checked.loaded, checked.begun
     arrays = (checked.reference.values, begun.input_um)
-    plan = assemble(loaded, *arrays, begun.state, checked.conditioning(), paced=False)
+    conditioning = checked.conditioning()
+    plan = assemble(
+        loaded, *arrays, begun.state, conditioning, paced=False, heat_a2=checked.heat_a2
+    )
     host = BatchHost(
         plan, on_batch=recorder.batch, on_event=recorder.event, stop=lambda: recorder.error
     )

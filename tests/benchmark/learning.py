@@ -13,9 +13,10 @@ from pathlib import Path
 
 import numpy as np
 
-from hilctl.learning.session import Learned, Runner, Session, unpaced
+from hilctl.learning.session import Learned, Runner, Session
 from hilctl.run.result import RunResult
 from hilctl.run.start import checked_experiment
+from hilctl.run.step import unpaced
 from hilctl.run.unpaced import run_unpaced
 from hilctl_drivers.simulated.rigs import SimulatedTerfenol, TerfenolOptions
 

@@ -13,11 +13,12 @@ from hilctl.analysis.report import summarize
 from hilctl.cli import app
 from hilctl.experiment.correction import load_correction
 from hilctl.experiment.load import load_experiment
-from hilctl.learning.session import Session, paced, unpaced
+from hilctl.learning.session import Session
 from hilctl.models.files import dump_model, load_model
 from hilctl.models.staged import FieldLag, StagedModel, Structure
 from hilctl.recording.reader import read
 from hilctl.run.start import checked_experiment, start_run
+from hilctl.run.step import paced, unpaced
 from hilctl.run.unpaced import run_unpaced
 
 CONFIGS = Path(__file__).parents[2] / "configs"

@@ -8,8 +8,9 @@ import pytest
 
 from hilctl.base.errors import InputError, RunError
 from hilctl.characterise import session
-from hilctl.characterise.session import Campaign, CampaignHost, StoppedCampaignError, unpaced
+from hilctl.characterise.session import Campaign, CampaignHost
 from hilctl.characterise.steps import STEPS
+from hilctl.run.step import StepStoppedError, unpaced
 
 FEW = ("rest", "polarity", "growing-1", "growing-2")
 SHORT = tuple(step for step in STEPS if step.name.startswith(FEW))
@@ -155,7 +156,7 @@ def test_a_sensor_at_its_end_is_named(experiment):
 
 def test_somebody_may_stop_it(experiment):
     rig = Rig(ends_at=2, code="stopped", stop_signal=signal.SIGTERM)
-    with pytest.raises(StoppedCampaignError, match="polarity-1: a test") as caught:
+    with pytest.raises(StepStoppedError, match="polarity-1: a test") as caught:
         run(experiment, rig)
     assert caught.value.signal == signal.SIGTERM
 

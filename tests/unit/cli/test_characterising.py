@@ -9,8 +9,9 @@ import typer
 from hilctl.base.errors import InputError, RunError
 from hilctl.characterise import session
 from hilctl.characterise.results import Characterisation
-from hilctl.characterise.session import CampaignPlan, StoppedCampaignError, paced, unpaced
+from hilctl.characterise.session import CampaignPlan
 from hilctl.cli.characterising import characterise
+from hilctl.run.step import StepStoppedError, paced, unpaced
 from tests.unit.characterise.conftest import experiment, limits, limits_with
 from tests.unit.characterise.test_results import FOUND
 
@@ -104,7 +105,7 @@ def test_what_is_no_model_is_exit_code_1(ends, tmp_path, capsys):
 
 @pytest.mark.parametrize(
     ("error", "code"),
-    [(StoppedCampaignError("rest: stopped", 15), 143), (KeyboardInterrupt(), 130)],
+    [(StepStoppedError("rest: stopped", 15), 143), (KeyboardInterrupt(), 130)],
 )
 def test_a_stop_says_how_to_go_on(ends, tmp_path, capsys, error, code):
     ends["error"] = error

@@ -4,17 +4,20 @@ import json
 import os
 import shutil
 from dataclasses import replace
+from datetime import datetime
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from hilctl.base.errors import ConfigError
 from hilctl.base.yaml.document import Document
 from hilctl.experiment.check import check
-from hilctl.experiment.history import left_by_last_run
+from hilctl.experiment.heat import CoilHeat
+from hilctl.experiment.history import heat_after, heat_before, left_by_last_run
 from hilctl.experiment.load import resolve
 from hilctl.models.files import dump_model
-from hilctl.recording.facts import HOLDS_FACT
+from hilctl.recording.facts import HEAT_FACT, HOLDS_FACT
 from tests.unit.experiment.test_initial_state import COMMAND, OMEGA, record
 
 HOLDS = ("tcp:10.0.0.5:502",)
@@ -153,3 +156,76 @@ class TestCheck:
         folder.record("new")
         plain = folder.loaded("compensator=none", "waveform.unit=A")
         assert check(plain).begun.begins == ""
+
+
+HOT = ["limits.rms_current_a=3.0", "limits.thermal_time_constant_s=20.0"]
+ENDED_S = datetime.fromisoformat("2026-01-01T00:01:00+00:00").timestamp()
+SAFE_END = {"output_safe": "true", "ended": "2026-01-01T00:01:00.000+00:00"}
+
+
+class TestHeat:
+    """What the last run has left of the coil's heat."""
+
+    def begun(self, folder, **facts):
+        return {
+            "started": "2026-01-01T00:00:00.000+00:00",
+            "limits": folder.loaded(*HOT).config.limits.model_dump_json(exclude_none=True),
+            HOLDS_FACT: json.dumps(list(HOLDS)),
+            **facts,
+        }
+
+    def write(self, folder, end, **facts):
+        return record(folder.runs / "a.mcap", COMMAND, facts=self.begun(folder, **facts), end=end)
+
+    def left(self, folder, waited_s, *settings):
+        return heat_before(folder.loaded(*HOT, *settings), None, ENDED_S + waited_s)
+
+    def test_it_has_cooled_since(self, folder):
+        """As the recording says it; by the clock, and not to below what the safe value makes."""
+        self.write(folder, {**SAFE_END, HEAT_FACT: "4.0"})
+        assert self.left(folder, 0.0) == 4.0
+        assert self.left(folder, 20.0) == pytest.approx(4.0 / np.e)
+        assert self.left(folder, 1e6, "safe.value=1.0") == pytest.approx(1.0)
+
+    def test_without_a_budget_or_a_past_there_is_none(self, folder):
+        self.write(folder, {**SAFE_END, HEAT_FACT: "4.0"})
+        assert heat_before(folder.loaded(), None, ENDED_S) == 0.0
+        assert heat_before(folder.loaded(*HOT, holds=()), None, ENDED_S) == 0.0
+        assert heat_before(folder.loaded(*HOT, holds=("tcp:other",)), None, ENDED_S) == 0.0
+
+    @pytest.mark.parametrize("end", [{}, SAFE_END, {**SAFE_END, HEAT_FACT: "warm"}])
+    def test_a_killed_run_s_is_worked_out_from_its_samples(self, folder, end):
+        """With what it began with; a fact that is no number is as hot as can be."""
+        path = self.write(folder, end, **{HEAT_FACT: "4.0"})
+        limits = folder.loaded(*HOT).config.limits
+        sure = CoilHeat(limits, 10000.0, 4.0)
+        sure.add(COMMAND)
+        found = heat_after(path, folder.loaded(*HOT).config, ENDED_S - 60.0)
+        assert found == (9.0 if HEAT_FACT in end else pytest.approx(sure.heat_a2, rel=1e-9))
+
+    def test_another_time_constant_asks_for_the_samples(self, folder):
+        self.write(folder, {**SAFE_END, HEAT_FACT: "4.0"}, **{HEAT_FACT: "0.0"})
+        other = self.left(folder, -1e6, "limits.thermal_time_constant_s=0.05")
+        sure = CoilHeat(
+            folder.loaded(*HOT, "limits.thermal_time_constant_s=0.05").config.limits, 10000.0, 0.0
+        )
+        sure.add(COMMAND)
+        assert other == pytest.approx(sure.heat_a2, rel=1e-9)
+
+    def test_where_nothing_says_it_the_coil_is_as_hot_as_its_budget_allows(self, folder):
+        path = self.write(folder, {**SAFE_END, "output_safe": "false", HEAT_FACT: "1.0"})
+        os.utime(path, (ENDED_S + 5.0, ENDED_S + 5.0))
+        assert self.left(folder, 5.0) == 9.0
+        assert self.left(folder, 25.0) == pytest.approx(9.0 / np.e)
+
+    def test_a_run_that_would_overheat_the_coil_is_refused_until_it_has_cooled(self, folder):
+        """And says how long that takes."""
+        self.write(folder, {**SAFE_END, HEAT_FACT: "8.9"})
+        sine = "waveform={kind: sine, unit: A, amplitude: 5.0, frequency_hz: 10.0, duration_s: 2.0}"
+        loaded = folder.loaded(*HOT, "compensator=none", sine)
+        with pytest.raises(ConfigError, match=r"begins at 2\.98 A rms, left by the last run: wait"):
+            check(loaded, None, 0.0, ENDED_S)
+        later = check(loaded, None, 0.0, ENDED_S + 60.0)
+        assert later.heat_a2 == pytest.approx(8.9 * np.exp(-3.0))
+        with pytest.raises(ConfigError, match="rms_current_a"):
+            check(loaded, None, 8.9, ENDED_S + 60.0)

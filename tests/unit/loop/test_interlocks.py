@@ -301,6 +301,12 @@ class TestThermal:
         trip, _ = trips(rested, 100, command=3.0)
         assert trip.sample == math.ceil(0.1 * RATE_HZ * math.log(8.0 / 5.0)) - 1
 
+    def test_starts_at_the_heat_that_the_last_run_has_left(self):
+        """A waveform that a cold coil stands for long is then too much at once."""
+        hot = replace(THERMAL, heat_a2=3.99)
+        assert trips(hot, 5, command=2.9)[0].code == "thermal"
+        assert trips(THERMAL, 5, command=2.9)[0] is None
+
     def test_starts_at_the_heat_of_the_output_that_is_found(self):
         """What stood at 3 A before the run has used up a budget of 2 A, and no less than safe."""
         assert trips(THERMAL, 5)[0] is None

@@ -61,7 +61,7 @@ class Neighbours:
         self.checked = SimpleNamespace(loaded=loaded, state_size=1)
         self.output = folder / "run.mcap"
         self.recorder = SimpleNamespace(
-            path=self.output, samples=95, missing=5, error="", notes=[],
+            path=self.output, samples=95, missing=5, error="", notes=[], adapted={},
             begin=self.begin, give_back=lambda: self.note("given back"),
         )  # fmt: skip
         self.outcome, self.broke = Outcome("completed", "waveform completed", 100, True, 0), ""

@@ -1,0 +1,156 @@
+"""What a recording says of its step: figures of one row of a campaign's table."""
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+
+from hilctl.analysis.report import summarize, worst_segment
+from hilctl.analysis.steady import steady_part
+from hilctl.base.arrays import F64
+from hilctl.base.events import OFFSET
+from hilctl.base.segments import Segment
+from hilctl.campaign.minor_loops import minor_loops
+from hilctl.campaign.ringing import ringing
+from hilctl.characterise.problem import RigProblemError
+from hilctl.characterise.response import small_signal
+from hilctl.recording.data import Recording
+from hilctl.recording.facts import HEAT_FACT
+from hilctl.waveforms.spec import Multisine, Step
+
+
+@dataclass(frozen=True, slots=True)
+class RunFigures:
+    """Figures of one run; None where one has no meaning.
+
+    Attributes:
+        peak_hysteresis_percent: Peak hysteresis, of the segment with the largest.
+        peak_error_percent: Largest displacement less reference, of the peak-to-peak.
+        rms_error_percent: Its root mean square.
+        loop_area: Area of the loop, in um times the unit of its input.
+        peak_to_peak_um: Peak-to-peak displacement.
+        low_um: Lowest displacement of the average cycle.
+        high_um: Highest displacement of it.
+        mean_um: Mean displacement of it.
+        offset_um: Offset that the run measured at rest, and took out.
+        minor_low_um: Peak-to-peak displacement of the minor loops at the lowest input.
+        minor_high_um: The same of those at the highest input.
+        minor_low_percent: Peak hysteresis of the minor loops at the lowest input, of their own
+            peak-to-peak.
+        minor_high_percent: The same of those at the highest input.
+        natural_hz: Natural frequency, by a step's ringing or a multisine's response.
+        damping_ratio: Its damping.
+        deadline_misses: Ticks that were skipped.
+        heat_before_a: Running rms of the coil current before the run, in A.
+        heat_after_a: The same after it.
+    """
+
+    peak_hysteresis_percent: float | None = None
+    peak_error_percent: float | None = None
+    rms_error_percent: float | None = None
+    loop_area: float | None = None
+    peak_to_peak_um: float | None = None
+    low_um: float | None = None
+    high_um: float | None = None
+    mean_um: float | None = None
+    offset_um: float | None = None
+    minor_low_um: float | None = None
+    minor_high_um: float | None = None
+    minor_low_percent: float | None = None
+    minor_high_percent: float | None = None
+    natural_hz: float | None = None
+    damping_ratio: float | None = None
+    deadline_misses: int | None = None
+    heat_before_a: float | None = None
+    heat_after_a: float | None = None
+
+
+FIGURES = tuple(field.name for field in fields(RunFigures))
+
+
+def figures_of(recording: Recording, waveform: Any) -> RunFigures:
+    """Work out the figures of a whole run.
+
+    Args:
+        recording: The run.
+        waveform: Its waveform, as the experiment has it.
+
+    Raises:
+        DataError: A fact of it is no number.
+    """
+    report = summarize(recording)
+    worst = recording.segments[worst_segment(report.segments)] if recording.segments else None
+    measured = [event.values.get("offset_um") for event in recording.events if event.code == OFFSET]
+    return RunFigures(
+        peak_hysteresis_percent=report.peak_hysteresis_percent,
+        peak_error_percent=report.peak_error_percent,
+        rms_error_percent=report.rms_error_percent,
+        loop_area=report.loop_area,
+        peak_to_peak_um=report.peak_to_peak_um,
+        **(_cycle(recording, worst) if worst else {}),
+        offset_um=measured[0] if measured else None,
+        **_structure(recording, waveform),
+        deadline_misses=report.skipped_ticks,
+        heat_before_a=_rms_a(recording.run.get(HEAT_FACT)),
+        heat_after_a=_rms_a(recording.end.get(HEAT_FACT)),
+    )
+
+
+def _rms_a(heat: str | None) -> float | None:
+    return None if heat is None else float(np.sqrt(float(heat)))
+
+
+def _cycle(recording: Recording, segment: Segment) -> dict[str, float]:
+    part = steady_part(recording, segment)
+    if part.cycle is None or not part.loop.size:
+        return {}
+    loop_input, output = part.loop
+    found = {
+        "low_um": float(output.min()),
+        "high_um": float(output.max()),
+        "mean_um": float(output.mean()),
+    }
+    return found | _minor(loop_input, output)
+
+
+def _minor(loop_input: F64, output: F64) -> dict[str, float]:
+    """Return the minor loops in the lower and in the upper half of the input, averaged."""
+    middle = 0.5 * float(loop_input.min() + loop_input.max())
+    loops = minor_loops(loop_input, output)
+    found = {}
+    for name, side in (
+        ("low", [loop for loop in loops if loop.middle < middle]),
+        ("high", [loop for loop in loops if loop.middle > middle]),
+    ):
+        if side:
+            found[f"minor_{name}_um"] = float(np.mean([loop.peak_to_peak_um for loop in side]))
+            percents = [loop.peak_hysteresis_percent for loop in side]
+            found[f"minor_{name}_percent"] = float(np.mean(percents))
+    return found
+
+
+def _structure(recording: Recording, waveform: Any) -> dict[str, float | None]:
+    """Return natural frequency and damping, where a waveform is one to see them by."""
+    found = None
+    if isinstance(waveform, Multisine):
+        try:
+            found = small_signal(recording)
+        except RigProblemError:  # lost in noise: there is nothing to say
+            return {}
+    elif isinstance(waveform, Step):
+        found = _ringing(recording, waveform)
+    if found is None or found.natural_hz is None:
+        return {}
+    return {"natural_hz": found.natural_hz, "damping_ratio": found.damping_ratio}
+
+
+def _ringing(recording: Recording, waveform: Step) -> Any:
+    """Return the ringing after the largest step of the waveform."""
+    segment, rate_hz = recording.segments[0], recording.sample_rate_hz
+    levels = np.array([0.0, *waveform.levels])
+    largest = int(np.argmax(np.abs(np.diff(levels))))
+    dwell = round(waveform.dwell_s * rate_hz)
+    begin = segment.start + largest * dwell + round(waveform.rise_s * rate_hz) + 1
+    samples = recording.samples.part(begin, segment.start + (largest + 1) * dwell)
+    whole = samples.index.size and np.isfinite(samples.displacement_um).all()
+    return ringing(samples.displacement_um, rate_hz) if whole else None

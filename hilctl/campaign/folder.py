@@ -1,0 +1,145 @@
+"""A campaign's folder: the recordings in it, made whole, and who works on it."""
+
+import fcntl
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from hilctl.base.errors import ConfigError, DataError, InputError
+from hilctl.base.yaml.document import load_document
+from hilctl.campaign.steps import CampaignSteps, base_problem, settings_of
+from hilctl.experiment.parts import RecordingConfig
+from hilctl.recording.ends import read_ends
+from hilctl.recording.recover import recover_recording
+from hilctl.run.run_folder import RunFolder, runs
+from hilctl.run.step import RunKey, completed_key
+
+_LONGEST_WAIT_S = 60.0
+_POLL_S = 0.1
+
+
+def campaign_folder(campaign: CampaignSteps) -> Path:
+    """Return the folder of a campaign that is given no other: as its file says, or by its name.
+
+    Raises:
+        ConfigError: The base experiment can't be read, or breaks rules.
+    """
+    config = campaign.config
+    if config.folder is not None:
+        return Path(config.folder)
+    try:
+        document = load_document(campaign.experiment)
+        for text in (*campaign.settings, *settings_of(config.set)):
+            document.set(text)
+    except ConfigError:
+        raise
+    except InputError as error:
+        raise base_problem(campaign, error) from None
+    recording = document.data.get("recording")
+    given = recording.get("folder") if isinstance(recording, dict) else None
+    return Path(given if isinstance(given, str) else RecordingConfig().folder) / config.name
+
+
+@contextmanager
+def held_folder(
+    folder: Path, sleep_s: Callable[[float], None], wait_s: float = 5.0
+) -> Iterator[None]:
+    """Make a campaign's folder, and hold it against every other campaign.
+
+    Args:
+        folder: The folder.
+        sleep_s: Waits that long.
+        wait_s: How long to wait for one that is just ending.
+
+    Raises:
+        InputError: It can't be made, or another campaign works on it.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        held = os.open(folder, os.O_RDONLY)
+    except OSError as error:
+        raise InputError(f"{folder}: can't be made: {error.strerror}") from None
+    try:
+        waited_s = 0.0
+        while not _locked(held):
+            if waited_s >= wait_s:
+                raise InputError(f"{folder}: another campaign is writing to it")
+            sleep_s(_POLL_S)
+            waited_s += _POLL_S
+        yield
+    finally:
+        os.close(held)
+
+
+def _locked(held: int) -> bool:
+    try:
+        fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
+
+
+def await_runs(folder: Path, sleep_s: Callable[[float], None]) -> None:
+    """Wait for the end of runs that record to a folder: of one whose supervisor was killed.
+
+    Its loop goes on until it misses the supervisor, and leaves by its safe ramp.
+
+    Raises:
+        InputError: One does not end.
+    """
+    waited_s = 0.0
+    while living := [run for run in runs() if run.alive and _is_in(run, folder)]:
+        if living[0].supervised or waited_s > _LONGEST_WAIT_S:
+            run = living[0].card
+            raise InputError(
+                f"{folder}: run {run.name} records to it: wait for its end, or stop it"
+            )
+        sleep_s(_POLL_S)
+        waited_s += _POLL_S
+
+
+def _is_in(run: RunFolder, folder: Path) -> bool:
+    return Path(run.card.recording).parent == folder.resolve()
+
+
+def make_whole(folder: Path) -> list[str]:
+    """Make recordings whole that were cut short; return what was done, for people."""
+    done = []
+    for path in sorted(folder.glob("*.mcap")):
+        try:
+            if read_ends(path).state == "unfinished":
+                done.append(f"{path}: {recover_recording(path).reason}")
+        except DataError:  # no recording of a run, or nothing to recover
+            continue
+    return done
+
+
+def standing_runs(folder: Path) -> dict[RunKey, list[Path]]:
+    """Return the completed runs whose recordings are in a folder, in the order of their names."""
+    found: dict[RunKey, list[Path]] = {}
+    for path in sorted(folder.glob("*.mcap")):
+        key = completed_key(path)
+        if key is not None:
+            found.setdefault(key, []).append(path)
+    return found
+
+
+def last_begun(folder: Path) -> Path | None:
+    """Return the recording in a folder whose run began last; None without any."""
+    begun = []
+    for path in folder.glob("*.mcap"):
+        try:
+            begun.append((read_ends(path).run.get("started", ""), path))
+        except DataError:
+            continue
+    return max(begun)[1] if begun else None
+
+
+def new_recording(folder: Path, name: str, number: int) -> Path:
+    """Return a name that no file has: ``NAME-0001.mcap``, and ``NAME-0001-2.mcap`` after that."""
+    path, attempt = folder / f"{name}-{number:04d}.mcap", 1
+    while os.path.lexists(path):
+        attempt += 1
+        path = folder / f"{name}-{number:04d}-{attempt}.mcap"
+    return path
