@@ -106,6 +106,28 @@ class SafeOnlyWhileOpen(Ideal):
             self.current_a = command
 
 
+class SafeOnceItWasOpen(Ideal):
+    """Can't connect by itself the first time."""
+
+    was_open = False
+
+    def open(self, sample_rate_hz, block):
+        super().open(sample_rate_hz, block)
+        self.was_open = True
+
+    def make_safe(self, command):
+        if self.was_open:
+            self.current_a = command
+
+
+class SafeUntilItIsClosed(SafeOnceItWasOpen):
+    """Can't connect by itself again."""
+
+    def make_safe(self, command):
+        if self.is_open or not self.was_open:
+            self.current_a = command
+
+
 class SafeElsewhere(Ideal):
     """Puts out zero, whatever the safe value is."""
 
@@ -355,6 +377,8 @@ MUST_FAIL = {
     DoesNothing: {"exchanges_blocks", "make_safe_works_open_or_closed"},
     NeverMadeSafe: {"make_safe_works_open_or_closed"},
     SafeOnlyWhileOpen: {"make_safe_works_open_or_closed"},
+    SafeOnceItWasOpen: {"make_safe_works_open_or_closed"},
+    SafeUntilItIsClosed: {"make_safe_works_open_or_closed"},
     SafeElsewhere: {"make_safe_works_open_or_closed"},
     LiesAboutItsOutput: {"says_what_it_puts_out"},
     DoesNotSayWhatItKnows: {"says_what_it_puts_out"},

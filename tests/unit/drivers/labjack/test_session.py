@@ -160,7 +160,7 @@ def scene():
 
 def test_readings_are_waited_for_by_the_device_s_clock(scene):
     """As long as the scans that are still due take; then one message fetches them."""
-    made = scene((10, 0, 90), (20, 5, 65), (5, 0, 65))
+    made = scene((10, 0, 90), (20, 5, 65), (5, 4, 61), (10, 0, 55))
     made.session.start()
     assert made.session.take(10).tolist() == list(range(10))
     assert made.slept_s == [0.01]
@@ -168,7 +168,9 @@ def test_readings_are_waited_for_by_the_device_s_clock(scene):
     assert made.slept_s == [0.01, 0.02]
     assert made.session.take(5).tolist() == list(range(30, 35))
     assert made.slept_s == [0.01, 0.02]  # all five were there
-    assert made.device.calls == 3
+    assert made.session.take(10).tolist() == list(range(35, 45))
+    assert made.slept_s[2:] == [0.006]  # four of ten were there
+    assert made.device.calls == 4
 
 
 def test_readings_beyond_those_asked_for_are_kept(scene):
