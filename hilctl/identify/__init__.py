@@ -20,5 +20,6 @@ data           loops and histories, from recordings and tables
 searched       thresholds searched from several starts
 staged         free weights and stages, without a search for what is linear
 field          plays and drags of an effective field, from whole histories
+refine         a better model from recordings of its use
 literature     the other models of the literature
 """
