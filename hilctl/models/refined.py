@@ -49,8 +49,8 @@ Refinable: TypeAlias = (
 
 LEAST_SLOPE = 0.1
 """Smallest slope of x + R[x] by the next x that a model may have, whatever came before."""
-_POSITIONS = 120  # of x that the slope is worked out at, each way
-_TURNS = (0.01, 3.0, 12)  # of the longest drag: nearest and furthest turn that is tried, how many
+_POSITIONS = 60  # of x that the slope is worked out at, each way
+_TURNS = (0.02, 2.0, 8)  # of the longest drag: nearest and furthest turn that is tried, how many
 
 
 class ResidualOperator(Strict):

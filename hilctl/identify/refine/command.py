@@ -14,7 +14,7 @@ from hilctl.identify.fit_model import VERSIONS, error_table
 from hilctl.identify.found_range import identified_range
 from hilctl.identify.job import OnProgress, ignore_progress
 from hilctl.identify.refine.runs import load_runs
-from hilctl.identify.refine.strength import Choice, Strength, parts_of
+from hilctl.identify.refine.strength import WORTH, Choice, Strength, parts_of
 from hilctl.identify.verdict import data_reasons
 from hilctl.models.base import HysteresisModel, IdentifiedRange, Provenance
 from hilctl.models.files import dump_model, load_model
@@ -125,7 +125,7 @@ def refine_runs(
 def _reasons(choice: Choice) -> list[str]:
     if choice.better:
         return []
-    if choice.worse:
+    if choice.ratio <= WORTH:
         return [f"'{label}', which was not fitted, would become worse" for label in choice.worse]
     return [
         f"runs that were not fitted would have {choice.ratio:.2f} times the old error: what is "

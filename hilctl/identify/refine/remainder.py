@@ -1,16 +1,17 @@
 """What a model leaves of the displacement, as one linear problem in the numbers of an operator."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from hilctl.base.arrays import F64, I64
 from hilctl.identify.data.records import History
+from hilctl.identify.refine.delay import delayed_model
 from hilctl.kernels.residual import residual_columns
 from hilctl.models.base import HysteresisModel
-from hilctl.models.refined import RefinedModel, ResidualOperator, rest_um
+from hilctl.models.refined import LEAST_SLOPE, RefinedModel, ResidualOperator, rest_um
 
 PLAYS, DRAGS, CELLS = 8, 5, 12
 LENGTHS = (0.03, 0.6)  # of the span: shortest and longest drag
@@ -21,9 +22,11 @@ SEED = 1
 DRAGGED, FREE, SMOOTH, BENT = 0.3, 0.1, 3.0, 1.0
 """How firm: drags, the constant, differences of plays and of drags beside each other."""
 SMALL = 0.05  # of the span, by which errors of runs that move little are no heavier than that
-ANCHOR = 0.02  # weight of each run's worth of the old model on motions of its whole range
+ANCHOR = 0.005  # weight of each run's worth of the old model on motions of its whole range
 CREEP_S = 0.1
-OWN = 0.01  # ridge of what a run may have of its own, of its weight
+GOLDEN = 1.618  # ratio of frequencies that never meet again
+ROOM = 1.1  # times the least slope that a model may have
+OWN = 1e-4  # ridge of what a run may have of its own, of its weight
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,16 +56,22 @@ class Remainder:
         x_um: For each run, float64[n], what the base gives, less that at rest.
     """
 
-    def __init__(self, model: HysteresisModel, runs: Sequence[History]) -> None:
-        """Run the base on what was put out, and lay the operator's cells over what comes of it."""
-        self._model = model
-        self.base: HysteresisModel = model.base if isinstance(model, RefinedModel) else model
+    def __init__(
+        self, model: HysteresisModel, runs: Sequence[History], fitted: Sequence[History]
+    ) -> None:
+        """Run the base on what was put out, and lay the operator's cells over what comes of it.
+
+        Args:
+            model: The old model.
+            runs: All that is fitted or judged.
+            fitted: Those of them that a delay is taken from.
+        """
+        self._old = model
+        bare: HysteresisModel = model.base if isinstance(model, RefinedModel) else model
+        self.base = delayed_model(bare, fitted)
         self._runs = tuple(runs)
         self._rest_um = rest_um(self.base)
-        self.x_um = tuple(
-            self.base.forward(run.sample_rate_hz).process(run.command) - self._rest_um
-            for run in self._runs
-        )
+        self.x_um = tuple(self._base_um(self.base, run) for run in self._runs)
         low, high = model.output_range_um or (np.inf, -np.inf)
         low = min(low - self._rest_um, *(float(x.min()) for x in self.x_um), 0.0)
         high = max(high - self._rest_um, *(float(x.max()) for x in self.x_um), 0.0)
@@ -71,6 +80,8 @@ class Remainder:
             float(np.quantile(np.abs(np.diff(x)), 0.999)) * run.sample_rate_hz
             for x, run in zip(self.x_um, self._runs, strict=True)
         )
+        if isinstance(model, RefinedModel):  # what is held to at its speeds must be known there
+            self.fastest_um_per_s = max(self.fastest_um_per_s, model.residual.fastest_um_per_s)
         self._window_s = WINDOW * math.pi * self._span / self.fastest_um_per_s
         self._grid = self._operator(np.zeros(self.size - 1))
 
@@ -94,20 +105,27 @@ class Remainder:
         Small motions must not spoil large ones: on motions of the model's whole range, slow and
         fast, it is to stay what it was, but for what runs say with more weight.
         """
-        half, middle = 0.5 * self._span, self._low + 0.5 * self._span
         total = Moments(np.zeros((self.size, self.size)), np.zeros(self.size))
+        rate_hz = 1.0 / self._window_s  # one window is one sample here: rates are those of runs
+        for x in self._motions():
+            rows = np.unique(np.linspace(0, x.size - 1, ROWS).astype(np.int64))
+            columns, was = self._columns(x, rows, rate_hz), self._was(x, rate_hz)[rows]
+            total += _sums(columns, was, self._weight(x, rows))
+        scale = ANCHOR * len(self._runs)
+        return Moments(scale * total.normal, scale * total.right)
+
+    def _motions(self) -> Iterator[F64]:
+        """Give motions of the whole range: growing sines, slow and fast, and small in large."""
+        half, middle = 0.5 * self._span, self._low + 0.5 * self._span
         for speed in (0.05, 0.9):
             points = round(2.0 * math.pi * half / (speed * self.fastest_um_per_s * self._window_s))
             turns = np.arange(6 * points) / points
             path = np.minimum(turns / 4.0, 1.0) * half * np.sin(2.0 * np.pi * turns)
-            x = np.minimum(turns, 1.0) * middle + path
-            # One window is one sample here, so that rate is what it is in a run.
-            rows = np.unique(np.linspace(0, x.size - 1, ROWS).astype(np.int64))
-            columns = self._columns(x, rows, 1.0 / self._window_s)
-            was = self._was(x, 1.0 / self._window_s)[rows]
-            total += _sums(columns, was, self._weight(x, rows))
-        scale = ANCHOR * len(self._runs)
-        return Moments(scale * total.normal, scale * total.right)
+            yield np.minimum(turns, 1.0) * middle + path
+        turns = np.arange(ROWS) / 400.0
+        sines = [np.sin(2.0 * np.pi * turns * golden) for golden in GOLDEN ** np.arange(5.0)]
+        mixed = np.sum(sines, axis=0)
+        yield np.minimum(turns, 1.0) * (middle + half * mixed / np.max(np.abs(mixed)))
 
     def firm(self, strength: float, moments: Moments) -> F64:
         """Return what holds all numbers small and neighbours alike: float64[m, m]."""
@@ -128,28 +146,35 @@ class Remainder:
         return firm
 
     def model(self, numbers: F64) -> RefinedModel:
-        """Return the model with these numbers.
-
-        Raises:
-            pydantic.ValidationError: It has no inverse.
-        """
-        ranges = {name: getattr(self._model, name) for name in ("input_range", "output_range_um")}
+        """Return the model with these numbers, all of them less where it would have no inverse."""
+        ranges = {name: getattr(self._old, name) for name in _RANGES}
+        ranges |= {"provenance": self._old.provenance}
         base = self.base.model_copy(update=ranges)
-        return RefinedModel.of(base, self._operator(numbers[:-1]), float(numbers[-1]))
+        steep = 1.0 - self._operator(numbers[:-1], checked=False).least_slope
+        part = min(1.0, (1.0 - ROOM * LEAST_SLOPE) / steep) if steep > 0.0 else 1.0
+        return RefinedModel.of(base, self._operator(part * numbers[:-1]), float(numbers[-1]))
 
     def modelled_um(self, model: HysteresisModel, number: int) -> F64:
         """Return the displacement of a run by the old model or one with other numbers."""
-        return self._through(model, self.x_um[number], self._runs[number].sample_rate_hz)
-
-    def _through(self, model: HysteresisModel, x: F64, rate_hz: float) -> F64:
+        run, x = self._runs[number], self.x_um[number]
         if not isinstance(model, RefinedModel):
-            return x + self._rest_um
+            return self._base_um(model, run) + rest_um(model)
+        if model is self._old:
+            return model.forward(run.sample_rate_hz).process(run.command)
+        return self._through(model, x, run.sample_rate_hz)
+
+    def _base_um(self, base: HysteresisModel, run: History) -> F64:
+        return base.forward(run.sample_rate_hz).process(run.command) - rest_um(base)
+
+    def _through(self, model: RefinedModel, x: F64, rate_hz: float) -> F64:
         operator = model.residual.forward(rate_hz, self._rest_um)
         return operator.process(x + self._rest_um) + model.output_offset_um
 
     def _was(self, x: F64, rate_hz: float) -> F64:
         """Return the remainder as the old model has it: float64[n]."""
-        return self._through(self._model, x, rate_hz) - self._rest_um - x
+        if not isinstance(self._old, RefinedModel):
+            return np.zeros(x.size)
+        return self._through(self._old, x, rate_hz) - self._rest_um - x
 
     def _of(self, x: F64, run: History, *, own: bool) -> Moments:
         rows = _rows(run)
@@ -177,11 +202,12 @@ class Remainder:
         moves = float(np.ptp(x[rows]))
         return 1.0 / ((moves + SMALL * self._span) * math.sqrt(rows.size))
 
-    def _operator(self, numbers: F64) -> ResidualOperator:
+    def _operator(self, numbers: F64, *, checked: bool = True) -> ResidualOperator:
         plays = PLAYS * CELLS
         lines = numbers[plays:].reshape(2 * DRAGS + 1, CELLS + 1).tolist()
         lengths = self._span * np.geomspace(*LENGTHS, DRAGS)
-        return ResidualOperator(
+        make = ResidualOperator if checked else ResidualOperator.model_construct
+        return make(
             lowest_um=self._low,
             cell_um=self._span / CELLS,
             thresholds_um=tuple((0.5 * self._span * (np.arange(PLAYS) / PLAYS) ** SPREAD).tolist()),
@@ -231,3 +257,6 @@ def _alike() -> F64:
         part[rows, first.ravel()], part[rows, second.ravel()] = -weight, weight
         parts.append(part)
     return np.vstack(parts)
+
+
+_RANGES = ("input_range", "output_range_um")

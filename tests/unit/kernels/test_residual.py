@@ -1,5 +1,7 @@
 """Plays, drags and rate of a displacement: bounded, undone, and linear in what is looked for."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -23,7 +25,13 @@ def tables(slopes, lines):
     values -= np.array([[np.interp(0.0, EDGES, line)] for line in values])
     most = np.abs(values).max(axis=1).sum() + np.abs(lines).max(axis=1).sum()
     grid = np.array([LOW, WIDTH, float(CELLS), 2.0, most + 1e-3])
-    return np.array([0.0, 2.0, 6.0, 15.0]), np.array([4.0, 30.0]), values.ravel(), lines.ravel(), grid
+    return (
+        np.array([0.0, 2.0, 6.0, 15.0]),
+        np.array([4.0, 30.0]),
+        values.ravel(),
+        lines.ravel(),
+        grid,
+    )
 
 
 def rest():
@@ -89,7 +97,7 @@ def test_drags_do_not_depend_on_how_finely_a_way_is_cut():
     lines[-1] = 0.0
     parts = tables(slopes, lines)
     corners = np.array([0.0, 20.0, -5.0, 11.0])
-    fine = np.concatenate([np.linspace(a, b, 200) for a, b in zip(corners, corners[1:])])
+    fine = np.concatenate([np.linspace(a, b, 200) for a, b in pairwise(corners)])
     assert given(fine, parts)[-1] == pytest.approx(given(corners, parts)[-1], abs=1e-9)
 
 
