@@ -30,7 +30,7 @@ from hilctl.models.kp import KrasnoselskiiPokrovskiiModel
 from hilctl.models.plays import PpiModel, RdpiModel
 from hilctl.models.preisach import PreisachModel
 from hilctl.models.spi import SpiModel
-from hilctl.models.staged import StagedModel
+from hilctl.models.staged import StagedModel, Structure
 
 Refinable: TypeAlias = (
     PpiModel
@@ -255,6 +255,11 @@ class RefinedModel(HysteresisModel):
     def operators(self) -> int:
         """Number of operators with memory."""
         return self.base.operators + self.residual.operators
+
+    @property
+    def structure(self) -> Structure | None:
+        """What the displacement goes through, where the base has it."""
+        return self.base.structure if isinstance(self.base, StagedModel) else None
 
     def forward(self, sample_rate_hz: float) -> Chain:
         """Return the operator from command to displacement in um, at rest."""

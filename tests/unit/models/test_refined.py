@@ -89,6 +89,11 @@ def test_of_takes_over_unit_ranges_and_provenance():
     assert model.operators == inner.operators + 5
 
 
+def test_feedback_finds_the_resonance_where_the_base_has_one():
+    assert RefinedModel.of(STAGED, residual(), 0.0).structure == STAGED.structure
+    assert RefinedModel.of(piezo_ppi(), residual(), 0.0).structure is None
+
+
 @pytest.mark.parametrize(("change", "message"), [
     ({"thresholds_um": (1.0, 3.0, 12.0)}, "the first of thresholds_um must be 0"),
     ({"thresholds_um": (0.0, 12.0, 3.0)}, "r must rise from 0"),
