@@ -94,6 +94,22 @@ def test_feedback_finds_the_resonance_where_the_base_has_one():
     assert RefinedModel.of(piezo_ppi(), residual(), 0.0).structure is None
 
 
+@pytest.mark.parametrize("name", BASES)
+@pytest.mark.parametrize("direction", ["forward", "inverse"])
+def test_a_state_that_is_restored_goes_on_with_the_same_bits(name, direction):
+    """All of it, that of the base's own stages too: a run replays from such states."""
+    model = RefinedModel.of(BASES[name], residual(), 0.4)
+    signal = sine() if direction == "inverse" else 0.2 * sine()
+    operator, other = (getattr(model, direction)(RATE_HZ) for _ in range(2))
+    operator.process(signal[:4000].copy())
+    state = operator.state()
+    went_on = operator.process(signal[4000:].copy())
+    operator.restore(state)
+    other.restore(state)
+    for each in (operator, other):
+        np.testing.assert_array_equal(each.process(signal[4000:].copy()), went_on)
+
+
 @pytest.mark.parametrize(("change", "message"), [
     ({"thresholds_um": (1.0, 3.0, 12.0)}, "the first of thresholds_um must be 0"),
     ({"thresholds_um": (0.0, 12.0, 3.0)}, "r must rise from 0"),
