@@ -51,6 +51,15 @@ def delayed_model(model: HysteresisModel, runs: Sequence[History]) -> Hysteresis
     return staged if moved else model
 
 
+def fastest_um_per_s(xs: Sequence[F64], runs: Sequence[History]) -> float:
+    """Return the largest speed of displacements, float64[n] each; single steps don't count."""
+    return max(
+        # Of a run that rests most of the time all but steps is still.
+        max(float(np.quantile(step_um, 0.999)), 0.01 * float(step_um.max())) * run.sample_rate_hz
+        for step_um, run in zip((np.abs(np.diff(x)) for x in xs), runs, strict=True)
+    )
+
+
 def _staged(model: HysteresisModel) -> StagedModel | None:
     if isinstance(model, StagedModel):
         return model
@@ -68,10 +77,7 @@ def _late_s(model: StagedModel, runs: Sequence[History]) -> tuple[float, float, 
     xs = [model.forward(run.sample_rate_hz).process(run.command) - rest for run in runs]
     low, high = min(float(x.min()) for x in xs), max(float(x.max()) for x in xs)
     span = high - low
-    fastest = max(
-        float(np.quantile(np.abs(np.diff(x)), 0.999)) * run.sample_rate_hz
-        for x, run in zip(xs, runs, strict=True)
-    )
+    fastest = fastest_um_per_s(xs, runs)
     fastest_hz = fastest / (np.pi * span)
     window_s = 0.05 / fastest_hz
     operator = ResidualOperator(

@@ -8,7 +8,7 @@ import numpy as np
 
 from hilctl.base.arrays import F64, I64
 from hilctl.identify.data.records import History
-from hilctl.identify.refine.delay import delayed_model
+from hilctl.identify.refine.delay import delayed_model, fastest_um_per_s
 from hilctl.kernels.residual import residual_columns
 from hilctl.models.base import HysteresisModel
 from hilctl.models.refined import LEAST_SLOPE, RefinedModel, ResidualOperator, rest_um
@@ -76,10 +76,7 @@ class Remainder:
         low = min(low - self._rest_um, *(float(x.min()) for x in self.x_um), 0.0)
         high = max(high - self._rest_um, *(float(x.max()) for x in self.x_um), 0.0)
         self._low, self._span = low, high - low
-        self.fastest_um_per_s = max(
-            float(np.quantile(np.abs(np.diff(x)), 0.999)) * run.sample_rate_hz
-            for x, run in zip(self.x_um, self._runs, strict=True)
-        )
+        self.fastest_um_per_s = fastest_um_per_s(self.x_um, self._runs)
         if isinstance(model, RefinedModel):  # what is held to at its speeds must be known there
             self.fastest_um_per_s = max(self.fastest_um_per_s, model.residual.fastest_um_per_s)
         self._window_s = WINDOW * math.pi * self._span / self.fastest_um_per_s

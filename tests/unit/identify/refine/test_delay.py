@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hilctl.identify.refine.delay import delayed_model
+from hilctl.identify.refine.delay import delayed_model, fastest_um_per_s
 from hilctl.models.butterfly import ButterflyModel
 from hilctl.models.deadband import DeadbandFunction
 from hilctl.models.staged import StagedModel
@@ -23,6 +23,13 @@ def test_a_delay_too_long_is_taken_back():
     found = delayed_model(old, [history(truth, i) for i in range(3)])
     assert isinstance(found, StagedModel)
     assert found.delay_s == pytest.approx(3e-4, rel=0.1)
+
+
+def test_a_run_that_only_steps_has_a_speed():
+    """Its window would have no end otherwise."""
+    run = history(OLD, 1)
+    steps = np.repeat([0.0, 5.0, -5.0], 2000)
+    assert fastest_um_per_s([steps], [run]) == pytest.approx(0.1 * run.sample_rate_hz)
 
 
 def test_wider_loops_are_no_delay():
