@@ -80,6 +80,10 @@ COMMANDS: dict[str, CommandEntry] = {
         "hilctl.cli.recordings:identify",
         "Identify a model's parameters from recordings or measured tables.",
     ),
+    "refine": CommandEntry(
+        "hilctl.cli.refining:refine",
+        "Improve a model from recordings of runs; it is written only where it has become better.",
+    ),
     "compare": CommandEntry(
         "hilctl.cli.comparing:compare",
         "Identify models of the literature on the same loops, and compare them.",

@@ -21,5 +21,6 @@ searched       thresholds searched from several starts
 staged         free weights and stages, without a search for what is linear
 field          plays and drags of an effective field, from whole histories
 generalised_duhem  slopes by place and direction, from whole histories
+refine         a better model from recordings of its use
 literature     the other models of the literature
 """

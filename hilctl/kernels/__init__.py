@@ -9,6 +9,7 @@ does not notice a callee that changed in another file. Units live one level abov
     implicit.py  operators whose inverse is found root by root: Preisach, KP, Bouc-Wen, Duhem
     envelope.py  play operators between envelopes
     field.py     plays and drags of an effective field, its losses, and their inverse
+    residual.py  plays, drags and rate of a modelled displacement, and what undoes them
     dynamics.py  field lag, structure and delay, and their inverses
     limit.py     peak and slew limits of a command
     interlock.py what ends a run, looked at in every sample

@@ -14,6 +14,7 @@ numeric_inverse.py  models whose inverse is found root by root: preisach.py, kp.
                (Krasnosel'skii-Pokrovskii), bouc_wen.py, duhem.py
 field.py       plays and drags of an effective field, a curve, losses; for staged.py
 generalised_duhem.py  slopes by place and direction, all over a band, with losses; for staged.py
+refined.py     a model and what runs have shown beyond it, with the inverse of both
 published.py   parametrisations and parameter sets from the literature
 files.py       model files, in and out
 """

@@ -38,10 +38,15 @@ class Chain(Operator):
         self._rest = rest
         self._memory[:] = rest
         self._stages = tuple(stages)
+        self.keep_in(self._memory)
+
+    def keep_in(self, memory: F64) -> None:
+        """Keep the memory in a given place from now on, that of each stage too."""
+        super().keep_in(memory)
         start = 0
-        for stage in stages:
+        for stage in self._stages:
             stop = start + stage.state().size
-            stage.keep_in(self._memory[start:stop])
+            stage.keep_in(memory[start:stop])
             start = stop
 
     def _run(self, block: F64, memory: F64, out: F64) -> None:

@@ -10,31 +10,9 @@ from hilctl.base.strict import Strict
 from hilctl.base.yaml.document import Document, load_document
 from hilctl.base.yaml.plain import dump
 from hilctl.models.base import HysteresisModel
-from hilctl.models.bouc_wen import BoucWenModel
-from hilctl.models.butterfly import ButterflyModel
-from hilctl.models.duhem import DuhemModel
-from hilctl.models.generalised import GeneralisedModel
-from hilctl.models.integrated import IntegratedModel
-from hilctl.models.kp import KrasnoselskiiPokrovskiiModel
-from hilctl.models.plays import PpiModel, RdpiModel
-from hilctl.models.preisach import PreisachModel
-from hilctl.models.spi import SpiModel
-from hilctl.models.staged import StagedModel
+from hilctl.models.refined import Refinable, RefinedModel
 
-AnyModel: TypeAlias = Annotated[
-    PpiModel
-    | SpiModel
-    | RdpiModel
-    | IntegratedModel
-    | StagedModel
-    | ButterflyModel
-    | GeneralisedModel
-    | PreisachModel
-    | KrasnoselskiiPokrovskiiModel
-    | BoucWenModel
-    | DuhemModel,
-    Field(discriminator="kind"),
-]
+AnyModel: TypeAlias = Annotated[Refinable | RefinedModel, Field(discriminator="kind")]
 
 
 class ModelFile(Strict):

@@ -1,0 +1,207 @@
+"""What a displacement has beyond what a model says: an operator of the modelled displacement.
+
+With ``x`` the displacement that a model gives, less that at rest, the actuator's is x + R[x], and
+
+    R[x] = sum q_i(F_i[x]) + sum (a_i(x) s_i + b_i(x) s_i^2) + c(x) rate
+
+*Plays* F_i of rising thresholds; *drags* s_i of lengths l_i, -1 to 1, which relax along the way
+that x travels, ds = (sign(dx) - s) |dx| / l; *rate*, -1 to 1, the change of x over a window of
+samples, of the fastest that was seen. All tables are lines through the same even edges of ``x``,
+and flat beyond them. So R is bounded, whatever the past, and so is the root of x + R[x] = y, the
+inverse.
+
+Memory, float64[p + d + n + 2]: the plays' outputs, the drags', ``x`` of the last n samples of the
+window, the last slope dx / dy, and the previous input; NaN means that there is none yet. It is
+updated in place, so any cut into blocks gives the same bits.
+
+Sources: I. D. Mayergoyz, "Mathematical Models of Hysteresis", Springer 1991 (plays as Preisach's
+triangle); P. R. Dahl, "Solid friction damping of mechanical vibrations", AIAA J. 14 (1976) 1675
+(drags); C. Eun and E. J. Powers, "A new Volterra predistorter based on the indirect learning
+architecture", IEEE Trans. Signal Process. 45 (1997) 223 (a model of a remainder, linear in what is
+looked for).
+"""
+
+import math
+from typing import TypeAlias
+
+import numpy as np
+
+from hilctl.base.arrays import F64, I64
+from hilctl.kernels.jit import kernel
+
+Tables: TypeAlias = tuple[F64, F64, F64, F64, F64]
+"""Thresholds float64[p], lengths float64[d], tables of the plays at the edges of c cells, float64[
+p (c + 1)], those of a, b and c, float64[(2 d + 1) (c + 1)], and the grid: lowest edge, width of a
+cell, c, change of x in a window that counts as rate 1, most that R can be either way."""
+
+_TABLES = "UniTuple(float64[::1], 5)"
+_STEPS = 60
+_TOLERANCE_UM = 1e-6
+
+
+@kernel("float64(float64, float64)", inline=True)
+def _within(place: float, cells: float) -> float:
+    """Return a place held within the cells; one that is not a number counts as the first."""
+    return min(place, cells) if place > 0.0 else 0.0
+
+
+@kernel(f"float64(float64, float64, float64[::1], {_TABLES})")
+def _peek(x: float, fastest: float, memory: F64, tables: Tables) -> float:
+    """Return R for a next x; change nothing."""
+    thresholds, lengths, values, weights, grid = tables
+    low, per_cell, cells = grid[0], 1.0 / grid[1], grid[2]
+    stride, plays, drags = int(cells) + 1, thresholds.size, lengths.size
+    total = 0.0
+    for i in range(plays):
+        held = max(min(memory[i], x + thresholds[i]), x - thresholds[i])
+        place = _within((held - low) * per_cell, cells)
+        cell = min(int(place), stride - 2)
+        j = i * stride + cell
+        total += values[j] + (values[j + 1] - values[j]) * (place - cell)
+    place = _within((x - low) * per_cell, cells)
+    cell = min(int(place), stride - 2)
+    part = place - cell
+    last = memory.size - 3
+    change = x - memory[last]
+    way, sign = abs(change), math.copysign(1.0, change)
+    for i in range(drags):
+        kept = math.exp(-way / lengths[i])
+        s = memory[plays + i] * kept + sign * (1.0 - kept)
+        a, b = i * stride + cell, (drags + i) * stride + cell
+        total += s * (weights[a] + part * (weights[a + 1] - weights[a]))
+        total += s * s * (weights[b] + part * (weights[b + 1] - weights[b]))
+    rate = max(-1.0, min(1.0, (x - memory[plays + drags]) / fastest))
+    c = 2 * drags * stride + cell
+    return float(total + rate * (weights[c] + part * (weights[c + 1] - weights[c])))
+
+
+@kernel(f"void(float64, float64, float64[::1], {_TABLES})")
+def _settle(x: float, given: float, memory: F64, tables: Tables) -> None:
+    """Bring all operators to a next x."""
+    thresholds, lengths = tables[0], tables[1]
+    plays, drags, last = thresholds.size, lengths.size, memory.size - 3
+    for i in range(plays):
+        memory[i] = max(min(memory[i], x + thresholds[i]), x - thresholds[i])
+    change = x - memory[last]
+    for i in range(drags):
+        kept = math.exp(-abs(change) / lengths[i])
+        memory[plays + i] = memory[plays + i] * kept + math.copysign(1.0, change) * (1.0 - kept)
+    if abs(memory[last + 2]) >= 0.0:
+        for k in range(plays + drags, last):
+            memory[k] = memory[k + 1]
+        memory[last] = x
+    else:  # it counts as having stood there for ever
+        for k in range(plays + drags, last + 1):
+            memory[k] = x
+    memory[last + 2] = given
+
+
+@kernel(f"float64(float64[::1], {_TABLES})", inline=True)
+def _fastest(memory: F64, tables: Tables) -> float:
+    """Return the change that counts as rate 1; none does where nothing has been before."""
+    return tables[4][3] if abs(memory[memory.size - 1]) >= 0.0 else math.inf
+
+
+@kernel(f"void(float64[::1], {_TABLES}, float64[::1], float64[::1])")
+def residual_forward(x: F64, tables: Tables, memory: F64, out: F64) -> None:
+    """Give x + R[x].
+
+    Args:
+        x: float64[n], in um. One that is not a number gives one that is none, and leaves no trace.
+        tables: See :data:`Tables`.
+        memory: See the module's docstring.
+        out: float64[n], filled.
+    """
+    for k in range(x.size):
+        now = x[k]
+        if abs(now) < math.inf:
+            out[k] = now + _peek(now, _fastest(memory, tables), memory, tables)
+            _settle(now, now, memory, tables)
+        else:
+            out[k] = np.nan
+
+
+@kernel(f"float64(float64, float64[::1], {_TABLES})")
+def _root(y: float, memory: F64, tables: Tables) -> float:
+    """Return the x that gives y: by secants from where the last ones lead, kept between bounds."""
+    fastest, most = _fastest(memory, tables), tables[4][4]
+    low, high, last = y - most, y + most, memory.size - 3
+    slope = memory[last + 1]
+    x = y if fastest == math.inf else memory[last] + slope * (y - memory[last + 2])
+    if not low <= x <= high:
+        x = y
+    before, missed_before = x, 0.0
+    for step in range(_STEPS):
+        missed = x + _peek(x, fastest, memory, tables) - y
+        if step > 0 and missed != missed_before:
+            secant = (x - before) / (missed - missed_before)
+            slope = secant if 0.0 < secant < 20.0 else 1.0
+        elif slope <= 0.0:
+            slope = 1.0
+        if abs(missed) <= _TOLERANCE_UM:
+            memory[last + 1] = slope
+            return x
+        if missed > 0.0:
+            high = x
+        else:
+            low = x
+        before, missed_before = x, missed
+        x -= slope * missed
+        # A secant across a corner may leave the bounds, or creep: halves end it.
+        if not low < x < high or step % 8 == 7:
+            x = 0.5 * (low + high)
+    return x
+
+
+@kernel(f"void(float64[::1], {_TABLES}, float64[::1], float64[::1])")
+def residual_inverse(y: F64, tables: Tables, memory: F64, out: F64) -> None:
+    """Find the x of which x + R[x] is y; arguments as for :func:`residual_forward`."""
+    for k in range(y.size):
+        now = y[k]
+        if abs(now) < math.inf:
+            out[k] = _root(now, memory, tables)
+            _settle(out[k], now, memory, tables)
+        else:
+            out[k] = np.nan
+
+
+@kernel(f"void(float64[::1], int64[::1], int64, {_TABLES}, float64[:, ::1])")
+def residual_columns(x: F64, rows: I64, window: int, tables: Tables, out: F64) -> None:
+    """Fill in what R is linear in, for identification: its slopes in each cell, and a, b and c.
+
+    Args:
+        x: float64[m], from rest.
+        rows: int64[N], samples that are filled in, rising.
+        window: Samples.
+        tables: See :data:`Tables`; thresholds, lengths and grid count.
+        out: float64[N, p c + (2 d + 1) (c + 1)], of zeros.
+    """
+    thresholds, lengths, _, _, grid = tables
+    low, width, cells = grid[0], grid[1], int(grid[2])
+    plays, drags = thresholds.size, lengths.size
+    held, s = np.zeros(plays), np.zeros(drags)
+    row, last = 0, 0.0
+    for k in range(x.size):
+        now = x[k]
+        for i in range(plays):
+            held[i] = max(min(held[i], now + thresholds[i]), now - thresholds[i])
+        for i in range(drags):
+            kept = math.exp(-abs(now - last) / lengths[i])
+            s[i] = s[i] * kept + math.copysign(1.0, now - last) * (1.0 - kept)
+        last = now
+        if row < rows.size and k == rows[row]:
+            for i in range(plays):
+                for j in range(cells):
+                    edge = low + j * width
+                    rest = min(max(-edge, 0.0), width)
+                    out[row, i * cells + j] = min(max(held[i] - edge, 0.0), width) - rest
+            place = _within((now - low) / width, grid[2])
+            cell = min(int(place), cells - 1)
+            part = place - cell
+            rate = max(-1.0, min(1.0, (now - x[max(k - window, 0)]) / grid[3]))
+            for i in range(2 * drags + 1):
+                factor = rate if i == 2 * drags else (s[i] if i < drags else s[i - drags] ** 2)
+                first = plays * cells + i * (cells + 1) + cell
+                out[row, first] = (1.0 - part) * factor
+                out[row, first + 1] = part * factor
+            row += 1

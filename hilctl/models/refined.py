@@ -1,0 +1,288 @@
+"""A model, and what recordings of its use have shown beyond it."""
+
+from collections.abc import Iterator
+from functools import cache
+from itertools import combinations
+from typing import Annotated, Any, Literal, Self, TypeAlias
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from hilctl.base.arrays import F64
+from hilctl.base.strict import Strict
+from hilctl.kernels.residual import Tables, residual_forward, residual_inverse
+from hilctl.models.base import (
+    HysteresisModel,
+    Operator,
+    Provenance,
+    Thresholds,
+    Weights,
+    refuse,
+    threshold_problems,
+)
+from hilctl.models.bouc_wen import BoucWenModel
+from hilctl.models.butterfly import ButterflyModel
+from hilctl.models.chain import Chain
+from hilctl.models.duhem import DuhemModel
+from hilctl.models.generalised import GeneralisedModel
+from hilctl.models.integrated import IntegratedModel
+from hilctl.models.kp import KrasnoselskiiPokrovskiiModel
+from hilctl.models.plays import PpiModel, RdpiModel
+from hilctl.models.preisach import PreisachModel
+from hilctl.models.spi import SpiModel
+from hilctl.models.staged import StagedModel, Structure
+
+Refinable: TypeAlias = (
+    PpiModel
+    | SpiModel
+    | RdpiModel
+    | IntegratedModel
+    | StagedModel
+    | ButterflyModel
+    | GeneralisedModel
+    | PreisachModel
+    | KrasnoselskiiPokrovskiiModel
+    | BoucWenModel
+    | DuhemModel
+)
+"""Every kind of model but the refined one."""
+
+LEAST_SLOPE = 0.1
+"""Smallest slope of x + R[x] by the next x that a model may have, whatever came before."""
+_POSITIONS = 60  # of x that the slope is worked out at, each way
+_TURNS = (0.02, 2.0, 8)  # of the longest drag: nearest and furthest turn that is tried, how many
+
+
+class ResidualOperator(Strict):
+    """R of the displacement x that a model gives, see :mod:`hilctl.kernels.residual`.
+
+    Attributes:
+        lowest_um: Lower end of the first cell of x.
+        cell_um: Width of a cell, > 0.
+        thresholds_um: Of the plays, rising from 0; the first is 0.
+        slopes: For each play, its slope in each cell.
+        lengths_um: Of the drags, each > 0.
+        drags_um: For each drag, a at the edges of the cells; then for each drag b.
+        rate_um: c at the edges of the cells.
+        window_s: Time over which the change of x is its rate, in s.
+        fastest_um_per_s: Rate that counts as 1; faster ones do too.
+    """
+
+    lowest_um: float
+    cell_um: float = Field(gt=0.0)
+    thresholds_um: Thresholds
+    slopes: tuple[Weights, ...]
+    lengths_um: Thresholds
+    drags_um: tuple[Weights, ...]
+    rate_um: Weights
+    window_s: float = Field(gt=0.0, le=1.0)
+    fastest_um_per_s: float = Field(gt=0.0, allow_inf_nan=False)
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        refuse(self._shape_problems())
+        if not (least := self.least_slope) >= LEAST_SLOPE:
+            raise ValueError(
+                f"the slope of x + R[x] must be >= {LEAST_SLOPE} for one inverse to exist: {least}"
+            )
+        return self
+
+    def _shape_problems(self) -> Iterator[str]:
+        if not self.thresholds_um or self.thresholds_um[0] != 0.0:
+            yield f"the first of thresholds_um must be 0: {list(self.thresholds_um[:1])}"
+        yield from threshold_problems("r", self.thresholds_um[1:])
+        yield from threshold_problems("l", self.lengths_um)
+        cells = len(self.rate_um) - 1
+        if cells < 1:
+            yield f"rate_um must have two values at least: {len(self.rate_um)}"
+        for name, lines, count, size in (
+            ("slopes", self.slopes, len(self.thresholds_um), cells),
+            ("drags_um", self.drags_um, 2 * len(self.lengths_um), cells + 1),
+        ):
+            if len(lines) != count or any(len(line) != size for line in lines):
+                yield f"{name} must have {count} lines of {size} values each"
+
+    @property
+    def operators(self) -> int:
+        """Number of plays and drags."""
+        return len(self.thresholds_um) + len(self.lengths_um)
+
+    @property
+    def least_slope(self) -> float:
+        """Smallest slope of x + R[x] by the next x, whatever came before.
+
+        Where x turns, plays follow it one after the other, from the narrowest on, and drags stand
+        where turns before have left them.
+        """
+        edges = self._edges()
+        slack = 0.01 * self.cell_um
+        x = np.linspace(edges[0] + slack, edges[-1] - slack, _POSITIONS).astype(np.float64)
+        least = min(
+            float((self._play_slope(x, edges, way) + self._drag_slope(x, edges, way)).min())
+            for way in (1.0, -1.0)
+        )
+        return 1.0 + least + float(self._rate_slope(x, edges).min())
+
+    def _edges(self) -> F64:
+        edges: F64 = self.lowest_um + self.cell_um * np.arange(len(self.rate_um), dtype=np.float64)
+        return edges
+
+    def _play_slope(self, x: F64, edges: F64, way: float) -> F64:
+        """Return the least slope of the plays where x goes that way: float64[n]."""
+        held = x[:, None] - way * np.array(self.thresholds_um)
+        cell = np.floor((held - edges[0]) / self.cell_um).astype(np.int64)
+        inside = (cell >= 0) & (cell < edges.size - 1)
+        slopes = np.array(self.slopes)[
+            np.arange(len(self.slopes)), np.clip(cell, 0, edges.size - 2)
+        ]
+        return np.asarray(np.cumsum(slopes * inside, axis=1).min(axis=1))
+
+    def _drag_slope(self, x: F64, edges: F64, way: float) -> F64:
+        """Return the least slope of the drags where x goes that way: float64[n]."""
+        if not self.lengths_um:
+            return np.zeros(x.size)
+        lengths, count = np.array(self.lengths_um), len(self.lengths_um)
+        states = _states(self.lengths_um)
+        moves = (1.0 - way * states) / lengths  # of a state, by the way gone
+        lines = [_line(x, edges, np.array(line)) for line in self.drags_um]
+        values, bends = (np.stack(each) for each in zip(*lines, strict=True))
+        slopes = states @ bends[:count] + states**2 @ bends[count:]
+        slopes += moves @ values[:count] + (2.0 * states * moves) @ values[count:]
+        return np.asarray(slopes.min(axis=0))
+
+    def _rate_slope(self, x: F64, edges: F64) -> F64:
+        value, bend = _line(x, edges, np.array(self.rate_um))
+        change_um = self.fastest_um_per_s * self.window_s
+        return np.asarray(-np.abs(bend) + np.minimum(value / change_um, 0.0))
+
+    def forward(self, sample_rate_hz: float, rest_um: float = 0.0) -> Operator:
+        """Return x + R[x] at rest, for displacements that are ``rest_um`` there."""
+        tables, window = self.tables(sample_rate_hz)
+
+        def run(x: F64, memory: F64, out: F64) -> None:
+            residual_forward(x, tables, memory, out)
+
+        numbers = self.operators + window + 2
+        return Operator(run, numbers, input_offset=-rest_um, output_offset=rest_um)
+
+    def inverse(self, sample_rate_hz: float, rest_um: float = 0.0) -> Operator:
+        """Return what undoes :meth:`forward`, at rest."""
+        tables, window = self.tables(sample_rate_hz)
+
+        def run(y: F64, memory: F64, out: F64) -> None:
+            residual_inverse(y, tables, memory, out)
+
+        numbers = self.operators + window + 2
+        return Operator(run, numbers, input_offset=-rest_um, output_offset=rest_um)
+
+    def tables(self, sample_rate_hz: float) -> tuple[Tables, int]:
+        """Return what the kernels take, and the window in samples."""
+        slopes = np.array(self.slopes)
+        plays, cells = slopes.shape
+        values = np.zeros((plays, cells + 1))
+        np.cumsum(slopes * self.cell_um, axis=1, out=values[:, 1:])
+        values -= np.array([[np.interp(0.0, self._edges(), line)] for line in values])
+        lines = np.array([*self.drags_um, self.rate_um])
+        window = max(1, round(self.window_s * sample_rate_hz))
+        fastest = self.fastest_um_per_s * window / sample_rate_hz
+        most = np.abs(values).max(axis=1).sum() + np.abs(lines).max(axis=1).sum()
+        grid = np.array([self.lowest_um, self.cell_um, float(cells), fastest, 1.001 * most + 1e-3])
+        arrays = np.array(self.thresholds_um), np.array(self.lengths_um), values.ravel()
+        return (*arrays, lines.ravel(), grid), window
+
+
+@cache
+def _states(lengths_um: tuple[float, ...]) -> F64:
+    """Return where a few turns leave drags: float64[m, d].
+
+    A state is the sum over the way gone of its sign times e^(-way / l) / l. A sum of d such
+    exponentials changes its sign d - 1 times at most, so a weighted sum of drags is largest where
+    the way has turned as often.
+    """
+    lengths = np.array(lengths_um)
+    at = float(lengths.max()) * np.geomspace(*_TURNS)
+    states = []
+    for turns in range(lengths.size):
+        for chosen in combinations(at, turns):
+            left = np.exp(-np.array(chosen)[:, None] / lengths)  # of the way before each turn
+            signs = (-1.0) ** np.arange(1, turns + 1)
+            states.append(1.0 + 2.0 * signs @ left)
+    both = np.array(states)
+    return np.concatenate((both, -both))
+
+
+def _line(x: F64, edges: F64, values: F64) -> tuple[F64, F64]:
+    """Return a line through points, and its slope: float64[n] each."""
+    cell = np.clip(np.searchsorted(edges, x) - 1, 0, edges.size - 2)
+    return np.interp(x, edges, values), (np.diff(values) / np.diff(edges))[cell]
+
+
+def rest_um(model: HysteresisModel) -> float:
+    """Return the displacement that a model has at rest."""
+    inner = getattr(model, "hysteresis", None)
+    return model.output_offset_um + (inner.output_offset_um if inner is not None else 0.0)
+
+
+class RefinedModel(HysteresisModel):
+    """A model, then a constant displacement and an operator of what it gives.
+
+    Attributes:
+        base: The model; the unit and the ranges are the refined model's.
+        residual: R of the displacement that it gives, less that at rest.
+    """
+
+    kind: Literal["refined"] = "refined"
+    base: Annotated[Refinable, Field(discriminator="kind")]
+    residual: ResidualOperator
+
+    @classmethod
+    def of(
+        cls, model: HysteresisModel, residual: ResidualOperator, offset_um: float
+    ) -> "RefinedModel":
+        """Put an operator behind a model, whose unit, ranges and provenance become theirs."""
+        shared = {name: getattr(model, name) for name in _SHARED}
+        bare = {"input_range": None, "output_range_um": None, "provenance": Provenance()}
+        base: Any = model.model_copy(update=bare)
+        return cls(base=base, residual=residual, output_offset_um=offset_um, **shared)
+
+    @model_validator(mode="after")
+    def _check_one_truth(self) -> Self:
+        if self.base.input_unit != self.input_unit:
+            raise ValueError(f"base.input_unit must be {self.input_unit}, as beside it")
+        return self
+
+    @property
+    def operators(self) -> int:
+        """Number of operators with memory."""
+        return self.base.operators + self.residual.operators
+
+    @property
+    def structure(self) -> Structure | None:
+        """What the displacement goes through, where the base has it."""
+        return self.base.structure if isinstance(self.base, StagedModel) else None
+
+    def forward(self, sample_rate_hz: float) -> Chain:
+        """Return the operator from command to displacement in um, at rest."""
+        operator = self.residual.forward(sample_rate_hz, rest_um(self.base))
+        return Chain(
+            [self.base.forward(sample_rate_hz), operator], output_offset=self.output_offset_um
+        )
+
+    def inverse(self, sample_rate_hz: float) -> Chain:
+        """Return the operator from displacement in um, ``preview`` samples ahead, to command.
+
+        Raises:
+            ModelError: The numbers of the base's inverse are not finite.
+        """
+        operator = self.residual.inverse(sample_rate_hz, rest_um(self.base))
+        inverse = self.base.inverse(sample_rate_hz)
+        return Chain(
+            [operator, inverse], preview=inverse.preview, input_offset=-self.output_offset_um
+        )
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return the parameters as plain mappings, lists and numbers, defaults left out."""
+        return super().to_mapping() | {"base": {"kind": self.base.kind, **self.base.to_mapping()}}
+
+
+_SHARED = ("input_unit", "input_range", "output_range_um", "provenance")

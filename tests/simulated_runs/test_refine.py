@@ -1,0 +1,42 @@
+"""Refining on the simulated rig: from recordings of compensated runs to a smaller error."""
+
+from pathlib import Path
+
+from hilctl.analysis.replay import replay
+from hilctl.analysis.report import summarize
+from hilctl.identify.refine.command import refine_files
+from hilctl.recording.reader import read
+from hilctl.run.start import checked_experiment
+from hilctl.run.unpaced import run_unpaced
+
+CONFIGS = Path(__file__).parents[2] / "configs"
+SINE = CONFIGS / "terfenol_sine_6a.yaml"
+STAGED = CONFIGS / "models" / "terfenol_staged.yaml"
+
+
+def run(path, model, frequency_hz, amplitude_um, seed):
+    """Run a rig that moves 5 % further than the one that the model is of; return its recording."""
+    settings = [
+        f"compensator.model={model}", f"waveform.frequency_hz={frequency_hz}",
+        f"waveform.amplitude={amplitude_um}", f"device.seed={seed}", "device.vary.strain=1.05",
+        f"waveform.duration_s={0.5 + 3.0 / frequency_hz:.4f}",
+    ]  # fmt: skip
+    run_unpaced(checked_experiment(SINE, settings), path)
+    return path
+
+
+def test_compensated_runs_make_a_model_better_on_another_reference(tmp_path):
+    """Runs at other frequencies and amplitudes; the one judged is not among them, and replays."""
+    given = ((20.0, 34.0), (60.0, 30.0), (120.0, 34.0), (150.0, 20.0))
+    runs = [
+        run(tmp_path / f"{i}.mcap", STAGED, frequency_hz, size, seed=i + 2)
+        for i, (frequency_hz, size) in enumerate(given)
+    ]
+    better = tmp_path / "better.yaml"
+    assert refine_files(STAGED, runs, better).better
+    was, now = (
+        summarize(read(run(tmp_path / f"{name}.mcap", model, 90.0, 28.0, seed=40)))
+        for name, model in (("was", STAGED), ("now", better))
+    )
+    assert now.peak_error_percent < 0.6 * was.peak_error_percent
+    assert replay(read(tmp_path / "now.mcap")).identical

@@ -1,0 +1,18 @@
+"""A page of before and after that needs nothing else."""
+
+from hilctl.identify.refine.command import refine_runs
+from hilctl.identify.refine.page import HEADINGS, refinement_page, refinement_rows, write_refinement
+
+
+def test_page_has_verdict_table_figures_and_model(old, runs, tmp_path):
+    found = refine_runs(old, runs[:3], source="a<b>.yaml")
+    rows = refinement_rows(found)
+    assert [row[0] for row in rows] == ["run 0", "run 1", "run 2"]
+    assert all(len(row) == len(HEADINGS) for row in rows)
+    page = refinement_page(found)
+    assert "a&lt;b&gt;.yaml" in page
+    assert "<b>" not in page.replace("<body>", "")
+    assert page.count("<img") == 2
+    assert "kind: refined" in page
+    write_refinement(found, tmp_path / "page.html")
+    assert (tmp_path / "page.html").read_text() == page

@@ -1,0 +1,54 @@
+"""What is held out in turn, and when a refinement counts as better."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hilctl.base.errors import DataError
+from hilctl.identify.fit_data import FitData
+from hilctl.identify.held_out import HeldOut
+from hilctl.identify.judge import judgement_of
+from hilctl.identify.refine.strength import Choice, Split, parts_of
+from tests.unit.identify.refine.conftest import OLD, history
+
+
+def held_out(factors):
+    """Errors of so much of each run."""
+    runs = tuple(history(OLD, i) for i in range(len(factors)))
+    data = FitData(runs)
+    modelled = np.concatenate([(1.0 + f) * run.displacement_um
+                               for f, run in zip(factors, runs, strict=True)])  # fmt: skip
+    return HeldOut(judgement_of(data, modelled), runs, "for a test")
+
+
+@pytest.mark.parametrize(("before", "after", "better"), [
+    ((0.02, 0.02), (0.01, 0.01), True),
+    ((0.02, 0.02), (0.02, 0.02), False),
+    ((0.10, 0.01), (0.03, 0.012), True),
+    ((0.10, 0.01), (0.03, 0.016), False),
+])  # fmt: skip
+def test_better_in_the_mean_and_nowhere_much_worse(before, after, better):
+    """What one run loses is held against what all gain."""
+    choice = Choice(0.1, False, held_out(before), held_out(after))
+    assert choice.better == better
+
+
+def test_each_of_several_runs_is_judged_by_what_the_others_say():
+    runs = [history(OLD, i) for i in range(3)]
+    parts, splits = parts_of(runs, ())
+    assert parts == tuple(runs)
+    assert splits == (Split((1, 2), (0,)), Split((0, 2), (1,)), Split((0, 1), (2,)))
+
+
+def test_others_to_validate_with_are_never_fitted():
+    runs = [history(OLD, i) for i in range(3)]
+    _, splits = parts_of(runs[:2], runs[2:])
+    assert splits == (Split((0, 1), (2,)),)
+
+
+def test_a_run_too_short_to_be_cut_is_refused():
+    run = history(OLD, 1)
+    short = replace(run, command=run.command[:20], displacement_um=run.displacement_um[:20])
+    with pytest.raises(DataError, match="give more recordings"):
+        parts_of([short], ())

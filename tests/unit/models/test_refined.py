@@ -1,0 +1,147 @@
+"""The refined model: files, conditions, and that its inverse undoes it, whatever its base."""
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from hilctl.models.base import Provenance
+from hilctl.models.files import dump_model, parse_model
+from hilctl.models.refined import RefinedModel, ResidualOperator, rest_um
+from hilctl.models.staged import FieldLag, StagedModel, Structure
+from tests.published import piezo_ppi, terfenol_rdpi
+
+RATE_HZ = 50_000.0
+STAGED = StagedModel.around(
+    terfenol_rdpi(),
+    lag=FieldLag(tau_s=1e-4),
+    structure=Structure(natural_hz=2200.0, damping_ratio=0.12),
+    delay_s=2.7e-5,
+)
+BASES = {
+    "ppi": piezo_ppi(),
+    "with an offset": piezo_ppi().model_copy(update={"output_offset_um": 7.0}),
+    "rdpi": terfenol_rdpi(),
+    "staged": STAGED,
+}
+
+
+def residual(scale=1.0, **changes):
+    rng = np.random.default_rng(3)
+    fields = {
+        "lowest_um": -40.0,
+        "cell_um": 10.0,
+        "thresholds_um": (0.0, 3.0, 12.0),
+        "slopes": tuple(map(tuple, (0.02 * scale * rng.normal(size=(3, 8))).tolist())),
+        "lengths_um": (5.0, 40.0),
+        "drags_um": tuple(map(tuple, (0.1 * scale * rng.normal(size=(4, 9))).tolist())),
+        "rate_um": tuple((0.1 * scale * rng.normal(size=9)).tolist()),
+        "window_s": 2e-4,
+        "fastest_um_per_s": 5e4,
+    }
+    return ResidualOperator(**{**fields, **changes})
+
+
+def sine(frequency_hz=100.0, samples=10_000):
+    t = np.arange(samples) / RATE_HZ
+    swell = np.minimum(np.minimum(1.0, t / 0.04), (t[-1] - t) / 0.04)
+    return swell * (9.0 * np.sin(2.0 * np.pi * frequency_hz * t) + 3.0)
+
+
+@pytest.mark.parametrize("name", BASES)
+def test_round_trip_gives_the_same_model(name):
+    model = RefinedModel.of(BASES[name], residual(), 0.4)
+    assert parse_model("text", dump_model(model)) == model
+
+
+@pytest.mark.parametrize("name", BASES)
+def test_forward_of_the_inverse_is_the_reference(name):
+    """As well as the base's own does: what is added is undone exactly."""
+    base = BASES[name]
+    model = RefinedModel.of(base, residual(), 0.4)
+    reference = sine() + rest_um(base)
+
+    def missed(which):
+        inverse = which.inverse(RATE_HZ)
+        after = np.full(inverse.preview, reference[-1])
+        inverse.process(reference[: inverse.preview].copy())
+        command = inverse.process(np.concatenate((reference[inverse.preview :], after)))
+        error = which.forward(RATE_HZ).process(command) - reference
+        return float(np.abs(error[1000 : -2 * inverse.preview - 1]).max())
+
+    assert missed(model) <= 1.5 * missed(base) + 3e-6
+
+
+def test_at_rest_it_stands_where_its_base_does_and_its_own_offset_further():
+    """An offset is no hysteresis: it has a number of its own."""
+    base = BASES["with an offset"]
+    model = RefinedModel.of(base, residual(), 0.4)
+    rest = model.forward(RATE_HZ).process(np.zeros(4))
+    np.testing.assert_allclose(rest, 7.4, atol=1e-12)
+    assert rest_um(base) == 7.0
+
+
+def test_of_takes_over_unit_ranges_and_provenance():
+    source = Provenance(source=("run.mcap",))
+    inner = piezo_ppi().model_copy(update={"input_range": (0.0, 5.0), "provenance": source})
+    model = RefinedModel.of(inner, residual(), 0.0)
+    assert (model.input_unit, model.input_range, model.provenance) == ("V", (0, 5), source)
+    assert model.base.input_range is None
+    assert model.operators == inner.operators + 5
+
+
+def test_feedback_finds_the_resonance_where_the_base_has_one():
+    assert RefinedModel.of(STAGED, residual(), 0.0).structure == STAGED.structure
+    assert RefinedModel.of(piezo_ppi(), residual(), 0.0).structure is None
+
+
+@pytest.mark.parametrize("name", BASES)
+@pytest.mark.parametrize("direction", ["forward", "inverse"])
+def test_a_state_that_is_restored_goes_on_with_the_same_bits(name, direction):
+    """All of it, that of the base's own stages too: a run replays from such states."""
+    model = RefinedModel.of(BASES[name], residual(), 0.4)
+    signal = sine() if direction == "inverse" else 0.2 * sine()
+    operator, other = (getattr(model, direction)(RATE_HZ) for _ in range(2))
+    operator.process(signal[:4000].copy())
+    state = operator.state()
+    went_on = operator.process(signal[4000:].copy())
+    operator.restore(state)
+    other.restore(state)
+    for each in (operator, other):
+        np.testing.assert_array_equal(each.process(signal[4000:].copy()), went_on)
+
+
+@pytest.mark.parametrize(("change", "message"), [
+    ({"thresholds_um": (1.0, 3.0, 12.0)}, "the first of thresholds_um must be 0"),
+    ({"thresholds_um": (0.0, 12.0, 3.0)}, "r must rise from 0"),
+    ({"lengths_um": (5.0, -1.0)}, "l must rise from 0"),
+    ({"slopes": ((0.0,) * 8,) * 2}, "slopes must have 3 lines of 8 values each"),
+    ({"drags_um": ((0.0,) * 9,) * 3}, "drags_um must have 4 lines of 9 values each"),
+    ({"rate_um": (0.0,)}, "rate_um must have two values at least: 1"),
+    ({"slopes": ((-0.95,) * 8, (0.0,) * 8, (0.0,) * 8)}, "for one inverse to exist"),
+    ({"window_s": 0.0}, "greater than 0"),
+])  # fmt: skip
+def test_conditions_are_named(change, message):
+    with pytest.raises(ValidationError, match=message):
+        residual(**change)
+
+
+def test_a_unit_of_its_own_is_refused():
+    with pytest.raises(ValidationError, match=r"base.input_unit must be A, as beside it"):
+        RefinedModel(base=piezo_ppi(), residual=residual())
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_least_slope_is_below_every_slope_that_a_walk_meets(seed):
+    """A certificate that a walk could beat would be none."""
+    operator = residual(scale=2.0)
+    rng = np.random.default_rng(seed)
+    walk = np.cumsum(rng.choice([-1.0, 1.0], 400) * rng.exponential(6.0, 400))
+    walk = np.abs((walk + 40.0) % 160.0 - 80.0) - 40.0  # reflected at both ends
+    met = []
+    for turn in range(20, 400, 7):
+        ends = []
+        for step in (0.0, 1e-4 * np.sign(walk[turn] - walk[turn - 1])):
+            way = np.append(walk[: turn + 1], walk[turn] + step)
+            ends.append(operator.forward(1.0).process(way)[-1])
+        met.append((ends[1] - ends[0]) / step)
+    assert operator.least_slope <= min(met) + 0.02
