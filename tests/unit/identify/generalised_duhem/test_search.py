@@ -4,28 +4,10 @@ import numpy as np
 import pytest
 
 from hilctl.base.arrays import F64
-from hilctl.identify.data.records import History
-from hilctl.identify.field.prepared import Prepared
-from hilctl.identify.field.stages import HIGH, LOW, STEP, Stages
 from hilctl.identify.generalised_duhem.search import DuhemSearch, _bounded_step
-from hilctl.identify.generalised_duhem.signals import (
-    FIRST,
-    HIGHEST,
-    LOWEST,
-    NAMES,
-    STAGES,
-    STEPS,
-    Signals,
-)
+from hilctl.identify.generalised_duhem.signals import FIRST, HIGHEST, LOWEST, NAMES, STEPS
 from hilctl.identify.generalised_duhem.tables import laid_over
-from tests.unit.identify.generalised_duhem.test_duhem_fits import RATE_HZ, command, truth
-
-
-def data(unit: float = 1.0, um: float = 1.0) -> Prepared:
-    """Return a record in other units of the command and the displacement."""
-    v = command(1)[:6000]
-    y = truth().forward(RATE_HZ).process(v)
-    return Prepared([History("random", unit * v, um * y, RATE_HZ)])
+from tests.unit.identify.generalised_duhem.test_signals import data
 
 
 def ready() -> tuple[DuhemSearch, F64]:
@@ -34,26 +16,6 @@ def ready() -> tuple[DuhemSearch, F64]:
     job._lay(laid_over(job._chosen(FIRST, 0.03, 500), 8, 6))
     job._first_um = 0.7
     return job, job._layout.first_logs()
-
-
-def test_the_row_is_made_of_the_stages_that_the_field_has() -> None:
-    for row, stages in ((FIRST, Stages()), (LOWEST, LOW), (HIGHEST, HIGH), (STEPS, STEP)):
-        assert row.size == len(NAMES)
-        assert dict(zip(NAMES, row, strict=True)) | {
-            name: getattr(stages, name) for name in STAGES
-        } == dict(zip(NAMES, row, strict=True))
-    assert (FIRST >= LOWEST).all()
-    assert (FIRST <= HIGHEST).all()
-
-
-def test_the_flux_rises_over_the_stroke_whatever_its_row() -> None:
-    signals = Signals(data())
-    for flux_slope, flux_bend in ((2.0, 2.0), (-2.0, -2.0), (0.0, 0.0)):
-        x = FIRST.copy()
-        x[-3:-1] = flux_slope, flux_bend
-        curve = signals.flux(x)
-        assert (np.diff(curve.operators) > 0.0).all()
-        assert np.ptp(curve.operators) == pytest.approx(np.ptp(curve.displacement_um))
 
 
 def test_slopes_are_those_of_the_errors() -> None:
