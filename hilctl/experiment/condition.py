@@ -116,8 +116,9 @@ def _cycle(config: Experiment) -> F64:
     falling, span, decay = np.maximum(turn - 1.0, 0.0), condition.cycles - 1.0, condition.decay
     if decay == 1.0:
         envelope = 1.0 - falling / span
-    else:  # shifted so that it ends at 0
-        envelope = (decay**falling - decay**span) / (1.0 - decay**span)
+    else:  # shifted so that it ends at 0; plain differences of powers near 1 are steps
+        log = math.log(decay)
+        envelope = decay**falling * np.expm1((span - falling) * log) / math.expm1(span * log)
     command: F64 = safe + envelope * np.where(wave > 0.0, above, below) * wave
     command[-1] = safe
     return command

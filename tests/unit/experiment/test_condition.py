@@ -1,12 +1,13 @@
 """The conditioning cycle of an experiment: how far it goes, how it ends, and what it makes."""
 
+import math
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from hilctl.base.errors import ConfigError
@@ -80,6 +81,7 @@ class TestCycle:
         safe=st.floats(-3.0, 3.0),
         rate_hz=st.sampled_from([200.0, 10e3]),
     )
+    @example(cycles=2, decay=math.nextafter(1.0, 0.0), slew=100.0, safe=0.0, rate_hz=200.0)
     def test_within_limits_and_to_the_safe_value(self, cycles, decay, slew, safe, rate_hz):
         """Whatever is asked for: range and slew are kept, and the last command is the safe one."""
         cycle, made = command_of(
