@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 from hilctl.analysis.catalogue_cache import cache_file, merged, read_cache, write_cache
 from hilctl.analysis.run_entry import COLUMNS, OPTIONS, Entry, entry_of, unreadable
-from hilctl.analysis.where import Condition, check_names
+from hilctl.analysis.where import RunCondition, check_names
 from hilctl.base.errors import InputError
 from hilctl.recording.facts import LABELS_FACT
 
@@ -69,14 +69,14 @@ class Catalogue:
         """Return the numbers of the rows that match, in order.
 
         Args:
-            where: A condition, see :class:`~hilctl.analysis.where.Condition`; empty for all.
+            where: A condition, see :class:`~hilctl.analysis.where.RunCondition`; empty for all.
             sort: Key to sort by; rows that have none come last.
             reverse: The other way round.
 
         Raises:
             InputError: The condition can't be read, or a key is none.
         """
-        condition = Condition(where) if where else None
+        condition = RunCondition(where) if where else None
         names = {sort, *(condition.names if condition else ())}
         if not names <= set(_PLAIN):
             check_names(names, self.keys(), [f"{prefix}." for prefix in _IN_JSON])

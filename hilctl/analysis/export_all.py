@@ -57,7 +57,7 @@ def export_all(
     Args:
         folder: Folder with recordings, at any depth.
         output: Folder to write to; made where it is not there.
-        on_progress: Is told the part that is done, and the next recording.
+        on_progress: Is given the part that is done, and the next recording.
 
     Raises:
         InputError: The folder can't be listed, a file can't be written, or pyarrow is missing.

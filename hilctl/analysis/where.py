@@ -1,7 +1,7 @@
 """Conditions on runs, as in ``frequency_hz > 100 and label.sample == "A7"``.
 
 They look like Python and are read by its parser, but nothing is run: what may stand in one is in
-:class:`Condition`. What is not known of a run matches nothing, nor does its contrary, as in SQL.
+:class:`RunCondition`. What is not known of a run matches nothing, nor does its contrary, as in SQL.
 """
 
 import ast
@@ -13,10 +13,10 @@ from typing import Any, TypeAlias
 from hilctl.base.errors import InputError
 from hilctl.base.printable import printable
 
-Values: TypeAlias = Mapping[str, Any]
+RunValues: TypeAlias = Mapping[str, Any]
 """The value of each name for one run; None where it is not known."""
-_Truth: TypeAlias = Callable[[Values], bool | None]
-_Term: TypeAlias = Callable[[Values], Any]
+_Truth: TypeAlias = Callable[[RunValues], bool | None]
+_Term: TypeAlias = Callable[[RunValues], Any]
 
 _log = logging.getLogger(__name__)
 
@@ -30,7 +30,7 @@ _ORDERS: Mapping[type[ast.cmpop], Callable[[Any, Any], bool]] = {
 }
 
 
-class Condition:
+class RunCondition:
     """A condition on the values of a run.
 
     It may hold names with points, names of labels that are none in Python as ``label["class"]``,
@@ -61,7 +61,7 @@ class Condition:
         except (ValueError, RecursionError, MemoryError):
             raise self._refused("can't be read") from None
 
-    def matches(self, values: Values) -> bool:
+    def matches(self, values: RunValues) -> bool:
         """Return whether it is true of a run; False where that is not known."""
         return self._truth(values) is True
 
@@ -108,7 +108,7 @@ class Condition:
         else:
             raise self._refused("'is' stands before None only")
 
-        def compared(values: Values) -> bool | None:
+        def compared(values: RunValues) -> bool | None:
             found = test(left(values), right(values))
             return found if found is None else found != contrary
 

@@ -34,6 +34,7 @@ from hilctl.analysis.export import export
 from hilctl.analysis.html import page
 from hilctl.analysis.replay import replay
 from hilctl.analysis.report import summarize
+from hilctl.analysis.run_entry import entry_of
 from hilctl.base.errors import ConfigError, HilctlError
 from hilctl.base.segments import Segment
 from hilctl.cli.report_view import render
@@ -384,6 +385,7 @@ def outcomes(path: Path, commands: Iterable[str] = COMMANDS) -> Iterator[tuple[s
     found: list[Recording] = []
     outcome, text = attempt(lambda: found.append(read(path)))
     yield "read", outcome, text
+    yield "list", *attempt(lambda: json.dumps(entry_of(path, "", 0, 0), allow_nan=False))
     for name in commands if found else ():
         yield name, *attempt(partial(COMMANDS[name], found[0], path))
     yield "recover", *attempt(partial(recover, path))

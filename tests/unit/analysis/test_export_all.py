@@ -24,10 +24,10 @@ def folder(tmp_path, monkeypatch):
 
 def exported(folder, output):
     """Export, and return how many were written, there, and left out for which reasons."""
-    told = []
-    done = export_all.export_all(folder, output, lambda part, path: told.append(part))
-    assert told == sorted(told)
-    assert told[-1] == 1.0
+    parts = []
+    done = export_all.export_all(folder, output, lambda part, path: parts.append(part))
+    assert parts == sorted(parts)
+    assert parts[-1] == 1.0
     return done.written, done.there, done.left_out
 
 

@@ -4,7 +4,7 @@ import logging
 
 import pytest
 
-from hilctl.analysis.where import Condition, check_names
+from hilctl.analysis.where import RunCondition, check_names
 from hilctl.base.errors import InputError
 
 RUN = {
@@ -19,7 +19,7 @@ RUN = {
 
 
 def matches(text):
-    condition = Condition(text)
+    condition = RunCondition(text)
     assert set(condition.names) <= set(RUN)
     return condition.matches(RUN)
 
@@ -110,10 +110,10 @@ def test_kinds_and_letters_count(text):
 )
 def test_anything_else_is_refused_in_a_line(text, problem):
     if not problem:
-        assert Condition(text).names == {"a": None}
+        assert RunCondition(text).names == {"a": None}
         return
     with pytest.raises(InputError, match=problem) as refused:
-        Condition(text)
+        RunCondition(text)
     assert str(refused.value).isprintable()
 
 
