@@ -31,6 +31,7 @@ def test_a_chain_is_its_operators_one_after_another():
         by_hand = stage.process(by_hand)
     assert chain.process(SIGNAL).tolist() == (by_hand - 0.5).tolist()
     assert chain.preview == 0
+    assert Chain([delayed(2)]).process(SIGNAL).tolist() == delayed(2).process(SIGNAL).tolist()
     assert Chain([delayed(1)], preview=4).preview == 4
 
 
