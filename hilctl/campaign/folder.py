@@ -6,12 +6,15 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from mcap.writer import MCAP0_MAGIC
+
 from hilctl.base.errors import ConfigError, DataError, InputError
 from hilctl.base.yaml.document import load_document
 from hilctl.campaign.steps import CampaignSteps, base_problem, settings_of
 from hilctl.experiment.parts import RecordingConfig
 from hilctl.recording.ends import read_ends
 from hilctl.recording.recover import recover_recording
+from hilctl.recording.writer import is_being_recorded
 from hilctl.run.run_folder import RunFolder, runs
 from hilctl.run.step import RunKey, completed_key
 
@@ -104,15 +107,32 @@ def _is_in(run: RunFolder, folder: Path) -> bool:
 
 
 def make_whole(folder: Path) -> list[str]:
-    """Make recordings whole that were cut short; return what was done, for people."""
+    """Make recordings whole that were cut short; return what was done, for people.
+
+    What was killed before its run began holds nothing of one: an empty file is removed, and one
+    with less than a head is kept as ``NAME.torn``.
+    """
     done = []
     for path in sorted(folder.glob("*.mcap")):
         try:
             if read_ends(path).state == "unfinished":
                 done.append(f"{path}: {recover_recording(path).reason}")
-        except DataError:  # no recording of a run, or nothing to recover
-            continue
+        except DataError:
+            done += _put_aside(path)
     return done
+
+
+def _put_aside(path: Path) -> list[str]:
+    """Take a file out of the way that was claimed for a run that never began."""
+    with path.open("rb") as stream:
+        head = stream.read(len(MCAP0_MAGIC))
+        if is_being_recorded(stream) or head not in {b"", MCAP0_MAGIC}:
+            return []
+    if not head:
+        path.unlink()
+        return [f"{path}: its run never began; the empty file is removed"]
+    torn = path.rename(f"{path}.torn")
+    return [f"{path}: its run never began; what there is is kept as {torn.name}"]
 
 
 def standing_runs(folder: Path) -> dict[RunKey, list[Path]]:

@@ -48,6 +48,7 @@ order: random
 reference_run: {{every: 10}}
 """
 BEYOND_S = 3.0
+IN_RUNS = 0.7
 TOLERANCE = 0.02
 
 
@@ -77,9 +78,18 @@ class KilledCampaign:
         log = (self._folder / "log").open("ab")
         return subprocess.Popen(self._command, env=self._environment, stdout=log, stderr=log)
 
-    def kill(self, after_s: float) -> bool:
-        """Start it and kill it; return whether it was still running."""
-        process = self.start()
+    def kill(self, after_s: float, *, in_runs: bool) -> bool:
+        """Start it and kill it; return whether it was still running.
+
+        Args:
+            after_s: How long after.
+            in_runs: After its first new recording, not after its start.
+        """
+        process, before = self.start(), len([*self.runs.glob("*.mcap")])
+        while in_runs and process.poll() is None:
+            if len([*self.runs.glob("*.mcap")]) > before:
+                break
+            time.sleep(0.02)
         try:
             process.wait(after_s)
         except subprocess.TimeoutExpired:
@@ -162,13 +172,14 @@ def main() -> None:
         process = campaign.start()
         while not any(campaign.runs.glob("*.mcap")) and process.poll() is None:
             time.sleep(0.02)
-        # From the start of the process to some runs after its first: any moment of what it does.
         longest_s = time.monotonic() - begun + BEYOND_S
         process.send_signal(signal.SIGKILL)
         process.wait()
         killed = 1
         while killed < options.kills:
-            if not campaign.kill(chosen.uniform(0.0, longest_s)):
+            in_runs = chosen.random() < IN_RUNS  # a busy machine takes long to start
+            after_s = chosen.uniform(0.0, BEYOND_S if in_runs else longest_s)
+            if not campaign.kill(after_s, in_runs=in_runs):
                 break  # it has come to its end
             killed += 1
         code = campaign.finish()

@@ -253,6 +253,7 @@ timing: {on_misses: warn, late_policy: skip}
 """
 
 
+@pytest.mark.timeout(600)
 def test_killed_in_real_time_it_loses_one_run_and_goes_on(tmp_path):
     """What was completed is not run again, and the coil's heat is not forgotten."""
     (tmp_path / "rig.yaml").write_text(RIG)
@@ -262,7 +263,7 @@ def test_killed_in_real_time_it_loses_one_run_and_goes_on(tmp_path):
              "--folder", str(runs)]  # fmt: skip
     process = subprocess.Popen(words, env=os.environ, stdout=subprocess.DEVNULL)
     second = runs / "few-0002.mcap"
-    deadline = time.monotonic() + 120.0
+    deadline = time.monotonic() + 240.0
     while not (second.exists() and second.stat().st_size > 3000):
         assert time.monotonic() < deadline
         assert process.poll() is None
@@ -270,7 +271,7 @@ def test_killed_in_real_time_it_loses_one_run_and_goes_on(tmp_path):
     os.kill(process.pid, signal.SIGKILL)
     process.wait()
     first = (runs / "few-0001.mcap").read_bytes()
-    done = subprocess.run(words, env=os.environ, capture_output=True, text=True, timeout=240)
+    done = subprocess.run(words, env=os.environ, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     assert (runs / "few-0001.mcap").read_bytes() == first
     with (runs / "few.csv").open(newline="") as stream:

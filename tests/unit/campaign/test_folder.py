@@ -88,6 +88,17 @@ def test_what_was_cut_short_is_made_whole(recorded, tmp_path):
     assert last_begun(tmp_path / "absent") is None
 
 
+def test_what_was_killed_before_its_run_began_is_out_of_the_way(recorded, tmp_path):
+    """Nobody should have to wonder about a file with nothing in it; other files stay."""
+    path, _ = recorded("a.mcap")
+    (tmp_path / "empty.mcap").touch()
+    (tmp_path / "head.mcap").write_bytes(path.read_bytes()[:20])
+    (tmp_path / "text.mcap").write_text("no recording")
+    assert len(make_whole(tmp_path)) == 2
+    left = {each.name for each in tmp_path.iterdir() if each.suffix != ".yaml"}
+    assert left == {"a.mcap", "head.mcap.torn", "text.mcap"}
+
+
 def test_names_are_never_taken_twice(tmp_path):
     first = new_recording(tmp_path, "few", 7)
     assert first.name == "few-0007.mcap"
