@@ -4,6 +4,7 @@ from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
+from scipy.linalg import qr
 from scipy.optimize import nnls
 
 from hilctl.base.arrays import F64, I64
@@ -59,8 +60,8 @@ def bounded_and_free(
         basis, corner = np.linalg.qr(free * scale[:, None])
         inside = basis.T @ table
         table -= basis @ inside
-    # Not SciPy's: that hands out the zeros below the triangle too, a row for each sample.
-    triangle: F64 = np.asarray(np.linalg.qr(table, mode="r"))
+    # Raw: mode "r" hands out the zeros below the triangle too, a row for each sample.
+    _, triangle = qr(table, mode="raw", overwrite_a=True)
     extra, _ = nnls(triangle[:, :size], triangle[:, size])
     if not others:
         return least + extra, np.zeros(0)
