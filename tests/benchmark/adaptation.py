@@ -1,6 +1,6 @@
 """How well a run on an actuator that has changed does with adaptation: see README.md beside it.
 
-Run it with ``python tests/benchmark/adaptation.py``. On each physics of the simulated rig, with
+Run it with ``python -m tests.benchmark.adaptation``. On each physics of the simulated rig, with
 creep, a model is identified; the rig then goes through ten minutes of other runs, in a room 10 K
 warmer or colder, and every reference runs on it: as it is, with an integrator, and with adaptation.
 Each is held against the same run on the fresh rig with neither. Errors are those of the
