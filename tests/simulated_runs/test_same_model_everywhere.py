@@ -10,15 +10,16 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import scipy
 
 from hilctl.base.arrays import F64
-from hilctl.identify.catalogue import CATALOGUE
+from hilctl.identify.catalogue import CATALOGUE, HISTORIES
 from hilctl.identify.data.cycles import average_cycle
-from hilctl.identify.data.records import SteadyLoop
+from hilctl.identify.data.records import History, SteadyLoop
 from hilctl.identify.fit_model import fit_model
 from hilctl.identify.settings import FitSettings
 from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
@@ -26,8 +27,8 @@ from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParamete
 RATE_HZ = 50_000.0
 POINTS = 64
 TONES = [(a, f) for a in (3.0, 7.0) for f in (10.0, 100.0, 200.0)]
-FITS = {
-    **{kind: {"kind": kind} for kind in CATALOGUE if kind != "field"},  # which takes no loops
+FITS: dict[str, dict[str, Any]] = {
+    **{kind: {"kind": kind} for kind in CATALOGUE if kind != "field"},
     "rdpi, exponential": {"kind": "rdpi", "weights": "exponential", "weight_by": "equal"},
     "rdpi, peak": {"kind": "rdpi", "offset": True, "peak_goal_percent": 4.0},
     "integrated, free": {"kind": "integrated", "weights": "free"},
@@ -59,6 +60,18 @@ def measured(amplitude_a: float, frequency_hz: float) -> SteadyLoop:
     return SteadyLoop(label, v, y, frequency_hz, RATE_HZ)
 
 
+def history() -> History:
+    """Return the rig's answer to a command that never repeats."""
+    time = np.arange(round(0.5 * RATE_HZ)) / RATE_HZ
+    phases = np.random.default_rng(1).uniform(0.0, 6.0, 8)
+    wave = sum(np.sin(37.0 * k * time + p) for k, p in enumerate(phases, 1))
+    command = np.ascontiguousarray(6.0 * np.clip(time / 0.02, 0.0, 1.0) * wave / np.ptp(wave))
+    displacement_um, current_a = np.empty_like(command), np.empty_like(command)
+    rig = TerfenolActuator(TerfenolParameters(), RATE_HZ, seed=3)
+    rig.step(command, displacement_um, current_a)
+    return History("random", command, displacement_um, RATE_HZ)
+
+
 def kernels_in_use() -> list[str]:
     """Return the kernels that NumPy's and SciPy's OpenBLAS have taken, as they say themselves."""
     names = []
@@ -76,13 +89,12 @@ def kernels_in_use() -> list[str]:
 
 def fit_all() -> None:
     """Fit every kind and print all models: what the processes of this test do."""
-    loops = [measured(*tone) for tone in TONES]
-    models = {
-        name: fit_model(loops, FitSettings(**choices), lambda: 0.0).model.model_dump(
-            mode="json", exclude={"provenance"}
-        )
-        for name, choices in FITS.items()
-    }
+    loops, whole = [measured(*tone) for tone in TONES], [history()]
+    models = {}
+    for name, choices in FITS.items():
+        records = whole if CATALOGUE[choices["kind"]].data == HISTORIES else loops
+        fit = fit_model(records, FitSettings(**choices), lambda: 0.0)
+        models[name] = fit.model.model_dump(mode="json", exclude={"provenance"})
     print(json.dumps(models))
 
 
