@@ -12,7 +12,8 @@ from hilctl.base.arrays import F64
 from hilctl.base.segments import Segment
 from hilctl.characterise.gaps import without_gaps
 from hilctl.characterise.results import UnseenReference
-from hilctl.identify.command import Identification, identify_files, settings_from
+from hilctl.identify.command import Identification, identify_records, settings_from
+from hilctl.identify.data.records import History
 from hilctl.identify.job import OnProgress, ignore_progress
 from hilctl.models.base import HysteresisModel
 from hilctl.recording.data import Recording
@@ -22,8 +23,9 @@ Mask: TypeAlias = npt.NDArray[np.bool_]
 
 _SLACK = 0.01
 
-FITTED = ("growing", "slow-loops", "fast-loops")
-"""Beginnings of the names of those steps whose recordings a model is identified from."""
+FITTED = ("slow-loops", "fast-loops", "small-motions", "training")
+"""Steps whose recordings a model is identified from: each begins with a motion of full size, so
+that what was before it does not matter."""
 
 JUDGED: Mapping[str, str] = {
     "held-out": "random reference",
@@ -36,7 +38,10 @@ JUDGED: Mapping[str, str] = {
 def identified(
     recordings: Mapping[str, Path], progress: OnProgress = ignore_progress
 ) -> Identification:
-    """Identify the model: the only place that says how. Nothing is written.
+    """Identify the kind of model that suits the device: the only place that says how.
+
+    It is found from whole histories: how an actuator came to where it stands is what small loops
+    depend on, and a steady loop does not say it.
 
     Args:
         recordings: The steps' recordings by name.
@@ -45,8 +50,18 @@ def identified(
     Raises:
         InputError: No model can be identified from them.
     """
-    fitted = [path for name, path in recordings.items() if name.startswith(FITTED)]
-    return identify_files(fitted, settings_from("staged", []), None, progress=progress)
+    fitted = [read(path) for name, path in recordings.items() if name in FITTED]
+    source = [recording.path.name for recording in fitted]
+    histories = [_history(recording) for recording in fitted]
+    unit = fitted[0].command_unit
+    settings = settings_from("auto", [])
+    return identify_records(histories, settings, unit, source=source, progress=progress)
+
+
+def _history(recording: Recording) -> History:
+    """Return what a recording has to the end of its last waveform; gaps are filled in."""
+    signals = without_gaps(recording, 0, recording.segments[-1].steady_stop)
+    return History(recording.path.name, *signals, recording.sample_rate_hz)
 
 
 def judged(

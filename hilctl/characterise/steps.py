@@ -274,16 +274,28 @@ def _take_biased(
     return measured.also(biased=found), text
 
 
-def _random(limits: CampaignLimits, measured: Measured) -> Keys:
-    amplitude = _MOST_RANDOM * full_amplitude(limits, measured)
-    return waveforms.random_reference(limits, amplitude, waveforms.RANDOM_SEED)
+def _small(limits: CampaignLimits, measured: Measured) -> Keys:
+    return waveforms.small_motions(limits, full_amplitude(limits, measured))
 
 
-def _take_random(
-    recording: Recording, limits: CampaignLimits, measured: Measured
-) -> tuple[Measured, str]:
-    del recording, limits
-    return measured, "kept from every fit"
+def _random(seed: int) -> Callable[[CampaignLimits, Measured], Keys]:
+    def make(limits: CampaignLimits, measured: Measured) -> Keys:
+        amplitude = _MOST_RANDOM * full_amplitude(limits, measured)
+        return waveforms.random_reference(limits, amplitude, seed)
+
+    return make
+
+
+def _taken(text: str) -> Callable[[Recording, CampaignLimits, Measured], tuple[Measured, str]]:
+    """Return what takes a recording that nothing is measured from before the model."""
+
+    def take(
+        recording: Recording, limits: CampaignLimits, measured: Measured
+    ) -> tuple[Measured, str]:
+        del recording, limits
+        return measured, text
+
+    return take
 
 
 def _again(limits: CampaignLimits, measured: Measured) -> Keys:
@@ -324,6 +336,18 @@ STEPS: tuple[CampaignStep, ...] = (
     CampaignStep("fast-loops", "loops at several frequencies", _fast, _take_fast),
     CampaignStep("reversal-curves", "first-order reversal curves", _reversal, _take_reversal),
     CampaignStep("biased-loops", "small loops all over the range", _biased, _take_biased),
-    CampaignStep("held-out", "a random reference, for the judgement", _random, _take_random),
+    CampaignStep("small-motions", "small random motions", _small, _taken("for the fit")),
+    CampaignStep(
+        "training",
+        "a random reference, for the fit",
+        _random(waveforms.TRAINING_SEED),
+        _taken("for the fit"),
+    ),
+    CampaignStep(
+        "held-out",
+        "a random reference, for the judgement",
+        _random(waveforms.HELD_OUT_SEED),
+        _taken("kept from every fit"),
+    ),
     CampaignStep("repeated", "the largest loop once more", _again, _take_again),
 )

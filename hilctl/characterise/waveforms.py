@@ -19,7 +19,8 @@ Keys: TypeAlias = dict[str, Any]
 
 REST_S = 2.0
 RANDOM_S = 3.0
-RANDOM_SEED = 7
+HELD_OUT_SEED = 7
+TRAINING_SEED = 100
 
 _ADAPTER: TypeAdapter[AnyWaveform] = TypeAdapter(AnyWaveform)
 _LINES_BELOW_TOP = 8.0  # lines of the small multisine within the band of loops
@@ -32,6 +33,8 @@ _REVERSALS = 9
 _BIASES = (0.7, 0.35, 0.0, -0.35, -0.7)
 _TRIES = 5
 _OF_BIAS = 0.15
+_PLACES = (0.6, -0.6, 0.0)
+_OF_SMALL = 0.35
 _RANDOM_BAND = (5.0, 0.5)  # of the lowest and of the highest frequency of loops
 
 
@@ -205,6 +208,13 @@ def biased_loops(limits: CampaignLimits, amplitude: float) -> Keys:
 
 def random_reference(limits: CampaignLimits, amplitude: float, seed: int) -> Keys:
     """Return a reference that never repeats, after a conditioning cycle."""
+    part = _random_part(limits, amplitude, seed, RANDOM_S, limits.centre)
+    return _sequence(limits, [conditioning(limits, amplitude), part])
+
+
+def _random_part(
+    limits: CampaignLimits, amplitude: float, seed: int, least_s: float, offset: float
+) -> Keys:
     first_hz, last_hz = _RANDOM_BAND[0] * limits.lowest_hz, _RANDOM_BAND[1] * limits.highest_hz
     part = {
         "kind": "random",
@@ -213,11 +223,21 @@ def random_reference(limits: CampaignLimits, amplitude: float, seed: int) -> Key
         "first_hz": min(first_hz, 0.5 * last_hz),
         "last_hz": last_hz,
         "seed": seed,
-        "offset": limits.centre,
+        "offset": offset,
     }
-    seconds = max(RANDOM_S, _RANDOM_CYCLES / limits.middle_hz)
+    seconds = max(least_s, _RANDOM_CYCLES / limits.middle_hz)
     part, _ = within(limits, _softened(limits, part, seconds, 1.0 / limits.middle_hz))
-    return _sequence(limits, [conditioning(limits, amplitude), part])
+    return part
+
+
+def small_motions(limits: CampaignLimits, amplitude: float) -> Keys:
+    """Return small aperiodic motions at places all over the range, after a conditioning cycle."""
+    small = _OF_SMALL * amplitude
+    parts = [
+        _random_part(limits, small, seed, 0.5 * RANDOM_S, limits.centre + part * amplitude)
+        for seed, part in enumerate(_PLACES, TRAINING_SEED + 1)
+    ]
+    return _sequence(limits, [conditioning(limits, amplitude), *parts])
 
 
 def _rounded(amplitude: float) -> float:

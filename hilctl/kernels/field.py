@@ -40,7 +40,7 @@ Losses: TypeAlias = tuple[float, float, float, float, float, float, float]
 
 _STEPS = 100
 _NARROWEST = 1e-14
-_NEAR = 1e-5  # of a change, and of its unit, to which it is worked out
+_NEAR = 1e-7  # of a change, and of its unit, to which it is worked out
 _OUTPUT, _COMMAND, _FIELD = 0, 1, 2
 _SPAN = "UniTuple(float64, 3)"
 _CURVE = "UniTuple(float64[::1], 2)"
@@ -51,7 +51,7 @@ _LOSSES = "UniTuple(float64, 7)"
 @kernel("int64(float64, float64)", inline=True)
 def _cell(place: float, cells: float) -> int:
     """Return the cell that a place lies in, or the one at the end that it is beyond."""
-    # A place that is not a number, from a memory that is none, must not become an index.
+    # What is not a number must not become an index.
     return int(min(place, cells - 1.0)) if place > 0.0 else 0
 
 
@@ -105,6 +105,21 @@ def drag_step(held: float, low: float, width: float, last: float, u: float, leng
     return width - up * length
 
 
+@kernel("float64(int64, float64, float64)", inline=True)
+def _rest(cell: int, lowest: float, width: float) -> float:
+    """Return how far a field of 0 is through a cell."""
+    return min(max(-(lowest + cell * width), 0.0), width)
+
+
+@kernel("float64(float64, float64, int64, float64, float64)", inline=True)
+def _waited(held: float, width: float, above: int, up: float, down: float) -> float:
+    """Return what a drag gives in a cell that the field left, which is so many cells above it."""
+    # Below the field it takes its part in what has gone up since, above it in what has gone down.
+    if above < 0:
+        return width - (width - held) * math.exp(-up)
+    return held * math.exp(-down) if above > 0 else held
+
+
 @kernel("void(float64[::1], int64[::1], float64, float64, float64, int64, int64, float64[:, ::1])")
 def drag_columns(
     u: F64, rows: I64, length: float, lowest: float, width: float, cells: int, first: int, out: F64
@@ -121,16 +136,23 @@ def drag_columns(
         first: Column of the first cell.
         out: float64[N, m], of which c columns are filled; 0 is rest.
     """
-    for j in range(cells):
-        low = lowest + j * width
-        rest = min(max(-low, 0.0), width)
-        held, last, k = rest, 0.0, 0
-        for row in range(rows.size):
-            while k <= rows[row]:
-                held = drag_step(held, low, width, last, u[k], length)
-                last = u[k]
-                k += 1
-            out[row, first + j] = held - rest
+    since = np.zeros(cells)
+    held = np.minimum(np.maximum(-lowest - width * np.arange(cells), 0.0), width)
+    last = up = down = 0.0
+    here = _cell(-lowest / width, cells)
+    k = 0
+    for row in range(rows.size):
+        while k <= rows[row]:
+            there, way = _cell((u[k] - lowest) / width, cells), abs(u[k] - last) / length
+            for j in range(min(here, there), max(here, there) + 1):
+                before = _waited(held[j], width, j - here, up - since[j], down - since[j])
+                held[j] = drag_step(before, lowest + j * width, width, last, u[k], length)
+                since[j] = (up if u[k] >= last else down) + way
+            up, down = (up + way, down) if u[k] >= last else (up, down + way)
+            here, last, k = there, u[k], k + 1
+        for j in range(cells):
+            now = _waited(held[j], width, j - here, up - since[j], down - since[j])
+            out[row, first + j] = now - _rest(j, lowest, width)
 
 
 @kernel("float64(float64, float64[::1], float64[::1])")
@@ -145,12 +167,6 @@ def mapped(x: float, knots: F64, values: F64) -> float:
             low = middle
     slope = (values[high] - values[low]) / (knots[high] - knots[low])
     return float(values[low] + slope * (x - knots[low]))
-
-
-@kernel("float64(int64, float64, float64)", inline=True)
-def _rest(cell: int, lowest: float, width: float) -> float:
-    """Return how far a field of 0 is through a cell."""
-    return min(max(-(lowest + cell * width), 0.0), width)
 
 
 @kernel(f"UniTuple(float64, 2)(float64, float64, int64, float64[::1], {_BANK})", inline=True)
@@ -243,39 +259,44 @@ def _settle(u: float, memory: F64, bank: Bank) -> None:
 @kernel(f"UniTuple(float64, 2)(float64, {_LOSSES})", inline=True)
 def lost_field(e: float, losses: Losses) -> tuple[float, float]:
     """Return h(e) and its slope."""
-    _, _, _, growth, bend, excess, even = losses
+    growth, bend, excess, even = losses[3:]
     size = abs(e)
     root = math.sqrt(size + even)
     more = growth * size + bend * size * size
-    value = e * (1.0 + more + excess / root)
     slope = 1.0 + 2.0 * more + bend * size * size
-    return value, slope + excess / root * (1.0 - 0.5 * size / (size + even))
+    slope += excess / root * (1.0 - 0.5 * size / (size + even))
+    return e * (1.0 + more + excess / root), slope
 
 
-@kernel(f"void(float64[::1], float64[::1], {_LOSSES}, float64[::1])")
-def field_left(v: F64, m: F64, losses: Losses, w: F64) -> None:
+@kernel(f"void(float64[::1], float64[::1], float64[::1], float64[::1], {_LOSSES}, float64[::1])")
+def field_left(v: F64, late: F64, step_s: F64, m: F64, losses: Losses, w: F64) -> None:
     """Work out the field that the losses leave of a command, for outputs that are known.
 
     Args:
-        v: float64[n], mean command over the step that ends at each sample.
-        m: float64[n], the operators' output at each.
-        losses: See :data:`Losses`, for these steps.
+        v: float64[n], command after a part, at least half, of the step that ends at each sample.
+        late: float64[n], that part.
+        step_s: float64[n], time of each step.
+        m: float64[n], the operators' output at each sample.
+        losses: See :data:`Losses`; the first three are in s, tau_b itself the third.
         w: float64[n], filled; the first is the first command.
     """
     w[0] = v[0]
-    z = change = 0.0
+    z = change = before = 0.0
     for k in range(1, v.size):
-        was = w[k - 1]
+        was, step = w[k - 1], step_s[k]
+        left = math.exp(-step / losses[2]) if losses[2] > 0.0 else 0.0
+        field, output = losses[0] / step, losses[1] * (m[k] - m[k - 1]) / step
+        change *= step / before if before > 0.0 else 0.0
+        before = step
         for _ in range(_STEPS):
-            e = losses[0] * change + losses[1] * (m[k] - m[k - 1])
-            lost, slope = lost_field(e, losses)
-            command = was + 0.5 * change + losses[2] * z + (1.0 - losses[2]) * lost
-            step = (v[k] - command) / (0.5 + (1.0 - losses[2]) * slope * losses[0])
-            change += step
-            if abs(step) <= _NEAR * (abs(change) + _NEAR):
+            lost, slope = lost_field(field * change + output, losses)
+            command = was + late[k] * change + left * z + (1.0 - left) * lost
+            more = (v[k] - command) / (late[k] + (1.0 - left) * slope * field)
+            change += more
+            if abs(more) <= _NEAR * (abs(change) + _NEAR):
                 break
         w[k] = was + change
-        z = losses[2] * z + (1.0 - losses[2]) * lost
+        z = left * z + (1.0 - left) * lost
 
 
 @kernel(

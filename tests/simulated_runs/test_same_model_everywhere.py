@@ -10,6 +10,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,7 +27,7 @@ from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParamete
 RATE_HZ = 50_000.0
 POINTS = 64
 TONES = [(a, f) for a in (3.0, 7.0) for f in (10.0, 100.0, 200.0)]
-FITS = {
+FITS: dict[str, dict[str, Any]] = {
     **{kind: {"kind": kind} for kind in CATALOGUE if kind != "field"},
     "rdpi, exponential": {"kind": "rdpi", "weights": "exponential", "weight_by": "equal"},
     "rdpi, peak": {"kind": "rdpi", "offset": True, "peak_goal_percent": 4.0},
@@ -93,10 +94,9 @@ def fit_all() -> None:
     loops, whole = [measured(*tone) for tone in TONES], [history()]
     models = {}
     for name, choices in FITS.items():
-        settings = FitSettings(**choices)
-        records = whole if CATALOGUE[settings.kind].data == HISTORIES else loops
-        model = fit_model(records, settings, lambda: 0.0).model
-        models[name] = model.model_dump(mode="json", exclude={"provenance"})
+        records = whole if CATALOGUE[choices["kind"]].data == HISTORIES else loops
+        fit = fit_model(records, FitSettings(**choices), lambda: 0.0)
+        models[name] = fit.model.model_dump(mode="json", exclude={"provenance"})
     print(json.dumps(models))
 
 

@@ -1,7 +1,80 @@
-"""Kernels of the fit: what of a path counts, and what plays give, each cell by itself."""
+"""Kernels of the fit: which samples count, and what plays give, each cell by itself."""
+
+import math
 
 from hilctl.base.arrays import F64, I64
 from hilctl.kernels.jit import kernel
+
+
+@kernel("int64(float64[::1], float64[::1], float64, float64, int64, int64, int64[::1])")
+def corners(x: F64, y: F64, off_x: float, off_y: float, thin: int, furthest: int, out: I64) -> int:
+    """Find the samples between which straight lines are near enough to two signals.
+
+    Args:
+        x: float64[n].
+        y: float64[n].
+        off_x: How far a line may be from x.
+        off_y: How far one may be from y.
+        thin: Samples that a step must have; all steps are multiples of it.
+        furthest: Most samples in a step.
+        out: int64[n], filled with samples, the first and the last multiple among them.
+
+    Returns:
+        How many there are.
+    """
+    out[0] = 0
+    first, count = 0, 1
+    low_x = low_y = -math.inf
+    high_x = high_y = math.inf
+    for k in range(thin, x.size, thin):
+        way = k - first
+        slope_x, slope_y = (x[k] - x[first]) / way, (y[k] - y[first]) / way
+        within = low_x <= slope_x <= high_x and low_y <= slope_y <= high_y
+        if way > thin and (not within or way > furthest):
+            first, way = k - thin, thin
+            out[count] = first
+            count += 1
+            slope_x, slope_y = (x[k] - x[first]) / way, (y[k] - y[first]) / way
+            low_x = low_y = -math.inf
+            high_x = high_y = math.inf
+        low_x, high_x = max(low_x, slope_x - off_x / way), min(high_x, slope_x + off_x / way)
+        low_y, high_y = max(low_y, slope_y - off_y / way), min(high_y, slope_y + off_y / way)
+    last = (x.size - 1) // thin * thin
+    if last > first:
+        out[count] = last
+        count += 1
+    return count
+
+
+@kernel("void(float64[:, ::1], int64[::1], float64, float64, float64, float64[::1])")
+def bare_displacement(
+    derivatives: F64, kept: I64, late: float, slope_gain: float, bend_gain: float, out: F64
+) -> None:
+    """Fill in y + slope_gain y' + bend_gain y'' of what comes some samples later.
+
+    Args:
+        derivatives: float64[3, n], y and its first two derivatives.
+        kept: int64[N], samples that are wanted.
+        late: Samples by which they are taken later, >= 0.
+        slope_gain: In the unit of time of the derivatives.
+        bend_gain: In its square.
+        out: float64[N], filled; the end goes on as it is.
+    """
+    whole = math.floor(late)
+    part, end = late - whole, derivatives.shape[1] - 1
+    for i in range(kept.size):
+        here, there = min(kept[i] + whole, end), min(kept[i] + whole + 1, end)
+        a = (
+            derivatives[0, here]
+            + slope_gain * derivatives[1, here]
+            + bend_gain * derivatives[2, here]
+        )
+        b = (
+            derivatives[0, there]
+            + slope_gain * derivatives[1, there]
+            + bend_gain * derivatives[2, there]
+        )
+        out[i] = a + part * (b - a)
 
 
 @kernel("int64(float64[::1], float64, int64[::1])")

@@ -3,7 +3,7 @@
 import math
 
 from hilctl.base.errors import DataError
-from hilctl.identify.data.records import SteadyLoop
+from hilctl.identify.data.records import History, SteadyLoop
 from hilctl.identify.field.prepared import Prepared
 from hilctl.identify.field.search import FieldEnd, FieldSearch, Size
 from hilctl.identify.field.stages import Stages
@@ -26,7 +26,7 @@ def fit_field(job: FitJob) -> FoundModel:
             " configs/identify_any.yaml is a campaign for it, --model staged takes loops"
         )
     settings = job.settings
-    data = Prepared(job.data.records)
+    data = Prepared([r for r in job.data.records if isinstance(r, History)])
     size = Size(settings.plays, settings.drags, settings.cells, settings.knots)
     found = FieldSearch(data, size, job.least).find(Stages(), job.progress)
     known = _parameters(found)

@@ -1,12 +1,13 @@
 """From a few starts to the stages; the weights follow from them, round by round."""
 
 from dataclasses import dataclass, replace
+from typing import TypeAlias
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from hilctl.base.arrays import F64, I64
 from hilctl.identify.field.columns import turning_points
+from hilctl.identify.field.descent import Place, settle
 from hilctl.identify.field.prepared import Prepared
 from hilctl.identify.field.stages import (
     HIGH,
@@ -28,8 +29,8 @@ MARGIN = 0.1  # of the span: room of the tables beyond what the data reach
 LENGTHS = (0.05, 0.4)  # of half the span: shortest and longest drag
 SPREAD = 1.4  # exponent: thresholds are closer together near 0
 SEARCH_ROWS, FINAL_ROWS = 2500, 12_000
-ROUNDS, TRIALS = 2, 7
-MARGIN_OF_BOUNDS = 1e-6  # a search can't begin on one
+ROUNDS = 2
+TRIED = 0.2  # of a unit: change that slopes are taken by; kinks of single rows are smoothed
 FIRST_LAGS = (0.02, 0.1, 0.4)  # starts: lag of the field
 FIRST_COUPLINGS = (-0.6, -0.3, 0.0, 0.3)
 LEAST_WIDEST = 0.1  # of half the span
@@ -51,17 +52,8 @@ class Size:
         return Size(min(self.plays, 8), self.drags, min(self.cells, 12), min(self.knots, 16))
 
 
-@dataclass(frozen=True, slots=True)
-class Paths:
-    """Samples and rows of all records.
-
-    Attributes:
-        samples: For each record, int64[n_i], those that its path is made of.
-        rows: For each record, int64[N_i], which of these are rows.
-    """
-
-    samples: tuple[I64, ...]
-    rows: tuple[I64, ...]
+Paths: TypeAlias = tuple[I64, ...]
+"""For each record int64[N_i], the samples that are rows."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,11 +93,11 @@ class FieldSearch:
         for turn in range(ROUNDS):
             progress((turn + 0.2) / (ROUNDS + 1), f"round {turn + 1} of {ROUNDS}")
             self._lay(stages_in(x), coarse)
-            self._learn(x, self._paths(stages_in(x)))
+            self._learn(x, self._paths())
             self._lay(stages_in(x), coarse)
-            self._learn(x, self._paths(stages_in(x)))
-            x = self._followed(x, self._paths(stages_in(x)))
-            self._learn(x, self._paths(stages_in(x)))
+            self._learn(x, self._paths())
+            x = self._followed(x, self._paths())
+            self._learn(x, self._paths())
         return self._end(x)
 
     def _forget(self) -> None:
@@ -117,36 +109,33 @@ class FieldSearch:
         self._forget()
         for _ in range(2):
             self._lay(stages, size)
-            self._learn(row(stages), self._paths(stages))
+            self._learn(row(stages), self._paths())
         self._lay(stages, size)
-        errors = self._errors(row(stages), self._paths(stages))
+        errors = self._errors(row(stages), self._paths())
         return float(np.sqrt(np.mean(errors**2))), stages
 
     def _followed(self, x: F64, paths: Paths) -> F64:
-        def errors(point: F64) -> F64:
-            return self._errors(point, paths) / self._data.stroke_um
+        size = self._data.stroke_um
 
-        def slopes(point: F64) -> F64:
-            return self._slopes(point, paths)
+        def sum_of(point: F64) -> float:
+            return float(np.mean((self._errors(point, paths) / size) ** 2))
 
-        found = least_squares(
-            errors,
-            np.clip(x, row(LOW) + MARGIN_OF_BOUNDS, row(HIGH) - MARGIN_OF_BOUNDS),
-            jac=slopes,
-            bounds=(row(LOW), row(HIGH)),
-            x_scale=row(STEP),
-            max_nfev=TRIALS,
-        )
-        return np.asarray(found.x, dtype=np.float64)
+        def place_of(point: F64) -> Place:
+            here = self._errors(point, paths) / size
+            slopes = self._slopes(point, here, paths)
+            normal, slope = slopes.T @ slopes, slopes.T @ here
+            return Place(float(np.mean(here**2)), slope / here.size, normal / here.size)
 
-    def _slopes(self, x: F64, paths: Paths) -> F64:
-        here = self._errors(x, paths)
+        return settle(sum_of, place_of, x, (row(LOW), row(HIGH)), row(STEP))
+
+    def _slopes(self, x: F64, here: F64, paths: Paths) -> F64:
         out = np.empty((here.size, len(NAMES)))
-        for i, step in enumerate(0.2 * row(STEP)):
+        for i, step in enumerate(TRIED * row(STEP)):
             there = x.copy()
             there[i] += step if x[i] + step <= row(HIGH)[i] else -step
-            out[:, i] = (self._errors(there, paths) - here) / (there[i] - x[i])
-        return out / self._data.stroke_um
+            errors = self._errors(there, paths) / self._data.stroke_um
+            out[:, i] = (errors - here) / (there[i] - x[i])
+        return out
 
     def _errors(self, x: F64, paths: Paths) -> F64:
         """Return errors of the displacement that commands would give: float64[N], in um.
@@ -155,26 +144,29 @@ class FieldSearch:
         model by as much more as it comes back through the coupling; without that, a coupling that
         explains the output by itself would look best.
         """
-        fields, _, known = self._signals(x)
+        fields, y, known = self._rows(x, paths)
         reach = max(float(np.ptp(u)) for u in fields)
         alone = max(reach - known.coupling * self._data.stroke_um, 0.1 * reach)
-        return self._solved(x, paths).errors_um * (reach / alone)
+        return self._weights(fields, y, paths).errors_um * (reach / alone)
+
+    def _solved(self, x: F64, paths: Paths) -> Weights:
+        fields, y, _ = self._rows(x, paths)
+        return self._weights(fields, y, paths)
+
+    def _weights(self, fields: list[F64], y: F64, paths: Paths) -> Weights:
+        grid = self._laid()
+        return solve(table(fields, paths, grid), y, grid, self._least, self._scale(y))
+
+    def _rows(self, x: F64, paths: Paths) -> tuple[list[F64], F64, Physical]:
+        """Return effective fields, displacements of the rows, and what they are worked out by."""
+        fields, bare, known = self._signals(x)
+        return fields, np.concatenate([b[rows] for b, rows in zip(bare, paths, strict=True)]), known
 
     def _signals(self, x: F64) -> tuple[list[F64], list[F64], Physical]:
         known = physical(stages_in(x), self._data)
         span = self._grid.width * self._grid.cells if self._grid else 2.0 * self._data.reach
         both = [signals(run, known, self._curve, span) for run in self._data.runs]
         return [u for u, _ in both], [y for _, y in both], known
-
-    def _solved(self, x: F64, paths: Paths) -> Weights:
-        fields, bare, _ = self._signals(x)
-        grid = self._laid()
-        ways = [np.ascontiguousarray(u[s]) for u, s in zip(fields, paths.samples, strict=True)]
-        columns = table(ways, paths.rows, grid)
-        y = np.concatenate(
-            [b[s[rows]] for b, s, rows in zip(bare, paths.samples, paths.rows, strict=True)]
-        )
-        return solve(columns, y, grid, self._least, self._scale(y))
 
     def _scale(self, y: F64) -> F64:
         """Return what makes errors of the operators' those of the displacement: float64[N]."""
@@ -222,25 +214,20 @@ class FieldSearch:
             0.5 * span * self._widest * spread, lengths, lowest, width, size.cells, size.knots
         )
 
-    def _paths(self, stages: Stages, *, final: bool = False) -> Paths:
-        way, rows = (FINAL_WAY, FINAL_ROWS) if final else (SEARCH_WAY, SEARCH_ROWS)
-        fields, _, _ = self._signals(row(stages))
-        grid = self._laid()
-        samples = []
-        for u in fields:
-            out = np.empty(u.size, dtype=np.int64)
-            count = turning_points(u, way * grid.width * grid.cells, out)
-            samples.append(out[:count].copy())
-        step = max(1, sum(s.size for s in samples) // rows)
-        kept = []
-        for s, run in zip(samples, self._data.runs, strict=True):
-            judged = np.arange(int(np.searchsorted(s, run.judged)), s.size, step)
-            kept.append(judged.astype(np.int64))
-        return Paths(tuple(samples), tuple(kept))
+    def _paths(self, *, final: bool = False) -> Paths:
+        """Return the rows: where commands turn, and as far apart as they go."""
+        way, most = (FINAL_WAY, FINAL_ROWS) if final else (SEARCH_WAY, SEARCH_ROWS)
+        rows = []
+        for run in self._data.runs:
+            out = np.empty(run.command.size, dtype=np.int64)
+            count = turning_points(run.command, way * 2.0 * self._data.reach, out)
+            rows.append(out[:count][out[:count] >= run.judged])
+        step = max(1, sum(each.size for each in rows) // most)
+        return tuple(np.ascontiguousarray(each[::step]) for each in rows)
 
     def _end(self, x: F64) -> FieldEnd:
         self._lay(stages_in(x), self._size)
-        paths = self._paths(stages_in(x), final=True)
+        paths = self._paths(final=True)
         self._learn(x, paths)
         found = self._solved(x, paths)
         return FieldEnd(physical(stages_in(x), self._data), self._laid(), found)

@@ -100,20 +100,18 @@ def signals(run: Run, known: Physical, curve: Curve | None, span: float) -> tupl
             the displacement itself stands for it.
         span: Of the effective field, which says below what size the excess loss is even.
     """
-    slope_s = 2.0 * known.damping_ratio * known.radian_s
-    y = run.bare_um(known.delay_s, slope_s, known.radian_s**2)
+    y = run.bare_um(known.delay_s, 2.0 * known.damping_ratio * known.radian_s, known.radian_s**2)
     m = y if curve is None else curve.operators_of(y)
     lost = known.losses
-    left = math.exp(-run.step_s / lost.decay_s) if lost.decay_s > 0.0 else 0.0
-    w = np.empty_like(y)
     losses = (
-        lost.field_s / run.step_s,
-        lost.output_s / run.step_s,
-        left,
+        lost.field_s,
+        lost.output_s,
+        lost.decay_s,
         lost.growth,
         lost.bend,
         lost.excess,
         even_excess(span),
     )
-    field_left(run.command, np.ascontiguousarray(m), losses, w)
+    w = np.empty_like(y)
+    field_left(run.command, run.late, run.step_s, m, losses, w)
     return w + known.coupling * m, y

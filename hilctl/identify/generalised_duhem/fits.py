@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from hilctl.base.errors import DataError
-from hilctl.identify.data.records import SteadyLoop
+from hilctl.identify.data.records import History, SteadyLoop
 from hilctl.identify.field.prepared import Prepared
 from hilctl.identify.generalised_duhem.search import DuhemEnd, DuhemSearch
 from hilctl.identify.generalised_duhem.signals import NAMES
@@ -28,7 +28,7 @@ def fit_generalised_duhem(job: FitJob) -> FoundModel:
             f" {loops[0]}; configs/identify_any.yaml is a campaign for it, --model staged takes"
             " loops"
         )
-    data = Prepared(job.data.records)
+    data = Prepared([r for r in job.data.records if isinstance(r, History)])
     settings = job.settings
     found = DuhemSearch(data, settings.cells, settings.across, job.least).find(job.progress)
     parameters = _parameters(found)

@@ -1,12 +1,16 @@
 """The model of a campaign, and its error on what no fit saw."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from hilctl.base.errors import DataError
 from hilctl.base.segments import Segment
+from hilctl.characterise import modelling
 from hilctl.characterise.modelling import FITTED, JUDGED, held_out
 from hilctl.characterise.steps import STEPS
+from hilctl.identify.data.records import History
 from hilctl.models.plays import PpiModel
 
 MODEL = PpiModel(
@@ -31,8 +35,8 @@ def run(make_recording):
 def test_what_is_judged_is_not_fitted():
     names = [step.name for step in STEPS]
     assert set(JUDGED) <= set(names)
-    assert not any(name.startswith(FITTED) for name in JUDGED)
-    assert all(any(name.startswith(each) for name in names) for each in FITTED)
+    assert set(FITTED) <= set(names)
+    assert not set(FITTED) & set(JUDGED)
 
 
 def test_a_perfect_model_has_no_error(run):
@@ -71,3 +75,22 @@ def test_missing_samples_are_refused(make_recording, run):
     )
     with pytest.raises(DataError, match="samples are missing or have no displacement"):
         held_out(MODEL, short, 0.0, "x")
+
+
+def test_the_kind_is_chosen_on_whole_histories_of_what_may_be_fitted(run, monkeypatch):
+    """Named by their files; to the end of the last waveform at full size, gaps filled in."""
+    asked = []
+
+    def identify(records, settings, unit, **more):
+        asked.append((records, settings, unit, more["source"]))
+        return "found"
+
+    monkeypatch.setattr(modelling, "identify_records", identify)
+    monkeypatch.setattr(modelling, "read", lambda path: run())
+    paths = {name: Path(f"{name}.mcap") for name in [*FITTED, *JUDGED, "growing-1"]}
+    assert modelling.identified(paths) == "found"
+    ((records, settings, unit, source),) = asked
+    assert len(records) == len(source) == len(FITTED)
+    assert (settings.auto, settings.whole, unit) == (True, True, "A")
+    assert all(isinstance(record, History) for record in records)
+    assert all(record.command.size == 1900 for record in records)

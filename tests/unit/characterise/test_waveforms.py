@@ -23,6 +23,7 @@ WAVEFORMS = {
     "reversal": lambda x: w.reversal_curves(x, x.reach),
     "biased": lambda x: w.biased_loops(x, x.reach),
     "random": lambda x: w.random_reference(x, x.reach, 1),
+    "small": lambda x: w.small_motions(x, x.reach),
 }
 
 

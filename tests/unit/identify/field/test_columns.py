@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hilctl.identify.field.columns import turning_points
+from hilctl.identify.field.columns import bare_displacement, corners, turning_points
 from hilctl.identify.field.weights import Grid, table
 from hilctl.models.field import FieldModel, OutputCurve
 
@@ -48,3 +48,35 @@ def test_turning_points_and_rows_are_enough_of_a_path() -> None:
     whole = table([u], [kept], GRID)
     few = table([np.ascontiguousarray(u[kept])], [np.arange(kept.size)], GRID)
     assert few == pytest.approx(whole, abs=0.02)
+
+
+def test_straight_lines_between_corners_are_near_both_signals() -> None:
+    x, y = path(), np.cos(np.linspace(0.0, 40.0, 600))
+    kept = np.empty(600, dtype=np.int64)
+    kept = kept[: corners(np.ascontiguousarray(x), y, 0.2, 0.03, 2, 40, kept)].copy()
+    assert kept.size < 200
+    assert (kept % 2 == 0).all()
+    assert (kept[0], kept[-1]) == (0, 598)
+    assert np.diff(kept).min() >= 2
+    assert np.diff(kept).max() <= 40
+    every = np.arange(599)
+    # A line goes through its ends, which are themselves as far off as it is.
+    assert np.abs(np.interp(every, kept, x[kept]) - x[:599]).max() < 2.0 * 0.2
+    assert np.abs(np.interp(every, kept, y[kept]) - y[:599]).max() < 2.0 * 0.03
+
+
+def test_corners_of_one_signal_alone_are_kept() -> None:
+    still, edge = np.zeros(100), np.concatenate([np.zeros(50), np.arange(50.0)])
+    kept = np.empty(100, dtype=np.int64)
+    for x, y in ((still, edge), (edge, still)):
+        count = corners(x, y, 0.1, 0.1, 1, 1000, kept)
+        assert kept[:count].tolist() == [0, 50, 99]
+
+
+def test_what_comes_later_is_taken_between_samples() -> None:
+    derivatives = np.array([[0.0, 1.0, 4.0, 9.0], [0.0, 2.0, 4.0, 6.0], [2.0, 2.0, 2.0, 2.0]])
+    out = np.empty(3)
+    bare_displacement(derivatives, np.array([0, 1, 3]), 1.25, 0.5, 0.1, out)
+    whole = derivatives[0] + 0.5 * derivatives[1] + 0.1 * derivatives[2]
+    expected = [0.75 * whole[1] + 0.25 * whole[2], 0.75 * whole[2] + 0.25 * whole[3], whole[3]]
+    assert out == pytest.approx(expected)

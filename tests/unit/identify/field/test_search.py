@@ -72,7 +72,7 @@ def laid(size: Size = SIZE) -> FieldSearch:
 def test_the_data_are_met_and_the_lag_is_found() -> None:
     end = found()
     assert np.std(end.weights.errors_um) < 0.005 * data().stroke_um
-    assert end.known.losses.field_s == pytest.approx(5e-4, rel=0.3)
+    assert 2.5e-4 < end.known.losses.field_s < 1e-3  # of 5e-4; some is taken for a later decay
     assert (end.weights.slopes >= 0.0).all()
     assert (end.weights.slopes[0] >= LEAST).all()
 
@@ -120,8 +120,8 @@ def test_of_the_starts_the_one_with_the_least_error_is_followed(
 def test_a_search_ends_within_its_bounds_though_it_starts_beyond() -> None:
     job = laid()
     x = row(HIGH) + 1.0
-    job._learn(row(Stages()), job._paths(Stages()))
-    ended = job._followed(x, job._paths(Stages()))
+    job._learn(row(Stages()), job._paths())
+    ended = job._followed(x, job._paths())
     assert (ended >= row(LOW)).all()
     assert (ended <= row(HIGH)).all()
     assert (ended != x).all()
@@ -139,7 +139,8 @@ def test_slopes_are_those_of_the_errors_and_tried_within_the_bounds(
 
     monkeypatch.setattr(job, "_errors", errors)
     for x in (row(LOW), row(Stages()), row(HIGH)):
-        slopes = job._slopes(x, job._paths(Stages()))
+        here = errors(x, ()) / job._data.stroke_um
+        slopes = job._slopes(x, here, job._paths())
         assert slopes == pytest.approx(matrix / job._data.stroke_um)
     assert (np.array(tried) >= row(LOW)).all()
     assert (np.array(tried) <= row(HIGH)).all()
@@ -167,7 +168,7 @@ def test_thresholds_wider_than_what_has_weight_are_given_up(
 ) -> None:
     size = Size(8, 1, 6, 5)
     job = laid(size)
-    before, paths = job._laid().thresholds, job._paths(Stages())
+    before, paths = job._laid().thresholds, job._paths()
     weights = job._solved(row(Stages()), paths)
     slopes = np.where(np.arange(9)[:, None] <= last, np.ones((9, 6)), 0.0)
     slopes[8] = 1.0
@@ -181,31 +182,29 @@ def test_thresholds_wider_than_what_has_weight_are_given_up(
 def test_rows_are_samples_that_count(ignore: int) -> None:
     job = FieldSearch(data(ignore=ignore), SIZE, LEAST)
     job._lay(Stages(), SIZE)
-    paths = job._paths(Stages())
-    (samples,), (rows,) = paths.samples, paths.rows
-    run = job._data.runs[0]
-    assert (samples[0], samples[-1]) == (0, run.command.size - 1)
-    assert samples[rows].min() >= run.judged
-    assert samples[rows[0] - 1] < run.judged or rows[0] == 0
+    paths = job._paths()
+    (rows,), run = paths, job._data.runs[0]
+    assert rows.min() >= run.judged
+    assert rows[-1] == run.command.size - 1
+    assert (np.diff(rows) > 0).all()
 
 
 def test_the_last_fit_sees_more_of_a_path() -> None:
     job = laid()
-    few, more = job._paths(Stages()), job._paths(Stages(), final=True)
+    (few,), (more,) = job._paths(), job._paths(final=True)
     assert SEARCH_WAY > FINAL_WAY
-    assert few.samples[0].size < more.samples[0].size
-    span = job._laid().cells * job._laid().width
-    (u,), _, _ = job._signals(row(Stages()))
-    fastest = np.abs(np.diff(u)).max()
-    for paths, way in ((few, SEARCH_WAY), (more, FINAL_WAY)):
-        assert np.abs(np.diff(u[paths.samples[0]])).max() < way * span + fastest
+    assert few.size < more.size
+    command, reach = job._data.runs[0].command, job._data.reach
+    fastest = np.abs(np.diff(command)).max()
+    for rows, way in ((few, SEARCH_WAY), (more, FINAL_WAY)):
+        assert np.abs(np.diff(command[rows])).max() < way * 2.0 * reach + fastest
 
 
 def test_errors_of_the_operators_are_brought_to_um_by_the_curve() -> None:
     """Where it rises by 2 um an um, an error of the operators' is half of one of the output."""
     job = laid()
     assert job._scale(np.array([1.0, 2.0])).tolist() == [1.0, 1.0]
-    found_here = job._learn(row(Stages()), job._paths(Stages()))
+    found_here = job._learn(row(Stages()), job._paths())
     curve = found_here.curve
     middle = 0.5 * (curve.displacement_um[1:] + curve.displacement_um[:-1]) + found_here.offset_um
     slopes = np.diff(curve.displacement_um) / np.diff(curve.operators)
@@ -217,7 +216,7 @@ def test_a_coupling_pays_for_what_comes_back_through_it() -> None:
     job = laid()
     for coupling in (-0.5, 0.0, 0.3):
         x = row(Stages(coupling=coupling))
-        paths = job._paths(Stages(coupling=coupling))
+        paths = job._paths()
         (u,), _, known = job._signals(x)
         more = 1.0 / (1.0 - known.coupling * job._data.stroke_um / np.ptp(u))
         plain = job._solved(x, paths).errors_um
@@ -243,5 +242,5 @@ def test_lengths_of_drags_rise_by_the_same_factor(count: int) -> None:
 def test_the_least_slope_of_the_first_line_holds_throughout_the_search() -> None:
     job = FieldSearch(data(), SIZE, 20.0)
     job._lay(Stages(), SIZE)
-    weights = job._solved(row(Stages()), job._paths(Stages()))
+    weights = job._solved(row(Stages()), job._paths())
     assert weights.slopes[0].min() >= 20.0

@@ -36,7 +36,10 @@ def history(command: float = 1.0, um: float = 1.0, rate: float = 1.0) -> History
 
 
 def plain_run(command: np.ndarray, derivatives: np.ndarray) -> Run:
-    return Run(1.0 / RATE_HZ, np.ascontiguousarray(command), derivatives, 0)
+    size = command.size
+    steps = np.full(size, 1.0 / RATE_HZ)
+    kept, late = np.arange(size), np.full(size, 0.5)
+    return Run(RATE_HZ, kept, steps, late, np.ascontiguousarray(command), derivatives, 0)
 
 
 def test_a_row_is_the_stages_in_the_order_of_their_names() -> None:
