@@ -22,7 +22,8 @@ def fit_exponential(job: FitJob) -> FoundModel:
 def _searched(problem: SearchProblem, job: FitJob) -> FoundModel:
     data, settings = job.data, job.settings
     rng = np.random.default_rng(settings.seed)
-    scale = weight_roots(data.records, settings.weight_by)
+    roots = weight_roots(data.records, settings.weight_by)
+    scale = np.append(roots, np.ones(problem.held))
     found = search(problem, scale, data.stroke_um, settings.starts, rng, job.progress)
     if settings.peak_goal_percent is not None:
         goal_um = settings.peak_goal_percent / 100.0 * data.stroke_um

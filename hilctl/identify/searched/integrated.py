@@ -71,6 +71,11 @@ class ExponentialProblem:
         """Names of what is searched, in the order of the space."""
         return SEARCHED if self._settings.offset else SEARCHED[:-1]
 
+    @property
+    def held(self) -> int:
+        """Rows after those of the samples: none, two numbers each make the weights smooth."""
+        return 0
+
     def error_um(self, x: F64, scale: F64) -> F64:
         """Return modelled minus measured displacement, see :class:`SearchProblem`."""
         known, data = self.parameters(x, scale), self._data

@@ -13,6 +13,9 @@ from hilctl.identify.settings import FitSettings
 from hilctl.models.plays import PlayModel, PpiModel, RdpiModel
 from hilctl.models.spi import SpiModel
 
+SMOOTHNESS = 1e-4  # weight of a density's slope, see _held
+RIDGE = 1e-4  # weight of the weights themselves
+
 
 def spacing_limit(data: FitData, settings: FitSettings) -> float:
     """Return the largest threshold spacing at which every play still moves in a full cycle.
@@ -30,12 +33,30 @@ def numbered(settings: FitSettings) -> F64:
     return np.arange(1, settings.plays + 1, dtype=np.float64) - shift
 
 
+def _held(data: FitData, plays: int) -> F64:
+    """Return what holds free weights, float64[m, n + 1], relative to the command itself.
+
+    Weights are a density times the spacing, so the mean square slope of one density is n^3 times
+    the differences' squares: however many plays, it counts alike. The first play stands for all
+    that are narrower as well, the last for all that are wider: neither is of the density.
+    """
+    longest = float(np.linalg.norm(data.columns(np.empty(0))))
+    between = SMOOTHNESS * plays**1.5 * np.diff(np.eye(plays), axis=0)[1:-1]
+    weights = np.vstack([between, RIDGE * np.eye(plays)])
+    return longest * np.column_stack([np.zeros(len(weights)), weights])
+
+
 class PlaysProblem:
     """Fit a PPI (3.25-3.27) or an RDPI (5.11, 5.14).
 
     The sum of squares is linear in the weights, so for each set of thresholds they are worked out
     rather than searched (variable projection). With free weights they are a_0 and a_1 to a_n;
     with exponential ones, a_0 and the factor of e^(-beta i).
+
+    Loops leave the free weights of neighbouring thresholds all but open: least squares alone would
+    make spikes of them, of which an inverse asks more current than the loops had. So rows after
+    those of the samples hold differences of neighbours small and, far less, the weights themselves,
+    which leaves one solution.
 
     Searched, in this order: the spacing, relative to the largest that makes sense; for an RDPI,
     the largest growth of the thresholds relative to half the peak-to-peak command; for
@@ -57,9 +78,13 @@ class PlaysProblem:
         if self._exponential:
             low, high, guess = [*low, 0.0], [*high, 40.0], [*guess, 1.5]
         size = data.target_um.size
-        self._free = np.ones((size, 1)) if settings.offset else np.empty((size, 0))
+        free = np.ones((size, 1)) if settings.offset else np.empty((size, 0))
         if settings.creep:
-            self._free = data.creep
+            free = data.creep
+        self._held = np.empty((0, 2)) if self._exponential else _held(data, settings.plays)
+        rows = len(self._held)
+        self._free = np.vstack([free, np.zeros((rows, free.shape[1]))])
+        self._target = np.append(data.target_um, np.zeros(rows))
         self._space = SearchSpace(np.array(low), np.array(high), np.array(guess))
 
     @property
@@ -74,12 +99,17 @@ class PlaysProblem:
         beta = "beta_0" if self._rate_dependent else "beta"
         return (*names, beta) if self._exponential else names
 
+    @property
+    def held(self) -> int:
+        """Rows after those of the samples."""
+        return len(self._held)
+
     def error_um(self, x: F64, scale: F64) -> F64:
         """Return modelled minus measured displacement, see :class:`search.Problem`."""
         columns = self._columns(x)
         weights, free = self._solve(columns, scale)
         beside = self._free @ free
-        return np.asarray(columns @ weights + (beside - self._data.target_um), dtype=np.float64)
+        return np.asarray(columns @ weights + (beside - self._target), dtype=np.float64)
 
     def slopes_um(self, x: F64, scale: F64) -> F64:
         """Return the derivatives of the error, but for what the weights make up for themselves.
@@ -100,7 +130,9 @@ class PlaysProblem:
             parts.append((plays @ (-i * weights) / weights.size)[:, None])
         moving = columns[:, found > self._least()]
         basis = qr(np.hstack([moving, self._free]) * scale[:, None], mode="economic")[0]
-        slopes = np.hstack(parts) * scale[:, None]
+        slopes = np.zeros((scale.size, len(self.searched)))
+        samples = slice(self._data.target_um.size)
+        slopes[samples] = np.hstack(parts) * scale[samples, None]
         return np.asarray((slopes - basis @ (basis.T @ slopes)) / scale[:, None])
 
     def build(self, x: F64, scale: F64) -> PlayModel:
@@ -135,7 +167,7 @@ class PlaysProblem:
         return out | ({"output_offset_um": self._offset_um(free)} if free.size else {})
 
     def _solve(self, columns: F64, scale: F64) -> tuple[F64, F64]:
-        return bounded_and_free(columns, self._free, self._data.target_um, scale, self._least())
+        return bounded_and_free(columns, self._free, self._target, scale, self._least())
 
     def _least(self) -> F64:
         """Return the lower bounds of the weights; the first is that of a_0."""
@@ -145,13 +177,14 @@ class PlaysProblem:
 
     def _offset_um(self, free: F64) -> float:
         """Return the constant displacement; with creep, its mean over all samples."""
-        return float(np.mean(self._free @ free)) if free.size else 0.0
+        samples = slice(self._data.target_um.size)
+        return float(np.mean(self._free[samples] @ free)) if free.size else 0.0
 
     def _columns(self, x: F64) -> F64:
         thresholds = self._spacing(x) * numbered(self._settings)
         columns = self._data.columns(thresholds, self._growth_s(x))
         if not self._exponential:
-            return columns
+            return np.vstack([columns, self._held])
         return np.column_stack([columns[:, 0], columns[:, 1:] @ self._decay(x)])
 
     def _spacing(self, x: F64) -> float:

@@ -62,8 +62,13 @@ class SearchProblem(Protocol):
         """Names of what is searched, in the order of the space."""
         ...
 
+    @property
+    def held(self) -> int:
+        """Rows of the errors after those of the samples, which hold weights smooth."""
+        ...
+
     def error_um(self, x: F64, scale: F64) -> F64:
-        """Return modelled minus measured displacement.
+        """Return modelled minus measured displacement, and the rows that hold weights smooth.
 
         Args:
             x: float64[p], a point of the space.
@@ -214,17 +219,21 @@ def refine_peak(
         The point with the smallest peak error that was met on the way.
     """
     best, x, scale = found, found.x, found.scale
-    peak = lowest = float(np.max(np.abs(problem.error_um(x, scale))))
+    samples = slice(scale.size - problem.held)
+    errors_um = np.abs(problem.error_um(x, scale)[samples])
+    peak = lowest = float(np.max(errors_um))
     for i in range(ROUNDS):
         if peak <= goal_um:
             break
         progress(i / ROUNDS, f"peak error {peak:.3g} um, goal {goal_um:.3g} um")
         # Samples gain little by little as they near the goal: with a sharp border, rounding would
         # decide on which side a sample is.
-        near = np.abs(problem.error_um(x, scale)) / goal_um
-        scale = scale * (1.0 + EMPHASIS * np.clip((near - NEARLY) / (1.0 - NEARLY), 0.0, 1.0))
+        near = errors_um / goal_um
+        scale = scale.copy()
+        scale[samples] *= 1.0 + EMPHASIS * np.clip((near - NEARLY) / (1.0 - NEARLY), 0.0, 1.0)
         x, _ = polished(problem, x, scale, ROUND)
-        peak = float(np.max(np.abs(problem.error_um(x, scale))))
+        errors_um = np.abs(problem.error_um(x, scale)[samples])
+        peak = float(np.max(errors_um))
         if peak < lowest:
             best, lowest = SearchEnd(x, scale, found.starts), peak
     return best

@@ -5,10 +5,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.optimize import nnls
 
 from hilctl.base.arrays import F64
 from hilctl.identify.data.records import SteadyLoop
 from hilctl.identify.fit_data import FitData
+from hilctl.identify.fit_model import fit_model
 from hilctl.identify.searched.plays import PlaysProblem
 from hilctl.identify.settings import FitSettings
 from hilctl.models.published import exponential_integrated
@@ -36,7 +38,7 @@ def differences(run: Callable[[F64], F64], x: F64, step: float) -> F64:
 def test_gradient_where_the_weights_follow(data: FitData, kind: Any, weights: Any) -> None:
     """Slopes lack what the weights make up for, and yet give the gradient of the sum of squares."""
     problem = PlaysProblem(data, FitSettings(kind=kind, weights=weights, plays=6, offset=True))
-    x, scale = problem.space.guess, 1.0 + (np.arange(data.target_um.size) % 3)
+    x, scale = problem.space.guess, 1.0 + (np.arange(data.target_um.size + problem.held) % 3)
 
     def square(at: F64) -> F64:
         return np.array([np.sum((problem.error_um(at, scale) * scale) ** 2)])
@@ -45,3 +47,26 @@ def test_gradient_where_the_weights_follow(data: FitData, kind: Any, weights: An
     gradient = 2.0 * errors @ (problem.slopes_um(x, scale) * scale[:, None])
     expected = differences(square, x, 1e-5)[0]
     np.testing.assert_allclose(gradient, expected, rtol=2e-3, atol=1e-3 * np.abs(expected).max())
+
+
+def test_free_weights_are_one_density_without_spikes(data: FitData) -> None:
+    """Neighbours differ by a fifth; least squares alone would let them jump by nine tenths.
+
+    The first and the last stand for all plays beyond them.
+    """
+    settings = FitSettings(kind="rdpi", plays=20, offset=True, starts=2)
+    found = fit_model(data.records, settings, lambda: 0.0)
+    inner = np.array(found.model.weights)[1:-1]
+    assert inner.min() > 0.05 * inner.max()
+    assert np.abs(np.diff(inner)).max() < 0.25 * inner.max()
+
+
+def test_samples_decide_where_they_can(data: FitData) -> None:
+    """What holds the weights costs the fit next to nothing."""
+    problem = PlaysProblem(data, FitSettings(kind="rdpi", weights="free", plays=20))
+    x, scale = problem.space.guess, np.ones(data.target_um.size + problem.held)
+    held = problem.error_um(x, scale)[: data.target_um.size]
+    columns = data.columns(np.array(problem.build(x, scale).thresholds), problem._growth_s(x))
+    bare, _ = nnls(columns, data.target_um)
+    least = columns @ bare - data.target_um
+    assert np.linalg.norm(held) < 1.01 * np.linalg.norm(least)

@@ -20,6 +20,8 @@ class Curve:
     def __init__(self, target: F64) -> None:
         self.target = target
 
+    held = 0
+
     def error_um(self, x: F64, scale: F64) -> F64:
         return np.asarray(x[0] * np.sin(x[1] * TIME) - self.target, dtype=np.float64)
 
