@@ -140,7 +140,6 @@ def identify(
     from hilctl.cli.identify_view import print_identification
     from hilctl.cli.progress import shown_progress
     from hilctl.identify.command import identify_files, settings_from
-    from hilctl.identify.page import write_identification
 
     del list_settings
     check_page(html, overwrite=overwrite)
@@ -161,6 +160,8 @@ def identify(
             files, chosen, output, validate or [], scheduler, overwrite=overwrite, progress=progress
         )
     if html is not None:
+        from hilctl.identify.page import write_identification
+
         write_identification(found, html)
     refused = found.verdict.grade == "not a model"
     if as_json:

@@ -71,7 +71,7 @@ def fit_model(
 ) -> FittedModel:
     """Fit a model's parameters to steady loops and time histories.
 
-    The criterion is the published sum of squared displacement errors (3.27, 5.14, 6.24) over all
+    The criterion is the published sum of squared displacement errors (4.9, 5.14, 6.24) over all
     points of all loops, subject to the published bounds and to the conditions for the inverse.
 
     The linear algebra is many small steps: with more than one BLAS thread on a busy machine they

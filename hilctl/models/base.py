@@ -230,7 +230,7 @@ def length_problems(name: str, values: Weights, thresholds: Thresholds) -> Itera
 
 
 def play_weight_problems(direct: float, weights: Weights) -> Iterator[str]:
-    """Say which conditions for inverting a sum of plays are broken (5.6)."""
+    """Say which conditions for inverting a sum of plays are broken (5.5, 5.10)."""
     if not direct > 0.0:
         yield f"a_0 must be > 0 for the inverse to exist: {direct!r}"
     for i, weight in enumerate(weights, start=1):

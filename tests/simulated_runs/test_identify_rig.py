@@ -164,15 +164,54 @@ def test_staged_inverse_straightens_the_rig(frequency_hz: float) -> None:
     assert error <= 1.0
 
 
+@cache
+def chapter_4() -> list[SteadyLoop]:
+    """Return the grid of (4.9)."""
+    return sines([3.0, 7.0], [10.0, 100.0, 200.0], 200)
+
+
 def test_without_rate_or_deadbands_the_model_is_far_off() -> None:
-    """At 6 A up to 200 Hz a PPI misses the rate and an RDPI the asymmetry (4.5: 13.5 and 9.6 %)."""
-    data = sines([3.0, 6.0], [10.0, 100.0, 200.0], 200)
-    omega = fit("integrated", data, starts=3)
-    no_rate = fit("ppi", data, plays=12, weights="exponential", starts=3, offset=True)
-    no_deadbands = fit("rdpi", data, plays=12, weights="exponential", starts=3)
-    assert omega.peak_percent < 3.0
-    assert no_rate.peak_percent > 3.0 * omega.peak_percent
-    assert no_deadbands.peak_percent > 2.0 * omega.peak_percent
+    """Figure 4.14, 5 and 7 A at 200 Hz: published 13.5 % without rate, 9.6 % without deadbands.
+
+    Here 11.5 and 11.3 %, against 2.8 % (published 3.72) of Omega.
+    """
+    others = sines([5.0, 7.0], [200.0], 200)
+    omega = judge(fit("integrated", chapter_4(), plays=10, starts=3).model, others)
+    no_rate = judge(fit("asymmetric", chapter_4(), plays=10).model, others)
+    choices = {"plays": 10, "weights": "exponential", "weight_by": "equal", "starts": 3}
+    no_deadbands = judge(fit("rdpi", chapter_4(), **choices).model, others)
+    assert omega.own_peak_percent <= 3.72
+    assert no_rate.own_peak_percent == pytest.approx(11.5, abs=1.0)
+    assert no_deadbands.own_peak_percent == pytest.approx(11.3, abs=1.0)
+
+
+def test_error_against_number_of_plays() -> None:
+    """Figure 4.10: the error falls with n, by little beyond 8 (rms 0.96, 0.75, 0.64, 0.59 %)."""
+    rms = [fit("integrated", chapter_4(), plays=n, starts=3).rms_percent for n in (2, 4, 8, 15)]
+    assert rms == pytest.approx([0.96, 0.75, 0.64, 0.59], abs=0.03)
+
+
+def test_more_plays_bring_little_at_6_a() -> None:
+    """Section 6.3: 6 A, 250 Hz, 3.68 % with 12 plays and 3.27 % with 36; here 2.8 and 2.3 %."""
+    data = sines([3.0, 6.0], [10.0, 50.0, 100.0, 150.0, 250.0], 300)
+    peaks = []
+    for found in (published_omega(), fit("integrated", data, plays=36, starts=3)):
+        (error,) = (e for e in found.errors if e.label == "6 A 250 Hz")
+        peaks.append(error.peak_percent)
+    assert peaks == pytest.approx([2.8, 2.3], abs=0.2)
+
+
+def test_areas_of_the_loops() -> None:
+    """Published: 0.12 to 0.96 % off at 7 A. Here Omega is 4.4 % off, with its stages 0.8 %."""
+    loops = sines([7.0], [10.0, 50.0, 100.0, 150.0, 200.0], 200)
+
+    def largest(found: FittedModel) -> float:
+        return max(
+            abs(error.area_error_percent or 0.0) for error in judge(found.model, loops).errors
+        )
+
+    assert largest(fit("staged", chapter_4(), plays=10, deadbands=8)) <= 0.96
+    assert largest(fit("integrated", chapter_4(), plays=10, starts=3)) <= 4.7
 
 
 def test_rdpi_at_small_amplitude() -> None:

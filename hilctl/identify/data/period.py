@@ -5,7 +5,6 @@ import math
 import numpy as np
 from scipy.fft import irfft, next_fast_len, rfft
 from scipy.optimize import minimize_scalar
-from scipy.signal import find_peaks
 
 from hilctl.analysis.metrics import MAD_TO_SIGMA
 from hilctl.base.arrays import F64, I64
@@ -72,6 +71,8 @@ def find_period(label: str, command: F64) -> tuple[float, int, int]:
 
 def _tops(alike: F64) -> I64:
     """Return the lags of the maxima beyond the first zero: nearer ones are noise."""
+    from scipy.signal import find_peaks  # it imports scipy.stats, which whole histories don't need
+
     first = max(int(np.argmax(alike <= 0.0)), FEWEST_POINTS)
     tops, _ = find_peaks(alike, height=LIKELY, prominence=PROMINENT)
     return np.asarray(tops[tops >= first], dtype=np.int64)

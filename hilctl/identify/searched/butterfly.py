@@ -7,7 +7,6 @@ around it stands a search over the thresholds' spacing and their growth with the
 
 import numpy as np
 from scipy.optimize import lsq_linear, minimize
-from scipy.signal import find_peaks
 
 from hilctl.base.arrays import F64
 from hilctl.base.errors import DataError
@@ -139,6 +138,8 @@ def _sides(loop: SteadyLoop, turning_um: float) -> F64:
     A loop changes wings at its lowest points, near the turning point. Between two of these, the
     wing is that of most of the command.
     """
+    from scipy.signal import find_peaks  # it imports scipy.stats, which is slow: not for others
+
     height_um = loop.displacement_um - turning_um
     start = int(np.argmax(height_um))
     height_um, command = np.roll(height_um, -start), np.roll(loop.command, -start)
