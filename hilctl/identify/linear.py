@@ -57,11 +57,12 @@ def bounded_and_free(
     size, others = columns.shape[1], free.shape[1]
     inside = np.zeros((others, size + 1))
     if others:
-        basis, corner = qr(free * scale[:, None], mode="economic")
+        basis, corner = np.linalg.qr(free * scale[:, None])
         inside = basis.T @ table
         table -= basis @ inside
-    triangle = qr(table, mode="r", overwrite_a=True)[0]
-    extra, _ = nnls(triangle[: size + 1, :size], triangle[: size + 1, size])
+    # Raw: mode "r" hands out the zeros below the triangle too, a row for each sample.
+    _, triangle = qr(table, mode="raw", overwrite_a=True)
+    extra, _ = nnls(triangle[:, :size], triangle[:, size])
     if not others:
         return least + extra, np.zeros(0)
     rest_inside = inside[:, size] - inside[:, :size] @ extra

@@ -14,6 +14,8 @@ _SLOPES = (0.3, 0.7, 1.2)  # of the envelopes, times the reach
 _SHIFTS = (-0.6, 0.0, 0.6)
 _EVALUATIONS = 40
 _FOLLOWED = 3  # of the starts: some end at other minima
+_POLISH = 8  # from where some of the samples left it
+_ENOUGH = 3_000  # samples, until the best start is known
 _LOW = (0.05, -3.0, 0.05, -3.0, 0.3, -0.3, 0.2)
 _HIGH = (4.0, 3.0, 4.0, 3.0, 3.0, 0.3, 1.0)
 
@@ -24,11 +26,17 @@ class _Search:
     A point holds slope (times the reach) and shift of the rising envelope, the same of the falling
     one, the falling one's height (the rising one's is 1: the weights carry the scale) and its value
     at 0, and the spacing relative to half the largest swing of z over the number of plays.
+
+    Args:
+        job: What is asked.
+        few: Whether some of the samples are enough; all of them make the memory all the same.
     """
 
-    def __init__(self, job: FitJob) -> None:
+    def __init__(self, job: FitJob, *, few: bool) -> None:
         self.job = job
         self.data = job.data
+        step = max(1, job.data.target_um.size // _ENOUGH) if few else 1
+        self.rows = slice(None, None, step)
         self.plays = job.settings.plays
 
     def envelopes(self, x: F64) -> tuple[Envelope, Envelope]:
@@ -51,7 +59,7 @@ class _Search:
         return float(x[6]) * swing / self.plays * np.arange(1, self.plays + 1, dtype=np.float64)
 
     def solve(self, x: F64) -> tuple[F64, float, F64]:
-        """Return p_0 to p_n, the constant displacement, and the error float64[N]."""
+        """Return p_0 to p_n, the constant displacement, and the error float64[M]."""
         rising, falling = (envelope.array() for envelope in self.envelopes(x))
         thresholds = self.thresholds(x)
 
@@ -60,14 +68,15 @@ class _Search:
             envelope_outputs(v, rising, falling, thresholds, rest_memory(self.plays + 1), out)
             return out
 
-        columns = self.data.stack(run)
+        columns = self.data.stack(run)[self.rows]
         least = np.zeros(self.plays + 1)
         least[0] = self.job.least * self.data.reach / float(x[0])
-        weights, offset_um = weigh(self.job, columns, least)
-        return weights, offset_um, columns @ weights + offset_um - self.data.target_um
+        weights, offset_um = weigh(self.job, columns, least, self.rows)
+        error_um = columns @ weights + offset_um - self.data.target_um[self.rows]
+        return weights, offset_um, error_um
 
     def error_um(self, x: F64) -> F64:
-        """Return modelled minus measured displacement: float64[N]."""
+        """Return modelled minus measured displacement: float64[M]."""
         return self.solve(x)[2]
 
     def square(self, x: F64) -> float:
@@ -77,17 +86,19 @@ class _Search:
 
 def fit_generalised(job: FitJob) -> FoundModel:
     """Fit two tanh envelopes, and the weights of the plays behind them."""
-    problem = _Search(job)
+    few, problem = _Search(job, few=True), _Search(job, few=False)
+    low, high = np.array(_LOW), np.array(_HIGH)
     points = [
         np.array([slope, shift, slope, shift, 1.0, 0.0, 0.9])
         for slope in _SLOPES
         for shift in _SHIFTS
     ]
     ends = [
-        converged(problem.error_um, begin, np.array(_LOW), np.array(_HIGH), _EVALUATIONS)[0]
-        for begin in sorted(points, key=problem.square)[:_FOLLOWED]
+        converged(few.error_um, begin, low, high, _EVALUATIONS)[0]
+        for begin in sorted(points, key=few.square)[:_FOLLOWED]
     ]
-    x = ends[first_least([problem.square(end) for end in ends])]
+    best = ends[first_least([few.square(end) for end in ends])]
+    x, _ = converged(problem.error_um, best, low, high, _POLISH)
     weights, offset_um, _ = problem.solve(x)
     rising, falling = problem.envelopes(x)
     model = GeneralisedModel(

@@ -25,13 +25,19 @@ def fit_straight(job: FitJob) -> FoundModel:
     return FoundModel(model, 2, {"p_0": model.direct, "output_offset_um": offset_um})
 
 
-def weigh(job: FitJob, columns: F64, least: F64) -> tuple[F64, float]:
+def weigh(job: FitJob, columns: F64, least: F64, rows: slice = slice(None)) -> tuple[F64, float]:
     """Fit ``columns w + c`` to the measured displacement, w >= least.
+
+    Args:
+        job: What is asked.
+        columns: float64[M, m], of the judged samples that ``rows`` takes.
+        least: float64[m].
+        rows: All, or one of some.
 
     Returns:
         Weights float64[m], and the constant displacement in um.
     """
-    target_um = job.data.target_um
+    target_um = job.data.target_um[rows]
     return bounded_weights(columns, target_um, np.ones(target_um.size), least, offset=True)
 
 
