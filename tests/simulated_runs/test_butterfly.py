@@ -1,20 +1,25 @@
 """Rods without permanent magnets on the simulated rig: butterflies, and compensation on a wing."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from hilctl.analysis.replay import replay
 from hilctl.analysis.report import summarize
+from hilctl.cli import app
 from hilctl.identify.data.cycles import average_cycle
 from hilctl.identify.data.records import SteadyLoop
 from hilctl.identify.fit_model import fit_model
+from hilctl.identify.judge import judge
 from hilctl.identify.settings import FitSettings
-from hilctl.models.files import dump_model
+from hilctl.models.files import dump_model, load_model
 from hilctl.recording.reader import read
-from hilctl.run.start import start_run
+from hilctl.run.start import checked_experiment, start_run
+from hilctl.run.unpaced import run_unpaced
 from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
 
 CONFIG = Path(__file__).parents[2] / "configs" / "terfenol_sine_6a.yaml"
@@ -61,6 +66,37 @@ def test_the_model_meets_both_wings(found):
     assert found.peak_percent <= 3.0
     assert found.rms_percent <= 0.8
     assert found.model.bias == 0.0
+
+
+def test_one_model_holds_for_a_bias_that_it_was_not_found_on(found):
+    """Without magnets a bias is part of the command: one density then depends on it as the rig."""
+    others = [
+        loop(2.5, frequency_hz, bias_a) for bias_a in (2.5, 4.5) for frequency_hz in (10, 100)
+    ]
+    assert judge(found.model, others).own_peak_percent <= 6.0
+
+
+def test_butterflies_are_identified_by_the_command(tmp_path):
+    """From a recording of a rig without magnets, by ``hilctl identify``."""
+    sines = [
+        {"kind": "sine", "amplitude": a, "offset": b, "frequency_hz": 50.0, "duration_s": 0.3,
+         "soft_start_s": 0.1, "soft_end_s": 0.1}
+        for a, b in ((3.0, 0.0), (6.0, 0.0), (2.0, 3.5), (3.5, 3.5))
+    ]  # fmt: skip
+    settings = (
+        "device.magnet=false",
+        f"waveform={json.dumps({'kind': 'sequence', 'unit': 'A', 'parts': sines})}",
+        "compensator=none",
+    )
+    checked = checked_experiment(CONFIG, settings)
+    loops, model = tmp_path / "loops.mcap", tmp_path / "model.yaml"
+    assert run_unpaced(checked, loops, overwrite=True).code == "completed"
+    words = ["identify", str(loops), "--model", "butterfly", "--set", "turning_um=0.0"]
+    words += ["--set", "magnets=false", "--output", str(model), "--json"]
+    result = CliRunner().invoke(app, words)
+    assert result.exit_code == 0, result.output
+    assert json.loads(result.stdout)["peak_percent"] <= 3.0
+    assert load_model(model).kind == "butterfly"
 
 
 def test_compensation_on_a_wing(found, tmp_path):

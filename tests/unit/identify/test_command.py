@@ -1,6 +1,8 @@
 """The identify command's work: tables in, model, figures and page out."""
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -90,3 +92,18 @@ def test_settings_are_checked_together() -> None:
     assert "is a setting of staged, not of ppi" in problems["lag"]
     with pytest.raises(InputError, match=r"unknown kind of model 'presach' .*'preisach'"):
         settings_from("presach", [])
+
+
+def test_histories_import_neither_plots_nor_statistics(tables: list[Path]) -> None:
+    """They would take longer than the fit of a small table, and 80 MB."""
+    code = (
+        "import sys\nfrom hilctl.cli import main\ntry:\n    main()\nfinally:\n"
+        "    print([m for m in ('matplotlib', 'scipy.stats') if m in sys.modules])"
+    )
+    words = ["identify", str(tables[0]), "--model", "ppi"]
+    words += [word for text in TABLE for word in ("--set", text)]
+    done = subprocess.run(
+        [sys.executable, "-c", code, *words], capture_output=True, text=True, timeout=120
+    )
+    assert "fitted: " in done.stdout, done.stderr
+    assert done.stdout.splitlines()[-1] == "[]"
