@@ -301,7 +301,7 @@ def show(rig: Rig, options: argparse.Namespace) -> tuple[dict[str, Any], bool]:
     also = [name for name in ("conditioned", "floor") if getattr(options, name)]
     names = ["from rest", *also]
     say = partial(print, file=sys.stderr if options.json else sys.stdout, flush=True)
-    say(f"\n{rig.physics}, {' '.join(['', *options.options])}{options.model}: "
+    say(f"\n{' '.join([rig.physics, *options.options])}, {options.model}: "
         f"{took_s:.1f} s of processor time, inverse {cost:.2f} us a sample")  # fmt: skip
     say(f"{'reference':20} {'peak %':>7} {'no mean':>8} {'rms %':>6} {'noise':>6}"
         + "".join(f" | {name:>13}" for name in names) + " | goal")  # fmt: skip
