@@ -7,13 +7,14 @@ from scipy.linalg import qr
 
 from hilctl.base.arrays import F64
 from hilctl.identify.fit_data import FitData
-from hilctl.identify.linear import RIDGE, bounded_and_free
+from hilctl.identify.linear import bounded_and_free
 from hilctl.identify.searched.search import SearchSpace
 from hilctl.identify.settings import FitSettings
 from hilctl.models.plays import PlayModel, PpiModel, RdpiModel
 from hilctl.models.spi import SpiModel
 
-SMOOTHNESS = 3e-4  # weight of a density's slope, see _held
+SMOOTHNESS = 1e-4  # weight of a density's slope, see _held
+RIDGE = 1e-4  # weight of the weights themselves
 
 
 def spacing_limit(data: FitData, settings: FitSettings) -> float:

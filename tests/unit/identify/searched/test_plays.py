@@ -50,7 +50,7 @@ def test_gradient_where_the_weights_follow(data: FitData, kind: Any, weights: An
 
 
 def test_free_weights_are_one_density_without_spikes(data: FitData) -> None:
-    """Neighbours differ by a tenth; least squares alone would let them jump by nine tenths.
+    """Neighbours differ by a fifth; least squares alone would let them jump by nine tenths.
 
     The first and the last stand for all plays beyond them.
     """
@@ -58,7 +58,7 @@ def test_free_weights_are_one_density_without_spikes(data: FitData) -> None:
     found = fit_model(data.records, settings, lambda: 0.0)
     inner = np.array(found.model.weights)[1:-1]
     assert inner.min() > 0.05 * inner.max()
-    assert np.abs(np.diff(inner)).max() < 0.15 * inner.max()
+    assert np.abs(np.diff(inner)).max() < 0.25 * inner.max()
 
 
 def test_samples_decide_where_they_can(data: FitData) -> None:
