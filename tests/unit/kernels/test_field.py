@@ -207,8 +207,12 @@ def test_the_slope_of_the_losses_is_their_derivative(only, e):
     assert lost_field(e, losses)[1] == pytest.approx(rise / 2e-5, rel=1e-4)
 
 
-def test_the_field_left_is_the_one_that_the_losses_were_added_to():
+@pytest.mark.parametrize("step_s", [1.0, 2e-5])
+def test_the_field_left_is_the_one_that_the_losses_were_added_to(step_s):
+    """The fit has times, where a run has what becomes of them in one sample."""
     w, m = path(), 5.0 * np.cos(np.arange(500) / 9.0)
-    left = np.empty_like(w)
-    field_left(commands(w, m, LOSSES), m, LOSSES, left)
+    left, half, steps_s = np.empty_like(w), np.full(w.size, 0.5), np.full(w.size, step_s)
+    field_s, output_s = step_s * LOSSES[0], step_s * LOSSES[1]
+    losses = (field_s, output_s, -step_s / math.log(LOSSES[2]), *LOSSES[3:])
+    field_left(commands(w, m, LOSSES), half, steps_s, m, losses, left)
     np.testing.assert_allclose(left, w, atol=1e-4 * np.abs(np.diff(w)).max())

@@ -50,7 +50,7 @@ def test_paths_keep_the_turns_and_points_no_further_apart_than_was_asked_for() -
     signals, (run,) = Signals(records), records.runs
     signals.choose(FIRST, 1e-9)
     (path,) = signals.paths(FIRST)
-    assert path.field.size == path.displacement_um.size == run.derivatives[0].size
+    assert path.field.size == path.displacement_um.size == run.kept.size
     assert 0 <= path.judged < path.field.size
     signals.choose(FIRST, 0.05)
     (coarse,) = signals.paths(FIRST)
