@@ -32,6 +32,8 @@ SEARCH_ROWS, FINAL_ROWS = 2500, 12_000
 ROUNDS = 2
 TRIED = 0.2  # of a unit: change that slopes are taken by; kinks of single rows are smoothed
 FIRST_LAGS = (0.02, 0.1, 0.4)  # starts: lag of the field
+NEAR_BOUND = 0.95
+STIFFER = (0.02, 0.05)  # radians of other starts, where the first leads to a bound
 FIRST_COUPLINGS = (-0.6, -0.3, 0.0, 0.3)
 LEAST_WIDEST = 0.1  # of half the span
 TAIL = 0.02  # of all weights: those of thresholds beyond the widest that is worth its place
@@ -65,6 +67,17 @@ class FieldEnd:
     weights: Weights
 
 
+@dataclass(frozen=True, slots=True)
+class _Descent:
+    """Where a descent has led, and what was learned of curve and cells on the way."""
+
+    error: float
+    stages: Stages
+    curve: Curve | None
+    grid: Grid | None
+    widest: float
+
+
 class FieldSearch:
     """Weights and stages of one size of model.
 
@@ -84,6 +97,19 @@ class FieldSearch:
 
     def find(self, first: Stages, progress: OnProgress) -> FieldEnd:
         """Follow the best of some starts down, and work out all weights there."""
+        found = self._descended(first, progress, 0.0)
+        if _at_bound(found.stages):
+            # A slow record says little of the structure: a soft one can bend what the hysteresis
+            # should, and takes the coupling along.
+            for k, radian in enumerate(STIFFER, start=1):
+                start = replace(first, radian=radian, delay=0.3 * radian)
+                other = self._descended(start, progress, 1.0 - 0.5**k)
+                found = min(found, other, key=lambda each: each.error)
+        self._curve, self._grid, self._widest = found.curve, found.grid, found.widest
+        return self._end(row(found.stages))
+
+    def _descended(self, first: Stages, progress: OnProgress, done: float) -> "_Descent":
+        """Return where the best of some starts leads."""
         coarse = self._size.coarse
         tried = [self._tried(replace(first, field=lag), coarse) for lag in FIRST_LAGS]
         first = min(tried, key=_error)[1]
@@ -91,14 +117,16 @@ class FieldSearch:
         x = row(min(tried, key=_error)[1])
         self._forget()
         for turn in range(ROUNDS):
-            progress((turn + 0.2) / (ROUNDS + 1), f"round {turn + 1} of {ROUNDS}")
+            part = (turn + 0.2) / (ROUNDS + 1)
+            progress(done + (1.0 - done) * part, f"round {turn + 1} of {ROUNDS}")
             self._lay(stages_in(x), coarse)
             self._learn(x, self._paths())
             self._lay(stages_in(x), coarse)
             self._learn(x, self._paths())
             x = self._followed(x, self._paths())
             self._learn(x, self._paths())
-        return self._end(x)
+        error = float(np.sqrt(np.mean(self._errors(x, self._paths()) ** 2)))
+        return _Descent(error, stages_in(x), self._curve, self._grid, self._widest)
 
     def _forget(self) -> None:
         self._curve = self._grid = None
@@ -231,6 +259,12 @@ class FieldSearch:
         self._learn(x, paths)
         found = self._solved(x, paths)
         return FieldEnd(physical(stages_in(x), self._data), self._laid(), found)
+
+
+def _at_bound(stages: Stages) -> bool:
+    """Return whether structure or coupling have come about as far as they may go."""
+    far = NEAR_BOUND * HIGH.radian, NEAR_BOUND * LOW.coupling, NEAR_BOUND * HIGH.coupling
+    return stages.radian > far[0] or not far[1] < stages.coupling < far[2]
 
 
 def _error(tried: tuple[float, Stages]) -> float:

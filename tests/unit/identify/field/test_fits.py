@@ -10,6 +10,7 @@ from hilctl.identify.fit_model import fit_model
 from hilctl.identify.judge import judge
 from hilctl.identify.settings import FitSettings
 from hilctl.models.staged import FieldLag, StagedModel, Structure
+from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
 from tests.staged import truth
 
 RATE_HZ = 20_000.0
@@ -43,6 +44,18 @@ def test_a_history_that_was_not_fitted_is_met() -> None:
     assert judged.peak_percent < 3.0
     # What holds the field back by a constant time is found as that, not as what follows the slope.
     assert 1e-4 < found.parameters["field_s"] < 4e-4
+
+
+def test_a_structure_that_a_slow_record_leaves_open_does_not_bend_the_hysteresis() -> None:
+    """The first start ends with one as soft as it may be, and misses the data by 4 % rms."""
+    t = np.arange(25_000) / 50e3
+    phases = np.random.default_rng(1).uniform(0.0, 6.0, 8)
+    wave = sum(np.sin(37.0 * k * t + p) for k, p in enumerate(phases, 1))
+    command = np.ascontiguousarray(6.0 * np.clip(t / 0.02, 0.0, 1.0) * wave / np.ptp(wave))
+    y, current_a = np.empty_like(command), np.empty_like(command)
+    TerfenolActuator(TerfenolParameters(), 50e3, seed=3).step(command, y, current_a)
+    found = fit_model([History("slow", command, y, 50e3)], FitSettings(kind="field"), lambda: 0.0)
+    assert found.rms_percent < 0.6
 
 
 def test_steady_loops_are_refused() -> None:
