@@ -1,6 +1,6 @@
 """Kill a campaign at random moments, and judge what it has left once it is done.
 
-Run it with ``python tests/benchmark/campaign_kills.py``; see README.md beside it.
+Run it with ``python -m tests.benchmark.campaign_kills``; see README.md beside it.
 """
 
 import argparse
@@ -19,8 +19,9 @@ from pathlib import Path
 
 from hilctl.experiment.heat import CoilHeat, cooled
 from hilctl.experiment.load import load_experiment
-from hilctl.recording.data import HEAT_FACT
-from hilctl.recording.reader import read, read_end_facts
+from hilctl.recording.ends import read_ends
+from hilctl.recording.facts import HEAT_FACT
+from hilctl.recording.reader import read
 from hilctl.recording.salvage import Salvage
 from hilctl.run.step import completed_key
 
@@ -154,7 +155,7 @@ def _is_sound(path: Path) -> bool:
         salvage = Salvage(stream)
         for _ in salvage.records():
             pass
-    return salvage.sound and bool(read_end_facts(path))
+    return salvage.sound and bool(read_ends(path).end)
 
 
 def main() -> None:

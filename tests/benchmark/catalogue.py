@@ -1,6 +1,6 @@
 """How long ``hilctl list`` takes over thousands of recordings, before and after it knows them.
 
-Run it with ``python tests/benchmark/catalogue.py``; see README.md beside it.
+Run it with ``python -m tests.benchmark.catalogue``; see README.md beside it.
 """
 
 import argparse

@@ -1,6 +1,6 @@
 """Time what the loop does to bytes in each exchange, and pymodbus for the same messages.
 
-Run it with ``python tests/benchmark/frames.py``; ``--max-exchange-us`` and ``--max-crc-us`` make it
+Run it with ``python -m tests.benchmark.frames``; ``--max-exchange-us`` and ``--max-crc-us`` make it
 exit with 1 where building and checking one exchange, or a CRC of 25 bytes, costs more.
 """
 

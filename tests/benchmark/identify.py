@@ -1,6 +1,6 @@
 """Time the identification of Omega against the published method, on the published grid.
 
-Run it with ``python tests/benchmark/identify.py``; see README.md beside it. The published method is
+Run it with ``python -m tests.benchmark.identify``; see README.md beside it. The published method is
 bounded least squares on all parameters from several starts (6.24), with SciPy, derivatives by
 differences; it stands here, not in the package, and uses the same compiled operators.
 """

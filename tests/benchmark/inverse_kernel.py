@@ -1,6 +1,6 @@
 """Time the integrated inverse, compiled by numba, against the same loop in C.
 
-Run it with ``python tests/benchmark/inverse_kernel.py``; see README.md beside it. Both are compiled
+Run it with ``python -m tests.benchmark.inverse_kernel``; see README.md beside it. Both are compiled
 into a temporary folder, so the tree stays as it is.
 """
 

@@ -1,6 +1,6 @@
 """Kill and stop a run's processes at random times, and judge by the device's own log of writes.
 
-Run it with ``python tests/benchmark/kills.py``; see README.md beside it.
+Run it with ``python -m tests.benchmark.kills``; see README.md beside it.
 """
 
 import argparse
@@ -20,11 +20,11 @@ from typing import Any
 
 import numpy as np
 import yaml
-from kill_wires import WIRES, AttackedWire, DeviceLog
-from other_reader import NOT_INSTALLED, verdict
-from wire_runs import make_real_time
 
 from hilctl.recording.reader import read
+from tests.benchmark.kill_wires import WIRES, AttackedWire, DeviceLog
+from tests.benchmark.other_reader import NOT_INSTALLED, verdict
+from tests.benchmark.wire_runs import make_real_time
 
 SLOW_WRITE = Path(__file__).with_name("slow_write.c")
 OBSERVED_S = 1.0

@@ -1,6 +1,6 @@
 """Time one exchange of the Modbus driver against libmodbus's C client, on one libmodbus server.
 
-Run it with ``python tests/benchmark/modbus_exchange.py``; see README.md beside it. It needs gcc and
+Run it with ``python -m tests.benchmark.modbus_exchange``; see README.md beside it. It needs gcc and
 libmodbus with its headers. Everything is built in a temporary folder.
 """
 

@@ -1,6 +1,6 @@
 """Identify a model on each physics of the simulated rig, and judge its inverse on all references.
 
-Run it with ``python tests/benchmark/physics.py``; see README.md beside it. The campaign is
+Run it with ``python -m tests.benchmark.physics``; see README.md beside it. The campaign is
 ``configs/identify_any.yaml``. The rig that the inverse drives has other noise than the one that the
 model was identified on, and starts from rest at each reference; nothing is learned or fed back.
 Errors are percent of the reference's own peak-to-peak.
@@ -22,9 +22,6 @@ from typing import Any, TypeAlias
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
-from causal_floor import CausalInverse, rods_wanted_um
-from learning import CYCLES, EXPERIMENT, SOFT_S
-from references import RATE_HZ, Row, Stroke, random, references
 
 from hilctl.base.arrays import F64
 from hilctl.experiment.condition import conditioning_of
@@ -36,13 +33,17 @@ from hilctl.identify.fit_model import FittedModel, fit_model
 from hilctl.identify.job import ignore_progress
 from hilctl.identify.settings import FitSettings, IdentifySettings
 from hilctl.identify.workers import one_by_one
-from hilctl.learning.session import Session, unpaced
+from hilctl.learning.session import Session
 from hilctl.loop.compensator import Compensator
 from hilctl.models.base import HysteresisModel
 from hilctl.models.files import dump_model
+from hilctl.run.step import unpaced
 from hilctl.waveforms.build import build
 from hilctl_drivers.simulated.rigs import PHYSICS, Physics, TerfenolOptions
 from hilctl_drivers.simulated.terfenol import TerfenolActuator
+from tests.benchmark.causal_floor import CausalInverse, rods_wanted_um
+from tests.benchmark.learning import CYCLES, EXPERIMENT, SOFT_S
+from tests.benchmark.references import RATE_HZ, Row, Stroke, random, references
 
 CAMPAIGN = Path(__file__).parents[2] / "configs" / "identify_any.yaml"
 MARGIN = 0.06  # of the range that a model was identified on, at either end

@@ -28,7 +28,8 @@ from hilctl.loop.compensator import Compensator
 from hilctl.models.base import HysteresisModel
 from hilctl_drivers.simulated.rigs import PHYSICS, Physics, TerfenolOptions
 from hilctl_drivers.simulated.terfenol import TerfenolActuator
-from tests.benchmark.physics import RATE_HZ, UNJUDGED, identified, references, swelling
+from tests.benchmark import physics as benchmark
+from tests.benchmark.references import RATE_HZ, Row, references
 
 GOAL, WORSE = 0.5, 1.05  # times the old error: of all references, and of any one
 CHANGED: dict[str, Any] = {
@@ -38,6 +39,11 @@ CHANGED: dict[str, Any] = {
     "thermal": {"rise_k_per_a2": 0.0, "tau_s": 100.0, "growth_um_per_k": 0.3, "ambient_k": 5.0},
 }
 NOISE_UM = TerfenolOptions().parameters().sensor_noise_um
+
+
+def swelling(time_s: F64, over_s: float) -> F64:
+    """Return a raised cosine from 0 to 1."""
+    return np.asarray(0.5 - 0.5 * np.cos(np.pi * np.clip(time_s / over_s, 0.0, 1.0)))
 
 
 class Rig:
@@ -124,11 +130,11 @@ def refined(rig: Rig, model: HysteresisModel, low_um: float, high_um: float) -> 
     return refine_runs(model, runs)
 
 
-def missed(rig: Rig, model: HysteresisModel, reference_um: F64, first: int) -> tuple[float, float]:
+def missed(rig: Rig, model: HysteresisModel, row: Row) -> tuple[float, float]:
     """Return rms and peak error of a compensated reference, in percent of its peak-to-peak."""
-    answer_um = rig.driven(command_of(model, reference_um), 1, noise=False)
-    error = (answer_um - reference_um)[first:-UNJUDGED]
-    to_percent = 100.0 / float(np.ptp(reference_um[first:-UNJUDGED]))
+    answer_um = rig.driven(command_of(model, row.reference_um), 1, noise=False)
+    error = (answer_um - row.reference_um)[row.judged]
+    to_percent = 100.0 / float(np.ptp(row.reference_um[row.judged]))
     return (
         float(np.sqrt(np.mean(error**2))) * to_percent,
         float(np.max(np.abs(error))) * to_percent,
@@ -137,7 +143,7 @@ def missed(rig: Rig, model: HysteresisModel, reference_um: F64, first: int) -> t
 
 def of_any(physics: Physics) -> HysteresisModel:
     """Return a model of the whole campaign."""
-    return identified(physics, "field", seed=3)[0].model
+    return benchmark.identified(benchmark.Rig(physics, ()), "field", seed=3)[0].model
 
 
 def of_loops(physics: Physics) -> HysteresisModel:
@@ -171,18 +177,16 @@ def show(physics: Physics, start: str, model: HysteresisModel) -> bool:
     print(f"{'reference':22} {'rms %':>7} {'after':>7} {'ratio':>6} {'peak %':>7} {'after':>7} "
           f"{'noise':>6}")  # fmt: skip
     errors, met = [], found.better
-    for name, _, wave, first in references(low_um, high_um):
-        if "1 Hz" in name and not name.startswith("100 %, 1 Hz"):
+    for row in references(low_um, high_um):
+        if "1 Hz" in row.name and not row.name.startswith("100 %, 1 Hz"):
             continue  # as slow as the one of the full stroke, and long to simulate
-        (was, was_peak), (now, now_peak) = (
-            missed(rig, each, wave, first) for each in (model, found.model)
-        )
-        floor = 100.0 * NOISE_UM / float(np.ptp(wave[first:-UNJUDGED]))
+        (was, was_peak), (now, now_peak) = (missed(rig, each, row) for each in (model, found.model))
+        floor = 100.0 * NOISE_UM / float(np.ptp(row.reference_um[row.judged]))
         worse = now > max(WORSE * was, floor)
         met &= not worse
         errors.append((was, now, floor))
-        print(f"{name:22} {was:7.3f} {now:7.3f} {now / was:6.2f} {was_peak:7.2f} {now_peak:7.2f} "
-              f"{floor:6.3f}{'  worse' if worse else ''}", flush=True)  # fmt: skip
+        print(f"{row.name:22} {was:7.3f} {now:7.3f} {now / was:6.2f} {was_peak:7.2f} "
+              f"{now_peak:7.2f} {floor:6.3f}{'  worse' if worse else ''}", flush=True)  # fmt: skip
     was, now, floor = np.sqrt(np.mean(np.square(errors), axis=0))
     halved = now <= max(GOAL * was, floor)
     print(f"{'all':22} {was:7.3f} {now:7.3f} {now / was:6.2f} {'':15} {floor:6.3f}"

@@ -1,6 +1,6 @@
 """How well a model found on one rig compensates another: see README.md beside it.
 
-Run it with ``python tests/benchmark/robustness.py``. The simulated rig's lag, pinning, strain and
+Run it with ``python -m tests.benchmark.robustness``. The simulated rig's lag, pinning, strain and
 resonance are each off by 10 %, then it carries loads; every row is the full stroke at 1 to 250 Hz.
 Commands come from the compensator and the limiter of a run, and figures from the report of one; no
 time passes, so a run takes less than it would.

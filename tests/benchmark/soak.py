@@ -1,6 +1,6 @@
 """A long run at 50 kHz with recording: nothing dropped, memory flat, lateness by the minute.
 
-Run it with ``python tests/benchmark/soak.py``; see README.md beside it. It takes half an hour.
+Run it with ``python -m tests.benchmark.soak``; see README.md beside it. It takes half an hour.
 """
 
 import argparse

@@ -1,6 +1,6 @@
 """Time what a tick costs beside the device: from each wake-up to the next sleep, less the exchange.
 
-Run it with ``python tests/benchmark/tick.py``; see README.md beside it. It runs the loop process's
+Run it with ``python -m tests.benchmark.tick``; see README.md beside it. It runs the loop process's
 own code on the simulated rig, one sample a tick, with a clock that takes notes. Where LinuxCNC is
 installed, a thread of its HAL does the closest thing it has, for comparison.
 """

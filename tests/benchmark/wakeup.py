@@ -1,6 +1,6 @@
 """Compare hilctl's wake-up lateness with cyclictest's: same priority, same rate, same minute.
 
-Run it with ``python tests/benchmark/wakeup.py``; see README.md beside it. It needs cyclictest
+Run it with ``python -m tests.benchmark.wakeup``; see README.md beside it. It needs cyclictest
 (Debian: rt-tests). hilctl's side is measured through the loop's own pacer, clock and set-up.
 """
 

@@ -1,6 +1,6 @@
 """Compensated runs over every wire at its highest rate, against the same runs on the rig alone.
 
-Run it with ``python tests/benchmark/wires.py``; see README.md beside it. Everything is emulated:
+Run it with ``python -m tests.benchmark.wires``; see README.md beside it. Everything is emulated:
 TCP on loopback, serial lines on ptys.
 """
 
@@ -20,7 +20,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from wire_runs import (
+
+from tests.benchmark.wire_runs import (
     PRIORITY,
     WIRES,
     Wire,
