@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 
-.PHONY: run test test-slow lint clean
+.PHONY: run test test-slow test-long lint clean
 
 run: $(VENV)/.ready
 	$(BIN)/hilctl run configs/demo.yaml
@@ -16,7 +16,11 @@ test: $(VENV)/.ready
 
 test-slow: $(VENV)/.ready
 	@echo "Takes about 20 minutes: most of them real time, in which runs go on."
-	$(BIN)/pytest -n 2 --dist loadfile -m slow
+	$(BIN)/pytest -n 2 --dist loadfile -m "slow and not long"
+
+test-long: $(VENV)/.ready
+	@echo "Takes about 20 minutes: campaigns, published figures and rigs of other physics, as a whole."
+	$(BIN)/pytest -n 2 --dist loadfile -m long
 
 lint: $(VENV)/.ready
 	$(BIN)/ruff check .

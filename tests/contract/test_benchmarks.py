@@ -1,4 +1,4 @@
-"""Every benchmark can still be run: what it imports is there, and it says how it is used."""
+"""Every benchmark can still be run: what it imports is there."""
 
 import subprocess
 import sys
@@ -7,17 +7,12 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-BENCHMARKS = sorted(
-    path.stem
-    for path in (ROOT / "tests" / "benchmark").glob("*.py")
-    if "argparse" in path.read_text(encoding="utf-8")
-)
+BENCHMARKS = sorted(path.stem for path in (ROOT / "tests" / "benchmark").glob("*.py"))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", BENCHMARKS)
-def test_a_benchmark_says_how_it_is_used(name):
-    words = [sys.executable, "-m", f"tests.benchmark.{name}", "--help"]
+def test_what_benchmarks_import_is_there():
+    imports = "; ".join(f"import tests.benchmark.{name}" for name in BENCHMARKS)
+    words = [sys.executable, "-c", imports]
     done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
-    assert "usage:" in done.stdout

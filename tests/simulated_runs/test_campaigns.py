@@ -22,6 +22,8 @@ from hilctl.recording.reader import read
 
 CAMPAIGNS = Path(__file__).parents[2] / "configs" / "campaigns"
 
+pytestmark = pytest.mark.long
+
 
 class Table:
     """A campaign's table; columns by name."""

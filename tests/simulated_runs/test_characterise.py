@@ -28,7 +28,12 @@ def characterised(path, settings, folder, output):
 
 
 @pytest.mark.parametrize(
-    ("physics", "within_percent"), [("terfenol", 2.0), ("diffusion", 2.5), ("jiles_atherton", 8.0)]
+    ("physics", "within_percent"),
+    [
+        ("terfenol", 2.0),
+        pytest.param("diffusion", 2.5, marks=pytest.mark.long),
+        pytest.param("jiles_atherton", 8.0, marks=pytest.mark.long),
+    ],
 )
 def test_a_rig_of_any_physics_gets_a_model(tmp_path, physics, within_percent):
     """On a random reference that no fit saw; so does a sine under another noise."""

@@ -25,6 +25,8 @@ PEAK_UM = 13.0
 CENTRE_UM = -1.08
 """What 2.3 A moves, and the middle of that."""
 
+pytestmark = pytest.mark.long
+
 
 @pytest.fixture
 def run(tmp_path):

@@ -98,7 +98,8 @@ def laid_over(paths: Sequence[Path], cells: int, across: int) -> Layout:
     np.minimum.at(lows, bins, w)
     np.maximum.at(highs, bins, w)
     seen = np.isfinite(lows)
-    middles, halves = (0.5 * (edges[1:] + edges[:-1]))[seen], (0.5 * (lows + highs))[seen]
+    middles = (0.5 * (edges[1:] + edges[:-1]))[seen]
+    halves = 0.5 * (lows[seen] + highs[seen])
     room = MARGIN * float(np.ptp(y))
     nodes = np.linspace(float(y.min()) - room, float(y.max()) + room, cells + 1)
     centre = _extended(nodes, middles, halves)

@@ -54,6 +54,12 @@ def test_the_centre_is_the_middle_of_the_loops_and_the_band_holds_all() -> None:
     assert (np.diff(here.centre) > 0.0).all()
 
 
+def test_displacements_that_no_path_comes_by_lie_between_those_that_one_does() -> None:
+    y = np.concatenate([np.linspace(0.0, 10.0, 400), np.linspace(40.0, 50.0, 400)])
+    here = laid_over([Path(0.1 * y, y, 0)], 10, 4)
+    assert here.centre == pytest.approx(0.1 * here.nodes_um, abs=0.05)
+
+
 def test_the_centre_rises_though_loops_are_upright() -> None:
     """Where a displacement is met by one field only, nothing says how steep the middle is."""
     y = np.concatenate([np.linspace(0.0, 40.0, 400), np.linspace(40.0, 0.0, 400)])
