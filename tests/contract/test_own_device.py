@@ -95,6 +95,7 @@ def test_is_run(installed, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_is_characterised(installed, tmp_path):
     """From its limits to a model that knows a spring for what it is."""
     model = tmp_path / "model.yaml"

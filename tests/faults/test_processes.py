@@ -20,7 +20,7 @@ from hilctl.run.run_folder import runs
 from hilctl.run.shared_page import SIZE
 from tests.fakes import loop_of
 
-KILLS = Path(__file__).parents[1] / "benchmark" / "kills.py"
+ROOT = Path(__file__).parents[2]
 EXPERIMENT = {
     "name": "process_fault",
     "device": {"kind": "simulated_terfenol", "seed": 3},
@@ -84,9 +84,10 @@ def contiguous(recording):
 )
 def test_killed_and_stopped_processes_leave_a_safe_output_and_a_whole_recording(attack, stall_s):
     """Judged by the device's own log: every write is in the file, and the last is the safe one."""
-    words = [sys.executable, str(KILLS), "--count", "1", "--within-ms", "1500", "--json"]
+    words = [sys.executable, "-m", "tests.benchmark.kills"]
+    words += ["--count", "1", "--within-ms", "1500", "--json"]
     words += ["--attacks", attack, "--stall-s", str(stall_s)]
-    done = subprocess.run(words, capture_output=True, text=True, timeout=250)
+    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=250)
     assert done.returncode == 0, done.stdout + done.stderr
     (found,) = json.loads(done.stdout)
     assert found["attack"] == attack

@@ -64,7 +64,7 @@ def test_a_piezo_that_begins_at_0_v_gets_a_model(tmp_path):
 @pytest.mark.parametrize(
     ("setting", "code"),
     [
-        ("device.vary={strain: 0.5, resonance: 0.5}", ""),
+        pytest.param("device.vary={strain: 0.5, resonance: 0.5}", "", marks=pytest.mark.long),
         ("device.fault={kind: sensor_frozen, at_sample: 0}", "no_reaction"),
         ("device.fault={kind: sensor_inverted, at_sample: 0}", "wrong_polarity"),
         ("device.magnet=false", "no_bias"),
