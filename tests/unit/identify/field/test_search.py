@@ -72,7 +72,8 @@ def laid(size: Size = SIZE) -> FieldSearch:
 def test_the_data_are_met_and_the_lag_is_found() -> None:
     end = found()
     assert np.std(end.weights.errors_um) < 0.005 * data().stroke_um
-    assert 2.5e-4 < end.known.losses.field_s < 1e-3  # of 5e-4; some is taken for a later decay
+    # Some of it is taken for a later decay.
+    assert end.known.losses.field_s == pytest.approx(5e-4, rel=0.5)
     assert (end.weights.slopes >= 0.0).all()
     assert (end.weights.slopes[0] >= LEAST).all()
 
