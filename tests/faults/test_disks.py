@@ -158,7 +158,8 @@ def test_run_that_goes_on_counts_what_a_slow_disk_lost(tmp_path):
     assert printed["dropped"] > RATE_HZ
     assert index.size + printed["dropped"] == index[-1] + 1
     assert int(recording.end["dropped_in_ring"]) == printed["dropped"]
-    assert int(recording.end["late_ticks"]) < 0.1 * SECONDS * RATE_HZ / EXPERIMENT["block"]
+    # Ticks are late on a busy machine; a loop that waited for the disk would have stood still.
+    assert int(recording.end["worst_late_ns"]) < 2.0e9
     assert replay(recording).identical
 
 

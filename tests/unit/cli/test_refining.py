@@ -19,6 +19,7 @@ def given(monkeypatch, tmp_path, truth):
     return tmp_path / "old.yaml", [Path(f"{i}.mcap") for i in range(4)], tmp_path / "better.yaml"
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_what_is_better_is_written(monkeypatch, tmp_path, capsys):
     model, runs, output = given(monkeypatch, tmp_path, actuator())
     refine(model, runs, output, html=tmp_path / "page.html", as_json=True)

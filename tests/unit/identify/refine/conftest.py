@@ -63,8 +63,12 @@ def old():
     return OLD
 
 
-@pytest.fixture
-def runs():
+def five_runs():
     """Five runs, some of them small."""
     sizes = (6.5, 6.5, 4.0, 2.0, 5.0)
     return [history(actuator(), i, amplitude=size) for i, size in enumerate(sizes)]
+
+
+@pytest.fixture
+def runs():
+    return five_runs()

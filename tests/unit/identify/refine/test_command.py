@@ -10,7 +10,14 @@ from hilctl.base.errors import InputError
 from hilctl.identify.refine.command import refine_files, refine_runs
 from hilctl.models.files import dump_model, load_model
 from hilctl.models.refined import RefinedModel
-from tests.unit.identify.refine.conftest import OLD, RATE_HZ, actuator, command, history
+from tests.unit.identify.refine.conftest import (
+    OLD,
+    RATE_HZ,
+    actuator,
+    command,
+    five_runs,
+    history,
+)
 
 ROOT = Path(__file__).parents[4]
 GOLDEN = ROOT / "recordings" / "golden"
@@ -24,9 +31,14 @@ def missed_percent(model, truth, v):
     return 100.0 * float(np.sqrt(np.mean(error**2)) / np.ptp(wanted))
 
 
+@pytest.fixture(scope="module")
+def found():
+    """Return what five runs make of the old model."""
+    return refine_runs(OLD, five_runs(), source="old.yaml")
+
+
 @pytest.mark.parametrize("amplitude", [5.0, 3.0, 1.5])
-def test_error_on_unseen_references_is_far_less_than_half(old, runs, amplitude):
-    found = refine_runs(old, runs)
+def test_error_on_unseen_references_is_far_less_than_half(old, found, amplitude):
     v = command(77, amplitude)
     assert found.better
     assert missed_percent(found.model, actuator(), v) < 0.3 * missed_percent(old, actuator(), v)
@@ -93,8 +105,8 @@ def test_validation_runs_are_judged_and_not_fitted(old, runs):
     assert "run 3" not in found.model.provenance.source
 
 
-def test_provenance_says_what_it_was_refined_on(old, runs):
-    found = refine_runs(old, runs, source="old.yaml").model.provenance
+def test_provenance_says_what_it_was_refined_on(found):
+    found = found.model.provenance
     assert found.source == ("old.yaml", "run 0", "run 1", "run 2", "run 3", "run 4")
     assert "refined on 5 runs" in found.method
     assert {"held_out_peak", "held_out_rms"} <= found.errors_percent.keys()
