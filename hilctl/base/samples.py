@@ -14,6 +14,11 @@ import numpy.typing as npt
 from hilctl.base.arrays import F64, I64, U32
 from hilctl.base.device import CommandUnit
 
+LAST_SAMPLE = 2**40
+"""No index reaches it: a hundred million samples, and a safe ramp of an hour at 1 MHz."""
+LONGEST_NS = 2**60
+"""No time of a tick is longer, from the start of its machine on."""
+
 WhenRecorded: TypeAlias = Literal["always", "measured", "own_input"]
 """``measured``: where the device measures its command; ``own_input``: where the compensator's input
 is other than the reference."""

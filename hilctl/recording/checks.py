@@ -17,21 +17,18 @@ from pydantic import Field, TypeAdapter, ValidationError
 
 from hilctl.base.device import CommandUnit
 from hilctl.base.events import TUNED
-from hilctl.base.samples import COLUMNS, Batch, Head
+from hilctl.base.samples import COLUMNS, LAST_SAMPLE, LONGEST_NS, Batch, Head
 from hilctl.base.segments import SHORTEST_PERIOD, Segment
 from hilctl.base.strict import Strict
 from hilctl.recording import schema
 from hilctl.recording.data import TICK_COLUMNS
 from hilctl.recording.facts import LABELS_FACT, LabelValue
 
-LAST_SAMPLE = 2**40
-"""No index reaches it: a hundred million samples, and a safe ramp of an hour at 1 MHz."""
 MAX_UNIX_NS = 2**63 - 1
 """Latest time that 64 bits hold with a sign, as NumPy and Parquet have it: in the year 2262."""
 RATES_HZ = (1e-6, 1e9)
 """Lowest and highest rate of samples: far beyond those of any experiment."""
 
-_LONGEST_NS = 2**60
 _MOST_SEGMENTS_TEXT = 2**24
 _MOST_VALUES = 1000
 _UNITS: tuple[CommandUnit, ...] = ("A", "V")
@@ -89,7 +86,7 @@ def ticks_problem(ticks: Any) -> str:
         return f"sample {max(ticks.first_sample)} is beyond any run"
     for name in TICK_COLUMNS[1:]:
         furthest = max(map(abs, getattr(ticks, name)), default=0)
-        if furthest > _LONGEST_NS:
+        if furthest > LONGEST_NS:
             return f"{name} of {furthest} ns is longer than any run"
     return ""
 
@@ -116,7 +113,7 @@ def sound_blocks(batch: Batch) -> npt.NDArray[np.bool_]:
     """Return which blocks of a batch a loop can have written: bool[k]."""
     first = batch.heads[:, Head.FIRST_SAMPLE]
     times = batch.heads[:, [Head.DEADLINE_NS, Head.LATE_NS, Head.EXCHANGE_NS]]
-    in_time = ((times >= -_LONGEST_NS) & (times <= _LONGEST_NS)).all(axis=1)
+    in_time = ((times >= -LONGEST_NS) & (times <= LONGEST_NS)).all(axis=1)
     in_run = (first >= 0) & (first < LAST_SAMPLE - batch.flags.shape[1])
     begun = np.isfinite(batch.states[:, -1])
     return np.asarray(in_time & in_run & begun)

@@ -16,8 +16,8 @@ import numpy as np
 
 from hilctl.base.errors import DataError, InputError
 from hilctl.base.events import Event
-from hilctl.base.samples import Batch, Head
-from hilctl.recording.checks import LAST_SAMPLE, MAX_UNIX_NS, SoundMessages, sound_blocks
+from hilctl.base.samples import LAST_SAMPLE, Batch, Head
+from hilctl.recording.checks import MAX_UNIX_NS, SoundMessages, sound_blocks
 from hilctl.recording.messages import RecordingLayout
 from hilctl.recording.replace import Replacement
 from hilctl.recording.rewrite import Resaved, Survey

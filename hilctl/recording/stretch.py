@@ -5,8 +5,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 
 from hilctl.base.errors import DataError
+from hilctl.base.samples import LAST_SAMPLE
 from hilctl.base.segments import Segment
-from hilctl.recording.checks import LAST_SAMPLE
 from hilctl.recording.data import Recording, Ticks
 
 _OF_ANY_PART = {"code", "reason", "output_safe", "ended", "recovered"}

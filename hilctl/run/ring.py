@@ -22,9 +22,10 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
+import numpy.typing as npt
 
 from hilctl.base.arrays import F64, I64
-from hilctl.base.samples import ANSWERS, COLUMNS, Batch, Flag, Head
+from hilctl.base.samples import ANSWERS, COLUMNS, LAST_SAMPLE, LONGEST_NS, Batch, Flag, Head
 from hilctl.loop.block import Block
 from hilctl.run.shared_page import SIZE as _PAGE_SIZE
 from hilctl.run.shared_page import Field, SharedPage
@@ -179,8 +180,7 @@ class SampleRing:
         count = min(there, self.slots - first)
         batch = self._area.rows(slice(first, first + count))
         # HEAD may be seen before the block that it counts: the sequence numbers decide.
-        expected = np.arange(self._tail + 1, self._tail + count + 1)
-        wrong = np.flatnonzero(batch.heads[:, Head.SEQUENCE] != expected)
+        wrong = np.flatnonzero(~_whole(batch.heads, self._tail))
         if wrong.size:  # not yet visible, or damaged: what stands before it is good
             count = int(wrong[0])
             if count == 0:
@@ -204,7 +204,7 @@ class SampleRing:
         passed = 0
         while passed < there:
             slot = (self._tail + passed) % self.slots
-            if self._area.heads[slot, Head.SEQUENCE] == self._tail + passed + 1:
+            if _whole(self._area.heads[slot : slot + 1], self._tail + passed).all():
                 break
             passed += 1
         self._tail += passed
@@ -269,6 +269,20 @@ class SampleRing:
         ends = [next_sample, *(batch.heads[:-1, Head.FIRST_SAMPLE] + self.block).tolist()]
         batch.heads[:, Head.DROPPED_BEFORE] = batch.heads[:, Head.FIRST_SAMPLE] - ends
         return batch
+
+
+def _whole(heads: I64, number: int) -> npt.NDArray[np.bool_]:
+    """Return which blocks are those that come from ``number`` on, and may be recorded.
+
+    A recording that holds what no run can have is not read again.
+    """
+    expected = np.arange(number + 1, number + 1 + heads.shape[0])
+    first = heads[:, Head.FIRST_SAMPLE]
+    dropped = heads[:, Head.DROPPED_BEFORE]
+    possible = (first < LAST_SAMPLE) & (dropped >= 0) & (dropped <= first)
+    furthest = (heads >= -LONGEST_NS) & (heads <= LONGEST_NS)
+    whole: npt.NDArray[np.bool_] = (heads[:, Head.SEQUENCE] == expected) & possible
+    return whole & furthest.all(axis=1)
 
 
 def _shapes(slots: int, block: int, state_size: int) -> tuple[tuple[int, ...], ...]:

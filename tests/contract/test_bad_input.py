@@ -375,7 +375,7 @@ def test_process(tmp_path: Path, text: str, arguments: tuple[str, ...], message:
         cwd=tmp_path,
         capture_output=True,
         text=True,
-        timeout=60.0,
+        timeout=240.0,
     )
     check_refused(Ended(ended.returncode, ended.stdout, ended.stderr), message)
     if "--json" in arguments:

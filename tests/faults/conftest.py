@@ -68,7 +68,7 @@ class Log:
 
     def await_events(self, output: str, count: int) -> None:
         """Wait until so many events have come."""
-        deadline = time.monotonic() + 60.0
+        deadline = time.monotonic() + 240.0
         while (seen := len(self.events(output))) < count:
             assert time.monotonic() < deadline, f"{seen} of {count}"
             time.sleep(0.02)
@@ -98,18 +98,18 @@ class Run:
         # The supervisor first: it would start another guardian.
         for pid in (self.process.pid, *map(int, children.read_text().split())):
             os.kill(pid, number)
-        self.process.communicate(timeout=60)
+        self.process.communicate(timeout=240)
 
     def end(self) -> dict:
         """Wait for the end; return the JSON it printed."""
-        out, err = self.process.communicate(timeout=60)
+        out, err = self.process.communicate(timeout=240)
         assert "Traceback" not in err
         assert self.process.returncode == 3, err
         return json.loads(out)
 
     def refused(self) -> str:
         """Wait until it is refused; return what it said, and see that it left no file."""
-        _, err = self.process.communicate(timeout=60)
+        _, err = self.process.communicate(timeout=240)
         assert self.process.returncode == 2, err
         assert not self.output.exists()
         return err
@@ -117,7 +117,7 @@ class Run:
     def interrupt(self) -> dict:
         """Press Ctrl-C; return the JSON it printed."""
         self.process.send_signal(signal.SIGINT)
-        out, err = self.process.communicate(timeout=60)
+        out, err = self.process.communicate(timeout=240)
         assert self.process.returncode == 130, err
         return json.loads(out)
 

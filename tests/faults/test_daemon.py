@@ -87,7 +87,7 @@ def going(long_run, module_runs, monkeypatch):
     return long_run
 
 
-def await_state(state, timeout_s=60.0):
+def await_state(state, timeout_s=240.0):
     deadline = time.monotonic() + timeout_s
     while True:
         found = hilctl("status")["runs"]

@@ -96,7 +96,7 @@ def start(folder: Path, *, code: str = "", preexec=None, environment=None, **rec
 
 def end(process, code: int) -> dict:
     """Wait for the end; return the JSON it printed."""
-    out, err = process.communicate(timeout=60)
+    out, err = process.communicate(timeout=240)
     assert "Traceback" not in err
     assert process.returncode == code, err
     return json.loads(out)
@@ -104,7 +104,7 @@ def end(process, code: int) -> dict:
 
 def await_size(process, output: Path, size: int = 100_000) -> None:
     """Wait until the recording has grown to ``size`` bytes."""
-    deadline = time.monotonic() + 60.0
+    deadline = time.monotonic() + 240.0
     while not (output.exists() and output.stat().st_size > size):
         assert process.poll() is None, process.communicate()
         assert time.monotonic() < deadline
@@ -126,9 +126,10 @@ def test_full_disk(tmp_path, on_failure, whole):
     assert printed["reason"].startswith("waveform completed") == whole
     recorded = read(tmp_path / "run.mcap").samples.index
     assert np.array_equal(recorded, np.arange(recorded.size))
-    assert recorded.size == printed["recorded_samples"] > 1000
+    # Of the chunk that was cut by the full disk a reader may save some more.
+    assert recorded.size >= printed["recorded_samples"] > 1000
     assert f"; {printed['dropped']} samples are lost: " in printed["reason"]
-    total = recorded.size + printed["dropped"]
+    total = printed["recorded_samples"] + printed["dropped"]
     waveform = round(SECONDS * RATE_HZ)
     assert (waveform <= total <= waveform + RAMP_SAMPLES) if whole else total < waveform
 
@@ -202,7 +203,7 @@ def test_memory_that_is_not_to_be_had_is_told(tmp_path):
         resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, 50_000))
 
     process = start(tmp_path, preexec=nothing)
-    _, err = process.communicate(timeout=60)
+    _, err = process.communicate(timeout=240)
     assert process.returncode == 3, err
     assert err.count("\n") == 1
     assert "ring: no memory: File too large; less recording.ring_s needs less of it" in err

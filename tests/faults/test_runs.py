@@ -72,7 +72,7 @@ class Run:
 
     def await_samples(self, size=100_000) -> None:
         """Wait until the recording has grown to ``size`` bytes."""
-        deadline = time.monotonic() + 60.0
+        deadline = time.monotonic() + 240.0
         while not (self.output.exists() and self.output.stat().st_size > size):
             assert self.process.poll() is None, self.process.communicate()
             assert time.monotonic() < deadline
@@ -84,7 +84,7 @@ class Run:
 
     def end(self) -> tuple[int, dict]:
         """Wait for the end; return the exit code and the JSON it printed."""
-        out, err = self.process.communicate(timeout=60)
+        out, err = self.process.communicate(timeout=240)
         assert "Traceback" not in err
         return self.process.returncode, json.loads(out)
 

@@ -69,6 +69,7 @@ def test_the_second_user_of_a_device_is_refused(neighbour, device, run):
     assert mine.interrupt()["code"] == "stopped"
 
 
+@pytest.mark.long  # the other user's kernels are compiled anew
 def test_root_does_not_take_a_device_from_a_user(neighbour, device, run):
     """Who may do anything is refused as well: the lock is the kernel's, not a file's."""
     theirs = neighbour.start()
@@ -78,7 +79,7 @@ def test_root_does_not_take_a_device_from_a_user(neighbour, device, run):
     assert len(said.splitlines()) == 1
     device.log.await_events("DAC0", len(device.log.events("DAC0")) + 20)
     theirs.terminate()
-    out, err = theirs.communicate(timeout=60)
+    out, err = theirs.communicate(timeout=240)
     assert "Traceback" not in err
     assert json.loads(out)["output_safe"]
     assert (neighbour.folder / "theirs.mcap").stat().st_uid != os.geteuid()

@@ -19,7 +19,7 @@ import pytest
 
 HERE = Path(__file__).parent
 LIBMODBUS_SOURCE = HERE.parent / "benchmark" / "modbus_exchange.c"
-GIVE_UP_S = 60.0
+GIVE_UP_S = 240.0
 
 DEBIAN = "apt-get install {}"
 NPM = "npm ci --prefix tests/peers"

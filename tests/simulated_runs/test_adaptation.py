@@ -35,7 +35,7 @@ def run(tmp_path):
     ("model", "rate"),
     [
         (STAGED, ("sample_rate_hz=50000", "block=50")),
-        (STAGED, ("sample_rate_hz=10000", "block=1")),
+        pytest.param(STAGED, ("sample_rate_hz=10000", "block=1"), marks=pytest.mark.long),
         (OMEGA, ("sample_rate_hz=10000", "block=1")),
     ],
     ids=["staged-50", "staged-1", "omega-1"],

@@ -30,7 +30,7 @@ def characterised(path, settings, folder, output):
 @pytest.mark.parametrize(
     ("physics", "within_percent"),
     [
-        ("terfenol", 2.0),
+        pytest.param("terfenol", 2.0, marks=pytest.mark.long),
         pytest.param("diffusion", 2.5, marks=pytest.mark.long),
         pytest.param("jiles_atherton", 8.0, marks=pytest.mark.long),
     ],
@@ -66,7 +66,11 @@ def test_a_piezo_that_begins_at_0_v_gets_a_model(tmp_path):
     [
         pytest.param("device.vary={strain: 0.5, resonance: 0.5}", "", marks=pytest.mark.long),
         ("device.fault={kind: sensor_frozen, at_sample: 0}", "no_reaction"),
-        ("device.fault={kind: sensor_inverted, at_sample: 0}", "wrong_polarity"),
+        pytest.param(
+            "device.fault={kind: sensor_inverted, at_sample: 0}",
+            "wrong_polarity",
+            marks=pytest.mark.long,
+        ),
         ("device.magnet=false", "no_bias"),
         ("device.load_kg=90.0", "resonance"),
     ],

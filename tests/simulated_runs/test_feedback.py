@@ -107,7 +107,9 @@ def test_a_lost_sensor_ends_the_run_by_its_interlock(run):
     assert np.isfinite(samples.input_um[~ramp]).all()
 
 
-@pytest.mark.parametrize("model", [OMEGA, STAGED], ids=["omega", "staged"])
+@pytest.mark.parametrize(
+    "model", [pytest.param(OMEGA, marks=pytest.mark.long), STAGED], ids=["omega", "staged"]
+)
 def test_a_sensor_of_the_wrong_sign_ends_the_run(run, model):
     """By the safe ramp, once the correction has grown to its limit; a right one does not."""
     inverted = "device.fault={kind: sensor_inverted, at_sample: 0}"

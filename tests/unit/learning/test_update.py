@@ -81,7 +81,9 @@ def peaks(state: Learning) -> list[float]:
         ),
     ],
 )
-@pytest.mark.parametrize("coupling", [pytest.param(0.0, marks=pytest.mark.slow), 0.15])
+@pytest.mark.parametrize(
+    "coupling", [pytest.param(0.0, marks=[pytest.mark.slow, pytest.mark.long]), 0.15]
+)
 def test_the_error_goes_to_the_noise_floor(response, coupling):
     """Delay, resonance and hysteresis between harmonics leave less than 2 % within 20 runs."""
     state = learned(Plant(response, coupling))

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hilctl.base.samples import Flag, Head
+from hilctl.base.samples import LAST_SAMPLE, LONGEST_NS, Flag, Head
 from hilctl.run.ring import SampleRing
 from hilctl.run.shared_page import Field, PageText
 
@@ -91,6 +91,28 @@ def test_damaged_slot_is_not_taken(tmp_path):
     assert other.skip_damaged() == 1
     assert other.pop().heads[:, Head.FIRST_SAMPLE].tolist() == [6]
     assert other.skip_damaged() == 0
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        (Head.FIRST_SAMPLE, LAST_SAMPLE),
+        (Head.FIRST_SAMPLE, -1),
+        (Head.DROPPED_BEFORE, -1),
+        (Head.DROPPED_BEFORE, 4),
+        (Head.DEADLINE_NS, LONGEST_NS + 1),
+        (Head.LATE_NS, -LONGEST_NS - 1),
+    ],
+)
+def test_slot_that_no_recording_may_hold_is_not_taken(tmp_path, field, value):
+    """Recorded, it would keep all the rest from being read."""
+    ring = make(tmp_path)
+    for number in range(3):
+        push(ring, number)
+    ring._area.heads[1, field] = value
+    assert ring.pop().heads.shape[0] == 1
+    assert ring.skip_damaged() == 1
+    assert ring.pop().heads[:, Head.FIRST_SAMPLE].tolist() == [6]
 
 
 def test_what_was_not_released_is_there_for_the_next_consumer(tmp_path):
