@@ -33,6 +33,8 @@ def user_folders() -> list[Path]:
     Raises:
         OSError: No folder for temporary files can be written.
     """
+    if not hasattr(os, "geteuid"):  # Windows: the folder for temporary files is one's own
+        return [memory_folder() / "hilctl"]
     user = os.geteuid()
     return [memory_folder() / f"hilctl-{user}", Path(f"/run/user/{user}/hilctl")]
 
@@ -51,6 +53,10 @@ def private_folder(path: Path, *, make: bool = True) -> Path:
     if make:
         with suppress(FileExistsError):
             path.mkdir(mode=0o700)
+    if not hasattr(os, "geteuid"):  # Windows: what stands in one's own folder is one's own
+        if not path.is_dir():
+            raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path))
+        return path
     # Opened, then looked at: a look at the name might see another folder than the one used.
     descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
     try:

@@ -1,6 +1,5 @@
 """A campaign's folder: the recordings in it, made whole, and who works on it."""
 
-import fcntl
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -9,12 +8,13 @@ from pathlib import Path
 from mcap.writer import MCAP0_MAGIC
 
 from hilctl.base.errors import ConfigError, DataError, InputError
+from hilctl.base.locks import take_lock
 from hilctl.base.yaml.document import load_document
 from hilctl.campaign.steps import CampaignSteps, base_problem, settings_of
 from hilctl.experiment.parts import RecordingConfig
 from hilctl.recording.ends import read_ends
+from hilctl.recording.locks import is_being_recorded
 from hilctl.recording.recover import recover_recording
-from hilctl.recording.writer import is_being_recorded
 from hilctl.run.run_folder import RunFolder, runs
 from hilctl.run.step import RunKey, completed_key
 
@@ -77,7 +77,7 @@ def held_folder(
 
 def _locked(held: int) -> bool:
     try:
-        fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        take_lock(held)
     except BlockingIOError:
         return False
     return True

@@ -43,6 +43,9 @@ QUICK = (*STEERING, "list")
 """Commands that nobody wants to wait for: they go past the application, which takes longer to
 import than they take to run."""
 
+OF_LINUX = {"fcntl", "grp", "pty", "pwd", "resource", "termios", "tty"}
+"""Modules of Python that other systems lack."""
+
 
 def __getattr__(name: str) -> Any:
     """Import the application when it is asked for."""
@@ -96,6 +99,10 @@ def _machine_refused(error: Exception) -> str:
         return f"{where}{error.strerror or error}"
     if isinstance(error, MemoryError):
         return f"not enough memory{f': {error}' if str(error) else ''}"
+    if isinstance(error, ModuleNotFoundError) and error.name in OF_LINUX:
+        from hilctl.run.architecture import WORKS_ANYWHERE
+
+        return f"this needs Linux, whose {error.name!r} is not here: {WORKS_ANYWHERE}"
     # Both are also what is left of an import that ran out of memory.
     return f"a part of the installation can't be loaded, for want of memory or of a file: {error}"
 

@@ -11,7 +11,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from hilctl.base.errors import InputError
-from hilctl.cli import QUICK, quick
+from hilctl.cli import OF_LINUX, QUICK, quick
 
 
 class CommandEntry(NamedTuple):
@@ -166,6 +166,8 @@ def load(name: str) -> Any:
     try:
         found = getattr(import_module(module_name), attribute)
     except (ImportError, AttributeError) as error:
+        if error.name in OF_LINUX:
+            raise
         raise InputError(f"{name} can't be loaded: {error}") from error
     if name in QUICK:
         return _Quick(name, help=found.__doc__)

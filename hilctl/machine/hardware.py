@@ -1,6 +1,5 @@
 """CPUs, clocks, serial ports and disks: one function a check."""
 
-import grp
 from pathlib import Path
 
 from hilctl.machine.files import Finding, Machine
@@ -86,6 +85,8 @@ def serial_ports(machine: Machine) -> Finding:
 
 
 def _group_of(path: Path) -> str:
+    import grp
+
     try:
         return grp.getgrgid(path.stat().st_gid).gr_name
     except (KeyError, OSError):

@@ -8,7 +8,6 @@ import ctypes
 import errno
 import gc
 import os
-import resource
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +49,8 @@ class LinuxProcess:
 
     def lockable_bytes(self) -> int | None:
         """Return how much memory may be locked; None where any amount."""
+        import resource
+
         limit = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0]
         capable = int(self._status("CapEff"), 16) >> _CAP_IPC_LOCK & 1
         return None if capable or limit == resource.RLIM_INFINITY else limit

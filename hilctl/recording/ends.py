@@ -12,8 +12,8 @@ from mcap.records import Footer, McapRecord, Metadata, MetadataIndex, SummaryOff
 from mcap.writer import MCAP0_MAGIC as MAGIC
 
 from hilctl.base.errors import DataError
+from hilctl.recording.locks import is_being_recorded
 from hilctl.recording.records import FRAME, LARGEST_BYTES, parse
-from hilctl.recording.writer import is_being_recorded
 
 _HEAD_BYTES = 8192
 _TAIL_BYTES = 4096

@@ -25,9 +25,9 @@ from hilctl.recording.checks import (
     short,
 )
 from hilctl.recording.data import TICK_COLUMNS, Recording, ReplayStart, Ticks
+from hilctl.recording.locks import is_being_recorded
 from hilctl.recording.salvage import Salvage
 from hilctl.recording.stretch import Stretch
-from hilctl.recording.writer import is_being_recorded
 
 _log = logging.getLogger(__name__)
 

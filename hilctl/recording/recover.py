@@ -5,7 +5,6 @@ something is wrong, to save every whole record into a new file through the MCAP 
 which makes index, statistics and checksums anew.
 """
 
-import fcntl
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
@@ -18,11 +17,11 @@ from hilctl.base.errors import DataError, InputError
 from hilctl.base.events import Event
 from hilctl.base.samples import LAST_SAMPLE, Batch, Head
 from hilctl.recording.checks import MAX_UNIX_NS, SoundMessages, sound_blocks
+from hilctl.recording.locks import lock
 from hilctl.recording.messages import RecordingLayout
 from hilctl.recording.replace import Replacement
 from hilctl.recording.rewrite import Resaved, Survey
 from hilctl.recording.salvage import Damage, Salvage
-from hilctl.recording.writer import lock
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +99,7 @@ def recover_recording(
     """
     try:
         with path.open("rb") as stream:
-            lock(stream, fcntl.LOCK_SH)
+            lock(stream, shared=True)
             survey = _survey(path, stream)
             more = list(_not_in_file(extra, survey.next_sample))
             events = [event for event in events if _is_one(event)]

@@ -6,12 +6,10 @@ than that.
 """
 
 import errno
-import fcntl
 import json
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
-from io import FileIO
 from pathlib import Path
 from typing import BinaryIO
 
@@ -21,6 +19,7 @@ from hilctl import __version__
 from hilctl.base.events import Event
 from hilctl.base.samples import Batch
 from hilctl.base.segments import Segment
+from hilctl.recording.locks import lock
 from hilctl.recording.messages import MessageMaker, RecordingLayout, Topics
 
 _CHUNK_BYTES = 8 << 20  # each chunk's index stays in memory until the end of the run
@@ -138,7 +137,7 @@ class OutputFile:
             raise OSError(errno.EINVAL, "Not a regular file", str(path))
         # Not "wb": what stands there is emptied only once the run starts, and under the lock.
         self.stream: BinaryIO = path.open("r+b" if overwrite and not self._ours else "xb")
-        lock(self.stream, fcntl.LOCK_EX)
+        lock(self.stream)
 
     def begin(self) -> BinaryIO:
         """Empty the file and return it, open for writing; may be called again to begin anew."""
@@ -152,33 +151,3 @@ class OutputFile:
             self.stream.close()
         if self._ours:
             self._path.unlink(missing_ok=True)
-
-
-def lock(stream: BinaryIO, kind: int) -> None:
-    """Mark a recording as being written (``LOCK_EX``) or recovered (``LOCK_SH``) till it is closed.
-
-    A lock ends with the process that holds it, however that ends.
-
-    Raises:
-        BlockingIOError: It is being written by another.
-    """
-    try:
-        fcntl.flock(stream, kind | fcntl.LOCK_NB)
-    except BlockingIOError:
-        stream.close()
-        raise BlockingIOError(errno.EAGAIN, "another hilctl is recording to it") from None
-    except OSError as error:
-        if error.errno not in {errno.ENOLCK, errno.ENOTSUP}:  # a file system without locks
-            raise
-
-
-def is_being_recorded(stream: BinaryIO | FileIO) -> bool:
-    """Return whether a run is recording to an open file; where there are no locks, False."""
-    try:
-        fcntl.flock(stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return True
-    except OSError:
-        return False
-    fcntl.flock(stream, fcntl.LOCK_UN)
-    return False

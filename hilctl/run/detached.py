@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hilctl.base.errors import InputError, RunError
+from hilctl.run.architecture import require_real_time_machine
 from hilctl.run.run_folder import RunFolder, runs
 from hilctl.run.start import checked_experiment, output_of
 
@@ -44,6 +45,7 @@ def start_detached(
         InputError: It can't be used; nothing has moved.
         RunError: It ended before it ran; the text is what it said.
     """
+    require_real_time_machine()
     checked = checked_experiment(experiment, settings)
     output = output_of(checked, output)
     log = free_log(output)

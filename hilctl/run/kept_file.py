@@ -1,13 +1,12 @@
 """A recording that somebody deletes, renames or empties while it is written."""
 
-import fcntl
 import os
 import shutil
 from contextlib import suppress
 from pathlib import Path
 from typing import BinaryIO
 
-from hilctl.recording.writer import lock
+from hilctl.recording.locks import lock
 
 
 def is_emptied(stream: BinaryIO, had_bytes: int) -> bool:
@@ -59,7 +58,7 @@ def put_back(path: Path, stream: BinaryIO) -> tuple[Path, str]:
         return path, f"was renamed to {now}; it has its name back beside that one"
     free = _free(path)
     with opened.open("rb") as content, free.open("xb") as copy:
-        lock(copy, fcntl.LOCK_EX)
+        lock(copy)
         shutil.copyfileobj(content, copy)
         copy.flush()
         # The stream's own descriptor: whoever holds the stream goes on, and sees no difference.

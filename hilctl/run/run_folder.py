@@ -9,11 +9,9 @@ A device's lock is a name of an abstract Unix socket: it holds against every use
 """
 
 import errno
-import fcntl
 import hashlib
 import json
 import os
-import pwd
 import shutil
 import socket
 import struct
@@ -24,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from hilctl.base.errors import InputError, RunError
+from hilctl.base.locks import is_locked, take_lock
 from hilctl.base.private import private_folder, user_folders
 
 _CARD = "run.json"
@@ -257,6 +256,8 @@ def _holder(name: str) -> str:
     for run in runs():
         if run.card.supervisor == process:
             return f"run {run.card.experiment} (process {process}, recording {run.card.recording})"
+    import pwd
+
     try:
         return f"process {process} of {pwd.getpwuid(user).pw_name}"
     except KeyError:
@@ -267,7 +268,7 @@ def _holder(name: str) -> str:
 def _locked(path: Path) -> Iterator[int]:
     descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o600)
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        take_lock(descriptor)
         yield descriptor
     finally:
         os.close(descriptor)
@@ -286,7 +287,7 @@ def taken_over(run: RunFolder) -> Iterator[bool]:
         yield False
         return
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        take_lock(descriptor)
         # Under the lock: who had it before may have removed what there was.
         held = (run.path / _CARD).exists()
     except BlockingIOError:
@@ -303,13 +304,9 @@ def _is_locked(path: Path) -> bool:
     except FileNotFoundError:
         return False
     try:
-        # Shared: two that look at once must not take each other for the holder.
-        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return True
+        return is_locked(descriptor)
     finally:
         os.close(descriptor)
-    return False
 
 
 def facts_of(run: RunFolder) -> dict[str, Any]:

@@ -9,9 +9,8 @@ from pathlib import Path
 from hilctl.base.errors import InputError
 from hilctl.experiment.check import Checked, check
 from hilctl.experiment.load import load_experiment
-from hilctl.run.architecture import require_ordered_memory
+from hilctl.run.architecture import require_real_time_machine
 from hilctl.run.result import Progress, RunResult
-from hilctl.run.supervisor import Supervisor
 
 _log = logging.getLogger(__name__)
 
@@ -28,9 +27,8 @@ def checked_experiment(
         heat_a2: Heat that its coil has at least, in A^2.
 
     Raises:
-        InputError: It can't be used, all problems are listed; or this machine can't run any.
+        InputError: It can't be used, all problems are listed.
     """
-    require_ordered_memory()
     return check(load_experiment(path, settings), output.parent if output else None, heat_a2)
 
 
@@ -72,6 +70,10 @@ def start_run(
         InputError: Nothing has moved, and no file is left.
         RunError: The device could not be opened; nothing has moved, and no file is left.
     """
+    require_real_time_machine()
+    # Not before: what only checks or computes works where a supervisor can't be imported.
+    from hilctl.run.supervisor import Supervisor
+
     checked = checked_experiment(path, settings, output, heat_a2)
     # Of a device with a past: nobody should have to look into the recording for what was taken.
     if checked.begun.begins and checked.loaded.device.info.holds:

@@ -6,11 +6,10 @@ import errno
 import math
 import os
 import select
-import termios
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from fcntl import ioctl
+from functools import partial
 from os import read, write
 from typing import Literal
 
@@ -78,9 +77,9 @@ def _open_port(path: str, settings: SerialSettings, timeout_s: float) -> serial.
     if settings.boot_s > 0.0:
         try:
             _keep_levels(port.fileno())
-        except termios.error as error:
+        except OSError:
             port.close()
-            raise OSError(*error.args) from None
+            raise
     return port
 
 
@@ -90,9 +89,23 @@ def _keep_levels(fd: int) -> None:
     A level that falls resets some boards, and so would the next one to open the port: with the
     output at whatever the board boots with, and deaf to the safe value until it has booted.
     """
-    attributes = termios.tcgetattr(fd)
-    attributes[2] &= ~termios.HUPCL
-    termios.tcsetattr(fd, termios.TCSANOW, attributes)
+    import termios
+
+    try:
+        attributes = termios.tcgetattr(fd)
+        attributes[2] &= ~termios.HUPCL
+        termios.tcsetattr(fd, termios.TCSANOW, attributes)
+    except termios.error as error:
+        raise OSError(*error.args) from None
+
+
+def _counts_waiting(fd: int, waiting: "array.array[int]") -> Callable[[], object]:
+    """Return what fills ``waiting[0]`` with the number of bytes that have come."""
+    # Only here: settings can be read and checked on computers that have neither.
+    from fcntl import ioctl
+    from termios import FIONREAD
+
+    return partial(ioctl, fd, FIONREAD, waiting)
 
 
 class SerialLink:
@@ -125,6 +138,7 @@ class SerialLink:
         self._fd = -1
         self._poll = select.poll()
         self._waiting = array.array("i", [0])
+        self._count_waiting: Callable[[], object] = lambda: None
         self._stale = False
         self._quiet_at = 0.0
         self.low_latency = False
@@ -182,6 +196,7 @@ class SerialLink:
         except (OSError, ValueError, NotImplementedError):  # ptys and USB CDC have no such setting
             self.low_latency = False
         self._port, self._fd = port, port.fileno()
+        self._count_waiting = _counts_waiting(self._fd, self._waiting)
         self._poll = select.poll()
         self._poll.register(self._fd, select.POLLIN)
         if boot:
@@ -203,7 +218,7 @@ class SerialLink:
         try:
             if self._stale:
                 self.drain()
-            ioctl(self._fd, termios.FIONREAD, self._waiting)
+            self._count_waiting()
             if self._waiting[0] or self._gap_s:
                 self._await_gap()
             deadline = self._clock() + self._timeout_s
@@ -318,6 +333,8 @@ class SerialLink:
             return
         if self._stale and self._settings.flow == "xonxoff":
             # Closing waits for bytes that a device with its XOFF out never takes, 30 s and more.
+            import termios
+
             with contextlib.suppress(termios.error):  # where the port is gone
                 port.reset_output_buffer()
         port.close()
