@@ -75,6 +75,22 @@ def devices(context: typer.Context, as_json: AsJson = False) -> None:
 
 
 @devices_app.command()
+def show(
+    name: Annotated[str, typer.Argument(help="Device, or shipped profile.")],
+    as_json: AsJson = False,
+) -> None:
+    """Show a device's options, or a profile's inputs, outputs, sources and notes."""
+    from hilctl.cli.machine_view import print_described
+    from hilctl.experiment.inventory import describe
+
+    found = describe(name)
+    if as_json:
+        print_json(found.to_mapping())
+    else:
+        print_described(found)
+
+
+@devices_app.command()
 def probe(experiment: ExperimentFile, settings: Settings = None, as_json: AsJson = False) -> None:
     """Read an experiment's device and judge what it says; only reads, so nothing moves."""
     from hilctl.cli.probe_view import print_probed

@@ -1,7 +1,7 @@
 """This machine for people, in a terminal: its diagnosis, and the devices at it."""
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 
 from rich.console import Group, RenderableType
@@ -10,7 +10,7 @@ from rich.table import Table
 from rich.text import Text
 
 from hilctl.cli.console import console
-from hilctl.experiment.inventory import Inventory
+from hilctl.experiment.inventory import Described, Inventory
 from hilctl.machine.diagnosis import Diagnosis, lateness_counts
 from hilctl.machine.latency import Latency
 from hilctl.machine.realtime import SetUpStep
@@ -110,3 +110,49 @@ def print_inventory(found: Inventory) -> None:
     terminal = console()
     terminal.print(table, profiles)
     terminal.print(ports if found.serial_ports else "no serial port found", soft_wrap=True)
+
+
+def print_described(found: Described) -> None:
+    """Print a device's options, or what a profile says of its device."""
+    terminal = console()
+    terminal.print(f"{found.name}: {found.place}", soft_wrap=True, markup=False)
+    if found.options:
+        terminal.print(_options(found))
+    profile = found.profile
+    for key in ("vendor", "model", "verified", "unverified", "max_rate_hz"):
+        if key in profile:
+            terminal.print(f"{key}: {_plain(profile[key])}", markup=False)
+    for key in ("outputs", "inputs"):
+        if profile.get(key):
+            terminal.print(_channels(key, profile[key]))
+    for key in ("source", "notes"):
+        texts = profile.get(key, [])
+        for text in [texts] if isinstance(texts, str) else texts:
+            terminal.print(f"{key}: {_plain(text)}", markup=False, soft_wrap=True)
+
+
+def _options(found: Described) -> Table:
+    table = Table(box=None)
+    for heading in ("key", "default", "meaning"):
+        table.add_column(heading, no_wrap=heading == "key")
+    for option in found.options:
+        default = "must be given" if option.default is None else option.default
+        table.add_row(option.name, Text(default), Text(option.description))
+    return table
+
+
+def _channels(title: str, channels: Mapping[str, Mapping[str, object]]) -> Table:
+    table = Table(title=title, title_justify="left", show_header=False, box=None)
+    for name, channel in channels.items():
+        low, high, unit = (channel.get(key, "?") for key in ("min", "max", "unit"))
+        table.add_row(Text(name), f"{low} to {high} {unit}")
+    return table
+
+
+def _plain(value: object) -> str:
+    """Return a value of a file as one line."""
+    return (
+        ", ".join(map(str, value))
+        if isinstance(value, list | tuple)
+        else " ".join(str(value).split())
+    )

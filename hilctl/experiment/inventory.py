@@ -7,7 +7,9 @@ from pathlib import Path
 from typing import Any, cast
 
 from hilctl.base.errors import InputError
-from hilctl.experiment.registry import known_devices
+from hilctl.base.yaml.document import load_document
+from hilctl.base.yaml.messages import did_you_mean
+from hilctl.experiment.registry import device_class, known_devices
 
 SHIPPED_PROFILES = "hilctl_drivers.profile:shipped_profiles"
 
@@ -47,6 +49,68 @@ class Inventory:
 def inventory() -> Inventory:
     """Look for devices, profiles and serial ports; nothing is opened."""
     return Inventory(known_devices(), _profiles(), _serial_ports())
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceOption:
+    """A key of a device's section.
+
+    Attributes:
+        name: The key.
+        default: What holds where it is left out, as text; None where it may not be left out.
+        description: What it is.
+    """
+
+    name: str
+    default: str | None
+    description: str
+
+
+@dataclass(frozen=True, slots=True)
+class Described:
+    """What is to be known of a device or a profile before an experiment names it.
+
+    Attributes:
+        name: The name.
+        place: Class of the device, or file of the profile.
+        options: Keys of the device's section; empty for a profile.
+        profile: The profile as it stands in its file; empty for a device.
+    """
+
+    name: str
+    place: str
+    options: tuple[DeviceOption, ...]
+    profile: dict[str, Any]
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return the fields as plain values."""
+        return asdict(self)
+
+
+def describe(name: str) -> Described:
+    """Return what is known of a device or a shipped profile; nothing is opened.
+
+    Raises:
+        InputError: There is none of this name, or it can't be loaded.
+    """
+    kinds, profiles = known_devices(), _profiles()
+    if name in profiles:
+        path = Path(profiles[name])
+        return Described(name, str(path), (), load_document(path).data)
+    if name not in kinds:
+        hint = did_you_mean(name, [*kinds, *profiles])
+        raise InputError(f"there is no device or profile '{name}' ({hint})")
+    schema = device_class(name).Options.model_json_schema()
+    needed = schema.get("required", [])
+    options = tuple(
+        DeviceOption(
+            key,
+            None if key in needed else "" if (value := each.get("default")) is None else str(value),
+            str(each.get("description", "")),
+        )
+        for key, each in schema.get("properties", {}).items()
+    )
+    return Described(name, kinds[name], options, {})
 
 
 def _profiles() -> dict[str, str]:

@@ -6,8 +6,13 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from hilctl.cli.machine_view import measuring, print_inventory, render
-from hilctl.experiment.inventory import Inventory, SerialPort
+from hilctl.cli.machine_view import measuring, print_described, print_inventory, render
+from hilctl.experiment.inventory import (
+    Described,
+    DeviceOption,
+    Inventory,
+    SerialPort,
+)
 from hilctl.machine.diagnosis import Diagnosis
 from hilctl.machine.latency import Latency
 
@@ -34,6 +39,23 @@ def test_ports_are_listed_or_said_to_be_none(capsys):
     shown = capsys.readouterr().out
     assert "/dev/ttyUSB0" in shown
     assert "no serial port" not in shown
+
+
+def test_what_is_known_of_a_profile_is_printed_as_it_stands(capsys):
+    channel = {"min": 0.0, "max": 5.0, "unit": "V"}
+    profile = {"model": "[T7]", "outputs": {"DAC0": channel}, "notes": ("one\nnote", "another")}
+    print_described(Described("t7", "t7.yaml", (), profile))
+    shown = capsys.readouterr().out
+    for text in ("t7: t7.yaml", "model: [T7]", "0.0 to 5.0 V", "notes: one note", "notes: another"):
+        assert text in shown
+
+
+def test_options_that_must_be_given_are_said(capsys):
+    options = (DeviceOption("host", None, "where it is"), DeviceOption("port", "502", "its port"))
+    print_described(Described("dac", "a:B", options, {}))
+    shown = capsys.readouterr().out
+    assert "host  must be given" in shown
+    assert "502" in shown
 
 
 def test_no_bar_where_output_is_for_programs(capsys):

@@ -7,7 +7,7 @@ import pytest
 
 from hilctl.base.errors import InputError
 from hilctl.experiment import inventory as module
-from hilctl.experiment.inventory import inventory
+from hilctl.experiment.inventory import describe, inventory
 
 
 def test_devices_profiles_and_ports_are_listed(monkeypatch):
@@ -26,3 +26,23 @@ def test_drivers_that_are_not_there_are_said(monkeypatch, place):
     monkeypatch.setattr(module, "SHIPPED_PROFILES", place)
     with pytest.raises(InputError, match="the shipped profiles can't be listed"):
         inventory()
+
+
+def test_a_device_is_described_by_its_options():
+    options = {option.name: option for option in describe("modbus_dac").options}
+    assert options["profile"].default is None
+    assert options["timeout_s"].default == "0.1"
+    assert options["host"].default == ""
+    assert "longest wait" in options["timeout_s"].description
+
+
+def test_a_profile_is_described_as_it_stands():
+    found = describe("labjack_t7")
+    assert found.profile["model"] == "T7"
+    assert any("0 to 5 V only" in note for note in found.profile["notes"])
+    assert found.to_mapping()["options"] == ()
+
+
+def test_a_name_that_is_neither_gets_a_hint():
+    with pytest.raises(InputError, match=r"no device or profile 'labjak_t7'.*'labjack_t7'"):
+        describe("labjak_t7")
