@@ -96,10 +96,10 @@ def replay(
     from hilctl.analysis.replay import replay as recompute
     from hilctl.cli.console import print_replay
     from hilctl.models.files import load_model
-    from hilctl.recording.reader import read
+    from hilctl.recording.reader import Pieces
 
     finish_orphans()
-    result = recompute(read(recording), load_model(model) if model else None)
+    result = recompute(Pieces(recording), load_model(model) if model else None)
     if as_json:
         print_json(result.to_mapping())
     else:
