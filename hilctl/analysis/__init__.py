@@ -10,7 +10,8 @@ plots.py    plots over time: history, error, lateness
 loops.py    the hysteresis loop
 html.py     one self-contained page
 replay.py   the same commands again
-export.py   CSV, Parquet, NPZ, MAT; export_all.py  all recordings of a folder as one data set
+export.py   samples as a table; export_files.py  CSV, Parquet, NPZ, MAT; export_all.py  all
+            recordings of a folder as one data set
 catalogue.py  the recordings below a folder, over catalogue_cache.py; run_entry.py  what is known
             of each; where.py  conditions on them
 """

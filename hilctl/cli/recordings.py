@@ -200,7 +200,7 @@ def export(
 ) -> None:
     """Write a recording's samples as CSV, NumPy, Parquet or MATLAB file."""
     from hilctl.analysis.export import export as write
-    from hilctl.recording.reader import read
+    from hilctl.recording.reader import Pieces
 
     finish_orphans()
     if every:
@@ -208,7 +208,7 @@ def export(
             raise InputError("--all: writes whole recordings, and replaces none")
         _export_all(recording, output, as_json=as_json)
         return
-    rows = write(read(recording, _stretch(from_s, to_s)), output, overwrite=overwrite)
+    rows = write(Pieces(recording, _stretch(from_s, to_s)), output, overwrite=overwrite)
     if as_json:
         print_json({"output": str(output), "rows": rows})
     else:
