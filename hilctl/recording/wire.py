@@ -5,6 +5,8 @@ all else there is the protobuf library, which knows every way to write a message
 as long.
 """
 
+import struct
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
@@ -23,11 +25,16 @@ _LONGEST_VARINT = 10
 _TICK0, _N, _DROPPED, _T_REL, _FLAGS, _STATE, _PREVIOUS = 1, 2, 3, 4, 9, 14, 15
 _COLUMNS = {field.block: field.name for field in RECORDED_FIELDS}
 _NUMBERS = {_TICK0, _N, _DROPPED}
+_NUMBER_OF = {name: number for number, name in _COLUMNS.items()}
 _DOUBLES = {_T_REL, _STATE, _PREVIOUS, *_COLUMNS}
 _TICKS = dict(enumerate(TICK_COLUMNS, start=1))
 _LARGEST_N = 2**32
 _LARGEST = 2**63 - 1
 _NONE = np.empty(0)
+_EIGHT_BYTES = 1
+_DOUBLE = struct.Struct("<Bd")
+_ZERO = bytes(8)
+_SCOPE_SAMPLE, SCOPE_T_REL, _SCOPE_FLAGS = 1, 2, 7
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,6 +44,7 @@ class BlockArrays:
     Attributes:
         tick0: Index of its first sample.
         n: Its samples.
+        dropped: Samples missing before it.
         flags: uint32[n].
         columns: float64[n] by name of their field; none that is empty.
         state: float64[s], the compensator's memory before it; mostly empty.
@@ -45,6 +53,7 @@ class BlockArrays:
 
     tick0: int
     n: int
+    dropped: int
     flags: U32
     columns: dict[str, F64]
     state: F64
@@ -57,6 +66,7 @@ class BlockArrays:
         return cls(
             tick0=message.tick0,
             n=message.n,
+            dropped=message.dropped,
             flags=np.array(message.flags, dtype=np.uint32),
             columns={name: values for name, values in columns.items() if values.size},
             state=np.array(message.state, dtype=np.float64),
@@ -84,11 +94,67 @@ def sample_block(data: bytes) -> BlockArrays | None:
     return BlockArrays(
         tick0=numbers.get(_TICK0, 0),
         n=numbers.get(_N, 0),
+        dropped=numbers.get(_DROPPED, 0),
         flags=flags.astype(np.uint32),
         state=doubles.pop(_STATE, _NONE),
         previous_command=doubles.pop(_PREVIOUS, _NONE),
         columns={_COLUMNS[number]: values for number, values in doubles.items() if values.size},
     )
+
+
+def block_bytes(block: BlockArrays, t_rel: F64) -> bytes:
+    """Return a ``SampleBlock`` as the protobuf library writes it, in a tenth of its time.
+
+    Args:
+        block: What it holds.
+        t_rel: float64[n], time of its samples in s.
+    """
+    lists = {_T_REL: t_rel, _STATE: block.state, _PREVIOUS: block.previous_command}
+    lists |= {_NUMBER_OF[name]: values for name, values in block.columns.items()}
+    packed = {number: values.tobytes() for number, values in lists.items()}
+    packed[_FLAGS] = _packed(block.flags)
+    numbers = {_TICK0: block.tick0, _N: block.n, _DROPPED: block.dropped}
+    heads = [_number(field << 3) + _number(value) for field, value in numbers.items() if value]
+    return b"".join(heads) + b"".join(
+        _number(field << 3 | _BYTES) + _number(len(packed[field])) + packed[field]
+        for field in sorted(packed)
+        if packed[field]
+    )
+
+
+def scope_bytes(sample: int, flags: int, doubles: Mapping[int, float]) -> bytes:
+    """Return a ``Sample`` as the protobuf library writes it.
+
+    Args:
+        sample: Index of the sample.
+        flags: Its flags.
+        doubles: Its numbers by field, in any order.
+    """
+    parts = {
+        field: _DOUBLE.pack(field << 3 | _EIGHT_BYTES, each) for field, each in doubles.items()
+    }
+    parts |= {field: b"" for field, part in parts.items() if part[1:] == _ZERO}  # as by default
+    if sample:
+        parts[_SCOPE_SAMPLE] = _number(_SCOPE_SAMPLE << 3) + _number(sample)
+    if flags:
+        parts[_SCOPE_FLAGS] = _number(_SCOPE_FLAGS << 3) + _number(flags)
+    return b"".join(parts[field] for field in sorted(parts))
+
+
+def _packed(values: U32) -> bytes:
+    if values.size and values.max() < _MORE:
+        return values.astype(np.uint8).tobytes()
+    return b"".join(map(_number, values.tolist()))
+
+
+def _number(value: int) -> bytes:
+    """Return a number of no sign as its bytes, lowest first, seven bits in each."""
+    found = bytearray()
+    while value >= _MORE:
+        found.append(value & (_MORE - 1) | _MORE)
+        value >>= 7
+    found.append(value)
+    return bytes(found)
 
 
 def tick_block(data: bytes) -> Ticks | None:

@@ -29,7 +29,8 @@ def block_message(**fields):
 
 def same(found, message):
     expected = wire.BlockArrays.of(message)
-    assert (found.tick0, found.n) == (expected.tick0, expected.n)
+    numbers = [(each.tick0, each.n, each.dropped) for each in (found, expected)]
+    assert numbers[0] == numbers[1]
     for name in ("flags", "state", "previous_command"):
         one, other = getattr(found, name), getattr(expected, name)
         assert (one.dtype, one.tobytes()) == (other.dtype, other.tobytes()), name
@@ -51,8 +52,22 @@ def same(found, message):
 )
 def test_a_block_is_what_the_library_reads(fields):
     message = block_message(**fields)
+    data = message.SerializeToString()
     for _ in range(2):  # the second time by its layout
-        same(wire.sample_block(message.SerializeToString()), message)
+        same(wire.sample_block(data), message)
+    assert wire.block_bytes(wire.sample_block(data), np.array(message.t_rel)) == data
+
+
+@pytest.mark.parametrize("value", [0.0, -0.0, 1.5, float("nan"), 5e-324])
+@pytest.mark.parametrize(("sample", "flags"), [(0, 0), (127, 8), (2**40, 2**32 - 1)])
+def test_a_sample_of_the_scope_is_what_the_library_writes(value, sample, flags):
+    message = schema.message("Sample")
+    message.sample, message.flags, message.t_rel = sample, flags, 0.25
+    doubles = {wire.SCOPE_T_REL: 0.25}
+    for field in (each for each in RECORDED_FIELDS if each.scope):
+        setattr(message, field.name, value)
+        doubles[field.scope] = value
+    assert wire.scope_bytes(sample, flags, doubles) == message.SerializeToString()
 
 
 @given(lists(integers(0, 2**64 - 1)), lists(integers(-(2**63), 2**63 - 1)))
