@@ -1,9 +1,10 @@
 """What a recording says: figures of merit, tables, plots and a page.
 
-timing.py   pure: lateness percentiles, late ticks
+timing.py   lateness percentiles, late ticks; quantiles.py  percentiles in bounded memory
 steady.py   which part of a recording is judged, and its average cycle
 figures.py  what a report holds
-report.py   from a recording to a report
+report.py   from a recording, whole or in pieces, to a report; segment_figures.py  those of one
+            segment
 table.py    a report for people, as rows of text
 canvas.py   what all plots share: style, colours, signals over time, PNG
 plots.py    plots over time: history, error, lateness

@@ -49,16 +49,17 @@ def report(
     from hilctl.analysis.report import summarize
     from hilctl.cli.console import print_rich
     from hilctl.cli.report_view import render
-    from hilctl.recording.reader import read
+    from hilctl.recording.reader import Pieces
 
     finish_orphans()
-    contents = read(recording, _stretch(from_s, to_s))
-    summary = summarize(contents)
+    pieces = Pieces(recording, _stretch(from_s, to_s))
+    summary = summarize(pieces)
     if html is not None:
         from hilctl.analysis.html import write_html
+        from hilctl.recording.reader import read
 
         check_page(html, overwrite=overwrite)
-        write_html(contents, summary, html)
+        write_html(read(recording, pieces.stretch), summary, html)
     if as_json:
         print_json(summary.to_mapping())
     else:
