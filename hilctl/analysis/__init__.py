@@ -1,16 +1,18 @@
 """What a recording says: figures of merit, tables, plots and a page.
 
-timing.py   pure: lateness percentiles, late ticks
+timing.py   lateness percentiles, late ticks; quantiles.py  percentiles in bounded memory
 steady.py   which part of a recording is judged, and its average cycle
 figures.py  what a report holds
-report.py   from a recording to a report
+report.py   from a recording, whole or in pieces, to a report; segment_figures.py  those of one
+            segment
 table.py    a report for people, as rows of text
 canvas.py   what all plots share: style, colours, signals over time, PNG
 plots.py    plots over time: history, error, lateness
 loops.py    the hysteresis loop
 html.py     one self-contained page
 replay.py   the same commands again
-export.py   CSV, Parquet, NPZ, MAT; export_all.py  all recordings of a folder as one data set
+export.py   samples as a table; export_files.py  CSV, Parquet, NPZ, MAT; export_all.py  all
+            recordings of a folder as one data set
 catalogue.py  the recordings below a folder, over catalogue_cache.py; run_entry.py  what is known
             of each; where.py  conditions on them
 """

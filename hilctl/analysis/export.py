@@ -5,25 +5,21 @@ place for the facts of the run.
 """
 
 import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any, BinaryIO, TypeAlias
+from tempfile import TemporaryFile
+from typing import BinaryIO
 
-import numpy as np
-
+from hilctl.analysis.export_files import FORMATS, ColumnFile, Columns, Facts, ParquetFile
 from hilctl.base.errors import DataError, InputError
 from hilctl.base.files import check_writable, write_file
 from hilctl.base.samples import COLUMNS
 from hilctl.recording.data import Recording
 
-Columns: TypeAlias = Mapping[str, Any]
-Facts: TypeAlias = Mapping[str, str]
-Write: TypeAlias = Callable[[BinaryIO, Columns, Facts], None]
 
-_ROWS_AT_ONCE = 20_000
-
-
-def export(recording: Recording, path: Path, *, overwrite: bool = False) -> int:
+def export(
+    recording: Recording | Iterable[Recording], path: Path, *, overwrite: bool = False
+) -> int:
     """Write samples to a file whose suffix says the format; it appears whole or not at all.
 
     Columns are ``sample``, ``t_s`` (since the start of the run), those of
@@ -32,7 +28,8 @@ def export(recording: Recording, path: Path, *, overwrite: bool = False) -> int:
     files also hold the facts of the run and the experiment and model as YAML.
 
     Args:
-        recording: The run.
+        recording: The run, or its pieces in order (:class:`hilctl.recording.reader.Pieces`): then
+            memory does not grow with its length.
         path: File to write: ``.csv``, ``.npz``, ``.parquet`` or ``.mat``.
         overwrite: Replace a file of that name.
 
@@ -40,29 +37,59 @@ def export(recording: Recording, path: Path, *, overwrite: bool = False) -> int:
         Number of samples written.
 
     Raises:
-        InputError: Unknown suffix, a file of that name exists, it can't be written, or pyarrow is
-            missing.
+        InputError: Unknown suffix, a file of that name exists, it can't be written or hold as many
+            samples, or pyarrow is missing.
         DataError: There is no sample.
     """
-    write = _FORMATS.get(path.suffix.lower())
-    if write is None:
-        known = ", ".join(_FORMATS)
+    begin = FORMATS.get(path.suffix.lower())
+    if begin is None:
+        known = ", ".join(FORMATS)
         raise InputError(f"{path}: the suffix must be one of {known}: got {path.suffix!r}")
     check_writable(path, overwrite=overwrite)
-    table = columns(recording)
-    write_file(path, lambda stream: write(stream, table, facts(recording)), overwrite=overwrite)
-    return int(table["sample"].size)
+    pieces = [recording] if isinstance(recording, Recording) else recording
+    rows = 0
+
+    def write(stream: BinaryIO) -> None:
+        nonlocal rows
+        with TemporaryFile(dir=path.parent) as aside:  # where there is room for the file itself
+            rows = write_pieces(pieces, begin(stream, aside))
+
+    write_file(path, write, overwrite=overwrite)
+    return rows
 
 
-def columns(recording: Recording) -> Columns:
-    """Return the columns that :func:`export` writes, by name.
+def write_pieces(
+    pieces: Iterable[Recording],
+    file: ColumnFile,
+    table_of: Callable[[Recording], Columns] | None = None,
+) -> int:
+    """Write the samples of pieces, and what the last of them says of the run.
+
+    Args:
+        pieces: At least one, in order.
+        file: Where to write.
+        table_of: Gives the columns of a piece; :func:`columns` where None.
+
+    Returns:
+        Number of samples written.
 
     Raises:
         DataError: There is no sample.
     """
+    rows = 0
+    for piece in pieces:
+        if piece.samples.index.size:
+            file.add((table_of or columns)(piece))
+            rows += piece.samples.index.size
+    if not rows:
+        raise DataError(f"{piece.path}: holds no sample")
+    file.finish(facts(piece))
+    return rows
+
+
+def columns(recording: Recording) -> Columns:
+    """Return the columns that :func:`export` writes, by name."""
     samples = recording.samples
-    if samples.index.size == 0:
-        raise DataError(f"{recording.path}: holds no sample")
     named = {
         COLUMNS[name].field(recording.command_unit).name: values
         for name, values in samples.columns().items()
@@ -90,62 +117,12 @@ def facts(recording: Recording) -> Facts:
     }
 
 
-def _write_csv(stream: BinaryIO, table: Columns, _facts: Facts) -> None:
-    stream.write((",".join(table) + "\n").encode())
-    stream.writelines(rows.encode() for rows in _csv_rows(table))
-
-
-def _csv_rows(table: Columns) -> Iterator[str]:
-    """Yield many lines at a time; ``%r`` is the shortest text that reads back as the same bits."""
-    line = ",".join("%d" if column.dtype.kind in "iu" else "%r" for column in table.values()) + "\n"
-    size = next(iter(table.values())).size
-    for start in range(0, size, _ROWS_AT_ONCE):
-        lists = [column[start : start + _ROWS_AT_ONCE].tolist() for column in table.values()]
-        yield "".join([line % row for row in zip(*lists, strict=True)])
-
-
-def _write_npz(stream: BinaryIO, table: Columns, facts: Facts) -> None:
-    np.savez(stream, allow_pickle=False, **table, **{k: np.array(v) for k, v in facts.items()})
-
-
-def _write_mat(stream: BinaryIO, table: Columns, facts: Facts) -> None:
-    from scipy.io import savemat
-
-    target: Any = stream  # the stubs know only paths
-    savemat(target, {**table, **facts}, oned_as="column")
-
-
 def write_parquet(stream: BinaryIO, table: Columns, facts: Facts) -> None:
     """Write columns, of NumPy or of Arrow, and facts as the file's metadata.
 
     Raises:
         InputError: pyarrow is missing.
     """
-    pa = arrow()
-    from pyarrow import parquet
-
-    metadata = {f"hilctl.{name}": text for name, text in facts.items()}
-    parquet.write_table(pa.table(dict(table)).replace_schema_metadata(metadata), stream)
-
-
-def arrow() -> Any:
-    """Return the module pyarrow.
-
-    Raises:
-        InputError: It is not installed.
-    """
-    try:
-        import pyarrow as pa
-    except ImportError:
-        raise InputError(
-            "writing .parquet needs pyarrow, which is not installed (pip install 'hilctl[parquet]')"
-        ) from None
-    return pa
-
-
-_FORMATS: dict[str, Write] = {
-    ".csv": _write_csv,
-    ".npz": _write_npz,
-    ".parquet": write_parquet,
-    ".mat": _write_mat,
-}
+    file = ParquetFile(stream)
+    file.add(table)
+    file.finish(facts)

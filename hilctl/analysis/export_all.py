@@ -7,6 +7,7 @@ the largest number that there is.
 
 import re
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from urllib.parse import quote
@@ -14,13 +15,14 @@ from urllib.parse import quote
 import numpy as np
 
 from hilctl.analysis.catalogue import read_catalogue
-from hilctl.analysis.export import Columns, arrow, columns, facts, write_parquet
+from hilctl.analysis.export import columns, write_pieces
+from hilctl.analysis.export_files import Columns, ParquetFile, arrow
 from hilctl.analysis.run_entry import Entry
 from hilctl.base.errors import DataError, InputError
 from hilctl.base.files import write_file
 from hilctl.base.samples import RECORDED_FIELDS
 from hilctl.recording.data import Recording
-from hilctl.recording.reader import read
+from hilctl.recording.reader import Pieces
 
 _UNKNOWN = "__HIVE_DEFAULT_PARTITION__"
 _DATE = re.compile(r"\d{4}-\d\d-\d\d")
@@ -85,17 +87,21 @@ def export_all(
 
 def _export_one(source: Path, target: Path, path: str, done: ExportedAll) -> None:
     try:
-        recording = read(source)
-        table = _uniform(recording)
-    except DataError as error:
-        done.left_out[path] = str(error).removeprefix(f"{source}: ")
-        return
-    try:
         target.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{target.parent}: can't be made: {error.strerror}") from None
-    kept = facts(recording)
-    write_file(target, lambda stream: write_parquet(stream, table, kept), overwrite=False)
+    try:
+        write_file(
+            target,
+            lambda stream: write_pieces(Pieces(source), ParquetFile(stream), _uniform),
+            overwrite=False,
+        )
+    except DataError as error:
+        with suppress(OSError):  # other files are in them
+            target.parent.rmdir()
+            target.parent.parent.rmdir()
+        done.left_out[path] = str(error).removeprefix(f"{source}: ")
+        return
     done.written += 1
 
 

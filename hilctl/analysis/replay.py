@@ -1,5 +1,7 @@
 """Recompute a recording's commands from the compensator's input, by the code that made them."""
 
+import math
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 from typing import Any
@@ -57,11 +59,14 @@ class ReplayResult:
         return asdict(self)
 
 
-def replay(recording: Recording, model: HysteresisModel | None = None) -> ReplayResult:
+def replay(
+    recording: Recording | Iterable[Recording], model: HysteresisModel | None = None
+) -> ReplayResult:
     """Recompute every command.
 
     Args:
-        recording: What was recorded.
+        recording: What was recorded, or its pieces in order
+            (:class:`hilctl.recording.reader.Pieces`): then memory does not grow with its length.
         model: Another model to invert instead of the recorded one; it starts from rest, its
             input is the reference ahead by its own preview, and the limits stay as recorded.
 
@@ -71,70 +76,174 @@ def replay(recording: Recording, model: HysteresisModel | None = None) -> Replay
         ConfigError: The recorded experiment or model breaks a rule.
         ModelError: The model has no inverse.
     """
-    if recording.samples.index.size == 0 or not recording.starts:
-        raise DataError(f"{recording.path}: holds no samples to replay")
-    if model is not None and not recording.compensated:
-        raise DataError(f"{recording.path}: had no compensator: there is no reference to replay")
-    if not np.isfinite(recording.samples.command).all():  # the limiter puts out no other
-        raise DataError(f"{recording.path}: /samples: every command must be finite")
-    document = Document(f"{recording.path}: experiment.yaml", recording.experiment_yaml)
-    config = document.validate(Experiment)
-    if config.sample_rate_hz != recording.sample_rate_hz:
-        rates = f"{recording.sample_rate_hz:g} Hz, its experiment is at {config.sample_rate_hz:g}"
-        raise DataError(f"{recording.path}: was recorded at {rates} Hz")
-    chosen = model or _recorded_model(recording)
-    compensator = Compensator(chosen, recording.sample_rate_hz)
-    limiter = Limiter(config.command_limits(), 1.0 / recording.sample_rate_hz)
-    samples = recording.samples
-    recorded = samples.input_um if recording.compensated else samples.wanted
-    wanted = np.empty_like(samples.wanted)
-    command = np.empty_like(samples.command)
-    flags = np.zeros_like(samples.flags)
-    known = np.zeros(samples.index.size, dtype=bool)
-    for start, rows in _stretches(recording):
-        known[rows] = True
-        limiter.last = start.previous_command
-        if model is None:
-            _restore(recording, compensator, start)
-        elif rows.start == 0:
-            waveform = (samples.flags[rows] & NO_WAVEFORM.value) == 0
-            compensator.begin(samples.reference_um[rows][waveform])
-        for part in _alike(samples.flags, rows):
-            # Another model than the recorded one looks ahead by its own preview.
-            inputs = compensator.ahead(samples.reference_um[part]) if model else recorded[part]
-            _recompute(samples, part, inputs, compensator, limiter, (wanted, command, flags))
-    return _compare(recording, known, (wanted, command, flags))
+    pieces = [recording] if isinstance(recording, Recording) else recording
+    running: _Running | None = None
+    for piece in pieces:
+        running = running or _Running(piece, model)
+        running.add(piece)
+    if running is None:
+        raise DataError("there is no recording to replay")
+    return running.result()
 
 
-def _recorded_model(recording: Recording) -> HysteresisModel | None:
-    if not recording.compensated:
-        return None
-    return parse_model(f"{recording.path}: model.yaml", recording.model_yaml)
+class _Running:
+    """A replay that goes on from piece to piece: the compensator and the limiter remember.
 
-
-def _restore(recording: Recording, compensator: Compensator, start: ReplayStart) -> None:
-    try:
-        compensator.restore(start.state)
-    except ModelError as error:
-        raise DataError(f"{recording.path}: /samples: sample {start.sample}: {error}") from None
-
-
-def _stretches(recording: Recording) -> list[tuple[ReplayStart, slice]]:
-    """Return where each gapless stretch starts, and its rows.
-
-    Blocks lost from a damaged file leave gaps that no start stands behind: what follows them, up to
-    the next start, is left out.
+    Args:
+        first: The first piece; what the run was stands in each.
+        model: Another model than the recorded one.
     """
-    index = recording.samples.index
-    firsts = np.searchsorted(index, [start.sample for start in recording.starts])
-    gaps = np.flatnonzero(np.diff(index) != 1) + 1
-    # No row twice: a start without a gap before it ends the stretch, too.
-    bounds = np.union1d(np.append(gaps, index.size), firsts)
-    ends = bounds[np.searchsorted(bounds, firsts, side="right")]
-    return [
-        (start, slice(first, end))
-        for start, first, end in zip(recording.starts, firsts.tolist(), ends.tolist(), strict=True)
-    ]
+
+    def __init__(self, first: Recording, model: HysteresisModel | None) -> None:
+        self._path = first.path
+        if model is not None and not first.compensated:
+            raise DataError(f"{first.path}: had no compensator: there is no reference to replay")
+        self._recorded = first.compensated
+        self._other = model is not None
+        self._compensator, self._limiter = _parts_of(first, model)
+        # What another model is fed lies ahead, perhaps in the next piece.
+        self._held_back = self._compensator.preview if self._other else 0
+        self._waiting: Samples | None = None
+        self._starts: list[ReplayStart] = []
+        self._any_start = False
+        self._known = self._unbegun = False
+        self._before: tuple[int, int] | None = None
+        self._comparison = _Comparison(first.command_unit)
+
+    def add(self, piece: Recording) -> None:
+        """Recompute what comes next."""
+        samples = piece.samples
+        if samples.index.size and not np.isfinite(samples.command).all():
+            # The limiter puts out no other.
+            raise DataError(f"{self._path}: /samples: every command must be finite")
+        self._any_start = self._any_start or bool(piece.starts)
+        self._starts += piece.starts
+        if self._waiting is not None:
+            samples = self._waiting.followed_by(samples)
+        ready = max(0, samples.index.size - self._held_back)
+        self._go(samples, ready)
+        self._waiting = samples.rows(slice(ready, None)) if self._held_back else None
+
+    def result(self) -> ReplayResult:
+        """Return how it went, at the end.
+
+        Raises:
+            DataError: There was nothing to recompute.
+        """
+        if self._waiting is not None:
+            self._go(self._waiting, self._waiting.index.size)
+        if not self._any_start or self._comparison.compared == 0:
+            raise DataError(f"{self._path}: holds no samples to replay")
+        return self._comparison.result()
+
+    def _go(self, samples: Samples, ready: int) -> None:
+        """Recompute the rows before ``ready``."""
+        if ready == 0:
+            return
+        out = np.empty(ready), np.empty(ready), np.zeros(ready, dtype=np.uint32)
+        known = np.zeros(ready, dtype=bool)
+        for rows, start in self._stretches(samples, ready):
+            if start is not None:
+                self._begin(start, first=rows.start == 0 and self._before is None)
+            elif rows.start or not self._follows(samples):
+                self._known = self._unbegun = False  # nothing says what the memory is there
+            if not self._known:
+                continue
+            known[rows.start : min(rows.stop, ready)] = True
+            for part in _alike(samples.flags, rows):
+                if part.start < ready:
+                    self._recompute(samples, part, rows.stop, ready, out)
+        self._comparison.add(samples.rows(slice(None, ready)), known, out)
+        self._before = int(samples.index[ready - 1]), int(samples.flags[ready - 1])
+
+    def _follows(self, samples: Samples) -> bool:
+        return self._before is not None and int(samples.index[0]) == self._before[0] + 1
+
+    def _stretches(
+        self, samples: Samples, ready: int
+    ) -> Iterator[tuple[slice, ReplayStart | None]]:
+        """Yield the gapless rows that begin before ``ready``, and what they start from.
+
+        Blocks lost from a damaged file leave gaps that no start stands behind.
+        """
+        index = samples.index
+        firsts = np.searchsorted(index, [start.sample for start in self._starts]).tolist()
+        starts = dict(zip(firsts, self._starts, strict=True))
+        gaps = np.flatnonzero(np.diff(index) != 1) + 1
+        # No row twice: a start without a gap before it ends the stretch, too.
+        bounds = np.unique([0, *gaps.tolist(), *firsts, index.size]).tolist()
+        self._starts = [start for row, start in starts.items() if row >= ready]
+        for begin, end in pairwise(bounds):
+            if begin < ready:
+                yield slice(begin, end), starts.get(begin)
+
+    def _begin(self, start: ReplayStart, *, first: bool) -> None:
+        self._known = True
+        self._limiter.last = start.previous_command
+        self._unbegun = self._other and first
+        if not self._other:
+            try:
+                self._compensator.restore(start.state)
+            except ModelError as error:
+                text = f"{self._path}: /samples: sample {start.sample}: {error}"
+                raise DataError(text) from None
+
+    def _recompute(
+        self, samples: Samples, part: slice, end: int, ready: int, out: tuple[F64, F64, U32]
+    ) -> None:
+        """Recompute rows of one kind, as far as they are ready."""
+        rows = slice(part.start, min(part.stop, ready))
+        wanted, command, flags = out[0][rows], out[1][rows], out[2][rows]
+        kind = int(samples.flags[part.start])
+        if kind & Flag.RAMP.value:
+            wanted[:] = self._limiter.limits.safe
+            self._limiter.ramp(command, flags, self._skipped_on_ramp(samples, part.start))
+            return
+        if kind & Flag.CONDITION.value:
+            flags |= Flag.CONDITION.value
+            wanted[:] = samples.wanted[rows]  # what was fed here, as the input is to a compensator
+        else:
+            self._compensator.process(self._inputs(samples, part, end)[: wanted.size], wanted)
+        self._limiter.limit(wanted, command, flags)
+
+    def _inputs(self, samples: Samples, part: slice, end: int) -> F64:
+        """Return what the compensator is fed on rows of the waveform."""
+        if not self._other:
+            return (samples.input_um if self._recorded else samples.wanted)[part]
+        if self._unbegun:
+            rest = slice(part.start, end)
+            waveform = (samples.flags[rest] & NO_WAVEFORM.value) == 0
+            self._compensator.begin(samples.reference_um[rest][waveform])
+            self._unbegun = False
+        # Another model than the recorded one looks ahead by its own preview.
+        return self._compensator.ahead(samples.reference_um[part])
+
+    def _skipped_on_ramp(self, samples: Samples, row: int) -> int:
+        """Return how many samples of a ramp were skipped just before a row."""
+        if row:
+            before: tuple[int, int] | None = (
+                int(samples.index[row - 1]),
+                int(samples.flags[row - 1]),
+            )
+        else:
+            before = self._before
+        flags = int(samples.flags[row])
+        if before is None or not flags & before[1] & Flag.RAMP.value:
+            return 0
+        return int(samples.index[row]) - before[0] - 1 if flags & Flag.AFTER_SKIPPED.value else 0
+
+
+def _parts_of(first: Recording, model: HysteresisModel | None) -> tuple[Compensator, Limiter]:
+    """Return compensator and limiter as they were recorded, or with another model."""
+    document = Document(f"{first.path}: experiment.yaml", first.experiment_yaml)
+    config = document.validate(Experiment)
+    if config.sample_rate_hz != first.sample_rate_hz:
+        rates = f"{first.sample_rate_hz:g} Hz, its experiment is at {config.sample_rate_hz:g}"
+        raise DataError(f"{first.path}: was recorded at {rates} Hz")
+    if model is None and first.compensated:
+        model = parse_model(f"{first.path}: model.yaml", first.model_yaml)
+    limiter = Limiter(config.command_limits(), 1.0 / first.sample_rate_hz)
+    return Compensator(model, first.sample_rate_hz), limiter
 
 
 def _alike(flags: U32, rows: slice) -> list[slice]:
@@ -144,62 +253,56 @@ def _alike(flags: U32, rows: slice) -> list[slice]:
     return [slice(a, b) for a, b in pairwise(bounds) if b > a]
 
 
-def _recompute(
-    samples: Samples,
-    rows: slice,
-    inputs: F64,
-    compensator: Compensator,
-    limiter: Limiter,
-    out: tuple[F64, F64, U32],
-) -> None:
-    wanted, command, flags = out[0][rows], out[1][rows], out[2][rows]
-    if samples.flags[rows.start] & Flag.RAMP.value:
-        wanted[:] = limiter.limits.safe
-        limiter.ramp(command, flags, _skipped_on_ramp(samples, rows.start))
-        return
-    if samples.flags[rows.start] & Flag.CONDITION.value:
-        flags |= Flag.CONDITION.value
-        wanted[:] = samples.wanted[rows]  # what was fed here, as the input is to a compensator
-    else:
-        compensator.process(inputs, wanted)
-    limiter.limit(wanted, command, flags)
+class _Comparison:
+    """How recomputed commands compare with recorded ones, summed up over the pieces."""
 
+    def __init__(self, command_unit: str) -> None:
+        self._unit = command_unit
+        self.compared = self._left_out = self._differing = self._limited = 0
+        self._first: int | None = None
+        self._largest = self._squares = 0.0
+        self._lowest, self._highest = math.inf, -math.inf
 
-def _skipped_on_ramp(samples: Samples, row: int) -> int:
-    """Return how many samples of a ramp were skipped just before a row."""
-    if row == 0 or not samples.flags[row] & samples.flags[row - 1] & Flag.RAMP.value:
-        return 0
-    skipped = samples.flags[row] & Flag.AFTER_SKIPPED.value
-    return int(samples.index[row] - samples.index[row - 1]) - 1 if skipped else 0
+    def add(
+        self, samples: Samples, known: npt.NDArray[np.bool_], recomputed: tuple[F64, F64, U32]
+    ) -> None:
+        if not known.all():
+            self._left_out += int(np.count_nonzero(~known))
+            samples = samples.rows(known)
+            recomputed = recomputed[0][known], recomputed[1][known], recomputed[2][known]
+        if samples.index.size == 0:
+            return
+        wanted, command, flags = recomputed
+        same = (
+            (wanted.view(np.uint64) == samples.wanted.view(np.uint64))
+            & (command.view(np.uint64) == samples.command.view(np.uint64))
+            & (flags == samples.flags & np.uint32(_LIMIT_BITS))
+        )
+        different = np.flatnonzero(~same)
+        if different.size and self._first is None:
+            self._first = int(samples.index[different[0]])
+        with np.errstate(over="ignore", invalid="ignore"):  # of commands near the end of all
+            change = command - samples.command
+            self._squares += float(np.sum(change**2))
+        self._differing += different.size
+        self._largest = float(np.maximum(self._largest, np.max(np.abs(change))))
+        self._lowest = min(self._lowest, float(command.min()))
+        self._highest = max(self._highest, float(command.max()))
+        limited = flags & np.uint32(Flag.RANGE_LIMITED | Flag.SLEW_LIMITED)
+        self._limited += int(np.count_nonzero(limited))
+        self.compared += command.size
 
-
-def _compare(
-    recording: Recording, known: npt.NDArray[np.bool_], recomputed: tuple[F64, F64, U32]
-) -> ReplayResult:
-    samples = recording.samples
-    wanted, command = recomputed[0][known], recomputed[1][known]
-    flags = recomputed[2][known]
-    recorded = samples.command[known]
-    same = (
-        (wanted.view(np.uint64) == samples.wanted[known].view(np.uint64))
-        & (command.view(np.uint64) == recorded.view(np.uint64))
-        & (flags == samples.flags[known] & np.uint32(_LIMIT_BITS))
-    )
-    different = np.flatnonzero(~same)
-    with np.errstate(over="ignore", invalid="ignore"):  # of commands near the end of all numbers
-        change = command - recorded
-        rms_difference = float(np.sqrt(np.mean(change**2)))
-    limited = flags & (Flag.RANGE_LIMITED | Flag.SLEW_LIMITED).value
-    return ReplayResult(
-        samples=command.size,
-        left_out_samples=samples.index.size - command.size,
-        identical=different.size == 0,
-        first_difference=int(samples.index[known][different[0]]) if different.size else None,
-        differing_samples=different.size,
-        largest_difference=float(np.max(np.abs(change))),
-        rms_difference=rms_difference,
-        command_unit=recording.command_unit,
-        command_min=float(command.min()),
-        command_max=float(command.max()),
-        limited_samples=int(np.count_nonzero(limited)),
-    )
+    def result(self) -> ReplayResult:
+        return ReplayResult(
+            samples=self.compared,
+            left_out_samples=self._left_out,
+            identical=self._differing == 0,
+            first_difference=self._first,
+            differing_samples=self._differing,
+            largest_difference=self._largest,
+            rms_difference=math.sqrt(self._squares / self.compared),
+            command_unit=self._unit,
+            command_min=self._lowest,
+            command_max=self._highest,
+            limited_samples=self._limited,
+        )

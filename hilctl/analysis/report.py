@@ -1,19 +1,23 @@
 """From a recording to a report."""
 
-from collections.abc import Sequence
-from typing import Any
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from hilctl.analysis import timing
 from hilctl.analysis.figures import RunReport, SegmentReport
-from hilctl.analysis.steady import steady_part
-from hilctl.base import metrics
+from hilctl.analysis.segment_figures import SegmentGathering
+from hilctl.analysis.steady import judged, waveform_end
 from hilctl.base.arrays import F64
-from hilctl.base.events import ADAPTED
-from hilctl.base.samples import NO_WAVEFORM, Flag
+from hilctl.base.errors import DataError
+from hilctl.base.events import ADAPTED, TUNED, Event
+from hilctl.base.samples import LAST_SAMPLE, NO_WAVEFORM, Flag, Samples
 from hilctl.base.segments import Segment
 from hilctl.recording.data import Recording
+
+_LIMITED = Flag.RANGE_LIMITED | Flag.SLEW_LIMITED | Flag.INVALID
 
 _WORST = (
     "peak_hysteresis_percent",
@@ -26,60 +30,163 @@ _WORST = (
 )
 
 
-@np.errstate(over="ignore", invalid="ignore")  # of readings near the end of all numbers
-def summarize(recording: Recording) -> RunReport:
+Windows: TypeAlias = list[tuple[Segment, tuple[int, int, int]]]
+
+
+def summarize(recording: Recording | Iterable[Recording]) -> RunReport:
     """Work out all figures that a recording allows; one cut short gives those of what it holds.
+
+    Args:
+        recording: The run, or its pieces in order, which can be gone through again
+            (:class:`hilctl.recording.reader.Pieces`): then memory does not grow with its length,
+            and a run that ended early or was tuned is read twice.
 
     Raises:
         DataError: A counter in the record of the end is not a number.
     """
-    segments = tuple(judge(recording, segment) for segment in recording.segments)
-    return RunReport(
-        **_identity(recording),
-        **_counts(recording),
-        **_worst(segments),
-        **_timing(recording),
-        adapted=_adapted(recording),
-        segments=segments,
-    )
+    if isinstance(recording, Recording):
+        windows = _windows(recording, recording.events, waveform_end(recording.samples))
+        return _gathered([recording], windows)[1]
+    first, report, actual = _first_pass(recording)
+    # How far the run got and how it was tuned is known only now.
+    return report if actual == first else _gathered(recording, actual)[1]
+
+
+def _first_pass(pieces: Iterable[Recording]) -> tuple[Windows, RunReport, Windows]:
+    """Gather figures as if the run ends as planned; return the windows taken, and the right."""
+    gathering, report = _gathered(pieces, None)
+    return gathering.windows, report, gathering.right_windows()
+
+
+def _gathered(
+    pieces: Iterable[Recording], windows: Windows | None
+) -> tuple["_RunGathering", RunReport]:
+    gathering: _RunGathering | None = None
+    for piece in pieces:
+        gathering = gathering or _RunGathering(piece, windows or _windows(piece, (), LAST_SAMPLE))
+        gathering.add(piece)
+    if gathering is None:
+        raise DataError("there is no recording to judge")
+    return gathering, gathering.report()
+
+
+def _windows(recording: Recording, events: Iterable[Event], end: int) -> Windows:
+    """Return the segments with the samples that are judged of each."""
+    known = list(events)
+    return [(each, judged(each, known, end)) for each in recording.segments]
 
 
 def judge(recording: Recording, segment: Segment) -> SegmentReport:
     """Work out the figures of one segment; None where it has not been reached."""
-    part = steady_part(recording, segment)
-    samples, (loop_input, output) = part.samples, part.loop
-    repeats = segment.period > 0.0
-    stroke_um, (peak, rms), (peak_raw, rms_raw) = None, (None, None), (None, None)
-    if output.size:
-        stroke_um = metrics.peak_to_peak(output)
-        if recording.compensated:
-            peak, rms = metrics.peak_and_rms_percent(output - loop_input, stroke_um)
-            peak_raw, rms_raw = metrics.peak_and_rms_percent(part.raw_error_um, stroke_um)
-    noise_um = hysteresis = area = floor = None
-    if not repeats or segment.period >= metrics.SHORTEST_PERIOD:
-        noise_um = metrics.sensor_noise_um(samples.index, samples.displacement_um)
-    if part.cycle is not None:
-        hysteresis = metrics.peak_hysteresis_percent(loop_input, output)
-        area = metrics.loop_area(loop_input, output)
-        if noise_um is not None and stroke_um is not None:
-            floor = metrics.noise_floor_percent(noise_um, part.cycle.counts, stroke_um)
-    return SegmentReport(
-        label=segment.label,
-        start_s=segment.start / recording.sample_rate_hz,
-        frequency_hz=recording.sample_rate_hz / segment.period if repeats else None,
-        samples=recording.samples.part(segment.start, segment.stop).index.size,
-        steady_cycles=part.cycles,
-        steady_samples=samples.index.size,
-        peak_to_peak_um=stroke_um,
-        peak_error_percent=peak,
-        rms_error_percent=rms,
-        peak_error_raw_percent=peak_raw,
-        rms_error_raw_percent=rms_raw,
-        peak_hysteresis_percent=hysteresis,
-        loop_area=area,
-        sensor_noise_um=noise_um,
-        noise_floor_percent=floor,
-    )
+    window = judged(segment, recording.events, waveform_end(recording.samples))
+    gathering = SegmentGathering(recording, segment, window)
+    with np.errstate(over="ignore", invalid="ignore"):
+        gathering.add(recording.samples)
+    return gathering.report()
+
+
+class _RunGathering:
+    """Gathers the figures of a run, piece by piece."""
+
+    def __init__(self, first: Recording, windows: Windows) -> None:
+        self.windows = windows
+        self._last = first
+        self._segments = [SegmentGathering(first, *window) for window in windows]
+        longest = max((segment.stop for segment in first.segments), default=0)
+        self._ticks = timing.TickGathering(longest / first.sample_rate_hz / 60.0)
+        self._events: list[Event] = []
+        self._counts: Counter[str] = Counter()
+        self._waveform: tuple[int, int] | None = None
+        self._command, self._displacement_um = _Extremes(), _Extremes()
+
+    @np.errstate(over="ignore", invalid="ignore")  # of readings near the end of all numbers
+    def add(self, piece: Recording) -> None:
+        """Take the next piece."""
+        self._last = piece
+        self._ticks.add(piece.ticks)
+        self._events += [event for event in piece.events if event.code in {TUNED, ADAPTED}]
+        if piece.samples.index.size:
+            self._count(piece.samples)
+            for segment in self._segments:
+                segment.add(piece.samples)
+
+    def _count(self, samples: Samples) -> None:
+        waveform = (samples.flags & np.uint32(NO_WAVEFORM)) == 0
+        index, flags = samples.index[waveform], samples.flags[waveform]
+        if index.size:
+            first = self._waveform[0] if self._waveform else int(index[0])
+            self._waveform = first, int(index[-1]) + 1
+        self._counts["samples"] += index.size
+        self._counts["recorded_samples"] += samples.index.size
+        self._counts["limited_samples"] += int(np.count_nonzero(flags & np.uint32(_LIMITED)))
+        invalid = flags & np.uint32(Flag.SENSOR_INVALID)
+        self._counts["sensor_invalid_samples"] += int(np.count_nonzero(invalid))
+        self._command.add(samples.command)
+        self._displacement_um.add(samples.displacement_um)
+
+    def right_windows(self) -> Windows:
+        """Return what is to be judged by what is known at the end."""
+        return _windows(self._last, self._events, self._waveform[1] if self._waveform else 0)
+
+    def report(self) -> RunReport:
+        """Return the figures, at the end."""
+        segments = tuple(segment.report() for segment in self._segments)
+        return RunReport(
+            **_identity(self._last),
+            **self._counted(),
+            **_worst(segments),
+            **self._timing(),
+            adapted=self._adapted(),
+            segments=segments,
+        )
+
+    def _counted(self) -> dict[str, Any]:
+        first, stop = self._waveform or (0, 0)
+        end = max((segment.stop for segment in self._last.segments), default=0)
+        names = ("samples", "recorded_samples", "limited_samples", "sensor_invalid_samples")
+        counts = {name: self._counts[name] for name in names}
+        return {
+            **counts,
+            "complete": bool(self._last.end) and stop >= end,
+            "ramp_samples": counts["recorded_samples"] - counts["samples"],
+            "duration_s": (stop - first) / self._last.sample_rate_hz,
+            "dropped": self._last.dropped,
+            "command_min": self._command.low,
+            "command_max": self._command.high,
+            "displacement_min_um": self._displacement_um.low,
+            "displacement_max_um": self._displacement_um.high,
+        }
+
+    def _adapted(self) -> dict[str, float]:
+        found = [event.values for event in self._events if event.code == ADAPTED]
+        return dict(found[-1]) if found else {}
+
+    def _timing(self) -> dict[str, Any]:
+        ticks, last = self._ticks, self._last
+        return {
+            "deadline_misses": timing.misses(last, ticks.ticks),
+            "skipped_ticks": timing.counter(last, "skipped_ticks", None),
+            "late_ticks": timing.counter(last, "late_ticks", ticks.late_ticks()),
+            "lateness_us": ticks.late_us(),
+            "lateness_by_minute": ticks.by_minute(),
+            "exchange_us": ticks.exchange_us(),
+        }
+
+
+class _Extremes:
+    """The lowest and the highest finite value; None where there is none."""
+
+    def __init__(self) -> None:
+        self.low: float | None = None
+        self.high: float | None = None
+
+    def add(self, column: F64) -> None:
+        finite = np.isfinite(column)
+        known = column if finite.all() else column[finite]
+        if known.size:
+            low, high = float(known.min()), float(known.max())
+            self.low = low if self.low is None else min(self.low, low)
+            self.high = high if self.high is None else max(self.high, high)
 
 
 def _identity(recording: Recording) -> dict[str, Any]:
@@ -95,53 +202,6 @@ def _identity(recording: Recording) -> dict[str, Any]:
         "compensated": recording.compensated,
         "command_unit": recording.command_unit,
         "loop_area_unit": f"um*{'um' if recording.compensated else recording.command_unit}",
-    }
-
-
-def _counts(recording: Recording) -> dict[str, Any]:
-    samples = recording.samples
-    waveform = (samples.flags & NO_WAVEFORM) == 0
-    index, flags = samples.index[waveform], samples.flags[waveform]
-    first, stop = (int(index[0]), int(index[-1]) + 1) if index.size else (0, 0)
-    end = max((segment.stop for segment in recording.segments), default=0)
-    limited = Flag.RANGE_LIMITED | Flag.SLEW_LIMITED | Flag.INVALID
-    command_min, command_max = _extremes(samples.command)
-    displacement_min_um, displacement_max_um = _extremes(samples.displacement_um)
-    return {
-        "complete": bool(recording.end) and stop >= end,
-        "samples": index.size,
-        "ramp_samples": samples.index.size - index.size,
-        "recorded_samples": samples.index.size,
-        "duration_s": (stop - first) / recording.sample_rate_hz,
-        "dropped": recording.dropped,
-        "limited_samples": int(np.count_nonzero(flags & limited)),
-        "sensor_invalid_samples": int(np.count_nonzero(flags & Flag.SENSOR_INVALID)),
-        "command_min": command_min,
-        "command_max": command_max,
-        "displacement_min_um": displacement_min_um,
-        "displacement_max_um": displacement_max_um,
-    }
-
-
-def _extremes(column: F64) -> tuple[float | None, float | None]:
-    finite = column[np.isfinite(column)]
-    return (float(finite.min()), float(finite.max())) if finite.size else (None, None)
-
-
-def _adapted(recording: Recording) -> dict[str, float]:
-    found = [event.values for event in recording.events if event.code == ADAPTED]
-    return dict(found[-1]) if found else {}
-
-
-def _timing(recording: Recording) -> dict[str, Any]:
-    ticks = recording.ticks
-    return {
-        "deadline_misses": timing.misses(recording),
-        "skipped_ticks": timing.counter(recording, "skipped_ticks", None),
-        "late_ticks": timing.counter(recording, "late_ticks", timing.late_ticks(ticks)),
-        "lateness_us": timing.percentiles_us(ticks.late_ns),
-        "lateness_by_minute": timing.by_minute(ticks),
-        "exchange_us": timing.percentiles_us(ticks.exchange_ns),
     }
 
 

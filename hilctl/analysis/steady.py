@@ -1,11 +1,12 @@
 """Which part of a recording is judged, and the average cycle of that part."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from hilctl.base.arrays import F64
-from hilctl.base.events import TUNED
+from hilctl.base.events import TUNED, Event
 from hilctl.base.metrics import Fold, fold
 from hilctl.base.samples import NO_WAVEFORM, Flag, Samples
 from hilctl.base.segments import Segment
@@ -44,29 +45,45 @@ def waveform_end(samples: Samples) -> int:
     return int(waveform[-1]) + 1 if waveform.size else 0
 
 
+def judged(segment: Segment, events: Iterable[Event], end: int) -> tuple[int, int, int]:
+    """Return which samples of a segment are judged: first, after the last, and whole cycles.
+
+    Of a segment cut short, these are the last whole cycles it got to; of one that was tuned while
+    it ran, they lie behind the last change.
+
+    Args:
+        segment: The segment.
+        events: Those of the run, in order.
+        end: Index after the last sample of the waveform.
+    """
+    begin = max(segment.steady_start, _tuned_until(events, segment))
+    stop = min(segment.steady_stop, end)
+    known = replace(segment, steady_start=begin, steady_stop=max(stop, begin))
+    return known.steady_cycles()
+
+
+def trusted(samples: Samples) -> Samples:
+    """Return the samples whose displacement the run has trusted."""
+    doubtful = (samples.flags & np.uint32(Flag.SENSOR_INVALID)) != 0
+    return samples.rows(~doubtful) if doubtful.any() else samples
+
+
 def steady_samples(recording: Recording, segment: Segment) -> tuple[Samples, int]:
     """Return the samples to judge of a segment, and how many whole cycles they are.
 
-    Of a segment cut short, these are the last whole cycles it got to; of one that was tuned while
-    it ran, they lie behind the last change. Samples whose displacement the run did not trust are
-    left out.
+    They are :func:`judged`, and :func:`trusted`.
     """
-    begin = max(segment.steady_start, _tuned_until(recording, segment))
-    end = min(segment.steady_stop, waveform_end(recording.samples))
-    known = replace(segment, steady_start=begin, steady_stop=max(end, begin))
-    start, stop, cycles = known.steady_cycles()
-    samples = recording.samples.part(start, stop)
-    trusted = (samples.flags & Flag.SENSOR_INVALID) == 0
-    return samples.rows(trusted), cycles
+    start, stop, cycles = judged(segment, recording.events, waveform_end(recording.samples))
+    return trusted(recording.samples.part(start, stop)), cycles
 
 
-def _tuned_until(recording: Recording, segment: Segment) -> int:
+def _tuned_until(events: Iterable[Event], segment: Segment) -> int:
     """Return the index after the last change of the reference that reaches a segment; 0 if none.
 
     A change ends the one before it, wherever that stands.
     """
     until = 0
-    for event in recording.events:
+    for event in events:
         if event.code == TUNED and event.sample < segment.steady_stop:
             # Where a recording does not say how long it took, nothing behind it is judged.
             until = event.sample + int(event.values.get("samples", segment.steady_stop))

@@ -26,6 +26,8 @@ MAD_TO_SIGMA = 1.482602218505602
 _WIDEST_HOLE = 0.05
 _FEWEST_BINS = 4
 _ORDER = 6
+NOISE_OVERLAP = _ORDER
+"""Samples before a piece that its first windows of noise need."""
 _GAIN = 924.0**0.5  # of white noise: the root of binomial(12, 6)
 _FEWEST_WINDOWS = 32
 
@@ -277,14 +279,24 @@ def sensor_noise_um(index: I64, displacement_um: F64) -> float | None:
         rms in um; None with fewer than 32 windows.
     """
     finite = np.isfinite(displacement_um)
-    index, displacement_um = index[finite], displacement_um[finite]
-    if index.size < _ORDER + _FEWEST_WINDOWS:
-        return None
+    windows = noise_windows_um(index[finite], displacement_um[finite])
+    return noise_of(float(np.median(windows)), windows.size) if windows.size else None
+
+
+def noise_windows_um(index: I64, displacement_um: F64) -> F64:
+    """Return the magnitude of what no polynomial explains, of each window: float64[m], m <= n - 6.
+
+    Args:
+        index: int64[n], sample index; windows with a gap are left out.
+        displacement_um: float64[n], finite.
+    """
     unbroken = index[_ORDER:] - index[:-_ORDER] == _ORDER
-    windows = np.diff(displacement_um, _ORDER)[unbroken]
-    if windows.size < _FEWEST_WINDOWS:
-        return None
-    return MAD_TO_SIGMA * float(np.median(np.abs(windows))) / _GAIN
+    return np.asarray(np.abs(np.diff(displacement_um, _ORDER)[unbroken]))
+
+
+def noise_of(median_um: float, windows: int) -> float | None:
+    """Return the rms noise by the median of :func:`noise_windows_um`; None of too few windows."""
+    return MAD_TO_SIGMA * median_um / _GAIN if windows >= _FEWEST_WINDOWS else None
 
 
 def expected_maximum(values: int) -> float:

@@ -49,16 +49,17 @@ def report(
     from hilctl.analysis.report import summarize
     from hilctl.cli.console import print_rich
     from hilctl.cli.report_view import render
-    from hilctl.recording.reader import read
+    from hilctl.recording.reader import Pieces
 
     finish_orphans()
-    contents = read(recording, _stretch(from_s, to_s))
-    summary = summarize(contents)
+    pieces = Pieces(recording, _stretch(from_s, to_s))
+    summary = summarize(pieces)
     if html is not None:
         from hilctl.analysis.html import write_html
+        from hilctl.recording.reader import read
 
         check_page(html, overwrite=overwrite)
-        write_html(contents, summary, html)
+        write_html(read(recording, pieces.stretch), summary, html)
     if as_json:
         print_json(summary.to_mapping())
     else:
@@ -96,10 +97,10 @@ def replay(
     from hilctl.analysis.replay import replay as recompute
     from hilctl.cli.console import print_replay
     from hilctl.models.files import load_model
-    from hilctl.recording.reader import read
+    from hilctl.recording.reader import Pieces
 
     finish_orphans()
-    result = recompute(read(recording), load_model(model) if model else None)
+    result = recompute(Pieces(recording), load_model(model) if model else None)
     if as_json:
         print_json(result.to_mapping())
     else:
@@ -200,7 +201,7 @@ def export(
 ) -> None:
     """Write a recording's samples as CSV, NumPy, Parquet or MATLAB file."""
     from hilctl.analysis.export import export as write
-    from hilctl.recording.reader import read
+    from hilctl.recording.reader import Pieces
 
     finish_orphans()
     if every:
@@ -208,7 +209,7 @@ def export(
             raise InputError("--all: writes whole recordings, and replaces none")
         _export_all(recording, output, as_json=as_json)
         return
-    rows = write(read(recording, _stretch(from_s, to_s)), output, overwrite=overwrite)
+    rows = write(Pieces(recording, _stretch(from_s, to_s)), output, overwrite=overwrite)
     if as_json:
         print_json({"output": str(output), "rows": rows})
     else:

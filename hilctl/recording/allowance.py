@@ -46,9 +46,9 @@ class Allowance:
         """Count bytes that stay in memory."""
         self._take("bytes of samples, ticks and events", size)
 
-    def message(self) -> None:
-        """Count a message."""
-        self._take("messages", 1)
+    def message(self, count: int = 1) -> None:
+        """Count messages."""
+        self._take("messages", count)
 
     def _take(self, what: str, amount: int) -> None:
         self._left[what] -= amount

@@ -6,7 +6,8 @@ leaves the message out.
 
 import json
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from functools import cache
 from typing import Annotated, Any
 
 import numpy as np
@@ -17,12 +18,13 @@ from pydantic import Field, TypeAdapter, ValidationError
 
 from hilctl.base.device import CommandUnit
 from hilctl.base.events import TUNED
-from hilctl.base.samples import COLUMNS, LAST_SAMPLE, LONGEST_NS, Batch, Head
+from hilctl.base.samples import COLUMNS, LAST_SAMPLE, LONGEST_NS, RECORDED_FIELDS, Batch, Head
 from hilctl.base.segments import SHORTEST_PERIOD, Segment
 from hilctl.base.strict import Strict
-from hilctl.recording import schema
-from hilctl.recording.data import TICK_COLUMNS
+from hilctl.recording import schema, wire
+from hilctl.recording.data import TICK_COLUMNS, Ticks
 from hilctl.recording.facts import LABELS_FACT, LabelValue
+from hilctl.recording.wire import BlockArrays
 
 MAX_UNIX_NS = 2**63 - 1
 """Latest time that 64 bits hold with a sign, as NumPy and Parquet have it: in the year 2262."""
@@ -37,57 +39,84 @@ _LINE = 60
 
 
 def decode(topic: str, data: bytes) -> tuple[Any, str]:
-    """Return a message of one of hilctl's topics, and why it is none of hilctl's, if so."""
+    """Return a message of one of hilctl's topics, and why it is none of hilctl's, if so.
+
+    Returns:
+        Of ``/samples`` a :class:`~hilctl.recording.wire.BlockArrays`, of ``/ticks``
+        :class:`~hilctl.recording.data.Ticks`, else a message of the protobuf library.
+    """
+    plain = _PLAIN.get(topic)
+    if plain and (found := plain[0](data)) is not None:
+        return found, ""
     decoded = schema.message(schema.TOPICS[topic])
     try:
         decoded.ParseFromString(data)
     except DecodeError as error:
         return decoded, f"can't be decoded: {error}"
-    return decoded, ""
+    return plain[1](decoded) if plain else decoded, ""
 
 
-def block_problem(block: Any, next_sample: int) -> str:
+_PLAIN: dict[str, tuple[Callable[[bytes], Any], Callable[[Any], Any]]] = {
+    "/samples": (wire.sample_block, wire.BlockArrays.of),
+    "/ticks": (wire.tick_block, wire.ticks_of),
+}
+
+
+def block_problem(block: BlockArrays, next_sample: int) -> str:
     """Check samples.
 
     Args:
-        block: A ``SampleBlock``.
+        block: What a ``SampleBlock`` holds.
         next_sample: Index after the last sample before it.
     """
     if not block.n:
         return "holds no sample"
     if not next_sample <= block.tick0 < LAST_SAMPLE:
         return f"sample {block.tick0} can't follow sample {next_sample - 1}"
-    if wrong := _wrong_lengths(block, "", block.n):
+    lengths = {name: values.size for name, values in block.columns.items()}
+    lengths["flags"] = block.flags.size
+    # Of a million samples there are thousands of blocks, and all have the same columns.
+    complete = set(lengths.values()) == {block.n} and _has_all(tuple(lengths))
+    if not complete and (wrong := _wrong_lengths(lengths, "", block.n)):
         return f"{block.n} samples with {wrong}"
     before = block.previous_command
-    if len(before) > 1 or not all(map(math.isfinite, before)):
+    if before.size > 1 or not np.isfinite(before).all():
         return "previous_command must be one finite number"
     return ""
 
 
-def _wrong_lengths(message: Any, prefix: str, samples: int) -> str:
+@cache
+def _has_all(names: tuple[str, ...]) -> bool:
+    """Return whether columns of right lengths are all that there must be."""
+    return not _wrong_lengths(dict.fromkeys(names, 1), "", 1)
+
+
+def _wrong_lengths(given: Mapping[str, int], prefix: str, samples: int) -> str:
     """Return which columns of a message have not one value a sample."""
-    lengths = {f"{prefix}flags": len(getattr(message, f"{prefix}flags"))}
+    lengths = {f"{prefix}flags": given.get(f"{prefix}flags", 0)}
     for column in COLUMNS.values():
         names = sorted({prefix + column.field(unit).name for unit in _UNITS})
-        given = {name: len(getattr(message, name)) for name in names}
-        filled = {name: length for name, length in given.items() if length}
+        filled = {name: given[name] for name in names if given.get(name)}
         missing = {" or ".join(names): 0} if column.when == "always" else {}
         lengths |= filled or missing
     return _listed({name: length for name, length in lengths.items() if length != samples})
 
 
-def ticks_problem(ticks: Any) -> str:
-    """Check a ``TickBlock``."""
-    lengths = {name: len(getattr(ticks, name)) for name in TICK_COLUMNS}
+def ticks_problem(ticks: Ticks) -> str:
+    """Check what a ``TickBlock`` holds."""
+    columns = {name: getattr(ticks, name) for name in TICK_COLUMNS}
+    lengths = {name: values.size for name, values in columns.items()}
     if len(set(lengths.values())) != 1:
         return "its columns differ in length: " + _listed(lengths)
-    if max(ticks.first_sample, default=0) >= LAST_SAMPLE:
-        return f"sample {max(ticks.first_sample)} is beyond any run"
+    if not ticks.first_sample.size:
+        return ""
+    if ticks.first_sample.max() >= LAST_SAMPLE:
+        return f"sample {ticks.first_sample.max()} is beyond any run"
     for name in TICK_COLUMNS[1:]:
-        furthest = max(map(abs, getattr(ticks, name)), default=0)
-        if furthest > LONGEST_NS:
-            return f"{name} of {furthest} ns is longer than any run"
+        # Not by the magnitude: the lowest of all numbers has none.
+        lowest, highest = int(columns[name].min()), int(columns[name].max())
+        if max(-lowest, highest) > LONGEST_NS:
+            return f"{name} of {max(-lowest, highest)} ns is longer than any run"
     return ""
 
 
@@ -104,9 +133,14 @@ def event_problem(event: Any, time_ns: int) -> str:
     if event.code == TUNED and not all(0.0 <= abs(value) < LAST_SAMPLE for value in event.values):
         return f"a change of the reference by {list(event.values)}"
     before = len(event.before_sample)
-    if before and (wrong := _wrong_lengths(event, "before_", before)):
+    if before and (wrong := _wrong_lengths(_lengths_before(event), "before_", before)):
         return f"{before} samples before it with {wrong}"
     return ""
+
+
+def _lengths_before(event: Any) -> dict[str, int]:
+    names = ["before_flags", *(f"before_{field.name}" for field in RECORDED_FIELDS)]
+    return {name: len(getattr(event, name)) for name in names}
 
 
 def sound_blocks(batch: Batch) -> npt.NDArray[np.bool_]:

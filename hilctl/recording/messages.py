@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, Self
+from typing import NamedTuple, Self
 
 import numpy as np
 from mcap.writer import Writer
@@ -15,8 +15,10 @@ from hilctl.base.samples import COLUMNS, Batch, Head, RecordedField, SampleColum
 from hilctl.recording import schema
 from hilctl.recording.checks import MAX_UNIX_NS, RATES_HZ
 from hilctl.recording.data import TICK_COLUMNS
+from hilctl.recording.wire import SCOPE_T_REL, BlockArrays, block_bytes, scope_bytes
 
 _MAX_BLOCK = 500
+_NONE = np.empty(0)
 _YEAR_NS = 366 * 86_400 * 10**9
 
 
@@ -183,16 +185,19 @@ class MessageMaker:
         columns = list(self._layout.recorded(samples))
         first = int(batch.heads[row, Head.FIRST_SAMPLE])
         dropped = int(batch.heads[row, Head.DROPPED_BEFORE])
-        out = schema.message("SampleBlock")
-        out.tick0, out.n, out.dropped = first, samples.index.size, dropped
-        out.t_rel.extend((samples.index / self._layout.sample_rate_hz).tolist())
-        out.flags.extend(samples.flags.tolist())
-        for field, values in columns:
-            getattr(out, field.name).extend(values.tolist())
-        if self.samples == 0 or dropped:
-            out.state.extend(batch.states[row, :-1].tolist())
-            out.previous_command.append(float(batch.states[row, -1]))
-        yield Encoded("/samples", self._layout.time_ns(first), out.SerializeToString())
+        begins = self.samples == 0 or bool(dropped)
+        state = batch.states[row] if begins else _NONE
+        block = BlockArrays(
+            tick0=first,
+            n=samples.index.size,
+            dropped=dropped,
+            flags=samples.flags,
+            columns={field.name: values for field, values in columns},
+            state=state[:-1],
+            previous_command=state[-1:],
+        )
+        data = block_bytes(block, samples.index / self._layout.sample_rate_hz)
+        yield Encoded("/samples", self._layout.time_ns(first), data)
         self.samples += samples.index.size
         self.missing += dropped
         yield from self._scope(samples, columns)
@@ -201,14 +206,14 @@ class MessageMaker:
         self, samples: Samples, columns: list[tuple[RecordedField, F64]]
     ) -> Iterator[Encoded]:
         first = int(samples.index[0])
-        shown = [(field.name, values) for field, values in columns if field.scope]
-        for k in range(-first % self._stride, samples.index.size, self._stride):
-            out: Any = schema.message("Sample")
-            out.sample, out.flags = first + k, int(samples.flags[k])
-            out.t_rel = out.sample / self._layout.sample_rate_hz
-            for name, values in shown:
-                setattr(out, name, values[k])
-            yield Encoded("/scope", self._layout.time_ns(first + k), out.SerializeToString())
+        rows = slice(-first % self._stride, None, self._stride)
+        shown = {field.scope: values[rows].tolist() for field, values in columns if field.scope}
+        flags = samples.flags[rows].tolist()
+        for k, sample in enumerate(samples.index[rows].tolist()):
+            doubles = {field: values[k] for field, values in shown.items()}
+            doubles[SCOPE_T_REL] = sample / self._layout.sample_rate_hz
+            data = scope_bytes(sample, flags[k], doubles)
+            yield Encoded("/scope", self._layout.time_ns(sample), data)
 
     def _ticks(self, batch: Batch) -> Encoded:
         out = schema.message("TickBlock")

@@ -7,13 +7,14 @@ is right, and so is an attachment's checksum. A chunk counts as whole where its 
 import re
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from functools import cache
 from io import BytesIO
 from typing import Any, BinaryIO
 
 import lz4.frame
+import numpy as np
 import zstandard
 from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.exceptions import McapError
@@ -46,13 +47,15 @@ LARGEST_BYTES = 2 * LARGEST_CHUNK_BYTES
 """No record that hilctl writes is larger; a length beyond it is a damaged one."""
 
 _MESSAGE = struct.Struct("<HIQQ")
+_MESSAGE_FRAME = struct.Struct("<BQHIQQ")  # opcode and length as well
+_LOG_TIME_AT = 6
+_IS_MESSAGE = int(Opcode.MESSAGE)  # an enumeration takes longer to compare than all else here
 _PIECE_BYTES = 65536
 _KINDS: dict[int, Any] = {
     Opcode.HEADER: Header,
     Opcode.FOOTER: Footer,
     Opcode.SCHEMA: Schema,
     Opcode.CHANNEL: Channel,
-    Opcode.CHUNK: Chunk,
     Opcode.CHUNK_INDEX: ChunkIndex,
     Opcode.ATTACHMENT: Attachment,
     Opcode.ATTACHMENT_INDEX: AttachmentIndex,
@@ -84,6 +87,8 @@ def parse(opcode: int, body: bytes) -> McapRecord | None:
         return _message(body)
     if opcode == Opcode.METADATA:
         return _metadata(body)
+    if opcode == Opcode.CHUNK:
+        return _chunk(body)
     if opcode not in _KINDS:
         return None
     builder = RecordBuilder()
@@ -105,6 +110,27 @@ def _message(body: bytes) -> Message | None:
         data=body[_MESSAGE.size :],
         publish_time=publish_time,
         sequence=sequence,
+    )
+
+
+def _chunk(body: bytes) -> Chunk | None:
+    # Not by the library, which copies what is in it four times.
+    try:
+        first, last, size, crc, name_length = _CHUNK.unpack_from(body)
+        begin = _CHUNK.size + name_length + _LENGTH.size
+        name = body[_CHUNK.size : _CHUNK.size + name_length].decode()
+        (length,) = _LENGTH.unpack_from(body, begin - _LENGTH.size)
+    except (struct.error, UnicodeDecodeError):
+        return None
+    if begin + length != len(body):
+        return None
+    return Chunk(
+        compression=name,
+        data=body[begin:],
+        message_end_time=last,
+        message_start_time=first,
+        uncompressed_crc=crc,
+        uncompressed_size=size,
     )
 
 
@@ -169,6 +195,9 @@ def inflate(compression: str, data: bytes, size: int, allowance: Allowance) -> b
         return data
     stream: Any
     if compression == "zstd":
+        if (whole := _at_once(data, size)) is not None:
+            allowance.expand(len(whole))
+            return whole
         # A frame may ask for a window of gigabytes.
         limited = zstandard.ZstdDecompressor(max_window_size=LARGEST_CHUNK_BYTES)
         stream = limited.stream_reader(data)
@@ -189,6 +218,16 @@ def inflate(compression: str, data: bytes, size: int, allowance: Allowance) -> b
     return bytes(out)
 
 
+def _at_once(data: bytes, size: int) -> bytes | None:
+    """Return what a frame of a known, right size holds; None where it is any other."""
+    try:
+        if size > LARGEST_CHUNK_BYTES or zstandard.frame_content_size(data) != size:
+            return None
+        return zstandard.ZstdDecompressor().decompress(data, allow_extra_data=False)
+    except zstandard.ZstdError:
+        return None
+
+
 @dataclass(frozen=True, slots=True)
 class Contents:
     """What a whole chunk holds.
@@ -196,14 +235,28 @@ class Contents:
     Attributes:
         records: Schemas, channels and messages in order.
         indexes: Channel id to the bytes that its message index must have.
+        unread: Messages that are left out of ``records``.
     """
 
     records: tuple[McapRecord, ...]
     indexes: dict[int, bytes]
+    unread: int = 0
 
 
-def contents(chunk: Chunk, allowance: Allowance) -> Contents | None:
-    """Return what a chunk holds, or None where its checksum or a record in it is wrong."""
+def contents(chunk: Chunk, allowance: Allowance, unread: Collection[int] = ()) -> Contents | None:
+    """Return what a chunk holds, or None where its checksum or a record in it is wrong.
+
+    Args:
+        chunk: A chunk, whose own lengths are right.
+        allowance: Counts what comes out of it.
+        unread: Ids of channels whose messages are only counted.
+    """
+    data = checked(chunk, allowance)
+    return None if data is None else _walked(data, unread)
+
+
+def checked(chunk: Chunk, allowance: Allowance) -> bytes | None:
+    """Return the bytes of a chunk's records, or None where their checksum or size is wrong."""
     if chunk.uncompressed_size > LARGEST_CHUNK_BYTES:
         return None
     data = inflate(chunk.compression, chunk.data, chunk.uncompressed_size, allowance)
@@ -211,23 +264,50 @@ def contents(chunk: Chunk, allowance: Allowance) -> Contents | None:
         return None
     if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
         return None
+    return data
+
+
+def _walked(data: bytes, unread: Collection[int]) -> Contents | None:
+    """Return the records of a chunk; None where they do not fill it to its last byte."""
     records: list[McapRecord] = []
-    entries: dict[int, list[int]] = {}
-    end = 0
-    for at, record in split(data):
-        records.append(record)
-        if isinstance(record, Message):
-            entries.setdefault(record.channel_id, []).extend((record.log_time, at))
-        end = at + FRAME.size + FRAME.unpack_from(data, at)[1]
-        if len(records) > MOST_IN_CHUNK:
+    places: dict[int, list[int]] = {}
+    left_out = at = 0
+    last = len(data) - _MESSAGE_FRAME.size
+    while at + FRAME.size <= len(data):
+        opcode, length = FRAME.unpack_from(data, at)
+        end = at + FRAME.size + length
+        if end > len(data) or len(records) + left_out > MOST_IN_CHUNK:
             return None
-    if end != len(data):
+        if opcode == _IS_MESSAGE and length >= _MESSAGE.size and at <= last:
+            head = _MESSAGE_FRAME.unpack_from(data, at)
+            channel_id = head[2]
+            places.setdefault(channel_id, []).append(at)
+            if channel_id in unread:
+                left_out += 1
+            else:
+                body = data[at + _MESSAGE_FRAME.size : end]
+                records.append(Message(channel_id, head[4], body, head[5], head[3]))
+        else:
+            record = parse(opcode, data[at + FRAME.size : end])
+            if record is None:
+                return None
+            if isinstance(record, Channel) and record.id in unread:  # it may be of another topic
+                return _walked(data, ())
+            records.append(record)
+        at = end
+    if at != len(data):
         return None
-    return Contents(tuple(records), {key: _index(key, each) for key, each in entries.items()})
+    indexes = {channel_id: _index(channel_id, data, each) for channel_id, each in places.items()}
+    return Contents(tuple(records), indexes, left_out)
 
 
-def _index(channel_id: int, entries: list[int]) -> bytes:
-    return struct.pack(f"<HI{len(entries)}Q", channel_id, 8 * len(entries), *entries)
+def _index(channel_id: int, data: bytes, places: list[int]) -> bytes:
+    """Return the message index of a channel: time and place of each message."""
+    at = np.array(places)
+    bytes_of = (at + FRAME.size + _LOG_TIME_AT)[:, None] + np.arange(_LENGTH.size)
+    times = np.frombuffer(data, np.uint8)[bytes_of].view("<u8")
+    head = struct.pack("<HI", channel_id, 2 * _LENGTH.size * at.size)
+    return head + np.column_stack((times, at.astype("<u8"))).tobytes()
 
 
 def next_likely(stream: BinaryIO, at: int, size: int) -> int:

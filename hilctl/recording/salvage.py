@@ -90,6 +90,8 @@ class Salvage:
         header: The file's header, where it is whole.
         damages: Stretches that could not be read.
         finished: Whether footer and closing magic are there and the index fits the data.
+        unread: Ids of channels whose messages are not given out from now on; these channels must
+            have been.
     """
 
     def __init__(self, stream: BinaryIO, sound: SoundMessages | None = None) -> None:
@@ -101,6 +103,7 @@ class Salvage:
         self.header: Header | None = None
         self.damages: list[Damage] = []
         self.finished = False
+        self.unread: set[int] = set()
         self._data_ended = False
         self._channels: set[int] = set()
         self._indexes: dict[int, bytes] = {}
@@ -169,7 +172,9 @@ class Salvage:
             right = self._indexes.pop(int.from_bytes(body[:2], "little"), None)
             return _Found(None, None, end) if body == right else None
         record = parse(opcode, body)
-        inside = contents(record, self.allowance) if isinstance(record, Chunk) else None
+        inside = None
+        if isinstance(record, Chunk):
+            inside = contents(record, self.allowance, self.unread)
         if record is None or (isinstance(record, Chunk) and inside is None):
             return None
         return _Found(record, inside, end)
@@ -185,6 +190,8 @@ class Salvage:
         if found.inside is not None:
             self._chunks.append(at)
             self._indexes = dict(found.inside.indexes)
+            self._messages += found.inside.unread
+            self.allowance.message(found.inside.unread)
             return list(found.inside.records)
         if self._data_ended or isinstance(record, DataEnd):
             self._take_summary(record)

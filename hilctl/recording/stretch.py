@@ -1,7 +1,7 @@
 """A stretch of a run, by time: only its samples are kept in memory, however long the run was."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, fields, replace
 
 from hilctl.base.errors import DataError
@@ -44,23 +44,50 @@ class Stretch:
         Raises:
             DataError: The recording holds no sample of it.
         """
-        rate_hz = recording.sample_rate_hz
-        start, stop = self.samples(rate_hz)
-        samples = recording.samples.part(start, stop)
-        index = samples.index
-        if index.size == 0:
-            whole = "its samples are elsewhere" if recording.samples.index.size else "it has none"
-            raise DataError(f"{recording.path}: holds no sample from {self}: {whole}")
-        ticks = recording.ticks
+        (whole,) = self.cut_pieces([recording])
+        return whole
+
+    def cut_pieces(self, pieces: Iterable[Recording]) -> Iterator[Recording]:
+        """Cut a recording that comes in pieces, see :class:`hilctl.recording.reader.Pieces`.
+
+        What can be said only of all that is there stands in the last one: counters, and segments
+        that end with its last sample.
+
+        Raises:
+            DataError: There is no sample of it.
+        """
+        held: Recording | None = None
+        given = found = first = end = 0
+        for piece in pieces:
+            if held is not None:
+                yield held
+            held = self._part(piece)
+            index = held.samples.index
+            given += piece.samples.index.size
+            if index.size:
+                first, end = first if found else int(index[0]), int(index[-1]) + 1
+                found += index.size
+        if held is None or not found:
+            whole = "its samples are elsewhere" if given else "it has none"
+            path = held.path if held else "the recording"
+            raise DataError(f"{path}: holds no sample from {self}: {whole}")
+        yield replace(
+            held,
+            segments=tuple(_cut(piece.segments, first, end)),
+            dropped=end - first - found,
+            end={name: text for name, text in held.end.items() if name in _OF_ANY_PART},
+        )
+
+    def _part(self, piece: Recording) -> Recording:
+        start, stop = self.samples(piece.sample_rate_hz)
+        ticks = piece.ticks
         within = (ticks.first_sample >= start) & (ticks.first_sample < stop)
         return replace(
-            recording,
-            samples=samples,
-            segments=tuple(_cut(recording.segments, int(index[0]), int(index[-1]) + 1)),
+            piece,
+            samples=piece.samples.part(start, stop),
+            segments=tuple(_cut(piece.segments, start, stop)),
             ticks=Ticks(**{each.name: getattr(ticks, each.name)[within] for each in fields(ticks)}),
-            starts=tuple(each for each in recording.starts if start <= each.sample < stop),
-            dropped=int(index[-1]) + 1 - int(index[0]) - index.size,
-            end={name: text for name, text in recording.end.items() if name in _OF_ANY_PART},
+            starts=tuple(each for each in piece.starts if start <= each.sample < stop),
         )
 
     def __str__(self) -> str:

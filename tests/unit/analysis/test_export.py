@@ -14,6 +14,7 @@ from pyarrow import parquet
 from scipy.io import loadmat
 
 from hilctl.analysis.export import export
+from hilctl.analysis.export_files import NpzFile
 from hilctl.base.errors import DataError, InputError
 from hilctl.base.samples import Samples
 from hilctl.base.segments import Segment
@@ -223,11 +224,11 @@ def test_existing_file_is_kept_unless_told(tmp_path: Path) -> None:
 def test_full_disk_leaves_the_old_file_and_nothing_else(tmp_path: Path, monkeypatch) -> None:
     """A write that breaks off half-way is not seen under the file's name."""
 
-    def savez(stream, **_arrays) -> None:
-        stream.write(b"half of it")
+    def full(file: NpzFile, _facts: dict[str, str]) -> None:
+        file._stream.write(b"half of it")
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(np, "savez", savez)
+    monkeypatch.setattr(NpzFile, "finish", full)
     path = tmp_path / "out.npz"
     path.write_text("precious")
     with pytest.raises(InputError, match=r"out\.npz: can't be written: No space left on device"):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from pyarrow import dataset, parquet
 
-from hilctl.analysis import export, export_all
+from hilctl.analysis import export_all, export_files
 from hilctl.analysis.export_all import place_of
 from hilctl.analysis.run_entry import unreadable
 from hilctl.base.errors import InputError
@@ -88,11 +88,11 @@ def test_what_can_not_be_exported_is_said_and_the_rest_goes_on(folder, tmp_path)
 
 
 def test_a_disk_that_refuses_leaves_nothing_half_written(folder, tmp_path, monkeypatch):
-    def full(stream, table, facts):
-        stream.write(b"PAR1")
+    def full(file, facts):
+        file._stream.write(b"PAR1")
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(export_all, "write_parquet", full)
+    monkeypatch.setattr(export_all.ParquetFile, "finish", full)
     with pytest.raises(InputError, match="No space left on device"):
         exported(folder, tmp_path / "out")
     assert files(tmp_path / "out") == {}
@@ -132,4 +132,4 @@ def test_without_pyarrow_nothing_begins(folder, tmp_path, monkeypatch):
     with pytest.raises(InputError, match="needs pyarrow"):
         exported(folder, tmp_path / "out")
     assert not (tmp_path / "out").exists()
-    assert export.arrow().__name__ == "pyarrow"
+    assert export_files.arrow().__name__ == "pyarrow"

@@ -1,6 +1,7 @@
 """Replay: commands recomputed from a recording, bit for bit, and what can not be."""
 
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -8,8 +9,10 @@ import pytest
 
 from hilctl.analysis.replay import replay
 from hilctl.base.errors import DataError
+from hilctl.loop.compensator import Compensator
 from hilctl.models.files import load_model
-from hilctl.recording.reader import read
+from hilctl.recording import reader
+from hilctl.recording.reader import Pieces, read
 from hilctl.recording.recover import recover_recording
 
 ROOT = Path(__file__).parents[3]
@@ -87,3 +90,57 @@ def test_no_sample_is_replayed_twice():
     )
     found = replay(replace(recording, starts=(start, *starts)))
     assert (found.identical, found.samples) == (True, recording.samples.index.size)
+
+
+def pieces_of(recording, bounds):
+    """Cut a recording in memory, at any rows."""
+    for a, b in pairwise([0, *bounds, recording.samples.index.size]):
+        part = recording.samples.rows(slice(a, b))
+        index = part.index if part.index.size else np.array([-1])
+        starts = tuple(s for s in recording.starts if index[0] <= s.sample <= index[-1])
+        yield replace(recording, samples=part, starts=starts)
+
+
+@pytest.mark.parametrize(
+    "name", ["terfenol_compensated", "piezo_compensated", "terfenol_uncompensated"]
+)
+@pytest.mark.parametrize("bounds", [[1], [777, 778, 2500], [0, 0, 4000], range(0, 5000, 333)])
+def test_a_replay_in_pieces_is_that_of_the_whole(name, bounds):
+    """The memory goes on from piece to piece, wherever they are cut."""
+    recording = read(GOLDEN / f"{name}.mcap")
+    assert replay(pieces_of(recording, bounds)) == replay(recording)
+
+
+@pytest.mark.parametrize("bounds", [[1], [777, 778, 2500], range(0, 5000, 333), range(0, 5000, 3)])
+def test_another_model_looks_ahead_into_the_next_piece(bounds):
+    """Its input runs ahead by more samples than some of the pieces have."""
+    recording = read(GOLDEN / "terfenol_compensated.mcap")
+    model = load_model(CONFIGS / "models" / "terfenol_staged.yaml")
+    assert Compensator(model, recording.sample_rate_hz).preview > 3
+    whole, parts = replay(recording, model), replay(pieces_of(recording, bounds), model)
+    assert whole.rms_difference == pytest.approx(parts.rms_difference, rel=1e-12)
+    assert replace(whole, rms_difference=0.0) == replace(parts, rms_difference=0.0)
+
+
+@pytest.mark.parametrize("cut", range(0, 300, 25))
+def test_gaps_at_the_ends_of_pieces(cut):
+    """Behind a gap only a start says what the memory is, whether a piece ends there or not."""
+    recording = read(GOLDEN / "terfenol_compensated.mcap")
+    index = recording.samples.index
+    kept = recording.samples.rows((index < 1000) | (index >= 1200))
+    damaged = replace(recording, samples=kept)
+    result = replay(pieces_of(damaged, [850 + cut]))
+    assert result == replay(damaged)
+    assert result.left_out_samples == index.size - 1200
+    assert result.identical
+
+
+def test_a_damaged_file_in_pieces(tmp_path, monkeypatch):
+    data = bytearray((GOLDEN / "piezo_compensated.mcap").read_bytes())
+    data[len(data) // 2] ^= 4
+    path = tmp_path / "run.mcap"
+    path.write_bytes(data)
+    whole = replay(read(path))
+    monkeypatch.setattr(reader, "PIECE_SAMPLES", 1)
+    assert len(list(Pieces(path))) > 3
+    assert replay(Pieces(path)) == whole

@@ -1,7 +1,9 @@
 """From recordings to figures: what is judged, what is None, what counts as what."""
 
 import json
+from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,10 +13,13 @@ from hilctl.analysis.report import summarize, worst_segment
 from hilctl.analysis.table import run_rows
 from hilctl.base.arrays import F64
 from hilctl.base.errors import DataError
-from hilctl.base.events import ADAPTED, Event
+from hilctl.base.events import ADAPTED, TUNED, Event
 from hilctl.base.samples import Flag
 from hilctl.base.segments import Segment
+from hilctl.recording import reader
 from hilctl.recording.data import Recording, Ticks
+from hilctl.recording.reader import Pieces, read
+from hilctl.recording.stretch import Stretch
 
 RATE_HZ = 50_000.0
 LAG = 0.05
@@ -341,3 +346,78 @@ class TestWholeRun:
         assert mapping["command_max"] == 0.0
         assert mapping["segments"][0]["label"] == "sine"
         assert mapping["peak_hysteresis_percent"] == report.peak_hysteresis_percent
+
+
+GOLDEN = sorted((Path(__file__).parents[3] / "recordings" / "golden").glob("*.mcap"))
+
+
+def near(found: RunReport, expected: RunReport) -> None:
+    """Compare figures: sums to their rounding, all else exactly."""
+    assert _floats(found.to_mapping()) == pytest.approx(_floats(expected.to_mapping()), rel=1e-9)
+    assert _others(found.to_mapping()) == _others(expected.to_mapping())
+
+
+def _flat(mapping: dict) -> dict:
+    segments = enumerate(mapping["segments"])
+    return {**mapping, **{f"{key} {n}": v for n, each in segments for key, v in each.items()}}
+
+
+def _floats(mapping: dict) -> dict:
+    flat = _flat(mapping)
+    return {key: value for key, value in flat.items() if isinstance(value, float)}
+
+
+def _others(mapping: dict) -> dict:
+    flat = _flat(mapping)
+    return {key: v for key, v in flat.items() if not isinstance(v, float) and key != "segments"}
+
+
+@pytest.mark.parametrize("path", GOLDEN, ids=lambda path: path.stem)
+@pytest.mark.parametrize("size", [1, 1500, None])
+@pytest.mark.parametrize("stretch", [None, Stretch(0.02, 0.06), Stretch(0.03, None)])
+def test_a_report_in_pieces_is_that_of_the_whole(monkeypatch, path, size, stretch):
+    """Of one piece to the last bit; of many to the rounding of sums."""
+    expected = summarize(read(path, stretch))
+    if size is None:
+        assert summarize(Pieces(path, stretch)) == expected
+        return
+    monkeypatch.setattr(reader, "PIECE_SAMPLES", size)
+    near(summarize(Pieces(path, stretch)), expected)
+
+
+class Counted:
+    """Pieces of a recording in memory, and how often they were gone through."""
+
+    def __init__(self, recording: Recording, rows: int) -> None:
+        self.walks = 0
+        self._recording, self._rows = recording, rows
+
+    def __iter__(self) -> Iterator[Recording]:
+        self.walks += 1
+        whole, none = self._recording, Ticks(*(np.empty(0, dtype=np.int64),) * 4)
+        size = whole.samples.index.size
+        for at in range(0, size, self._rows):
+            samples = whole.samples.rows(slice(at, at + self._rows))
+            yield replace(whole, samples=samples, ticks=none, end={}, events=(), dropped=0)
+        yield replace(whole, samples=whole.samples.rows(slice(size, None)))
+
+
+def test_a_whole_run_is_read_once_and_one_that_ended_early_twice(lagging):
+    """Where it ends, and whether it was tuned, is known only at its end."""
+    whole = lagging()
+    once = Counted(whole, 700)
+    near(summarize(once), summarize(whole))
+    assert once.walks == 1
+    samples = whole.samples.rows(slice(None, 3300))
+    cut = replace(whole, samples=samples)
+    tuned = replace(whole, events=(Event(1100, "info", TUNED, "", {"samples": 500.0}),))
+    for recording in (cut, tuned):
+        twice = Counted(recording, 700)
+        near(summarize(twice), summarize(recording))
+        assert twice.walks == 2
+        assert summarize(twice).steady_cycles < summarize(whole).steady_cycles
+
+
+def test_no_pieces_are_no_recording():
+    with pytest.raises(DataError, match="no recording to judge"):
+        summarize([])

@@ -9,7 +9,7 @@ import pytest
 from hilctl.analysis.report import summarize
 from hilctl.base.errors import DataError
 from hilctl.base.segments import Segment
-from hilctl.recording import reader
+from hilctl.recording.allowance import Allowance
 from hilctl.recording.reader import read
 from hilctl.recording.stretch import Stretch
 
@@ -52,7 +52,7 @@ def test_blocks_elsewhere_are_not_kept(monkeypatch):
     """The allowance counts what stays in memory."""
     kept = []
 
-    class Counting(reader.Allowance):
+    class Counting(Allowance):
         def keep(self, size):
             kept.append(size)
             super().keep(size)

@@ -1,0 +1,266 @@
+"""Files of columns that come a piece at a time: CSV, NumPy, Parquet, MATLAB.
+
+None holds more than a piece in memory. Where a format wants a column as a whole, or its length
+first, the columns are put aside on the disk.
+"""
+
+import struct
+import zipfile
+from base64 import b64encode
+from collections.abc import Callable, Mapping
+from io import BytesIO
+from typing import IO, Any, BinaryIO, Protocol, TypeAlias
+
+import numpy as np
+
+from hilctl.base.errors import InputError
+
+Columns: TypeAlias = Mapping[str, Any]
+Facts: TypeAlias = Mapping[str, str]
+
+_CSV_ROWS = 20_000
+_GROUP_ROWS = 2**20  # pyarrow's own row groups
+_LARGEST_MAT_BYTES = 2**31 - 1  # of a variable, as MATLAB reads files of this version
+_MAT_HEADER_BYTES = 128
+_MATRIX, _DIMENSIONS, _NAME, _FLAGS = 14, 5, 1, 6
+_MAT_KINDS = {"int64": (14, 12), "float64": (6, 9), "uint32": (13, 6)}
+
+
+class ColumnFile(Protocol):
+    """A file in the making."""
+
+    def add(self, columns: Columns) -> None:
+        """Write more rows; the columns are those of the first call.
+
+        Raises:
+            OSError: The disk refuses.
+            InputError: The format can't hold them.
+        """
+        ...
+
+    def finish(self, facts: Facts) -> None:
+        """Write the rest, and what is kept beside the columns.
+
+        Raises:
+            OSError: The disk refuses.
+        """
+        ...
+
+
+class CsvFile:
+    """Lines of numbers; there is no place for facts.
+
+    Args:
+        stream: Where to write.
+        aside: Left empty.
+    """
+
+    def __init__(self, stream: BinaryIO, aside: IO[bytes] | None = None) -> None:
+        del aside
+        self._stream = stream
+        self._line = ""
+
+    def add(self, columns: Columns) -> None:
+        """Write rows; ``%r`` is the shortest text that reads back as the same bits."""
+        if not self._line:
+            kinds = ("%d" if each.dtype.kind in "iu" else "%r" for each in columns.values())
+            self._line = ",".join(kinds) + "\n"
+            self._stream.write((",".join(columns) + "\n").encode())
+        for start in range(0, next(iter(columns.values())).size, _CSV_ROWS):
+            lists = [column[start : start + _CSV_ROWS].tolist() for column in columns.values()]
+            rows = "".join([self._line % row for row in zip(*lists, strict=True)])
+            self._stream.write(rows.encode())
+
+    def finish(self, facts: Facts) -> None:
+        """Do nothing."""
+
+
+class ParquetFile:
+    """Row groups of a million; facts are the schema's metadata.
+
+    Columns may be of NumPy or of Arrow.
+
+    Args:
+        stream: Where to write.
+        aside: Left empty.
+
+    Raises:
+        InputError: pyarrow is missing.
+    """
+
+    def __init__(self, stream: BinaryIO, aside: IO[bytes] | None = None) -> None:
+        del aside
+        self._pa = arrow()
+        self._stream = stream
+        self._writer: Any = None
+        self._waiting: Any = None
+
+    def add(self, columns: Columns) -> None:
+        """Write what fills row groups, and keep the rest."""
+        rows = self._pa.table(dict(columns))
+        if self._waiting is not None:
+            rows = self._pa.concat_tables([self._waiting, rows])
+        while rows.num_rows > _GROUP_ROWS:
+            self._write(rows.slice(0, _GROUP_ROWS))
+            rows = rows.slice(_GROUP_ROWS)
+        self._waiting = rows
+
+    def finish(self, facts: Facts) -> None:
+        """Write the last row group and the facts."""
+        metadata = {f"hilctl.{name}": text for name, text in facts.items()}
+        if self._writer is None:
+            self._waiting = self._waiting.replace_schema_metadata(metadata)
+            self._write(self._waiting, store_schema=True)
+        else:
+            self._write(self._waiting)
+            schema = self._waiting.schema.with_metadata(metadata)
+            kept = {"ARROW:schema": b64encode(schema.serialize()).decode(), **metadata}
+            self._writer.add_key_value_metadata(kept)
+        self._writer.close()
+
+    def _write(self, rows: Any, *, store_schema: bool = False) -> None:
+        from pyarrow import parquet
+
+        if self._writer is None:
+            # Where the facts are not known yet, the schema that holds them is stored at the end.
+            kept = {"store_schema": store_schema}
+            self._writer = parquet.ParquetWriter(self._stream, rows.schema, **kept)
+        self._writer.write_table(rows.combine_chunks())
+
+
+class _Aside:
+    """Columns put aside in one file, a piece of each after the other."""
+
+    def __init__(self, file: IO[bytes]) -> None:
+        self._file = file
+        self._parts: dict[str, list[tuple[int, int]]] = {}
+        self.kinds: dict[str, np.dtype[Any]] = {}
+        self.rows = 0
+
+    def add(self, columns: Columns) -> None:
+        for name, values in columns.items():
+            self.kinds[name] = values.dtype
+            self._parts.setdefault(name, []).append((self._file.tell(), values.nbytes))
+            self._file.write(np.ascontiguousarray(values).data)
+        self.rows += next(iter(columns.values())).size
+
+    def copy(self, name: str, target: IO[bytes]) -> None:
+        """Write a column."""
+        for start, size in self._parts[name]:
+            self._file.seek(start)
+            target.write(self._file.read(size))
+
+
+class NpzFile:
+    """An archive of arrays; facts are texts beside them.
+
+    Args:
+        stream: Where to write.
+        aside: An empty file, for the columns until their length is known.
+    """
+
+    def __init__(self, stream: BinaryIO, aside: IO[bytes]) -> None:
+        self._stream = stream
+        self._aside = _Aside(aside)
+
+    def add(self, columns: Columns) -> None:
+        """Put rows aside."""
+        self._aside.add(columns)
+
+    def finish(self, facts: Facts) -> None:
+        """Write the archive."""
+        with zipfile.ZipFile(self._stream, "w") as archive:
+            for name, kind in self._aside.kinds.items():
+                with archive.open(f"{name}.npy", "w", force_zip64=True) as entry:
+                    descr = np.lib.format.dtype_to_descr(kind)
+                    shape = (self._aside.rows,)
+                    head = {"descr": descr, "fortran_order": False, "shape": shape}
+                    np.lib.format.write_array_header_1_0(entry, head)
+                    self._aside.copy(name, entry)
+            for name, text in facts.items():
+                with archive.open(f"{name}.npy", "w", force_zip64=True) as entry:
+                    np.lib.format.write_array(entry, np.array(text), allow_pickle=False)
+
+
+class MatFile:
+    """Column vectors of a MATLAB 5 file; facts are texts beside them.
+
+    Args:
+        stream: Where to write.
+        aside: An empty file, for the columns until their length is known.
+    """
+
+    def __init__(self, stream: BinaryIO, aside: IO[bytes]) -> None:
+        self._stream = stream
+        self._aside = _Aside(aside)
+
+    def add(self, columns: Columns) -> None:
+        """Put rows aside."""
+        self._aside.add(columns)
+        if 8 * self._aside.rows > _LARGEST_MAT_BYTES:
+            most = _LARGEST_MAT_BYTES // 8
+            raise InputError(
+                f".mat holds at most {most} samples: export a stretch (--from, --to) or .parquet"
+            )
+
+    def finish(self, facts: Facts) -> None:
+        """Write the file: what SciPy would, which wants each column in memory, twice."""
+        self._stream.write(_saved({})[:_MAT_HEADER_BYTES])
+        for name, kind in self._aside.kinds.items():
+            size = kind.itemsize * self._aside.rows
+            self._stream.write(_mat_head(name, kind, self._aside.rows))
+            self._aside.copy(name, self._stream)
+            self._stream.write(bytes(-size % 8))
+        self._stream.write(_saved(facts)[_MAT_HEADER_BYTES:])
+
+
+def _saved(facts: Facts) -> bytes:
+    from scipy.io import savemat
+
+    target = BytesIO()
+    stream: Any = target  # the stubs know only paths
+    savemat(stream, dict(facts), oned_as="column")
+    return target.getvalue()
+
+
+def _mat_head(name: str, kind: np.dtype[Any], rows: int) -> bytes:
+    """Return what stands before the numbers of a column vector.
+
+    Source: MAT-File Format, The MathWorks, version 5: a matrix is its flags with the class,
+    dimensions, name and numbers; each begins with its kind and bytes, and goes on to 8 bytes.
+    """
+    matrix_class, number_kind = _MAT_KINDS[kind.name]
+    size = kind.itemsize * rows
+    text = name.encode()
+    small = len(text) <= 4
+    named = struct.pack("<HH4s" if small else "<II", _NAME, len(text), *([text] if small else []))
+    if not small:
+        named += text + bytes(-len(text) % 8)
+    inside = struct.pack("<IIII", _FLAGS, 8, matrix_class, 0)
+    inside += struct.pack("<IIii", _DIMENSIONS, 8, rows, 1) + named
+    inside += struct.pack("<II", number_kind, size)
+    return struct.pack("<II", _MATRIX, len(inside) + size + -size % 8) + inside
+
+
+def arrow() -> Any:
+    """Return the module pyarrow.
+
+    Raises:
+        InputError: It is not installed.
+    """
+    try:
+        import pyarrow as pa
+    except ImportError:
+        raise InputError(
+            "writing .parquet needs pyarrow, which is not installed (pip install 'hilctl[parquet]')"
+        ) from None
+    return pa
+
+
+FORMATS: dict[str, Callable[[BinaryIO, IO[bytes]], ColumnFile]] = {
+    ".csv": CsvFile,
+    ".npz": NpzFile,
+    ".parquet": ParquetFile,
+    ".mat": MatFile,
+}
+"""What writes a file, by its suffix."""

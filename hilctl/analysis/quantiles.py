@@ -1,0 +1,109 @@
+"""Percentiles of any number of values in bounded memory: exact of some millions, else in bins."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from hilctl.base.arrays import F64, I64
+
+MOST_EXACT = 2**21
+"""Most values that are kept as they are; percentiles of more are right to 6e-5 of their size."""
+
+_BITS = 13  # of the fraction; a bin is 1.2e-4 of its value wide
+_SHIFT = 52 - _BITS
+_SIGN = np.int64(2**63 - 1)
+_WIDEST = 2**20
+_MIDDLE = 2 ** (63 - _SHIFT)
+
+
+class Quantiles:
+    """Takes values, and says how they are distributed."""
+
+    def __init__(self) -> None:
+        self.size = 0
+        self._largest: Any = None
+        self._values: list[Any] | None = []
+        self._counts = np.empty(0, dtype=np.int64)
+        self._reach = (2 * _MIDDLE, 0)
+        self._zeros = 0
+
+    def add(self, values: F64 | I64) -> None:
+        """Take more values, float64[n] or int64[n]; none of them NaN."""
+        if values.size == 0:
+            return
+        self.size += values.size
+        largest = values.max()
+        self._largest = largest if self._largest is None else max(self._largest, largest)
+        if self._values is None:
+            self._count(values)
+        else:
+            self._values.append(values)
+            if self.size > MOST_EXACT:
+                kept, self._values = self._values, None
+                for each in kept:
+                    self._count(each)
+
+    def _count(self, values: F64 | I64) -> None:
+        """Count values by the first bits of their floating-point form, which rise as they do."""
+        bits = values.astype(np.float64).view(np.int64)
+        keys = (bits ^ ((bits >> 63) & _SIGN)) >> _SHIFT
+        # A reading that stands still gives zeros, far from all other numbers.
+        others = keys[keys != 0]
+        self._zeros += keys.size - others.size
+        if others.size == 0:
+            return
+        if not self._counts.size:  # pages that nothing is counted in take no memory
+            self._counts = np.zeros(2 * _MIDDLE, dtype=np.int64)
+        places = others + _MIDDLE
+        low, high = int(places.min()), int(places.max())
+        self._reach = min(low, self._reach[0]), max(high + 1, self._reach[1])
+        if high - low < _WIDEST:
+            counts = np.bincount(places - low)
+            self._counts[low : low + counts.size] += counts
+        else:
+            numbers, counts = np.unique(places, return_counts=True)
+            self._counts[numbers] += counts
+
+    @property
+    def largest(self) -> float:
+        """The largest value, as it is.
+
+        Raises:
+            ValueError: There is none.
+        """
+        if self._largest is None:
+            raise ValueError("the largest of no values")
+        return float(self._largest)
+
+    def percentiles(self, percents: Sequence[float]) -> list[float]:
+        """Return percentiles as :func:`numpy.percentile` does; of at least one value."""
+        if self._values is not None:
+            return list(np.percentile(np.concatenate(self._values), percents).tolist())
+        centres, ends = self._centres()
+        places = np.asarray(percents) / 100.0 * (self.size - 1)
+        return list(centres[np.searchsorted(ends, places, side="right")].tolist())
+
+    def median(self) -> float:
+        """Return the median; of at least one value."""
+        if self._values is not None:
+            return float(np.median(np.concatenate(self._values)))
+        return self.percentiles([50.0])[0]
+
+    def above(self, threshold: float) -> int:
+        """Count the values above a threshold; in bins, those whose bin has its middle there."""
+        if self._values is not None:
+            return sum(int(np.count_nonzero(values > threshold)) for values in self._values)
+        centres, ends = self._centres()
+        counts = np.diff(ends, prepend=0)
+        return int(counts[centres > threshold].sum())
+
+    def _centres(self) -> tuple[F64, I64]:
+        """Return the middle of each bin, rising, and how many values there are up to its end."""
+        keys = np.flatnonzero(self._counts[slice(*self._reach)]) + self._reach[0] - _MIDDLE
+        counts = self._counts[keys + _MIDDLE]
+        edges = np.array([keys, keys + 1], dtype=np.int64) << _SHIFT
+        low, high = (edges ^ ((edges >> 63) & _SIGN)).view(np.float64)
+        at = int(np.searchsorted(keys, 0))
+        centres = np.insert(0.5 * low + 0.5 * high, at, 0.0)
+        return centres, np.cumsum(np.insert(counts, at, self._zeros))

@@ -1,0 +1,102 @@
+"""Files of columns that come in pieces: the same as of all at once."""
+
+import io
+import json
+from tempfile import TemporaryFile
+
+import numpy as np
+import pytest
+from pyarrow import parquet
+from scipy.io import savemat
+
+from hilctl.analysis import export_files
+from hilctl.analysis.export_files import CsvFile, MatFile, NpzFile, ParquetFile
+from hilctl.base.errors import InputError
+
+FACTS = {"run": json.dumps({"name": "x"}), "model_yaml": "", "experiment_yaml": "name: \u03bc\n"}
+
+
+def columns(start, stop):
+    rng = np.random.default_rng(start)
+    index = np.arange(start, stop)
+    values = rng.normal(size=index.size)
+    values[:1] = np.nan
+    return {
+        "sample": index, "t_s": index / 3.0, "reference_um": values, "a": -values,
+        "flags": index.astype(np.uint32),
+    }  # fmt: skip
+
+
+PARTS = [columns(0, 1), columns(1, 777), columns(777, 30_001)]
+WHOLE = {name: np.concatenate([part[name] for part in PARTS]) for name in PARTS[0]}
+
+
+def written(kind, path, parts):
+    with path.open("xb") as stream, TemporaryFile() as aside:
+        file = kind(stream, aside)
+        for part in parts:
+            file.add(part)
+        file.finish(FACTS)
+    return path
+
+
+def test_csv_in_pieces_is_that_of_the_whole(tmp_path):
+    (tmp_path / "a").mkdir()
+    (tmp_path / "b").mkdir()
+    one = written(CsvFile, tmp_path / "a" / "x.csv", PARTS).read_bytes()
+    assert one == written(CsvFile, tmp_path / "b" / "x.csv", [WHOLE]).read_bytes()
+    assert one.startswith(b"sample,t_s,reference_um,a,flags\n0,0.0,nan,nan,0\n")
+
+
+def test_mat_is_what_scipy_writes(tmp_path):
+    """Byte for byte, behind the line that says when."""
+    expected = io.BytesIO()
+    savemat(expected, {**WHOLE, **FACTS}, oned_as="column")
+    found = written(MatFile, tmp_path / "x.mat", PARTS).read_bytes()
+    assert found[116:] == expected.getvalue()[116:]
+
+
+def test_mat_says_what_it_can_not_hold(tmp_path, monkeypatch):
+    """Before it is written, and with a way out."""
+    monkeypatch.setattr(export_files, "_LARGEST_MAT_BYTES", 8 * 1000)
+    with (tmp_path / "x.mat").open("xb") as stream, TemporaryFile() as aside:
+        file = MatFile(stream, aside)
+        file.add(columns(0, 1000))
+        with pytest.raises(InputError, match=r"at most 1000 samples: export a stretch"):
+            file.add(columns(1000, 1001))
+
+
+def test_npz_holds_each_array_as_a_whole(tmp_path):
+    with np.load(written(NpzFile, tmp_path / "x.npz", PARTS), allow_pickle=False) as found:
+        for name, values in WHOLE.items():
+            assert (found[name].dtype, found[name].tobytes()) == (values.dtype, values.tobytes())
+        assert {name: str(found[name]) for name in FACTS} == FACTS
+        assert found.files == [*WHOLE, *FACTS]
+
+
+@pytest.mark.parametrize("rows", [1000, 30_000, 10**9])
+def test_parquet_row_groups_fill_up_across_pieces(tmp_path, monkeypatch, rows):
+    """Facts stand in the metadata, whether row groups were written before they were known."""
+    monkeypatch.setattr(export_files, "_GROUP_ROWS", rows)
+    path = written(ParquetFile, tmp_path / "x.parquet", PARTS)
+    file = parquet.ParquetFile(path)
+    groups = [file.metadata.row_group(k).num_rows for k in range(file.num_row_groups)]
+    assert groups == ([rows] * (30_000 // rows) + [1] if rows < 30_001 else [30_001])
+    table = file.read()
+    for name, values in WHOLE.items():
+        assert table[name].to_numpy().tobytes() == values.tobytes()
+    metadata = parquet.read_schema(path).metadata
+    assert {f"hilctl.{name}".encode(): text.encode() for name, text in FACTS.items()}.items() <= (
+        metadata.items()
+    )
+
+
+def test_a_small_parquet_is_what_pyarrow_writes(tmp_path):
+    """As one table with its metadata."""
+    import pyarrow as pa
+
+    metadata = {f"hilctl.{name}": text for name, text in FACTS.items()}
+    expected = io.BytesIO()
+    parquet.write_table(pa.table(WHOLE).replace_schema_metadata(metadata), expected)
+    path = written(ParquetFile, tmp_path / "x.parquet", PARTS)
+    assert path.read_bytes() == expected.getvalue()

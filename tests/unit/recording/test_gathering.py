@@ -1,0 +1,93 @@
+"""Pieces of a recording: together they are the whole, and each is of one shape."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hilctl.base.errors import DataError
+from hilctl.base.samples import COLUMNS
+from hilctl.recording import reader
+from hilctl.recording.data import TICK_COLUMNS
+from hilctl.recording.reader import Pieces, read
+from hilctl.recording.stretch import Stretch
+
+
+@pytest.fixture
+def recorded(tmp_path, make):
+    """A recording of many small chunks with gaps, and two events."""
+    path = tmp_path / "run.mcap"
+    batches = [make.batch(300 * i, 4, dropped=100 if i else 0, seed=i) for i in range(12)]
+    with path.open("wb") as stream:
+        make.write(stream, batches, events=[make.ended])
+    return path
+
+
+@pytest.mark.parametrize("size", [1, 700, 10**9])
+@pytest.mark.parametrize("stretch", [None, Stretch(0.011, 0.05)])
+def test_pieces_are_the_whole(monkeypatch, recorded, size, stretch):
+    """Samples, ticks, starts, events, end and segments, bit for bit."""
+    monkeypatch.setattr(reader, "PIECE_SAMPLES", size)
+    whole, pieces = read(recorded, stretch), list(Pieces(recorded, stretch))
+    assert len(pieces) >= 2 or size == 10**9
+    for name in ("index", *COLUMNS, "flags"):
+        joined = np.concatenate([getattr(piece.samples, name) for piece in pieces])
+        assert joined.tobytes() == getattr(whole.samples, name).tobytes()
+    for name in TICK_COLUMNS:
+        joined = np.concatenate([getattr(piece.ticks, name) for piece in pieces])
+        assert joined.tobytes() == getattr(whole.ticks, name).tobytes()
+    starts = [start for piece in pieces for start in piece.starts]
+    assert [(s.sample, s.state.tolist()) for s in starts] == [
+        (s.sample, s.state.tolist()) for s in whole.starts
+    ]
+    assert tuple(event for piece in pieces for event in piece.events) == whole.events
+    last = pieces[-1]
+    assert (last.end, last.dropped, last.segments) == (whole.end, whole.dropped, whole.segments)
+    assert not any(piece.end or piece.dropped for piece in pieces[:-1])
+
+
+def test_a_walk_can_be_repeated(recorded):
+    pieces = Pieces(recorded)
+    assert [p.samples.index.size for p in pieces] == [p.samples.index.size for p in pieces]
+
+
+def test_what_samples_are_can_not_be_said_behind_them(tmp_path, monkeypatch, make):
+    """Of a file that hilctl has not written; it was given out already by what stood before."""
+    path = tmp_path / "run.mcap"
+    with path.open("wb") as stream:
+        writer = make.write(stream, [make.batch(0, 4)], finish=False)
+        writer.flush()
+        writer._writer.add_metadata("hilctl.run", {"sample_rate_hz": "1.0"})
+        writer.finish({}, 0)
+    monkeypatch.setattr(reader, "PIECE_SAMPLES", 1)
+    with pytest.raises(DataError, match=r"hilctl\.run stands behind the first samples"):
+        list(Pieces(path))
+
+
+def test_a_column_in_some_blocks_only_is_refused(tmp_path, monkeypatch, make):
+    """Whoever takes pieces finds the same columns in each."""
+    path = tmp_path / "run.mcap"
+    with path.open("wb") as stream:
+        writer = make.write(stream, [make.batch(0, 4)], finish=False, measures=True)
+        layout = writer._maker._layout
+        writer._maker._layout = replace(layout, measures_command=False)
+        writer.batch(make.batch(200, 4))
+        writer.finish({}, 0)
+    monkeypatch.setattr(reader, "PIECE_SAMPLES", 1)
+    with pytest.raises(DataError, match="not in all blocks: measured"):
+        list(Pieces(path))
+    with pytest.raises(DataError, match="200 values of measured_a for 400 samples"):
+        read(path)
+
+
+def test_many_small_blocks_take_no_array_each(make):
+    """Views of messages are joined as they come."""
+    from hilctl.recording.gathering import _Table
+
+    table = _Table()
+    for number in range(2000):
+        table.add({"a": np.array([number])} | ({"b": np.array([number])} if number % 7 else {}))
+        assert len(table._loose.get("a", [])) < 512
+    assert table.column("a", np.int64).tolist() == list(range(2000))
+    assert table.column("b", np.int64).tolist() == [n for n in range(2000) if n % 7]
+    assert table.column("a", np.int64).size == 0
