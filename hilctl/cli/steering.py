@@ -54,7 +54,7 @@ def status(given: argparse.Namespace) -> int:
 
 
 def set_(given: argparse.Namespace) -> int:
-    """Move the reference of a run without a bump: gain * reference + offset."""
+    """Move a run without a bump: gain * reference + offset, and its inverse in or out."""
     chosen = find_run(given.run)
     answer = set_run(chosen, given.assignments, given.over)
     if given.json:
@@ -78,7 +78,10 @@ def stop(given: argparse.Namespace) -> int:
 
 def _set_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "assignments", nargs="+", metavar="KEY=VALUE", help="gain=NUMBER, offset=NUMBER."
+        "assignments",
+        nargs="+",
+        metavar="KEY=VALUE",
+        help="gain=NUMBER, offset=NUMBER, inverse=in|out.",
     )
     parser.add_argument(
         "--over", type=float, default=1.0, metavar="S", help="Time that the change takes, s."

@@ -89,24 +89,26 @@ def _refusal(run: RunFolder) -> str:
 
 
 def set_run(run: RunFolder, assignments: Sequence[str], over_s: float) -> dict[str, Any]:
-    """Move a running reference.
+    """Move a running reference, or take the inverse out and in.
 
     Args:
         run: The run.
-        assignments: ``gain=0.5``, ``offset=2.0``.
+        assignments: ``gain=0.5``, ``offset=2.0``, ``inverse=out``.
         over_s: Time that the change takes.
 
     Raises:
         InputError: No such parameter, or the run refuses it; nothing has changed.
         RunError: It does not answer.
     """
-    wanted: dict[str, float] = {}
+    wanted: dict[str, float | str] = {}
     for text in assignments:
         key, equals, value = text.partition("=")
-        if key not in {"gain", "offset"} or not equals:
-            raise InputError(f"must be gain=NUMBER or offset=NUMBER: {text!r}")
+        if key not in {"gain", "offset", "inverse"} or not equals:
+            raise InputError(f"must be gain=NUMBER, offset=NUMBER or inverse=in|out: {text!r}")
+        if key == "inverse" and value not in {"in", "out"}:
+            raise InputError(f"inverse must be in or out: {value!r}")
         try:
-            wanted[key] = float(value)
+            wanted[key] = value if key == "inverse" else float(value)
         except ValueError:
             raise InputError(f"{key} must be a number: {value!r}") from None
     return ask(run.socket, {"command": "set", **wanted, "over_s": over_s}, timeout_s=30.0)

@@ -23,17 +23,20 @@ class StatusRequest(Strict):
 
 
 class SetRequest(Strict):
-    """Move the reference's gain or offset over a ramp.
+    """Move the reference's gain or offset over a ramp, or fade the inverse out or in.
 
     Attributes:
         gain: Factor of the reference; left as it is where None.
         offset: Added to the reference, in the waveform's unit; left as it is where None.
+        inverse: ``out`` puts a straight line in the place of the inverse, ``in`` the inverse back;
+            left as it is where None.
         over_s: Time that the change takes.
     """
 
     command: Literal["set"]
     gain: float | None = None
     offset: float | None = None
+    inverse: Literal["in", "out"] | None = None
     over_s: Annotated[float, Field(gt=0.0, le=3600.0)] = 1.0
 
 
@@ -83,7 +86,7 @@ class Requests:
             raise InputError(f"{where}: {first['msg']}") from None
         if isinstance(request, StatusRequest):
             return self._status()
-        change = RequestedChange(request.gain, request.offset, request.over_s)
+        change = RequestedChange(request.gain, request.offset, request.over_s, request.inverse)
         self._changes.add(change)
         return change
 
@@ -101,6 +104,7 @@ class Requests:
             "late_ticks": page.get(Number.LATE_TICKS),
             "gain": self._changes.gain,
             "offset": self._changes.offset,
+            "inverse": self._changes.inverse,
             "recording_error": self._recorder.error,
             "heartbeat_age_s": (time.monotonic_ns() - page.get(Number.LOOP_HEARTBEAT_NS)) * 1e-9,
         }

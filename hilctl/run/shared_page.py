@@ -48,7 +48,7 @@ SIZE = _EVENTS_AT + _EVENT_SLOTS * _EVENT_BYTES
 
 
 class Field(IntEnum):
-    """Numbers of the page, int64 each; those named as gain or offset are float64."""
+    """Numbers of the page, int64 each; what a change leads to, but its samples, is float64."""
 
     MAGIC = 0
     SLOTS = 1
@@ -85,6 +85,9 @@ class Field(IntEnum):
     GUARDIAN_PHASE = 57
     TUNE_BEGINS_AT = 53
     TUNE_TAKEN_AT = 54
+    TUNE_INVERSE_SHARE = 58
+    TUNE_LINE_SLOPE = 59
+    TUNE_LINE_AT_ZERO = 60
 
 
 class Phase(IntEnum):

@@ -113,7 +113,7 @@ def test_set_sends_numbers(answers):
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("gain", "must be gain=NUMBER or offset=NUMBER: 'gain'"),
+        ("gain", "must be gain=NUMBER, offset=NUMBER or inverse=in.out: 'gain'"),
         ("rate=1", "must be gain=NUMBER"),
         ("gain=high", "gain must be a number: 'high'"),
     ],

@@ -69,7 +69,7 @@ def test_nobody_stops_a_run_by_its_socket(requests):
     [
         (b"{", "message: "),
         (b'{"command": "fly"}', "message: "),
-        (b'{"command": "set"}', "gain or offset is required"),
+        (b'{"command": "set"}', "gain, offset or inverse is required"),
         (b'{"command": "set", "gain": "1"}', "gain: "),
         (b'{"command": "set", "gain": 1.0, "over_s": 0.0}', "over_s: "),
         (b'{"command": "set", "gain": 1.0, "over_s": 1e9}', "over_s: "),
