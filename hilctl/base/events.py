@@ -22,6 +22,9 @@ the command's unit per um, and ``at_zero``, its command at a reference of 0 um.
 CHANGES = (TUNED, INVERSE)
 """Codes of the changes of a running reference or inverse: what is judged lies behind them."""
 
+MARK = "mark"
+"""Code of the event of a mark that somebody has set; its text is theirs."""
+
 OFFSET = "offset"
 """Code of the event of an offset between sensor and model that is taken out, at the waveform's
 first sample.

@@ -19,6 +19,7 @@ from hilctl.run.ring import SampleRing
 from hilctl.run.shared_page import Field
 
 _POLL_S = 0.02
+_MOST_WAITING = 64
 
 
 class RingRecorder:
@@ -61,6 +62,12 @@ class RingRecorder:
         """
         self._outcome, self._lost_loop = outcome, lost_loop
         self._ending.set()
+
+    @property
+    def takes_marks(self) -> bool:
+        """Whether a mark will be in the file; no crowd of them waits for a disk that stands."""
+        waiting = len(self._events) >= _MOST_WAITING
+        return not (waiting or self._ending.is_set() or self.recorder.error)
 
     @property
     def finished(self) -> bool:
