@@ -20,6 +20,8 @@ from hilctl.run.shared_page import Field
 
 _POLL_S = 0.02
 _MOST_WAITING = 64
+_KEPT = 8
+"""One part in so many of the ring stays for those who look on."""
 
 
 class RingRecorder:
@@ -95,7 +97,7 @@ class RingRecorder:
         if self.stalled_s() >= self._flush_s:
             # Room is given back only once the file has what stood there.
             if self.recorder.flush():
-                self._ring.release()
+                self._ring.release(keep=self._ring.slots // _KEPT)
             else:
                 self._ring.take_again()
             self._released_s = time.monotonic()

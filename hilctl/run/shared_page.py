@@ -58,6 +58,7 @@ class Field(IntEnum):
     SENT = 7
     HEAD = 8
     TAIL = 16
+    CLEANED = 17
     PHASE = 24
     GO = 25
     STOP = 26
@@ -260,6 +261,22 @@ class SharedPage:
         self._write(_EVENTS_AT + head % _EVENT_SLOTS * _EVENT_BYTES, _EVENT_BYTES, raw)
         # Last: an event that is counted is whole.
         self.put(Field.EVENT_HEAD, head + 1)
+
+    def look_at_events(self, since: int) -> tuple[list[Event], int]:
+        """Return the events from number ``since`` on that still stand there; takes nothing out.
+
+        Returns:
+            The events, and the number after the last of all.
+        """
+        head, found = self.get(Field.EVENT_HEAD), []
+        for number in range(max(since, head - _EVENT_SLOTS), head):
+            raw = self._read(_EVENTS_AT + number % _EVENT_SLOTS * _EVENT_BYTES, _EVENT_BYTES)
+            # Looked at again: the loop may have begun a new one in a slot that was released.
+            kept = self.get(Field.EVENT_TAIL) <= number
+            if kept or self.get(Field.EVENT_HEAD) < number + _EVENT_SLOTS:
+                with suppress(ValueError, TypeError):  # damaged: the recorder counts it
+                    found.append(Event(**json.loads(raw)))
+        return found, max(head, since)
 
     def pop_events(self) -> list[Event]:
         """Take the events that came since; they keep their room until they are released."""
