@@ -111,7 +111,9 @@ class RingRecorder:
         for event in page.pop_events():
             recorder.event(event)
         while self._events:
-            recorder.event(self._events.popleft())
+            event = self._events.popleft()
+            recorder.event(event)
+            page.leave_note(event)
 
     def _finish(self) -> None:
         outcome, page, recorder = self._outcome, self._ring.page, self.recorder
