@@ -8,6 +8,8 @@ commands.py    which commands there are, and where each one's function is
 options.py     options that they share; output.py  JSON, and what all of them say
 running.py     start and check runs; shown by run_view.py
 steering.py    status, set, mark and stop, in a tenth of a second; shown by status_view.py
+watching.py    a run in the terminal: watcher.py  keys and screens, watch_view.py  what is on them,
+               braille.py  curves, terminal.py  the terminal itself
 listing.py     recordings below a folder, found by what they say
 recordings.py  judge, replay, export and recover them, identify models;
                identify_view.py and report_view.py

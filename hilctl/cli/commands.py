@@ -56,6 +56,10 @@ COMMANDS: dict[str, CommandEntry] = {
     "stop": CommandEntry(
         "hilctl.cli.steering:stop", "End a run by its safe ramp, close, and record why."
     ),
+    "watch": CommandEntry(
+        "hilctl.cli.watching:watch",
+        "Show a run in the terminal as it goes on, with keys to stop and change it.",
+    ),
     "safe": CommandEntry(
         "hilctl.cli.running:safe",
         "Put a device at its safe value by hand, where no run holds it.",
