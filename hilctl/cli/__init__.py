@@ -8,6 +8,7 @@ commands.py    which commands there are, and where each one's function is
 options.py     options that they share; output.py  JSON, and what all of them say
 running.py     start and check runs; shown by run_view.py
 steering.py    status, set and stop, in a tenth of a second; shown by status_view.py
+live.py        the page of runs that are going on
 listing.py     recordings below a folder, found by what they say
 recordings.py  judge, replay, export and recover them, identify models;
                identify_view.py and report_view.py

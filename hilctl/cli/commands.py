@@ -53,6 +53,10 @@ COMMANDS: dict[str, CommandEntry] = {
     "stop": CommandEntry(
         "hilctl.cli.steering:stop", "End a run by its safe ramp, close, and record why."
     ),
+    "live": CommandEntry(
+        "hilctl.cli.live:live",
+        "Serve a page that shows runs as they go on, until Ctrl-C or the end of RUN.",
+    ),
     "safe": CommandEntry(
         "hilctl.cli.running:safe",
         "Put a device at its safe value by hand, where no run holds it.",
