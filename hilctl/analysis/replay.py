@@ -9,16 +9,21 @@ import numpy.typing as npt
 
 from hilctl.base.arrays import F64, U32
 from hilctl.base.errors import DataError, ModelError
+from hilctl.base.events import INVERSE
 from hilctl.base.samples import NO_WAVEFORM, Flag, Samples
 from hilctl.base.yaml.document import Document
 from hilctl.experiment.file import Experiment
 from hilctl.loop.compensator import Compensator
+from hilctl.loop.host import StraightLine
 from hilctl.loop.limiter import Limiter
+from hilctl.loop.tuning import fade, on_the_way
 from hilctl.models.base import HysteresisModel
 from hilctl.models.files import parse_model
 from hilctl.recording.data import Recording, ReplayStart
 
-_LIMIT_BITS = int(Flag.RANGE_LIMITED | Flag.SLEW_LIMITED | Flag.INVALID | NO_WAVEFORM)
+_LIMIT_BITS = int(
+    Flag.RANGE_LIMITED | Flag.SLEW_LIMITED | Flag.INVALID | Flag.INVERSE_OUT | NO_WAVEFORM
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,6 +96,7 @@ def replay(recording: Recording, model: HysteresisModel | None = None) -> Replay
     command = np.empty_like(samples.command)
     flags = np.zeros_like(samples.flags)
     known = np.zeros(samples.index.size, dtype=bool)
+    shares, line = _inverse_shares(recording)
     for start, rows in _stretches(recording):
         known[rows] = True
         limiter.last = start.previous_command
@@ -102,8 +108,34 @@ def replay(recording: Recording, model: HysteresisModel | None = None) -> Replay
         for part in _alike(samples.flags, rows):
             # Another model than the recorded one looks ahead by its own preview.
             inputs = compensator.ahead(samples.reference_um[part]) if model else recorded[part]
-            _recompute(samples, part, inputs, compensator, limiter, (wanted, command, flags))
+            faded = (shares[part], line)
+            _recompute(samples, part, inputs, compensator, limiter, faded, (wanted, command, flags))
     return _compare(recording, known, (wanted, command, flags))
+
+
+def _inverse_shares(recording: Recording) -> tuple[F64, StraightLine]:
+    """Return the inverse's share in each sample, float64[n], by its events; and what else is in it.
+
+    Raises:
+        DataError: The samples say otherwise: of a damaged file, an event is not there.
+    """
+    samples, line = recording.samples, StraightLine()
+    index, shares = samples.index, np.ones(samples.index.size)
+    before, after, begins, lasts = 1.0, 1.0, 0, 1
+    for event in (each for each in recording.events if each.code == INVERSE):
+        values = event.values
+        # Where it stands then: a change may begin before the one before it is through.
+        before = on_the_way(before, after, min(event.sample - begins, lasts) / lasts)
+        after, begins, lasts = values["share"], event.sample, int(values["samples"])
+        rows = slice(int(np.searchsorted(index, begins)), None)
+        shares[rows] = on_the_way(
+            before, after, np.minimum(index[rows] - begins + 1, lasts) / lasts
+        )
+        line = StraightLine(values["slope"], values["at_zero"])
+    out = (samples.flags & Flag.INVERSE_OUT.value) != 0
+    if not (out == ((shares < 1.0) & ((samples.flags & NO_WAVEFORM.value) == 0))).all():
+        raise DataError(f"{recording.path}: /events: when the inverse went out or in is not there")
+    return shares, line
 
 
 def _recorded_model(recording: Recording) -> HysteresisModel | None:
@@ -150,6 +182,7 @@ def _recompute(
     inputs: F64,
     compensator: Compensator,
     limiter: Limiter,
+    faded: tuple[F64, StraightLine],
     out: tuple[F64, F64, U32],
 ) -> None:
     wanted, command, flags = out[0][rows], out[1][rows], out[2][rows]
@@ -162,6 +195,7 @@ def _recompute(
         wanted[:] = samples.wanted[rows]  # what was fed here, as the input is to a compensator
     else:
         compensator.process(inputs, wanted)
+        fade(*faded, samples.reference_um[rows], wanted, flags)
     limiter.limit(wanted, command, flags)
 
 

@@ -10,7 +10,7 @@ from hilctl.analysis.figures import RunReport, SegmentReport
 from hilctl.analysis.steady import steady_part
 from hilctl.base import metrics
 from hilctl.base.arrays import F64
-from hilctl.base.events import ADAPTED
+from hilctl.base.events import ADAPTED, MARK
 from hilctl.base.samples import NO_WAVEFORM, Flag
 from hilctl.base.segments import Segment
 from hilctl.recording.data import Recording
@@ -40,6 +40,11 @@ def summarize(recording: Recording) -> RunReport:
         **_worst(segments),
         **_timing(recording),
         adapted=_adapted(recording),
+        marks=tuple(
+            (event.sample / recording.sample_rate_hz, event.text)
+            for event in recording.events
+            if event.code == MARK
+        ),
         segments=segments,
     )
 

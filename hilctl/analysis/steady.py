@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hilctl.base.arrays import F64
-from hilctl.base.events import TUNED
+from hilctl.base.events import CHANGES
 from hilctl.base.metrics import Fold, fold
 from hilctl.base.samples import NO_WAVEFORM, Flag, Samples
 from hilctl.base.segments import Segment
@@ -61,13 +61,13 @@ def steady_samples(recording: Recording, segment: Segment) -> tuple[Samples, int
 
 
 def _tuned_until(recording: Recording, segment: Segment) -> int:
-    """Return the index after the last change of the reference that reaches a segment; 0 if none.
+    """Return the index after the last change that reaches a segment; 0 if there is none.
 
     A change ends the one before it, wherever that stands.
     """
     until = 0
     for event in recording.events:
-        if event.code == TUNED and event.sample < segment.steady_stop:
+        if event.code in CHANGES and event.sample < segment.steady_stop:
             # Where a recording does not say how long it took, nothing behind it is judged.
             until = event.sample + int(event.values.get("samples", segment.steady_stop))
     return until

@@ -48,7 +48,10 @@ COMMANDS: dict[str, CommandEntry] = {
     ),
     "set": CommandEntry(
         "hilctl.cli.steering:set_",
-        "Move the reference of a run without a bump: gain * reference + offset.",
+        "Move a run's reference without a bump, or take its inverse out and in.",
+    ),
+    "mark": CommandEntry(
+        "hilctl.cli.steering:mark", "Set a mark in a run's recording, at the present sample."
     ),
     "stop": CommandEntry(
         "hilctl.cli.steering:stop", "End a run by its safe ramp, close, and record why."

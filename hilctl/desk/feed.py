@@ -76,7 +76,7 @@ class RunFeed:
         self.ended = False
         self._disk: DiskRoom | None = None
         self._next_block, self._next_event = max(0, self._page.get(Field.HEAD) - 1), 0
-        self._next_sample = -1
+        self._next_sample, self._next_note = -1, 0
         self._looked_s = -math.inf
 
     @property
@@ -103,7 +103,8 @@ class RunFeed:
         self._begin()
         batch, self._next_block = self._ring.look(self._next_block)
         events, self._next_event = self._page.look_at_events(self._next_event)
-        self.events = (self.events + events)[-_EVENTS:]
+        notes, self._next_note = self._page.look_at_notes(self._next_note)
+        self.events = (self.events + events + notes)[-_EVENTS:]
         if not batch.heads.shape[0]:
             return False
         self._lateness.add(batch)
@@ -143,6 +144,14 @@ class RunFeed:
         """Running figures of quality by name with unit; empty before the first whole cycle."""
         return self._figures.newest
 
+    @property
+    def inverse(self) -> str | None:
+        """Where the last change leads the inverse, ``in`` or ``out``; None without one."""
+        if not self.description.compensator:
+            return None
+        changed = self._page.get(Field.TUNE_WANTED)
+        return "out" if changed and not self._page.get_float(Field.TUNE_INVERSE_SHARE) else "in"
+
     def status(self) -> dict[str, Any]:
         """Return all that is not a trace, as plain values for JSON."""
         page, rate_hz = self._page, self.description.sample_rate_hz
@@ -161,6 +170,7 @@ class RunFeed:
             "figures": self.figures,
             "gain": page.get_float(Field.TUNE_GAIN) if page.get(Field.TUNE_WANTED) else 1.0,
             "offset": page.get_float(Field.TUNE_OFFSET) if page.get(Field.TUNE_WANTED) else 0.0,
+            "inverse": self.inverse,
             "missed_samples": self.missed,
             "late_ticks": page.get(Field.LATE_TICKS),
             "lateness_us": late,

@@ -19,6 +19,7 @@ from hilctl.run.ring import SampleRing
 from hilctl.run.shared_page import Field
 
 _POLL_S = 0.02
+_MOST_WAITING = 64
 _KEPT = 8
 """One part in so many of the ring stays for those who look on."""
 
@@ -65,6 +66,12 @@ class RingRecorder:
         self._ending.set()
 
     @property
+    def takes_marks(self) -> bool:
+        """Whether a mark will be in the file; no crowd of them waits for a disk that stands."""
+        waiting = len(self._events) >= _MOST_WAITING
+        return not (waiting or self._ending.is_set() or self.recorder.error)
+
+    @property
     def finished(self) -> bool:
         """Whether the recording is closed."""
         return not self._thread.is_alive()
@@ -104,7 +111,9 @@ class RingRecorder:
         for event in page.pop_events():
             recorder.event(event)
         while self._events:
-            recorder.event(self._events.popleft())
+            event = self._events.popleft()
+            recorder.event(event)
+            page.leave_note(event)
 
     def _finish(self) -> None:
         outcome, page, recorder = self._outcome, self._ring.page, self.recorder

@@ -8,6 +8,7 @@ import pytest
 
 from hilctl.analysis.replay import replay
 from hilctl.base.errors import DataError
+from hilctl.base.samples import Flag
 from hilctl.models.files import load_model
 from hilctl.recording.reader import read
 from hilctl.recording.recover import recover_recording
@@ -87,3 +88,11 @@ def test_no_sample_is_replayed_twice():
     )
     found = replay(replace(recording, starts=(start, *starts)))
     assert (found.identical, found.samples) == (True, recording.samples.index.size)
+
+
+def test_samples_without_the_inverse_need_the_event_that_says_so():
+    """Of a damaged file it may be gone: that is no difference of commands, and is said."""
+    recording = read(GOLDEN / "terfenol_compensated.mcap")
+    recording.samples.flags[500:600] |= np.uint32(Flag.INVERSE_OUT)
+    with pytest.raises(DataError, match="/events: when the inverse went out or in is not there"):
+        replay(recording)

@@ -84,9 +84,13 @@ def test_events_come_once_and_in_order(run):
     feed = RunFeed(folder)
     for number in range(40):
         ring.page.push_event(Event(number, "info", f"e{number}", ""))
+    ring.page.leave_note(Event(50, "info", "mark", "tapped"))
     feed.poll(1.0)
     feed.poll(1.1)
-    assert [event.code for event in feed.events] == [f"e{number}" for number in range(32)]
+    assert [event.code for event in feed.events] == [
+        *(f"e{number}" for number in range(32)),
+        "mark",
+    ]
 
 
 def test_status_is_json_and_says_where_the_run_stands(run):
@@ -122,3 +126,15 @@ def test_the_end_of_a_run_is_noticed_and_what_was_seen_stays(description, tmp_pa
 def test_a_run_that_can_not_be_looked_at_is_said(tmp_path):
     with run_folder("demo", tmp_path / "a.mcap", 12.0) as (folder, _), pytest.raises(RunError):
         RunFeed(folder)
+
+
+def test_where_the_inverse_is_led_is_said(run):
+    folder, ring = run
+    feed = RunFeed(folder)
+    assert feed.inverse == "in"
+    ring.page.put(Field.TUNE_WANTED, 1)
+    assert feed.status()["inverse"] == "out"
+    ring.page.put_float(Field.TUNE_INVERSE_SHARE, 1.0)
+    assert feed.inverse == "in"
+    feed.description = feed.description.model_copy(update={"compensator": ""})
+    assert feed.inverse is None

@@ -141,3 +141,19 @@ def test_nobody_waits_for_a_disk_that_stands_still(ring, recording, monkeypatch)
     recording.recorder.disk.set()
     recording._thread.join(30.0)
     assert recording.recorder.finished == ("waveform completed", 8)
+
+
+def test_marks_are_taken_as_long_as_they_will_be_in_the_file(recording):
+    """Not of a run that is over, on a disk that fails, or where too many wait for it."""
+    recording.recorder.error = ""
+    assert recording.takes_marks
+    for _ in range(64):
+        recording.record_event(Event(0, "info", "mark", "tapped"))
+    assert not recording.takes_marks
+    recording._drain()
+    assert recording.takes_marks
+    recording.recorder.error = "no room"
+    assert not recording.takes_marks
+    recording.recorder.error = ""
+    recording.end(ENDED, lost_loop=False)
+    assert not recording.takes_marks
