@@ -10,6 +10,7 @@ running.py     start and check runs; shown by run_view.py
 steering.py    status, set, mark and stop, in a tenth of a second; shown by status_view.py
 watching.py    a run in the terminal: watcher.py  keys and screens, watch_view.py  what is on them,
                braille.py  curves, terminal.py  the terminal itself
+live.py        the page of runs that are going on
 listing.py     recordings below a folder, found by what they say
 recordings.py  judge, replay, export and recover them, identify models;
                identify_view.py and report_view.py

@@ -60,6 +60,10 @@ COMMANDS: dict[str, CommandEntry] = {
         "hilctl.cli.watching:watch",
         "Show a run in the terminal as it goes on, with keys to stop and change it.",
     ),
+    "live": CommandEntry(
+        "hilctl.cli.live:live",
+        "Serve a page that shows runs as they go on, until Ctrl-C or the end of RUN.",
+    ),
     "safe": CommandEntry(
         "hilctl.cli.running:safe",
         "Put a device at its safe value by hand, where no run holds it.",
