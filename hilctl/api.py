@@ -10,12 +10,17 @@
 It speaks the protocol of ``docs/protocol.md`` and imports nothing heavy until it is needed.
 """
 
-from typing import Any
+import time
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
 
 from hilctl.base.errors import RunError
 from hilctl.run.client import find_run, mark_run, set_run, status_of, stop_runs
 from hilctl.run.protocol import InverseState
 from hilctl.run.run_folder import RunFolder
+
+if TYPE_CHECKING:
+    from hilctl.desk.subscription import RunFrame
 
 
 def connect(run: str | None = None) -> "RunConnection":
@@ -89,6 +94,24 @@ class RunConnection:
             RunError: The run does not answer.
         """
         return mark_run(self._folder, text)
+
+    def frames(self, every_s: float = 0.1, window_s: float = 0.5) -> Iterator["RunFrame"]:
+        """Subscribe to the run: give frames of its signals, figures and events until it is over.
+
+        It reads the run's shared memory, writes nothing there, and costs the run nothing. A caller
+        that is slow gets fewer frames; no spike is lost in those it gets.
+
+        Args:
+            every_s: Time from one frame to the next.
+            window_s: Time that each frame shows.
+
+        Raises:
+            RunError: The run has ended.
+        """
+        from hilctl.desk.feed import RunFeed
+        from hilctl.desk.subscription import frames_of
+
+        return frames_of(RunFeed(self._folder), every_s, window_s, time.monotonic, time.sleep)
 
     def stop(self, wait_s: float = 60.0) -> None:
         """End it by its safe ramp, and wait until its recording is closed.

@@ -113,10 +113,9 @@ class Watcher:
         self._screen.show(screen(self._feed, self._mode, typed or self._message))
 
     def _say(self) -> None:
-        events, rate_hz = self._feed.events, self._feed.description.sample_rate_hz
-        for event in events[self._seen :]:
-            self._screen.say(event_line(event, rate_hz))
-        self._seen = len(events)
+        events, self._seen = self._feed.events_since(self._seen)
+        for event in events:
+            self._screen.say(event_line(event, self._feed.description.sample_rate_hz))
         if self._clock() - self._said_s >= _LINE_S:
             self._said_s = self._clock()
             self._screen.say(line(self._feed))

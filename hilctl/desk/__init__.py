@@ -8,7 +8,8 @@ envelope.py   lowest and highest of each signal in buckets of samples: no spike 
 scope.py      windows over time, rolling or triggered to the waveform's cycle, and its loops
 figures.py    running figures of quality; spectrum.py  of the error
 lateness.py   how late the ticks woke; headroom.py  what is left to each limit
-feed.py       all of it from one run's folder; frames.py  as bytes for a page
+feed.py       all of it from one run's folder; frames.py  as bytes for a page, subscription.py
+              for programs
 server.py     the page and its connections, on loopback; static.py  its files, those of page/
 admission.py  who is let in; viewer.py  one page: what it asks for, and how much it gets
 live.py       the server as a process

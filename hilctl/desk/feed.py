@@ -72,6 +72,7 @@ class RunFeed:
         self.spectrum = ErrorSpectrum(self.description.sample_rate_hz)
         self._lateness, self._headroom = LatenessCounts(), Headroom(self.description)
         self.events: list[Event] = []
+        self._events_seen = 0
         self.missed = 0
         self.ended = False
         self._disk: DiskRoom | None = None
@@ -105,6 +106,7 @@ class RunFeed:
         events, self._next_event = self._page.look_at_events(self._next_event)
         notes, self._next_note = self._page.look_at_notes(self._next_note)
         self.events = (self.events + events + notes)[-_EVENTS:]
+        self._events_seen += len(events) + len(notes)
         if not batch.heads.shape[0]:
             return False
         self._lateness.add(batch)
@@ -126,6 +128,11 @@ class RunFeed:
         self._figures.add(traces, self.scope.segment)
         self.spectrum.add(traces)
         self._headroom.add(traces)
+
+    def events_since(self, seen: int) -> tuple[list[Event], int]:
+        """Return the events after the first ``seen`` of all that are kept, and how many there were."""
+        new = min(self._events_seen - seen, len(self.events))
+        return self.events[len(self.events) - new :], self._events_seen
 
     @property
     def state(self) -> str:

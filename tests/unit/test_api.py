@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+import time
 from types import SimpleNamespace
 
 import pytest
@@ -42,3 +43,12 @@ def test_it_imports_nothing_heavy():
     code = f"import sys, hilctl.api; print([m for m in {HEAVY!r} if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+def test_frames_are_those_of_the_run(run, monkeypatch):
+    """Subscribed with what is asked for, on this machine's time."""
+    monkeypatch.setattr("hilctl.desk.feed.RunFeed", lambda folder: folder.card.name)
+    monkeypatch.setattr("hilctl.desk.subscription.frames_of", lambda *given: iter([given]))
+    ((feed, every_s, window_s, clock, sleep),) = run.frames(0.2, 2.0)
+    assert (feed, every_s, window_s) == ("sine-7", 0.2, 2.0)
+    assert (clock, sleep) == (time.monotonic, time.sleep)

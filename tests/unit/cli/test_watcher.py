@@ -59,7 +59,7 @@ def sent(monkeypatch):
 
 def feed_of(inverse="in", gain=1.0, ends_after=10**9):
     left = iter(range(ends_after))
-    made = SimpleNamespace(folder="folder", inverse=inverse, events=[], ended=False)
+    made = SimpleNamespace(folder="folder", inverse=inverse, ended=False)
     made.description = SimpleNamespace(sample_rate_hz=1000.0)
     made.status = lambda: {"gain": gain}
 
@@ -151,7 +151,8 @@ def test_it_ends_with_the_run_and_unknown_keys_do_nothing(sent):
 def test_without_a_terminal_there_are_lines(sent):
     """One a second, and each event once."""
     feed = feed_of(ends_after=30)
-    feed.events = [Event(500, "info", "mark", "tapped")]
+    event = Event(500, "info", "mark", "tapped")
+    feed.events_since = lambda seen: ([event][seen:], 1)
     shown = watched([""] * 30, feed, interactive=False)
     assert shown.shown == []
     assert shown.said[0] == "0.500 s  mark: tapped"

@@ -138,3 +138,17 @@ def test_where_the_inverse_is_led_is_said(run):
     assert feed.inverse == "in"
     feed.description = feed.description.model_copy(update={"compensator": ""})
     assert feed.inverse is None
+
+
+def test_events_since_those_that_were_seen(run):
+    """Each once, however many there have been; the oldest are not kept."""
+    folder, ring = run
+    feed, seen = RunFeed(folder), 0
+    for number in range(100):
+        ring.page.leave_note(Event(number, "info", "mark", ""))
+        feed.poll(float(number))
+        events, seen = feed.events_since(seen)
+        assert [event.sample for event in events] == [number]
+    assert seen == 100
+    assert [event.sample for event in feed.events_since(10)[0]] == list(range(40, 100))
+    assert feed.events_since(100) == ([], 100)
