@@ -3,6 +3,8 @@
 The rooms, top to bottom; each sees those below it:
 
 cli          commands, messages and tables; the only room that prints
+api.py       a run from a program of one's own
+desk         who looks on: the live page of a run, and its server
 campaign     many runs of one experiment, kept and resumed
 characterise from a wired device to its model: a campaign of runs
 learning     corrections from run to run

@@ -108,6 +108,7 @@ class RunReport(Figures):
         lateness_by_minute: The same of each minute, with ``minute`` from 0 and its ``ticks``.
         adapted: What adaptation made of the model by the end, by name, see
             :data:`hilctl.base.events.ADAPTED`; empty without it.
+        marks: Time since the start of the run, in s, and text of each mark.
         exchange_us: The same of how long exchanges with the device took.
         segments: Figures of each segment.
     """
@@ -141,6 +142,7 @@ class RunReport(Figures):
     lateness_by_minute: list[dict[str, float]]
     exchange_us: dict[str, float]
     adapted: dict[str, float]
+    marks: tuple[tuple[float, str], ...]
     segments: tuple[SegmentReport, ...]
 
     def to_mapping(self) -> dict[str, Any]:

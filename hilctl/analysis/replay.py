@@ -1,8 +1,9 @@
 """Recompute a recording's commands from the compensator's input, by the code that made them."""
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
@@ -11,16 +12,21 @@ import numpy.typing as npt
 
 from hilctl.base.arrays import F64, U32
 from hilctl.base.errors import DataError, ModelError
+from hilctl.base.events import INVERSE, Event
 from hilctl.base.samples import NO_WAVEFORM, Flag, Samples
 from hilctl.base.yaml.document import Document
 from hilctl.experiment.file import Experiment
 from hilctl.loop.compensator import Compensator
+from hilctl.loop.host import StraightLine
 from hilctl.loop.limiter import Limiter
+from hilctl.loop.tuning import fade, on_the_way
 from hilctl.models.base import HysteresisModel
 from hilctl.models.files import parse_model
 from hilctl.recording.data import Recording, ReplayStart
 
-_LIMIT_BITS = int(Flag.RANGE_LIMITED | Flag.SLEW_LIMITED | Flag.INVALID | NO_WAVEFORM)
+_LIMIT_BITS = int(
+    Flag.RANGE_LIMITED | Flag.SLEW_LIMITED | Flag.INVALID | Flag.INVERSE_OUT | NO_WAVEFORM
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,6 +73,8 @@ def replay(
     Args:
         recording: What was recorded, or its pieces in order
             (:class:`hilctl.recording.reader.Pieces`): then memory does not grow with its length.
+            They are walked over twice where the inverse went out: what says so may stand behind
+            its samples.
         model: Another model to invert instead of the recorded one; it starts from rest, its
             input is the reference ahead by its own preview, and the limits stay as recorded.
 
@@ -79,7 +87,7 @@ def replay(
     pieces = [recording] if isinstance(recording, Recording) else recording
     running: _Running | None = None
     for piece in pieces:
-        running = running or _Running(piece, model)
+        running = running or _Running(piece, model, partial(_fades, pieces))
         running.add(piece)
     if running is None:
         raise DataError("there is no recording to replay")
@@ -92,10 +100,18 @@ class _Running:
     Args:
         first: The first piece; what the run was stands in each.
         model: Another model than the recorded one.
+        fades: Returns the events of the inverse going out and in, of all pieces.
     """
 
-    def __init__(self, first: Recording, model: HysteresisModel | None) -> None:
+    def __init__(
+        self,
+        first: Recording,
+        model: HysteresisModel | None,
+        fades: Callable[[], Sequence[Event]],
+    ) -> None:
         self._path = first.path
+        self._find_fades = fades
+        self._fades: Sequence[Event] | None = None
         if model is not None and not first.compensated:
             raise DataError(f"{first.path}: had no compensator: there is no reference to replay")
         self._recorded = first.compensated
@@ -108,6 +124,7 @@ class _Running:
         self._any_start = False
         self._known = self._unbegun = False
         self._before: tuple[int, int] | None = None
+        self._faded: tuple[F64, StraightLine] | None = None
         self._comparison = _Comparison(first.command_unit)
 
     def add(self, piece: Recording) -> None:
@@ -116,6 +133,8 @@ class _Running:
         if samples.index.size and not np.isfinite(samples.command).all():
             # The limiter puts out no other.
             raise DataError(f"{self._path}: /samples: every command must be finite")
+        if self._fades is None and (any(map(_is_fade, piece.events)) or _out(samples).any()):
+            self._fades = self._find_fades()
         self._any_start = self._any_start or bool(piece.starts)
         self._starts += piece.starts
         if self._waiting is not None:
@@ -142,6 +161,7 @@ class _Running:
             return
         out = np.empty(ready), np.empty(ready), np.zeros(ready, dtype=np.uint32)
         known = np.zeros(ready, dtype=bool)
+        self._faded = self._inverse_shares(samples.rows(slice(None, ready)))
         for rows, start in self._stretches(samples, ready):
             if start is not None:
                 self._begin(start, first=rows.start == 0 and self._before is None)
@@ -204,7 +224,36 @@ class _Running:
             wanted[:] = samples.wanted[rows]  # what was fed here, as the input is to a compensator
         else:
             self._compensator.process(self._inputs(samples, part, end)[: wanted.size], wanted)
+            if self._faded is not None:
+                shares, line = self._faded
+                fade(shares[rows], line, samples.reference_um[rows], wanted, flags)
         self._limiter.limit(wanted, command, flags)
+
+    def _inverse_shares(self, samples: Samples) -> tuple[F64, StraightLine] | None:
+        """Return the inverse's share in each sample, float64[n], and what else is in it.
+
+        None where it never went out.
+
+        Raises:
+            DataError: The samples say otherwise: of a damaged file, an event is not there.
+        """
+        if self._fades is None:
+            return None
+        line, index, shares = StraightLine(), samples.index, np.ones(samples.index.size)
+        before, after, begins, lasts = 1.0, 1.0, 0, 1
+        for event in self._fades:
+            values = event.values
+            # Where it stands then: a change may begin before the one before it is through.
+            before = on_the_way(before, after, min(event.sample - begins, lasts) / lasts)
+            after, begins, lasts = values["share"], event.sample, int(values["samples"])
+            rows = slice(int(np.searchsorted(index, begins)), None)
+            part = np.minimum(index[rows] - begins + 1, lasts) / lasts
+            shares[rows] = on_the_way(before, after, part)
+            line = StraightLine(values["slope"], values["at_zero"])
+        waveform = (samples.flags & NO_WAVEFORM.value) == 0
+        if not (_out(samples) == ((shares < 1.0) & waveform)).all():
+            raise DataError(f"{self._path}: /events: when the inverse went out or in is not there")
+        return shares, line
 
     def _inputs(self, samples: Samples, part: slice, end: int) -> F64:
         """Return what the compensator is fed on rows of the waveform."""
@@ -231,6 +280,20 @@ class _Running:
         if before is None or not flags & before[1] & Flag.RAMP.value:
             return 0
         return int(samples.index[row]) - before[0] - 1 if flags & Flag.AFTER_SKIPPED.value else 0
+
+
+def _fades(pieces: Iterable[Recording]) -> tuple[Event, ...]:
+    return tuple(event for piece in pieces for event in piece.events if _is_fade(event))
+
+
+def _is_fade(event: Event) -> bool:
+    return event.code == INVERSE
+
+
+def _out(samples: Samples) -> npt.NDArray[np.bool_]:
+    """Return in which samples the inverse is not alone."""
+    out: npt.NDArray[np.bool_] = (samples.flags & Flag.INVERSE_OUT.value) != 0
+    return out
 
 
 def _parts_of(first: Recording, model: HysteresisModel | None) -> tuple[Compensator, Limiter]:

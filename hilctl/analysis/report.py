@@ -12,7 +12,7 @@ from hilctl.analysis.segment_figures import SegmentGathering
 from hilctl.analysis.steady import judged, waveform_end
 from hilctl.base.arrays import F64
 from hilctl.base.errors import DataError
-from hilctl.base.events import ADAPTED, TUNED, Event
+from hilctl.base.events import ADAPTED, CHANGES, MARK, Event
 from hilctl.base.samples import LAST_SAMPLE, NO_WAVEFORM, Flag, Samples
 from hilctl.base.segments import Segment
 from hilctl.recording.data import Recording
@@ -85,6 +85,10 @@ def judge(recording: Recording, segment: Segment) -> SegmentReport:
     return gathering.report()
 
 
+_KEPT = {*CHANGES, ADAPTED, MARK}
+"""Codes of events that figures go by, or that are shown among them."""
+
+
 class _RunGathering:
     """Gathers the figures of a run, piece by piece."""
 
@@ -104,7 +108,7 @@ class _RunGathering:
         """Take the next piece."""
         self._last = piece
         self._ticks.add(piece.ticks)
-        self._events += [event for event in piece.events if event.code in {TUNED, ADAPTED}]
+        self._events += [event for event in piece.events if event.code in _KEPT]
         if piece.samples.index.size:
             self._count(piece.samples)
             for segment in self._segments:
@@ -137,6 +141,11 @@ class _RunGathering:
             **_worst(segments),
             **self._timing(),
             adapted=self._adapted(),
+            marks=tuple(
+                (event.sample / self._last.sample_rate_hz, event.text)
+                for event in self._events
+                if event.code == MARK
+            ),
             segments=segments,
         )
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hilctl.base.arrays import F64
-from hilctl.base.events import TUNED, Event
+from hilctl.base.events import CHANGES, Event
 from hilctl.base.metrics import Fold, fold
 from hilctl.base.samples import NO_WAVEFORM, Flag, Samples
 from hilctl.base.segments import Segment
@@ -84,7 +84,7 @@ def _tuned_until(events: Iterable[Event], segment: Segment) -> int:
     """
     until = 0
     for event in events:
-        if event.code == TUNED and event.sample < segment.steady_stop:
+        if event.code in CHANGES and event.sample < segment.steady_stop:
             # Where a recording does not say how long it took, nothing behind it is judged.
             until = event.sample + int(event.values.get("samples", segment.steady_stop))
     return until

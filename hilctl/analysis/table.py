@@ -52,6 +52,7 @@ def run_rows(report: RunReport) -> list[tuple[str, str]]:
         ("ticks", f"{_count(report.late_ticks)} late, {_count(report.skipped_ticks)} skipped"),
         *([("timing", report.deadline_misses)] if report.deadline_misses else []),
         *([("adapted", adapted_text(report.adapted))] if report.adapted else []),
+        *(("mark", f"{at_s:.6g} s: {printable(text)}") for at_s, text in report.marks),
         ("lateness", _percentiles(report.lateness_us)),
         ("exchange", _percentiles(report.exchange_us)),
     ]

@@ -11,6 +11,20 @@ TUNED = "tuned"
 Its values are ``gain``, ``offset`` and ``samples``, the number of samples that the change takes.
 """
 
+INVERSE = "inverse"
+"""Code of the event of the inverse being faded out or in, at the first sample that it moves.
+
+Its values are ``share``, the part of the inverse in the command that it leads to, ``samples``, the
+number of samples that it takes, and the straight line in the place of the inverse: ``slope``, in
+the command's unit per um, and ``at_zero``, its command at a reference of 0 um.
+"""
+
+CHANGES = (TUNED, INVERSE)
+"""Codes of the changes of a running reference or inverse: what is judged lies behind them."""
+
+MARK = "mark"
+"""Code of the event of a mark that somebody has set; its text is theirs."""
+
 OFFSET = "offset"
 """Code of the event of an offset between sensor and model that is taken out, at the waveform's
 first sample.

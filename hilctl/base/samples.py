@@ -270,6 +270,8 @@ class Flag(IntFlag):
     """Of the conditioning before the waveform, which has no reference: its cycle, and the rest."""
     AFTER_SKIPPED = 1 << 16
     """In the first block after skipped ticks: the output had been held, and has to catch up."""
+    INVERSE_OUT = 1 << 18
+    """The command was, in part or whole, that of a straight line in the place of the inverse."""
 
 
 NO_WAVEFORM = Flag.RAMP | Flag.CONDITION

@@ -7,7 +7,10 @@ application.py  what all commands hang on
 commands.py    which commands there are, and where each one's function is
 options.py     options that they share; output.py  JSON, and what all of them say
 running.py     start and check runs; shown by run_view.py
-steering.py    status, set and stop, in a tenth of a second; shown by status_view.py
+steering.py    status, set, mark and stop, in a tenth of a second; shown by status_view.py
+watching.py    a run in the terminal: watcher.py  keys and screens, watch_view.py  what is on them,
+               braille.py  curves, terminal.py  the terminal itself
+live.py        the page of runs that are going on
 listing.py     recordings below a folder, found by what they say
 recordings.py  judge, replay, export and recover them, identify models;
                identify_view.py and report_view.py
@@ -37,7 +40,7 @@ from hilctl.base.errors import ConfigError, HilctlError, InputError, RunError
 from hilctl.cli.output import print_json
 from hilctl.cli.streams import plain_streams
 
-STEERING = ("status", "set", "stop")
+STEERING = ("status", "set", "mark", "stop")
 """Commands about runs that are going on."""
 QUICK = (*STEERING, "list")
 """Commands that nobody wants to wait for: they go past the application, which takes longer to

@@ -48,10 +48,21 @@ COMMANDS: dict[str, CommandEntry] = {
     ),
     "set": CommandEntry(
         "hilctl.cli.steering:set_",
-        "Move the reference of a run without a bump: gain * reference + offset.",
+        "Move a run's reference without a bump, or take its inverse out and in.",
+    ),
+    "mark": CommandEntry(
+        "hilctl.cli.steering:mark", "Set a mark in a run's recording, at the present sample."
     ),
     "stop": CommandEntry(
         "hilctl.cli.steering:stop", "End a run by its safe ramp, close, and record why."
+    ),
+    "watch": CommandEntry(
+        "hilctl.cli.watching:watch",
+        "Show a run in the terminal as it goes on, with keys to stop and change it.",
+    ),
+    "live": CommandEntry(
+        "hilctl.cli.live:live",
+        "Serve a page that shows runs as they go on, until Ctrl-C or the end of RUN.",
     ),
     "safe": CommandEntry(
         "hilctl.cli.running:safe",

@@ -2,12 +2,14 @@
 
 import signal
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from hilctl.base.errors import HilctlError
+from hilctl.base.errors import HilctlError, InputError
 from hilctl.cli.options import AsJson, ExperimentFile, LabelTexts, Overwrite, Settings, with_labels
 from hilctl.cli.output import finish_orphans, print_json
 
@@ -21,6 +23,12 @@ def run(
     detach: Annotated[
         bool, typer.Option("--detach", help="Run in the background; see status, set and stop.")
     ] = False,
+    watch: Annotated[
+        bool, typer.Option("--watch", help="Show the run in the terminal, with keys to change it.")
+    ] = False,
+    live: Annotated[
+        bool, typer.Option("--live", help="Serve a page that shows the run as it goes on.")
+    ] = False,
     require_rt: Annotated[
         bool, typer.Option("--require-rt", help="Refuse without SCHED_FIFO and locked memory.")
     ] = False,
@@ -30,6 +38,10 @@ def run(
     settings = with_labels(settings, labels)
     if require_rt:
         settings.append("realtime.require=true")
+    if watch and (detach or as_json):
+        raise InputError("--watch: not with --detach, which hilctl watch looks at, nor with --json")
+    if detach and live:
+        raise InputError("--detach and --live: start it by --detach, and look at it by hilctl live")
     if detach:
         _detach(experiment, output, settings, overwrite=overwrite, as_json=as_json)
         return
@@ -37,7 +49,8 @@ def run(
     from hilctl.run.start import start_run
 
     finish_orphans()
-    with LiveView(quiet=as_json) as view:
+    quiet = as_json or watch
+    with _served(wanted=live), _watched(wanted=watch), LiveView(quiet=quiet) as view:
         result = start_run(experiment, settings, output, overwrite, view.update)
         if result.stop_signal:  # impatience must not cost the result of a run that has ended
             signal.signal(result.stop_signal, signal.SIG_IGN)
@@ -55,6 +68,29 @@ def run(
         raise typer.Exit(3)
     if result.stop_signal:
         raise typer.Exit(128 + result.stop_signal)
+
+
+@contextmanager
+def _watched(*, wanted: bool) -> Iterator[None]:
+    if not wanted:
+        yield
+        return
+    from hilctl.cli.watching import watched_beside
+
+    with watched_beside():
+        yield
+
+
+@contextmanager
+def _served(*, wanted: bool) -> Iterator[None]:
+    if not wanted:
+        yield
+        return
+    from hilctl.desk.live import served_beside
+
+    with served_beside() as url:
+        print(f"live page: {url}", file=sys.stderr)
+        yield
 
 
 def _detach(

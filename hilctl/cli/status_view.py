@@ -28,6 +28,8 @@ def _status_lines(run: dict[str, Any]) -> dict[str, str]:
         )
         lines["late ticks"] = f"{run['late_ticks']:,}"
         lines["reference"] = f"gain {run['gain']:g}, offset {run['offset']:g}"
+        if inverse := run["inverse"]:
+            lines["inverse"] = inverse
     lines["recording"] = run["recording"]
     if trouble := run.get("recording_error") or run.get("error"):
         lines["trouble"] = trouble
@@ -36,7 +38,9 @@ def _status_lines(run: dict[str, Any]) -> dict[str, str]:
 
 def print_change(name: str, answer: dict[str, Any]) -> None:
     """Print what a change of the reference comes to, and how far it was worked out before."""
-    values = f"gain {answer['gain']:g}, offset {answer['offset']:g}, over {answer['over_s']:g} s"
+    inverse = f", inverse {answer['inverse']}" if answer["inverse"] else ""
+    values = f"gain {answer['gain']:g}, offset {answer['offset']:g}{inverse}"
+    values += f", over {answer['over_s']:g} s"
     checked = f"every command of the next {answer['checked_s']:.3g} s is within the limits"
     if answer["checked_to_the_end"]:
         checked += ", to the end of the run"

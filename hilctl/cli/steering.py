@@ -1,4 +1,4 @@
-"""Commands about runs that are going on: status, set, stop.
+"""Commands about runs that are going on: status, set, mark, stop.
 
 They import nothing but the standard library: where a coil must be let go, a second is long.
 """
@@ -9,7 +9,15 @@ from collections.abc import Callable, Sequence
 from hilctl.base.errors import InputError
 from hilctl.cli.output import finish_orphans, print_json
 from hilctl.cli.status_view import print_change, print_status, print_stopped
-from hilctl.run.client import find_run, going_on, set_run, status_of, stop_runs
+from hilctl.run.client import (
+    assigned,
+    find_run,
+    going_on,
+    mark_run,
+    set_run,
+    status_of,
+    stop_runs,
+)
 from hilctl.run.run_folder import runs
 
 _NOT_ENDED = 3
@@ -54,13 +62,24 @@ def status(given: argparse.Namespace) -> int:
 
 
 def set_(given: argparse.Namespace) -> int:
-    """Move the reference of a run without a bump: gain * reference + offset."""
+    """Move a run's reference without a bump, or take its inverse out and in."""
     chosen = find_run(given.run)
-    answer = set_run(chosen, given.assignments, given.over)
+    answer = set_run(chosen, **assigned(given.assignments), over_s=given.over)
     if given.json:
         print_json(answer)
     else:
         print_change(chosen.card.name, answer)
+    return 0
+
+
+def mark(given: argparse.Namespace) -> int:
+    """Set a mark in a run's recording, at the present sample."""
+    chosen = find_run(given.run)
+    answer = mark_run(chosen, " ".join(given.text))
+    if given.json:
+        print_json(answer)
+    else:
+        print(f"{chosen.card.name}: marked sample {answer['sample']}: {answer['text']}")
     return 0
 
 
@@ -78,11 +97,18 @@ def stop(given: argparse.Namespace) -> int:
 
 def _set_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "assignments", nargs="+", metavar="KEY=VALUE", help="gain=NUMBER, offset=NUMBER."
+        "assignments",
+        nargs="+",
+        metavar="KEY=VALUE",
+        help="gain=NUMBER, offset=NUMBER: gain * reference + offset; inverse=in|out.",
     )
     parser.add_argument(
         "--over", type=float, default=1.0, metavar="S", help="Time that the change takes, s."
     )
+
+
+def _mark_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("text", nargs="+", metavar="TEXT", help="What happened, in one line.")
 
 
 def _stop_arguments(parser: argparse.ArgumentParser) -> None:
@@ -95,9 +121,11 @@ def _stop_arguments(parser: argparse.ArgumentParser) -> None:
 _COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
     "status": status,
     "set": set_,
+    "mark": mark,
     "stop": stop,
 }
 _ARGUMENTS: dict[str, Callable[[argparse.ArgumentParser], None]] = {
     "set": _set_arguments,
+    "mark": _mark_arguments,
     "stop": _stop_arguments,
 }

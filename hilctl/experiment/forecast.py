@@ -11,7 +11,9 @@ from hilctl.experiment.file import Experiment
 from hilctl.experiment.heat import CoilHeat, RunHeat
 from hilctl.experiment.initial_state import Begun
 from hilctl.experiment.load import LoadedExperiment
+from hilctl.experiment.straight import LineEnds
 from hilctl.loop.compensator import Compensator
+from hilctl.loop.host import StraightLine
 from hilctl.waveforms.build import Reference
 
 _CHUNK = 1_000_000
@@ -43,6 +45,7 @@ class Forecast:
         recording_mb: About how large the recording will be.
         highest_rate_hz: Highest sample rate that the device can keep.
         rate_note: Why that is so; empty where there is no more to say.
+        line: What can take the inverse's place; None where nothing can.
     """
 
     samples: int
@@ -62,11 +65,13 @@ class Forecast:
     recording_mb: float
     highest_rate_hz: float
     rate_note: str
+    line: StraightLine | None
 
     def to_mapping(self) -> dict[str, Any]:
         """Return the fields as plain values."""
         mapping = asdict(self)
         del mapping["heat"]  # a part of a campaign's sums, of no meaning by itself
+        del mapping["line"]  # of no meaning before somebody asks for it
         return mapping
 
 
@@ -102,12 +107,14 @@ def forecast_of(
         figures.add(conditioned)
         heat = heat.then(conditioned, limits, rate_hz)
     values = reference.values
+    ends = LineEnds()
     wanted = np.empty(min(_CHUNK, input_um.size))
     for start in range(0, input_um.size, _CHUNK):
         part = input_um[start : start + _CHUNK]
         out = wanted[: part.size]
         compensator.process(part, out)
         figures.add(out)
+        ends.add(values[start : start + _CHUNK], out)
         heat = heat.then(out, limits, rate_hz)
     byte_count = _BYTES_A_SAMPLE + (0.0 if input_um is reference.values else _BYTES_OF_INPUT)
     return Forecast(
@@ -128,6 +135,7 @@ def forecast_of(
         recording_mb=(values.size + conditioned.size) * byte_count / 1e6,
         highest_rate_hz=loaded.device.info.max_rate_hz,
         rate_note=loaded.device.info.rate_note,
+        line=None if loaded.model is None else ends.line(),
     )
 
 

@@ -1,4 +1,4 @@
-"""A change of gain or offset, worked out from where the run stands before the loop is given it.
+"""A change of gain, offset or inverse, worked out from where the run stands before it is made.
 
 The rest of a run may be hours long, and who asks for a change waits. So commands are worked out by
 the compensator that runs, from the present sample and its memory on, through the ramp of the change
@@ -25,7 +25,7 @@ from hilctl.experiment.check import Checked, command_problems, reference_problem
 from hilctl.experiment.forecast import CommandFigures, Forecast
 from hilctl.loop.compensator import Compensator
 from hilctl.loop.host import Tuning
-from hilctl.loop.tuning import Tuner, tune
+from hilctl.loop.tuning import Factors, Tuner, tune
 
 _CHUNK = 4096
 _PEAK_BLOCK = 65536
@@ -55,7 +55,7 @@ class RunPosition:
 
 @dataclass(frozen=True, slots=True)
 class TunedForecast:
-    """What a run would do with another gain and offset, within its limits.
+    """What a run would do with another gain, offset and share of the inverse, within its limits.
 
     Attributes:
         tuning: The change.
@@ -105,7 +105,7 @@ def tuned_forecast(
     tuning: Tuning,
     in_time: Callable[[], bool],
 ) -> TunedForecast:
-    """Work out what a running reference would do with another gain and offset.
+    """Work out what a running reference would do with another gain, offset or inverse.
 
     Args:
         checked: The experiment that runs.
@@ -283,11 +283,20 @@ class _Walk:
             stop = min(stop, begins_at)
         values = self._input_um[self.sample : stop]
         factors = self._tuner.advance(values.size)
-        if factors is not None:
-            values = values.copy()
-            with np.errstate(over="ignore", invalid="ignore"):  # what comes of it is refused
-                tune(factors, values, values)
         commands = np.empty(values.size)
-        self._compensator.process(values, commands)
+        if factors is None:
+            self._compensator.process(values, commands)
+        else:
+            with np.errstate(over="ignore", invalid="ignore"):  # what comes of it is refused
+                self._tuned(factors, values, commands)
         self.sample = stop
         return commands
+
+    def _tuned(self, factors: Factors, values: F64, commands: F64) -> None:
+        """Fill commands from the input (float64[n] each) of the samples that come now."""
+        reference, input_um = np.empty_like(values), np.empty_like(values)
+        tune(factors, values, input_um)
+        self._compensator.process(input_um, commands)
+        here = slice(self.sample, self.sample + values.size)
+        tune(factors, self.reference.values[here], reference)
+        self._tuner.fade(factors, reference, commands, np.zeros(values.size, dtype=np.uint32))

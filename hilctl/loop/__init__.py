@@ -6,7 +6,7 @@ beginning.py    what comes before the waveform: ramp, and conditioning.py with t
 host.py         what the loop needs of its host: time, room for blocks, supervision
 block.py        one block of samples, in its slot from birth to answer
 pacer.py        absolute deadlines and the policy for late ticks
-tuning.py       gain and offset of a running reference
+tuning.py       gain and offset of a running reference, and the inverse faded out and in
 compensator.py  the inverse of a model, in the loop's terms
 feedback.py     a controller around the compensator, sample by sample; integral.py, by blocks
 adaptation.py   offset, gain and weights of the model, adapted by the tracking error

@@ -12,7 +12,10 @@ from typing import Protocol
 
 from hilctl.base.arrays import F64
 from hilctl.base.errors import InputError
+from hilctl.base.samples import Flag
 from hilctl.loop.block import Block
+
+_INVERSE_OUT = int(Flag.INVERSE_OUT)
 
 
 class Controller(Protocol):
@@ -104,7 +107,9 @@ class Feedback:
     def take(self, block: Block) -> None:
         """Take what the last exchange brought."""
         limited = block.wanted.item(0) != block.command.item(0)
-        self._seen = block.displacement_um.item(0), limited
+        # With the inverse out the error is the actuator's own, and no correction can take it away.
+        stands = block.flags.item(0) & _INVERSE_OUT
+        self._seen = math.nan if stands else block.displacement_um.item(0), limited
 
     def correct(self, reference_um: float, displacement_um: float, *, limited: bool) -> float:
         """Return the correction of the next sample, in um.

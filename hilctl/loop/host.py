@@ -9,8 +9,21 @@ from hilctl.loop.block import Block
 
 
 @dataclass(frozen=True, slots=True)
+class StraightLine:
+    """What is put out in the place of the inverse: a command that is linear in the reference.
+
+    Attributes:
+        slope: In the command's unit per um.
+        at_zero: Command at a reference of 0 um.
+    """
+
+    slope: float = 0.0
+    at_zero: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
 class Tuning:
-    """A change of the reference that is requested while it runs.
+    """A change of the reference, or of the inverse's share, that is requested during a run.
 
     Attributes:
         gain: Factor of the reference.
@@ -18,12 +31,16 @@ class Tuning:
         samples: Samples that the change takes.
         begins_at: Sample that it begins at, so that it can be worked out before; at the next block
             where that one has gone by.
+        inverse_share: Part of the inverse in the command, from 0 to 1; the rest is the line's.
+        line: What the rest is made of.
     """
 
     gain: float
     offset: float
     samples: int
     begins_at: int = 0
+    inverse_share: float = 1.0
+    line: StraightLine = StraightLine()
 
 
 class Host(Protocol):

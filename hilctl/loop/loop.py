@@ -19,7 +19,7 @@ import numpy as np
 from hilctl.base.arrays import F64, U32
 from hilctl.base.device import Device
 from hilctl.base.errors import DeviceError
-from hilctl.base.events import OFFSET, TUNED, Event
+from hilctl.base.events import OFFSET, Event
 from hilctl.base.samples import Flag, Head
 from hilctl.loop.beginning import Beginning
 from hilctl.loop.block import Block
@@ -258,11 +258,9 @@ class Loop:
             self._host.record_event(Event(self._next_sample, "info", OFFSET, text, values))
 
     def _tune(self, tuning: Tuning) -> None:
+        for event in self._tuner.events(tuning, self._next_sample):
+            self._host.record_event(event)
         self._tuner.move(tuning)
-        gain, offset, samples = tuning.gain, tuning.offset, tuning.samples
-        text = f"reference gain to {gain:g}, offset to {offset:g}, over {samples} samples"
-        values = {"gain": gain, "offset": offset, "samples": float(samples)}
-        self._host.record_event(Event(self._next_sample, "info", TUNED, text, values))
 
     def _leave(self, code: Code, event: str, reason: str, sample: int | None = None) -> None:
         """Ramp to the safe value from the next block on.
@@ -336,7 +334,8 @@ class Loop:
         plan = self._plan
         start = self._next_sample - self._before.waveform_at
         stop = start + wanted.size
-        factors = self._tuner.advance(wanted.size)
+        tuner = self._tuner
+        factors = tuner.advance(wanted.size)
         if factors is None:
             reference[:] = plan.reference[start:stop]
             # The reference itself, as a rule: a copy of what was copied is the quicker one.
@@ -351,6 +350,9 @@ class Loop:
         if plan.adaptation is not None:
             plan.adaptation.follow(input_um, plan.block)
         self._compensator.process(input_um, wanted)
+        # The compensator's memory first: it goes on as if its command were put out.
+        if factors is not None:
+            tuner.fade(factors, reference, wanted, flags)
         return self._limiter.limit(wanted, command, flags)
 
     def _exchange(self, sent: Block) -> None:

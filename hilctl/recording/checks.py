@@ -17,7 +17,7 @@ from mcap.records import Channel, McapRecord, Message, Schema
 from pydantic import Field, TypeAdapter, ValidationError
 
 from hilctl.base.device import CommandUnit
-from hilctl.base.events import TUNED
+from hilctl.base.events import CHANGES, INVERSE
 from hilctl.base.samples import COLUMNS, LAST_SAMPLE, LONGEST_NS, RECORDED_FIELDS, Batch, Head
 from hilctl.base.segments import SHORTEST_PERIOD, Segment
 from hilctl.base.strict import Strict
@@ -130,8 +130,10 @@ def event_problem(event: Any, time_ns: int) -> str:
     if max(event.sample, *event.before_sample, 0) >= LAST_SAMPLE:
         return "a sample is beyond any run"
     # How many samples a change takes is worked with.
-    if event.code == TUNED and not all(0.0 <= abs(value) < LAST_SAMPLE for value in event.values):
+    if event.code in CHANGES and not all(0.0 <= abs(value) < LAST_SAMPLE for value in event.values):
         return f"a change of the reference by {list(event.values)}"
+    if event.code == INVERSE and not _is_fade(event):
+        return f"a change of the inverse by {list(event.values)}"
     before = len(event.before_sample)
     if before and (wrong := _wrong_lengths(_lengths_before(event), "before_", before)):
         return f"{before} samples before it with {wrong}"
@@ -141,6 +143,13 @@ def event_problem(event: Any, time_ns: int) -> str:
 def _lengths_before(event: Any) -> dict[str, int]:
     names = ["before_flags", *(f"before_{field.name}" for field in RECORDED_FIELDS)]
     return {name: len(getattr(event, name)) for name in names}
+
+
+def _is_fade(event: Any) -> bool:
+    """Return whether a replay can go by its values."""
+    values = dict(zip(event.value_names, event.values, strict=True))
+    whole = values.keys() >= {"share", "samples", "slope", "at_zero"}
+    return whole and 0.0 <= values["share"] <= 1.0 and values["samples"] >= 1.0
 
 
 def sound_blocks(batch: Batch) -> npt.NDArray[np.bool_]:

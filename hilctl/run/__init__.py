@@ -17,9 +17,12 @@ recorder.py        into the recording; metadata.py what it says of the run, end_
 kept_file.py       a file that somebody takes away while it is written
 ring_recorder.py   from the ring into it, in a thread of its own; progress.py  for who looks on
 run_folder.py      runs that are going on, and who holds a device
+description.py     what a run says of itself to those who look on
 requests.py        requests to a run, over control_socket.py; stopping.py a signal to stop;
-                   client.py sends them, detached.py starts runs in the background
-changes.py         gain and offset on their way to the loop; change_worker.py works them out
+                   client.py sends them, protocol.py has their words; detached.py starts runs in
+                   the background
+changes.py         gain, offset and inverse on their way to the loop; change_worker.py works
+                   them out
 systemd.py         readiness and watchdog of a service
 probe.py           whether a device answers, and whether that can be true
 orphans.py         what dead runs left behind

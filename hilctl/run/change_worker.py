@@ -22,7 +22,7 @@ from hilctl.base.arrays import F64
 from hilctl.base.errors import ConfigError, InputError, Problem
 from hilctl.experiment.check import Checked
 from hilctl.experiment.tuned import InputPeaks, RunPosition, TunedForecast, tuned_forecast
-from hilctl.loop.host import Tuning
+from hilctl.loop.host import StraightLine, Tuning
 from hilctl.loop.tuning import Tuner
 from hilctl.run.ring import SampleRing
 from hilctl.run.shared_page import Field
@@ -45,9 +45,10 @@ class WantedChange:
         ring: File of the run's ring.
         gain: Gain that the reference is to have.
         offset: Offset that it is to have.
+        inverse_share: Part of the inverse that the command is to have.
         samples: Samples that the change takes.
         lead_s: Time from now to its first sample, for working it out.
-        tuner: Gain and offset at the sample ``tuner_at``, and what moved them then.
+        tuner: Gain, offset and inverse at the sample ``tuner_at``, and what moved them then.
         tuner_at: That sample.
         heat_a2: Highest running mean square of the coil current that the run can have come to.
     """
@@ -55,6 +56,7 @@ class WantedChange:
     ring: str
     gain: float
     offset: float
+    inverse_share: float
     samples: int
     lead_s: float
     tuner: Tuner
@@ -181,7 +183,14 @@ def answer_to(
         begins_at = -(-earliest // config.block) * config.block
         if begins_at >= checked.forecast.samples:
             return "the waveform is over before the change could begin"
-        tuning = Tuning(wanted.gain, wanted.offset, wanted.samples, begins_at)
+        tuning = Tuning(
+            wanted.gain,
+            wanted.offset,
+            wanted.samples,
+            begins_at,
+            wanted.inverse_share,
+            checked.forecast.line or StraightLine(),
+        )
         position = RunPosition(sample, state, tuner, wanted.heat_a2)
         return tuned_forecast(checked, peaks, position, tuning, lambda: clock() < until)
     except ConfigError as error:

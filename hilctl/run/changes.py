@@ -1,4 +1,4 @@
-"""Changes of gain and offset on their way to the loop, one after another.
+"""Changes of gain, offset and inverse on their way to the loop, one after another.
 
 Each is worked out from where the loop stands, and only once the loop has taken the one before: so
 the second follows the first, and none is written over. Nothing here waits.
@@ -8,10 +8,11 @@ from collections import deque
 from collections.abc import Mapping
 from copy import copy
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 from hilctl.base.errors import InputError
 from hilctl.experiment.check import Checked
+from hilctl.experiment.straight import fade_refusal
 from hilctl.experiment.tuned import TunedForecast
 from hilctl.loop.host import Tuning
 from hilctl.loop.tuning import Tuner
@@ -19,6 +20,7 @@ from hilctl.run.change_worker import WantedChange
 from hilctl.run.run_folder import RunFolder
 from hilctl.run.shared_page import Field, SharedPage
 
+_SHARES: dict[str | None, float] = {"in": 1.0, "out": 0.0}
 _MOST_WAITING = 16
 _LEAD_S = 0.5
 _TRIES = 3
@@ -44,11 +46,13 @@ class RequestedChange:
         gain: Factor of the reference; left as it is where None.
         offset: Added to the reference; left as it is where None.
         over_s: Time that the change takes.
+        inverse: Whether the inverse is to be ``in`` or ``out``; left as it is where None.
     """
 
     gain: float | None
     offset: float | None
     over_s: float
+    inverse: Literal["in", "out"] | None = None
     tries: int = 0
     _answer: Mapping[str, Any] | None = None
     _refusal: str = ""
@@ -89,7 +93,7 @@ class Changes:
     def __init__(
         self, checked: Checked, folder: RunFolder, page: SharedPage, worker: WorksOut
     ) -> None:
-        self.gain, self.offset = 1.0, 0.0
+        self.gain, self.offset, self._inverse_share = 1.0, 0.0, 1.0
         self._checked, self._ring, self._page = checked, str(folder.ring), page
         self._worker = worker
         self._waiting: deque[RequestedChange] = deque()
@@ -99,14 +103,25 @@ class Changes:
         self._placed: Tuning | None = None
         self._heat_a2 = (checked.forecast.heating_rms_a or 0.0) ** 2
 
+    @property
+    def inverse(self) -> str | None:
+        """Where the last change leads the inverse, ``in`` or ``out``; None where there is none."""
+        if self._checked.loaded.model is None:
+            return None
+        return "in" if self._inverse_share else "out"
+
     def add(self, change: RequestedChange) -> None:
         """Let a change wait for its turn.
 
         Raises:
             InputError: It can't have one.
         """
-        if change.gain is None and change.offset is None:
-            raise InputError("set: gain or offset is required")
+        if change.gain is None and change.offset is None and change.inverse is None:
+            raise InputError("set: gain, offset or inverse is required")
+        if change.inverse is not None:
+            checked = self._checked
+            if why := fade_refusal(checked.loaded, checked.forecast.line, change.inverse):
+                raise InputError(f"set: inverse: {why}")
         if why := self._too_late():
             raise InputError(f"set: {why}")
         if len(self._waiting) >= _MOST_WAITING:
@@ -156,6 +171,7 @@ class Changes:
             ring=self._ring,
             gain=self.gain if change.gain is None else change.gain,
             offset=self.offset if change.offset is None else change.offset,
+            inverse_share=_SHARES.get(change.inverse, self._inverse_share),
             samples=max(1, round(change.over_s * rate_hz)),
             lead_s=_LEAD_S * 2**change.tries,
             tuner=copy(self._tuner),
@@ -179,7 +195,7 @@ class Changes:
         next_sample = self._page.get(Field.NEXT_SAMPLE) + self._checked.loaded.config.block
         if next_sample <= found.tuning.begins_at:
             self._place(found)
-            change.accept(_answer(change, found))
+            change.accept(_answer(change, found, self.inverse))
             self._current = None
         elif change.tries < _TRIES:  # the loop has gone by: what was worked out no longer holds
             self._work_out(change)
@@ -194,18 +210,23 @@ class Changes:
         page, tuning = self._page, found.tuning
         page.put_float(Field.TUNE_GAIN, tuning.gain)
         page.put_float(Field.TUNE_OFFSET, tuning.offset)
+        page.put_float(Field.TUNE_INVERSE_SHARE, tuning.inverse_share)
+        page.put_float(Field.TUNE_LINE_SLOPE, tuning.line.slope)
+        page.put_float(Field.TUNE_LINE_AT_ZERO, tuning.line.at_zero)
         page.put(Field.TUNE_SAMPLES, tuning.samples)
         page.put(Field.TUNE_BEGINS_AT, tuning.begins_at)
         # Last: the loop reads the numbers above as soon as it sees a new count.
         page.put(Field.TUNE_WANTED, page.get(Field.TUNE_WANTED) + 1)
         self.gain, self.offset, self._placed = tuning.gain, tuning.offset, tuning
+        self._inverse_share = tuning.inverse_share
         self._heat_a2 = max(self._heat_a2, found.heat_a2)
 
 
-def _answer(change: RequestedChange, found: TunedForecast) -> dict[str, Any]:
+def _answer(change: RequestedChange, found: TunedForecast, inverse: str | None) -> dict[str, Any]:
     return {
         "gain": found.tuning.gain,
         "offset": found.tuning.offset,
+        "inverse": inverse,
         "over_s": change.over_s,
         "begins_at_sample": found.tuning.begins_at,
         "checked_s": found.checked_s,

@@ -1,4 +1,4 @@
-"""Runs in the background, from outside: find one, send it a request, stop it.
+"""Runs in the background, from outside: find one, ask it, change, mark and stop it.
 
 It imports nothing heavy: a stop must not wait for a compiler.
 """
@@ -9,10 +9,12 @@ from typing import Any
 
 from hilctl.base.errors import InputError, RunError
 from hilctl.run.control_socket import ask
+from hilctl.run.protocol import InverseState, request
 from hilctl.run.run_folder import RunFolder, facts_of, runs
 from hilctl.run.stopping import request_stop
 
 _POLL_S = 0.02
+_SET_S = 30.0
 
 
 def going_on() -> list[RunFolder]:
@@ -45,7 +47,7 @@ def status_of(run: RunFolder) -> dict[str, Any]:
     """Return where a run stands, also where nobody answers for it any more."""
     if run.supervised:
         try:
-            return ask(run.socket, {"command": "status"})
+            return ask(run.socket, request("status"))
         except (RunError, InputError) as error:
             return {**facts_of(run), "state": "not answering", "error": str(error)}
     state = "ramping down without its supervisor" if run.alive else "dead"
@@ -88,25 +90,56 @@ def _refusal(run: RunFolder) -> str:
         return str(error)
 
 
-def set_run(run: RunFolder, assignments: Sequence[str], over_s: float) -> dict[str, Any]:
-    """Move a running reference.
+def set_run(
+    run: RunFolder,
+    *,
+    gain: float | None = None,
+    offset: float | None = None,
+    inverse: InverseState | None = None,
+    over_s: float = 1.0,
+) -> dict[str, Any]:
+    """Move a running reference, or take the inverse out and in; what is None stays.
 
     Args:
         run: The run.
-        assignments: ``gain=0.5``, ``offset=2.0``.
+        gain: Factor of the reference.
+        offset: Added to it, in the waveform's unit.
+        inverse: Whether the inverse is to be in, or a straight line in its place.
         over_s: Time that the change takes.
 
     Raises:
-        InputError: No such parameter, or the run refuses it; nothing has changed.
+        InputError: The run refuses it; nothing has changed.
         RunError: It does not answer.
     """
-    wanted: dict[str, float] = {}
+    wanted = request("set", gain=gain, offset=offset, inverse=inverse, over_s=over_s)
+    return ask(run.socket, wanted, timeout_s=_SET_S)
+
+
+def mark_run(run: RunFolder, text: str) -> dict[str, Any]:
+    """Set a mark at the present sample of a run.
+
+    Raises:
+        InputError: The run refuses it.
+        RunError: It does not answer.
+    """
+    return ask(run.socket, request("mark", text=text))
+
+
+def assigned(assignments: Sequence[str]) -> dict[str, Any]:
+    """Return what :func:`set_run` is to set, from ``gain=0.5``, ``offset=2.0``, ``inverse=out``.
+
+    Raises:
+        InputError: There is no such parameter.
+    """
+    wanted: dict[str, Any] = {}
     for text in assignments:
         key, equals, value = text.partition("=")
-        if key not in {"gain", "offset"} or not equals:
-            raise InputError(f"must be gain=NUMBER or offset=NUMBER: {text!r}")
+        if key not in {"gain", "offset", "inverse"} or not equals:
+            raise InputError(f"must be gain=NUMBER, offset=NUMBER or inverse=in|out: {text!r}")
+        if key == "inverse" and value not in {"in", "out"}:
+            raise InputError(f"inverse must be in or out: {value!r}")
         try:
-            wanted[key] = float(value)
+            wanted[key] = value if key == "inverse" else float(value)
         except ValueError:
             raise InputError(f"{key} must be a number: {value!r}") from None
-    return ask(run.socket, {"command": "set", **wanted, "over_s": over_s}, timeout_s=30.0)
+    return wanted

@@ -20,9 +20,8 @@ from types import TracebackType
 from typing import Any, Protocol, Self
 
 from hilctl.base.errors import InputError, RunError
+from hilctl.run.protocol import MAX_BYTES, VERSION, VERSION_KEY
 
-MAX_BYTES = 4096
-"""Longest question."""
 _MAX_CLIENTS = 64
 _BACKLOG = 256
 _SILENT_S = 0.5
@@ -180,8 +179,9 @@ class ControlServer:
             self._reply(client, {"ok": True, **answer})
 
     def _reply(self, client: _Client, answer: Mapping[str, Any]) -> None:
+        said = json.dumps({VERSION_KEY: VERSION, **answer})
         with suppress(OSError):  # it did not wait, or can't take it: its loss
-            client.connection.send(json.dumps(answer).encode() + b"\n")
+            client.connection.send(said.encode() + b"\n")
         self._drop(client)
 
     def _drop_longest_silent(self) -> None:
@@ -235,7 +235,7 @@ def ask(
 
     Raises:
         InputError: The run refuses; the text says why.
-        RunError: There is nobody, or no answer.
+        RunError: There is nobody, or no answer, or one of another version.
     """
     until = clock() + timeout_s
     raw = json.dumps(question).encode() + b"\n"
@@ -246,9 +246,16 @@ def ask(
         answer = json.loads(said)
     except (OSError, ValueError) as error:
         raise RunError(f"the run at {path.parent.name} does not answer: {error}") from None
-    if not isinstance(answer, dict) or not answer.pop("ok", False):
-        raise InputError(str(answer.get("error", "refused")) if isinstance(answer, dict) else "?")
-    return answer
+    spoken = answer.pop(VERSION_KEY, None) if isinstance(answer, dict) else None
+    if spoken != VERSION:
+        raise RunError(
+            f"the run at {path.parent.name} speaks protocol {spoken}, this hilctl {VERSION}: use "
+            "the hilctl that it was started with"
+        )
+    said_so: dict[str, Any] = answer
+    if not said_so.pop("ok", False):
+        raise InputError(str(said_so.get("error", "refused")))
+    return said_so
 
 
 def _asked_once(path: Path, raw: bytes, timeout_s: float) -> bytes:

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from hilctl.base.events import TUNED, Event
+from hilctl.base.events import CHANGES, Event
 from hilctl.base.metrics import (
     Folding,
     loop_area,
@@ -57,7 +57,7 @@ class EndFigures:
 
     def event(self, event: Event) -> None:
         """Take an event of the run."""
-        if event.code == TUNED:
+        if event.code in CHANGES:
             self._changes.append(event)
 
     def facts(self) -> dict[str, str]:

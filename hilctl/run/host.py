@@ -3,7 +3,7 @@
 import os
 
 from hilctl.base.device import Clock
-from hilctl.loop.host import Tuning
+from hilctl.loop.host import StraightLine, Tuning
 from hilctl.run.ring import SampleRing
 from hilctl.run.shared_page import Field, Phase, Stop
 
@@ -60,8 +60,14 @@ class RingHost:
         wanted, now = numbers[_TUNE_WANTED], numbers[_NEXT_SAMPLE]
         if wanted == numbers[_TUNE_TAKEN] or now < numbers[_TUNE_BEGINS_AT]:
             return None
-        gain, offset = page.get_float(Field.TUNE_GAIN), page.get_float(Field.TUNE_OFFSET)
-        tuning = Tuning(gain, offset, page.get(Field.TUNE_SAMPLES), page.get(Field.TUNE_BEGINS_AT))
+        tuning = Tuning(
+            page.get_float(Field.TUNE_GAIN),
+            page.get_float(Field.TUNE_OFFSET),
+            page.get(Field.TUNE_SAMPLES),
+            page.get(Field.TUNE_BEGINS_AT),
+            page.get_float(Field.TUNE_INVERSE_SHARE),
+            StraightLine(*map(page.get_float, (Field.TUNE_LINE_SLOPE, Field.TUNE_LINE_AT_ZERO))),
+        )
         numbers[_TUNE_TAKEN_AT] = now
         # Taken only once it has been read: the supervisor may write the next one from here on.
         numbers[_TUNE_TAKEN] = wanted

@@ -14,6 +14,7 @@ from hilctl.base.files import TextFiles
 from hilctl.base.yaml.document import Document
 from hilctl.experiment.check import Checked
 from hilctl.experiment.load import LoadedExperiment, resolve
+from hilctl.run.description import RunDescription
 from hilctl.run.run_folder import RunFolder
 
 
@@ -51,6 +52,8 @@ class Job:
     def of(cls, checked: Checked, folder: RunFolder, *, supervisor: int, silence_s: float) -> Self:
         """Return the job of a checked experiment; its arrays are left in the run's folder.
 
+        So is what the run says of itself to those who look on.
+
         Raises:
             RunError: There is no room for them.
         """
@@ -60,6 +63,7 @@ class Job:
         if begun.input_um is not checked.reference.values:
             input_um = folder.input_um
             _save(input_um, begun.input_um)
+        RunDescription.of(checked).write(folder.description)
         return cls(
             experiment=checked.loaded.yaml_text,
             files=checked.loaded.files.texts,

@@ -1,16 +1,18 @@
-"""Requests to a running supervisor: its status, and to move the reference."""
+"""Requests to a running supervisor: its status, to move the reference, and to set a mark."""
 
 import time
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, TypeAdapter, ValidationError
+from pydantic import AfterValidator, Field, TypeAdapter, ValidationError
 
 from hilctl.base.errors import InputError
+from hilctl.base.events import MARK, Event
 from hilctl.base.strict import Strict
 from hilctl.experiment.check import Checked
 from hilctl.run.changes import Changes, RequestedChange, WorksOut
-from hilctl.run.recorder import Recorder
+from hilctl.run.protocol import MAX_MARK
+from hilctl.run.ring_recorder import RingRecorder
 from hilctl.run.run_folder import RunFolder, facts_of
 from hilctl.run.shared_page import Field as Number
 from hilctl.run.shared_page import Phase, SharedPage
@@ -23,23 +25,44 @@ class StatusRequest(Strict):
 
 
 class SetRequest(Strict):
-    """Move the reference's gain or offset over a ramp.
+    """Move the reference's gain or offset over a ramp, or fade the inverse out or in.
 
     Attributes:
         gain: Factor of the reference; left as it is where None.
         offset: Added to the reference, in the waveform's unit; left as it is where None.
+        inverse: ``out`` puts a straight line in the place of the inverse, ``in`` the inverse back;
+            left as it is where None.
         over_s: Time that the change takes.
     """
 
     command: Literal["set"]
     gain: float | None = None
     offset: float | None = None
+    inverse: Literal["in", "out"] | None = None
     over_s: Annotated[float, Field(gt=0.0, le=3600.0)] = 1.0
 
 
-_REQUESTS: TypeAdapter[StatusRequest | SetRequest] = TypeAdapter(
-    Annotated[StatusRequest | SetRequest, Field(discriminator="command")]
+def _one_line(text: str) -> str:
+    if not text.strip() or not text.isprintable():
+        raise ValueError("must be one line of printable text")
+    return text
+
+
+class MarkRequest(Strict):
+    """Set a mark at the present sample.
+
+    Attributes:
+        text: What happened, for people.
+    """
+
+    command: Literal["mark"]
+    text: Annotated[str, Field(max_length=MAX_MARK), AfterValidator(_one_line)]
+
+
+REQUESTS: TypeAdapter[StatusRequest | SetRequest | MarkRequest] = TypeAdapter(
+    Annotated[StatusRequest | SetRequest | MarkRequest, Field(discriminator="command")]
 )
+"""Reads a request; ``command`` says which."""
 
 
 class Requests:
@@ -49,7 +72,7 @@ class Requests:
         checked: The experiment.
         folder: The run's folder.
         page: Shared with the loop.
-        recorder: What is being recorded.
+        recording: Takes what the loop exchanges.
         worker: Works changes of the reference out.
     """
 
@@ -58,13 +81,13 @@ class Requests:
         checked: Checked,
         folder: RunFolder,
         page: SharedPage,
-        recorder: Recorder,
+        recording: RingRecorder,
         worker: WorksOut,
     ) -> None:
         self._checked = checked
         self._folder = folder
         self._page = page
-        self._recorder = recorder
+        self._recording, self._recorder = recording, recording.recorder
         self._changes = Changes(checked, folder, page, worker)
         self.attend = self._changes.attend
         """Goes on with changes that are under way; to be called often."""
@@ -76,16 +99,26 @@ class Requests:
             InputError: It is no request, or can't be followed; nothing has changed.
         """
         try:
-            request = _REQUESTS.validate_json(line)
+            request = REQUESTS.validate_json(line)
         except ValidationError as error:
             first = error.errors(include_url=False, include_input=False)[0]
             where = ".".join(str(part) for part in first["loc"]) or "message"
             raise InputError(f"{where}: {first['msg']}") from None
         if isinstance(request, StatusRequest):
             return self._status()
-        change = RequestedChange(request.gain, request.offset, request.over_s)
+        if isinstance(request, MarkRequest):
+            return self._mark(request.text)
+        change = RequestedChange(request.gain, request.offset, request.over_s, request.inverse)
         self._changes.add(change)
         return change
+
+    def _mark(self, text: str) -> dict[str, Any]:
+        if not self._recording.takes_marks:
+            raise InputError("mark: the recording takes none now, or is over")
+        page = self._page
+        sample = page.get(Number.WAVEFORM_AT) + page.get(Number.NEXT_SAMPLE)
+        self._recording.record_event(Event(sample, "info", MARK, text))
+        return {"sample": sample, "text": text}
 
     def _status(self) -> dict[str, Any]:
         page, config = self._page, self._checked.loaded.config
@@ -101,6 +134,7 @@ class Requests:
             "late_ticks": page.get(Number.LATE_TICKS),
             "gain": self._changes.gain,
             "offset": self._changes.offset,
+            "inverse": self._changes.inverse,
             "recording_error": self._recorder.error,
             "heartbeat_age_s": (time.monotonic_ns() - page.get(Number.LOOP_HEARTBEAT_NS)) * 1e-9,
         }

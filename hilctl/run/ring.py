@@ -46,6 +46,7 @@ class SampleRing:
 
     Args:
         path: File that holds it; one that :meth:`create` made.
+        look_only: Map it so that nothing can be written: for those who look on.
 
     Attributes:
         page: Numbers, texts and events beside the blocks.
@@ -57,11 +58,12 @@ class SampleRing:
         OSError: It can't be opened.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, look_only: bool = False) -> None:
         self.path = path
-        descriptor = os.open(path, os.O_RDWR)
+        descriptor = os.open(path, os.O_RDONLY if look_only else os.O_RDWR)
         try:
-            self._map = mmap.mmap(descriptor, os.fstat(descriptor).st_size)
+            access = mmap.ACCESS_READ if look_only else mmap.ACCESS_WRITE
+            self._map = mmap.mmap(descriptor, os.fstat(descriptor).st_size, access=access)
         finally:
             os.close(descriptor)
         if len(self._map) < _PAGE_SIZE:
@@ -78,7 +80,7 @@ class SampleRing:
         self._area = self._views(state_size)
         self._heads = memoryview(self._area.heads.data.cast("B")).cast("q")
         self._sent, self._spares_used = self.page.get(Field.SENT), 0
-        self._tail = self._released = self.page.get(Field.TAIL)
+        self._tail = self._safe = self._released = self.page.get(Field.TAIL)
 
     @classmethod
     def create(
@@ -190,8 +192,8 @@ class SampleRing:
         return batch
 
     def take_again(self) -> None:
-        """Let all that was taken and not released be taken once more."""
-        self._tail = self._released
+        """Let all that was taken and is not safe be taken once more."""
+        self._tail = self._safe
         self.page.take_events_again()
 
     def skip_damaged(self) -> int:
@@ -230,15 +232,38 @@ class SampleRing:
                 return first, state
         return None
 
-    def release(self) -> None:
-        """Give the room of all that was taken back to the producer: it is safe elsewhere."""
+    def look(self, since: int) -> tuple[Batch, int]:
+        """Copy the blocks from number ``since`` on; takes nothing out, any process may call it.
+
+        Returns:
+            Those that still stand there whole, perhaps none, and the number after the last of all;
+            what is missing between was overwritten, or damaged.
+        """
+        head = self.page.get(Field.HEAD)
+        numbers = np.arange(max(since, self.page.get(Field.CLEANED), head - self.slots), head)
+        batch = self._area.rows(numbers % self.slots)
+        # Looked at again: of what is given back meanwhile, a part may be clean already.
+        whole = numbers >= self.page.get(Field.CLEANED)
+        whole &= batch.heads[:, Head.SEQUENCE] == numbers + 1
+        return batch if whole.all() else batch.rows(np.flatnonzero(whole)), max(head, since)
+
+    def release(self, keep: int = 0) -> None:
+        """Give the room of what was taken back to the producer: all of it is safe elsewhere.
+
+        Args:
+            keep: Newest blocks that stay for those who look on, until the next time.
+        """
         self.page.release_events()
+        self._safe = self._tail
+        until = max(self._released, self._tail - keep)
+        # Said first: who looks on must not take a block that is cleaned under its copy for whole.
+        self.page.put(Field.CLEANED, until)
         # Cleaned here and not in the tick; before the room is given, or the loop would be in it.
-        first, count = self._released % self.slots, self._tail - self._released
+        first, count = self._released % self.slots, until - self._released
         self._clean(slice(first, min(first + count, self.slots)))
         self._clean(slice(0, max(0, first + count - self.slots)))
-        self._released = self._tail
-        self.page.put(Field.TAIL, self._tail)
+        self._released = until
+        self.page.put(Field.TAIL, until)
 
     def _clean(self, slots: slice) -> None:
         """Let slots hold no flag and no answer."""

@@ -19,6 +19,9 @@ from hilctl.run.ring import SampleRing
 from hilctl.run.shared_page import Field
 
 _POLL_S = 0.02
+_MOST_WAITING = 64
+_KEPT = 8
+"""One part in so many of the ring stays for those who look on."""
 
 
 class RingRecorder:
@@ -63,6 +66,12 @@ class RingRecorder:
         self._ending.set()
 
     @property
+    def takes_marks(self) -> bool:
+        """Whether a mark will be in the file; no crowd of them waits for a disk that stands."""
+        waiting = len(self._events) >= _MOST_WAITING
+        return not (waiting or self._ending.is_set() or self.recorder.error)
+
+    @property
     def finished(self) -> bool:
         """Whether the recording is closed."""
         return not self._thread.is_alive()
@@ -88,7 +97,7 @@ class RingRecorder:
         if self.stalled_s() >= self._flush_s:
             # Room is given back only once the file has what stood there.
             if self.recorder.flush():
-                self._ring.release()
+                self._ring.release(keep=self._ring.slots // _KEPT)
             else:
                 self._ring.take_again()
             self._released_s = time.monotonic()
@@ -102,7 +111,9 @@ class RingRecorder:
         for event in page.pop_events():
             recorder.event(event)
         while self._events:
-            recorder.event(self._events.popleft())
+            event = self._events.popleft()
+            recorder.event(event)
+            page.leave_note(event)
 
     def _finish(self) -> None:
         outcome, page, recorder = self._outcome, self._ring.page, self.recorder

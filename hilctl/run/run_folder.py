@@ -77,6 +77,11 @@ class RunFolder:
         return self.path / "input_um.npy"
 
     @property
+    def description(self) -> Path:
+        """File of what the run says of itself to those who look on."""
+        return self.path / "description.json"
+
+    @property
     def guardian_job(self) -> Path:
         """File of what the guardian is to guard."""
         return self.path / "guardian.json"

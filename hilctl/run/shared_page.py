@@ -43,12 +43,14 @@ class PageText(IntEnum):
 
 
 _EVENTS_AT = _PAGE + len(PageText) * _TEXT_BYTES
-SIZE = _EVENTS_AT + _EVENT_SLOTS * _EVENT_BYTES
+_NOTES_AT = _EVENTS_AT + _EVENT_SLOTS * _EVENT_BYTES
+_NOTE_SLOTS = 32
+SIZE = _NOTES_AT + _NOTE_SLOTS * _EVENT_BYTES
 """Bytes that the numbers, the texts and the events take."""
 
 
 class Field(IntEnum):
-    """Numbers of the page, int64 each; those named as gain or offset are float64."""
+    """Numbers of the page, int64 each; what a change leads to, but its samples, is float64."""
 
     MAGIC = 0
     SLOTS = 1
@@ -58,6 +60,7 @@ class Field(IntEnum):
     SENT = 7
     HEAD = 8
     TAIL = 16
+    CLEANED = 17
     PHASE = 24
     GO = 25
     STOP = 26
@@ -76,6 +79,7 @@ class Field(IntEnum):
     EVENT_HEAD = 40
     EVENT_TAIL = 41
     EVENTS_LOST = 42
+    NOTE_HEAD = 43
     TUNE_WANTED = 48
     TUNE_TAKEN = 49
     TUNE_GAIN = 50
@@ -85,6 +89,9 @@ class Field(IntEnum):
     GUARDIAN_PHASE = 57
     TUNE_BEGINS_AT = 53
     TUNE_TAKEN_AT = 54
+    TUNE_INVERSE_SHARE = 58
+    TUNE_LINE_SLOPE = 59
+    TUNE_LINE_AT_ZERO = 60
 
 
 class Phase(IntEnum):
@@ -251,12 +258,46 @@ class SharedPage:
         if head - self.get(Field.EVENT_TAIL) >= _EVENT_SLOTS:
             self._integers[Field.EVENTS_LOST] += 1
             return
-        text = event.text
-        while len(raw := json.dumps({**asdict(event), "text": text})) > _EVENT_BYTES - 8:
-            text = text[: len(text) * 3 // 4]
-        self._write(_EVENTS_AT + head % _EVENT_SLOTS * _EVENT_BYTES, _EVENT_BYTES, raw)
+        self._write(_EVENTS_AT + head % _EVENT_SLOTS * _EVENT_BYTES, _EVENT_BYTES, _packed(event))
         # Last: an event that is counted is whole.
         self.put(Field.EVENT_HEAD, head + 1)
+
+    def look_at_events(self, since: int) -> tuple[list[Event], int]:
+        """Return the events from number ``since`` on that still stand there; takes nothing out.
+
+        Returns:
+            The events, and the number after the last of all.
+        """
+        head, found = self.get(Field.EVENT_HEAD), []
+        for number in range(max(since, head - _EVENT_SLOTS), head):
+            raw = self._read(_EVENTS_AT + number % _EVENT_SLOTS * _EVENT_BYTES, _EVENT_BYTES)
+            # Looked at again: the loop may have begun a new one in a slot that was released.
+            kept = self.get(Field.EVENT_TAIL) <= number
+            if kept or self.get(Field.EVENT_HEAD) < number + _EVENT_SLOTS:
+                with suppress(ValueError, TypeError):  # damaged: the recorder counts it
+                    found.append(Event(**json.loads(raw)))
+        return found, max(head, since)
+
+    def leave_note(self, event: Event) -> None:
+        """Show an event of the supervisor to those who look on; the recorder has it already.
+
+        The oldest gives way: nobody takes it out.
+        """
+        head = self.get(Field.NOTE_HEAD)
+        self._write(_NOTES_AT + head % _NOTE_SLOTS * _EVENT_BYTES, _EVENT_BYTES, _packed(event))
+        # Last: a note that is counted is whole.
+        self.put(Field.NOTE_HEAD, head + 1)
+
+    def look_at_notes(self, since: int) -> tuple[list[Event], int]:
+        """Return the notes from number ``since`` on that still stand there, and the next number."""
+        head, found = self.get(Field.NOTE_HEAD), []
+        for number in range(max(since, head - _NOTE_SLOTS), head):
+            raw = self._read(_NOTES_AT + number % _NOTE_SLOTS * _EVENT_BYTES, _EVENT_BYTES)
+            # Looked at again: a new one may have been begun in its slot.
+            if self.get(Field.NOTE_HEAD) < number + _NOTE_SLOTS:
+                with suppress(ValueError, TypeError):
+                    found.append(Event(**json.loads(raw)))
+        return found, max(head, since)
 
     def pop_events(self) -> list[Event]:
         """Take the events that came since; they keep their room until they are released."""
@@ -287,3 +328,11 @@ class SharedPage:
     def _read(self, at: int, size: int) -> str:
         length = min(int.from_bytes(self._map[at : at + 8], "little"), size - 8)
         return bytes(self._map[at + 8 : at + 8 + length]).decode(errors="replace")
+
+
+def _packed(event: Event) -> str:
+    """Return an event as JSON that fits into a slot; a text that is too long is cut."""
+    text = event.text
+    while len(raw := json.dumps({**asdict(event), "text": text})) > _EVENT_BYTES - 8:
+        text = text[: len(text) * 3 // 4]
+    return raw

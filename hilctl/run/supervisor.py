@@ -90,13 +90,13 @@ class Supervisor:
                     run_folder(config.name, self._output, time.time())
                 )
                 ring = self._make_ring(folder)
-                requests = Requests(self._checked, folder, ring.page, recorder, worker)
+                recording = RingRecorder(ring, recorder, config.recording.flush_s)
+                requests = Requests(self._checked, folder, ring.page, recording, worker)
                 server = stack.enter_context(ControlServer(folder.socket, requests.answer))
                 child = LoopChild(self._checked, folder, ring, locks + own, self._silence_s)
             except BaseException:
                 recorder.give_back()
                 raise
-            recording = RingRecorder(ring, recorder, config.recording.flush_s)
             safety = self._start(folder, ring, child, recording, locks + own)
             started = StartedRun(self._checked, ring, child, safety, recording)
             self._attend(started, server, requests)

@@ -131,7 +131,7 @@ def test_bad_messages_change_nothing(going):
         b'{"command": "set", "gain": "1"}\n': "valid number",
         b'{"command": "set", "gain": NaN}\n': "finite number",
         b'{"command": "set", "gain": 0.5, "extra": 1}\n': "Extra inputs",
-        b'{"command": "set"}\n': "gain or offset is required",
+        b'{"command": "set"}\n': "gain, offset or inverse is required",
         b'{"command": "set", "gain": 0.5, "over_s": 0.0}\n': "greater than 0",
         b"[" * 5000: "longer than",
         b"\xff\xfe\n": "Invalid JSON",

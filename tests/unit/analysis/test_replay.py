@@ -9,6 +9,7 @@ import pytest
 
 from hilctl.analysis.replay import replay
 from hilctl.base.errors import DataError
+from hilctl.base.samples import Flag
 from hilctl.loop.compensator import Compensator
 from hilctl.models.files import load_model
 from hilctl.recording import reader
@@ -144,3 +145,11 @@ def test_a_damaged_file_in_pieces(tmp_path, monkeypatch):
     monkeypatch.setattr(reader, "PIECE_SAMPLES", 1)
     assert len(list(Pieces(path))) > 3
     assert replay(Pieces(path)) == whole
+
+
+def test_samples_without_the_inverse_need_the_event_that_says_so():
+    """Of a damaged file it may be gone: that is no difference of commands, and is said."""
+    recording = read(GOLDEN / "terfenol_compensated.mcap")
+    recording.samples.flags[500:600] |= np.uint32(Flag.INVERSE_OUT)
+    with pytest.raises(DataError, match="/events: when the inverse went out or in is not there"):
+        replay(recording)

@@ -13,7 +13,7 @@ from hilctl.analysis.report import summarize, worst_segment
 from hilctl.analysis.table import run_rows
 from hilctl.base.arrays import F64
 from hilctl.base.errors import DataError
-from hilctl.base.events import ADAPTED, TUNED, Event
+from hilctl.base.events import ADAPTED, MARK, TUNED, Event
 from hilctl.base.samples import Flag
 from hilctl.base.segments import Segment
 from hilctl.recording import reader
@@ -251,6 +251,14 @@ class TestWholeRun:
         assert report.adapted == {"gain": 1.09}
         assert ("adapted", "gain 1.0900") in run_rows(report)
         assert summarize(lagging()).adapted == {}
+
+    def test_marks_are_rows_with_their_time(self, lagging) -> None:
+        """What steers a terminal is written out: the text comes from a file."""
+        made = lagging()
+        mark = Event(round(0.5 * made.sample_rate_hz), "info", MARK, "tapped \x1b[2J")
+        report = summarize(replace(made, events=(mark,)))
+        assert report.marks == ((0.5, "tapped \x1b[2J"),)
+        assert ("mark", "0.5 s: tapped \\x1b[2J") in run_rows(report)
 
     def test_worst_segment_counts(self, make_recording) -> None:
         """Percentages of the run are the largest of its segments; cycles are summed."""

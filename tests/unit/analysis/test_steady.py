@@ -36,7 +36,7 @@ def run(make_recording):
         for k in range(SAMPLES):
             if k in due:
                 tuner.move(due[k])
-            gain, offset = tuner.advance(1) or (1.0, 0.0)
+            gain, offset, _ = tuner.advance(1) or (1.0, 0.0, 1.0)
             reference_um[k : k + 1] = gain * plain[k : k + 1] + offset
         displacement_um = np.concatenate([np.zeros(LAG), reference_um[:-LAG]])
         whole = [Segment("sine", 0, SAMPLES, 0, SAMPLES, PERIOD)]

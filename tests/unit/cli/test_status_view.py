@@ -17,6 +17,7 @@ RUNNING = {
     "late_ticks": 1234,
     "gain": 0.5,
     "offset": -2.0,
+    "inverse": "out",
     "recording_error": "",
 }
 
@@ -41,6 +42,7 @@ def test_a_run_is_a_block_of_lines(shown):
         "  samples    624,500 recorded, 500 missing",
         "  late ticks 1,234",
         "  reference  gain 0.5, offset -2",
+        "  inverse    out",
         f"  recording  {PATH}",
     ]
 
@@ -77,11 +79,12 @@ def test_no_run_is_told(shown):
         (False, "within the limits; the rest was tried only where the reference goes furthest"),
     ],
 )
-def test_a_change_says_how_far_it_was_worked_out(capsys, to_the_end, rest):
-    answer = {"gain": 0.5, "offset": -2.0, "over_s": 1.5, "checked_s": 12.345}
+@pytest.mark.parametrize(("inverse", "said"), [(None, ""), ("out", ", inverse out")])
+def test_a_change_says_how_far_it_was_worked_out(capsys, to_the_end, rest, inverse, said):
+    answer = {"gain": 0.5, "offset": -2.0, "inverse": inverse, "over_s": 1.5, "checked_s": 12.345}
     print_change("sine-7", {**answer, "checked_to_the_end": to_the_end})
     assert capsys.readouterr().out.splitlines() == [
-        "sine-7: gain 0.5, offset -2, over 1.5 s",
+        f"sine-7: gain 0.5, offset -2{said}, over 1.5 s",
         f"  every command of the next 12.3 s is {rest}",
     ]
 

@@ -64,21 +64,21 @@ def test_all_runs_are_stopped_and_each_is_told(going, capsys):
 
 def test_set_says_what_was_taken(going, capsys):
     answer = {"gain": 0.5, "offset": -2.0, "over_s": 1.5, "checked_s": 3.0}
-    answer["checked_to_the_end"] = True
+    answer |= {"checked_to_the_end": True, "inverse": None}
     asked = []
 
-    def set_run(run, assignments, over_s):
-        asked.append((assignments, over_s))
+    def set_run(run, **wanted):
+        asked.append(wanted)
         return answer
 
     going.setattr("hilctl.cli.steering.set_run", set_run)
     assert steer("set", ["gain=0.5", "offset=-2", "--over", "1.5"]) == 0
     assert "sine-7: gain 0.5, offset -2, over 1.5 s" in capsys.readouterr().out
-    assert asked == [(["gain=0.5", "offset=-2"], 1.5)]
+    assert asked == [{"gain": 0.5, "offset": -2.0, "over_s": 1.5}]
 
 
 @pytest.mark.parametrize(
-    "words", [["status"], ["stop", "--all"], ["set", "gain=1"], ["stop", "-h"]]
+    "words", [["status"], ["stop", "--all"], ["set", "gain=1"], ["mark", "x"], ["stop", "-h"]]
 )
 def test_nobody_waits_for_an_import(words):
     """The whole command, as a user calls it, imports the standard library alone."""
@@ -108,3 +108,18 @@ def test_the_application_has_the_same_commands(name, capsys):
     with pytest.raises(SystemExit) as left:
         command(["--absent"], standalone_mode=False)
     assert left.value.code == 2
+
+
+def test_a_mark_is_one_text_however_many_words_it_has(going, capsys):
+    sent = []
+
+    def mark_run(run, text):
+        sent.append(text)
+        return {"sample": 600, "text": text}
+
+    going.setattr("hilctl.cli.steering.mark_run", mark_run)
+    assert steer("mark", ["tapped", "the stage"]) == 0
+    assert "marked sample 600: tapped the stage" in capsys.readouterr().out
+    assert steer("mark", ["tapped", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["sample"] == 600
+    assert sent == ["tapped the stage", "tapped"]

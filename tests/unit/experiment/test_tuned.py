@@ -16,7 +16,7 @@ from hilctl.experiment.check import check
 from hilctl.experiment.load import resolve
 from hilctl.experiment.tuned import InputPeaks, RunPosition, tuned_forecast
 from hilctl.loop.compensator import Compensator
-from hilctl.loop.host import Tuning
+from hilctl.loop.host import StraightLine, Tuning
 from hilctl.loop.tuning import Tuner, tune
 from hilctl.models.staged import FieldLag, StagedModel
 from tests.published import terfenol_rdpi
@@ -80,6 +80,10 @@ def put_out(made, compensator, tuner, start, stop, tunings):
             tune(factors, values, values)
         out = np.empty_like(values)
         compensator.process(values, out)
+        if factors is not None:
+            reference = np.empty_like(values)
+            tune(factors, made.reference.values[at : at + 500], reference)
+            tuner.fade(factors, reference, out, np.zeros(500, dtype=np.uint32))
         found.append(out)
     return np.concatenate(found) if found else np.empty(0)
 
@@ -106,10 +110,13 @@ def seen(monkeypatch):
 
 @pytest.mark.parametrize("model", [None, terfenol_rdpi(), LOOKING_AHEAD])
 @pytest.mark.parametrize("waveform", [SINE, CHIRP])
-def test_figures_are_those_of_the_loop_to_come(monkeypatch, model, waveform):
+@pytest.mark.parametrize("share", [1.0, 0.0])
+def test_figures_are_those_of_the_loop_to_come(monkeypatch, model, waveform, share):
     """From a change that is under way on, with the ramp of the next, to the end."""
     made = checked(waveform, model)
-    first, second = Tuning(0.8, 0.5, 9000, 2000), Tuning(0.5, -1.0, 3000, 7000)
+    line = made.forecast.line or StraightLine()
+    first = Tuning(0.8, 0.5, 9000, 2000)
+    second = Tuning(0.5, -1.0, 3000, 7000, share if model else 1.0, line)
     position, compensator, tuner = position_at(made, 5000, [first])
     assert position.tuner.moving
     kept = seen(monkeypatch)
@@ -273,3 +280,13 @@ def test_a_wish_that_is_no_number_is_refused():
     position, *_ = position_at(made, 1000)
     with pytest.raises(ConfigError):
         forecast(made, position, Tuning(1e308, 1e308, 500, 2000))
+
+
+def test_a_fade_that_is_too_fast_is_refused():
+    """Where the two commands are far apart, one sample is too short a time between them."""
+    made = checked(SINE, terfenol_rdpi(), slew=200.0)
+    position, _, _ = position_at(made, 1000)
+    slow, fast = (Tuning(1.0, 0.0, n, 2000, 0.0, made.forecast.line) for n in (500, 1))
+    assert forecast(made, position, slow).to_the_end
+    with pytest.raises(ConfigError, match="must change no faster than 200 A/s"):
+        forecast(made, position, fast)

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from hilctl.base.samples import Flag
 from hilctl.base.yaml.document import Document
 from hilctl.experiment.feedback import (
     gains_for,
@@ -276,3 +277,18 @@ class TestAroundModels:
         errors = np.abs(self.errors(model, 3.0))
         assert errors[0] > 2.9
         assert errors[-1000:].max() < 0.1
+
+
+def test_correction_stands_while_the_inverse_is_out():
+    """The error is the actuator's own then, and the correction is not put out: it must not grow."""
+    feedback, found = loop(), []
+    for k in range(100):
+        block = made_block()
+        block.reference[:], block.wanted[:], block.command[:] = 10.0, 1.0, 1.0
+        block.displacement_um[:] = 9.0
+        block.flags[:] = Flag.INVERSE_OUT if 20 <= k < 80 else 0
+        feedback.follow(block, np.zeros(1))
+        feedback.take(block)
+        found.append(feedback.correction_um)
+    assert np.diff(found[21:81]).tolist() == [0.0] * 59
+    assert 0.0 < found[10] < found[80] < found[99]

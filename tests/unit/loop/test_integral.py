@@ -113,6 +113,7 @@ class TestFrozen:
             Flag.UNANSWERED,
             Flag.AFTER_SKIPPED,
             Flag.INVALID,
+            Flag.INVERSE_OUT,
             64,
             512,
         ],

@@ -7,7 +7,7 @@ import pytest
 
 from hilctl.base.samples import Flag, Head
 from hilctl.loop.compensator import Compensator
-from hilctl.loop.host import Tuning
+from hilctl.loop.host import StraightLine, Tuning
 from hilctl.loop.interlocks import InterlockContext
 from hilctl.loop.limiter import CommandLimits
 from hilctl.loop.loop import Loop
@@ -514,3 +514,42 @@ def test_skipped_ticks_move_a_tuning_on():
     rig.run()
     at = [head[Head.FIRST_SAMPLE] for head in rig.host.heads].index(60)
     assert rig.host.columns[at][0][0] == pytest.approx(2.0 * (1.0 - 0.5 * 21 / 40))
+
+
+def test_inverse_that_comes_back_in_has_the_memory_of_one_that_was_never_out():
+    """It is fed while it is out: the commands after its way back are the same to the bit."""
+    reference = 10.0 * sine(400)
+    line = StraightLine(0.1, 0.25)
+    out, back = Tuning(1.0, 0.0, 20, 0, 0.0, line), Tuning(1.0, 0.0, 30, 0, 1.0, line)
+    rig = Rig(reference, block=10, model=terfenol_rdpi(), tunings={50: out, 200: back})
+    plain = Rig(reference, block=10, model=terfenol_rdpi())
+    for each in (rig, plain):
+        each.run()
+    commands, untouched = rig.host.column(1), plain.host.column(1)
+    assert (commands[70:200] == 0.1 * reference[70:200] + 0.25).all()
+    away = np.concatenate(rig.host.flags) == Flag.INVERSE_OUT
+    assert np.flatnonzero(away).tolist() == list(range(50, 229))
+    assert commands[~away].tobytes() == untouched[~away].tobytes()
+    assert [(each.sample, each.code) for each in rig.host.events] == [
+        (50, "inverse"),
+        (200, "inverse"),
+    ]
+
+
+def test_skipped_ticks_move_a_fade_on():
+    """The inverse is fed what was skipped, and its share is that of the sample."""
+    reference = np.linspace(0.0, 20.0, 200)
+    out = Tuning(1.0, 0.0, 40, 0, 0.0, StraightLine(0.1, 0.0))
+    rig = Rig(
+        reference,
+        model=terfenol_rdpi(),
+        tunings={40: out},
+        clock=FakeClock(stall_ns={50: 10_000_000}),
+    )
+    rig.run()
+    at = [head[Head.FIRST_SAMPLE] for head in rig.host.heads].index(60)
+    compensator, inverse = Compensator(terfenol_rdpi(), RATE_HZ), np.empty(61)
+    compensator.process(reference[:61].copy(), inverse)
+    share = 1.0 - 21 / 40
+    expected = share * inverse[60] + (1.0 - share) * 0.1 * reference[60]
+    assert rig.host.columns[at][1][0] == pytest.approx(expected, rel=1e-12)

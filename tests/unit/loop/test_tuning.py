@@ -1,11 +1,15 @@
 """Gain and offset of a running reference."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hilctl.loop.host import Tuning
+from hilctl.base.events import INVERSE, TUNED
+from hilctl.base.samples import Flag
+from hilctl.loop.host import StraightLine, Tuning
 from hilctl.loop.tuning import Tuner, tune
 
 
@@ -76,7 +80,7 @@ def test_two_arrays_are_moved_alike():
     tune(factors, np.ones(10), a)
     tune(factors, np.zeros(10), b)
     assert a - b == pytest.approx(1.0 + np.arange(1, 11) / 10)
-    assert tuner.advance(1) == (2.0, 1.0)
+    assert tuner.advance(1) == (2.0, 1.0, 1.0)
 
 
 @given(st.integers(0, 80), st.integers(1, 60))
@@ -95,6 +99,59 @@ def test_samples_that_go_by_count(passed, samples):
     )
     gain, offset = looked.gain, looked.offset
     if passed:
-        gains, offsets = (np.broadcast_to(each, 1) for each in looked.advance(1))
+        gains, offsets, _ = (np.broadcast_to(each, 1) for each in looked.advance(1))
         assert gains[0] <= gain
         assert offsets[0] <= offset
+
+
+FADE = Tuning(1.0, 0.0, 30, 0, 0.0, StraightLine(0.5, -1.0))
+BACK = replace(FADE, samples=20, inverse_share=1.0)
+
+
+def faded(tuner, reference, wanted, block, moves):
+    """Put commands through in blocks; return them, and where a flag is set."""
+    out, flags = wanted.copy(), np.zeros(wanted.size, dtype=np.uint32)
+    for start in range(0, wanted.size, block):
+        if start in moves:
+            tuner.move(moves[start])
+        part = slice(start, start + block)
+        if (factors := tuner.advance(out[part].size)) is not None:
+            tuner.fade(factors, reference[part], out[part], flags[part])
+    return out, flags == Flag.INVERSE_OUT
+
+
+def test_inverse_goes_over_to_the_line_and_back_to_the_bit():
+    """In a line from sample to sample; before and after, the inverse's commands are untouched."""
+    reference, wanted = np.random.default_rng(1).normal(size=(2, 200))
+    wanted[150] = -0.0
+    out, flagged = faded(Tuner(), reference, wanted, 10, {40: FADE, 100: BACK})
+    straight = 0.5 * reference - 1.0
+    share = np.interp(np.arange(200), [39, 69, 99, 119], [1.0, 0.0, 0.0, 1.0])
+    assert out == pytest.approx(share * wanted + (1.0 - share) * straight)
+    assert (out[69:100] == straight[69:100]).all()
+    assert flagged.tolist() == (share < 1.0).tolist()
+    assert out[~flagged].tobytes() == wanted[~flagged].tobytes()
+
+
+@given(st.sampled_from([1, 2, 5, 10, 20]), st.integers(0, 6))
+def test_block_cuts_give_the_same_bits_of_a_fade(block, overtaken):
+    """Also of one that the next overtakes in its midst."""
+    reference, wanted = np.random.default_rng(2).normal(size=(2, 200))
+    moves = {40: FADE, 40 + 20 * overtaken: BACK} if overtaken else {40: FADE}
+    whole, _ = faded(Tuner(), reference, wanted, 20, moves)
+    cut, _ = faded(Tuner(), reference, wanted, block, moves)
+    assert cut.tobytes() == whole.tobytes()
+
+
+def test_events_name_what_moves_and_no_more():
+    """A fade alone is no change of the reference; both together are one event each."""
+    tuner = Tuner()
+    (event,) = tuner.events(FADE, 40)
+    assert (event.sample, event.code, event.text) == (40, INVERSE, "inverse out, over 30 samples")
+    assert event.values == {"share": 0.0, "samples": 30.0, "slope": 0.5, "at_zero": -1.0}
+    tuner.move(FADE)
+    tuner.pass_over(30)
+    both = Tuning(0.5, 0.0, 20)
+    assert [each.code for each in tuner.events(both, 90)] == [TUNED, INVERSE]
+    assert [each.code for each in tuner.events(replace(FADE, gain=0.5), 90)] == [TUNED]
+    assert [each.code for each in Tuner().events(BACK, 0)] == [TUNED]

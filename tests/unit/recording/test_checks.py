@@ -10,7 +10,7 @@ from mcap.records import Attachment, Channel, Message, Metadata, Schema
 from mcap.writer import Writer
 
 from hilctl.base.errors import DataError, InputError
-from hilctl.base.events import TUNED, Event
+from hilctl.base.events import INVERSE, TUNED, Event
 from hilctl.base.samples import Head
 from hilctl.base.segments import Segment
 from hilctl.recording import schema
@@ -28,6 +28,8 @@ from hilctl.recording.recover import recover_recording
 from hilctl.recording.salvage import Salvage
 
 GOOD = Segment("sine", 0, 100, 10, 90, 20.0).to_mapping()
+
+FADE = {"share": 0.0, "samples": 10.0, "slope": 0.1, "at_zero": 0.0}
 
 
 @pytest.fixture
@@ -109,6 +111,17 @@ def _set(topic, **fields):
         (
             _set("/events", code=TUNED, value_names=["samples"], values=[float("inf")]),
             "a change of the reference by",
+        ),
+        *(
+            (
+                _set("/events", code=INVERSE, value_names=[*wrong], values=[*wrong.values()]),
+                "a change of the inverse by",
+            )
+            for wrong in (
+                FADE | {"share": 1.5},
+                FADE | {"samples": 0.0},
+                {key: value for key, value in FADE.items() if key != "slope"},
+            )
         ),
     ],
 )  # fmt: skip

@@ -45,7 +45,14 @@ def pass_block(ring, first_sample, memory):
 
 
 def wanted(ring, **changes):
-    given = {"gain": 0.5, "offset": 0.0, "samples": 5000, "lead_s": 0.5, "tuner": Tuner()}
+    given = {
+        "gain": 0.5,
+        "offset": 0.0,
+        "inverse_share": 1.0,
+        "samples": 5000,
+        "lead_s": 0.5,
+        "tuner": Tuner(),
+    }
     given |= {"tuner_at": 0, "heat_a2": 0.0, **changes}
     return WantedChange(ring=str(ring.path), **given)
 

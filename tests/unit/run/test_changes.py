@@ -9,11 +9,12 @@ import pytest
 
 from hilctl.base.errors import InputError
 from hilctl.experiment.tuned import TunedForecast
-from hilctl.loop.host import Tuning
+from hilctl.loop.host import StraightLine, Tuning
 from hilctl.run.changes import Changes, RequestedChange
 from hilctl.run.shared_page import SIZE, Field, SharedPage, Stop
 
 SAMPLES, RATE_HZ, BLOCK = 100_000, 1000.0, 10
+LINE = StraightLine(0.1, -2.0)
 
 
 @dataclass
@@ -38,7 +39,8 @@ class FakeWorker:
     def approve(self, begins_at, heat_a2=0.0):
         """Let the change that was asked for last be within the limits."""
         wanted = self.asked[-1]
-        tuning = Tuning(wanted.gain, wanted.offset, wanted.samples, begins_at)
+        share = wanted.inverse_share
+        tuning = Tuning(wanted.gain, wanted.offset, wanted.samples, begins_at, share, LINE)
         self.answer = TunedForecast(tuning, 2.5, False, heat_a2)
 
 
@@ -56,14 +58,16 @@ def worker():
 
 @pytest.fixture
 def changes(page, worker):
-    forecast = SimpleNamespace(samples=SAMPLES, heating_rms_a=2.0)
-    loaded = SimpleNamespace(config=SimpleNamespace(sample_rate_hz=RATE_HZ, block=BLOCK))
+    forecast = SimpleNamespace(samples=SAMPLES, heating_rms_a=2.0, line=LINE)
+    limits = SimpleNamespace(tracking_error_um=None)
+    config = SimpleNamespace(sample_rate_hz=RATE_HZ, block=BLOCK, limits=limits)
+    loaded = SimpleNamespace(config=config, model=object())
     checked = SimpleNamespace(forecast=forecast, loaded=loaded)
     return Changes(checked, SimpleNamespace(ring=Path("ring")), page, worker)
 
 
-def change(changes, gain=None, offset=None, over_s=2.0):
-    made = RequestedChange(gain, offset, over_s)
+def change(changes, gain=None, offset=None, over_s=2.0, inverse=None):
+    made = RequestedChange(gain, offset, over_s, inverse)
     changes.add(made)
     changes.attend()
     return made
@@ -89,6 +93,7 @@ def test_a_change_reaches_the_loop_whole_once_it_is_worked_out(changes, page, wo
     assert made.answer() == {
         "gain": 0.5,
         "offset": 0.0,
+        "inverse": "in",
         "over_s": 2.0,
         "begins_at_sample": 600,
         "checked_s": 2.5,
@@ -206,5 +211,34 @@ def test_a_queue_that_is_full_takes_no_more(changes):
 
 
 def test_a_change_of_nothing_is_refused(changes):
-    with pytest.raises(InputError, match="gain or offset is required"):
+    with pytest.raises(InputError, match="gain, offset or inverse is required"):
         change(changes)
+
+
+def test_the_inverse_goes_out_and_stays_there_until_it_is_wanted_in(changes, page, worker):
+    """A change of the gain in between leaves it where it is."""
+    shares = [Field.TUNE_INVERSE_SHARE, Field.TUNE_LINE_SLOPE, Field.TUNE_LINE_AT_ZERO]
+    for at, wanted, share in (
+        (600, {"inverse": "out"}, 0.0),
+        (700, {"gain": 0.5}, 0.0),
+        (
+            800,
+            {"inverse": "in"},
+            1.0,
+        ),
+    ):
+        made = change(changes, **wanted)
+        assert worker.asked[-1].inverse_share == share
+        worker.approve(at)
+        changes.attend()
+        assert made.answer()["inverse"] == changes.inverse == ("in" if share else "out")
+        assert [page.get_float(each) for each in shares] == [share, 0.1, -2.0]
+        take(page, at)
+
+
+def test_an_inverse_that_is_not_there_can_not_go_out(changes, page):
+    changes._checked.loaded.model = None
+    with pytest.raises(InputError, match="set: inverse: the experiment has no compensator"):
+        change(changes, inverse="out")
+    assert changes.inverse is None
+    assert page.get(Field.TUNE_WANTED) == 0

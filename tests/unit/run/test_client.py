@@ -6,7 +6,15 @@ import pytest
 
 from hilctl.base.errors import InputError, RunError
 from hilctl.run import client
-from hilctl.run.client import find_run, going_on, set_run, status_of, stop_runs
+from hilctl.run.client import (
+    assigned,
+    find_run,
+    going_on,
+    mark_run,
+    set_run,
+    status_of,
+    stop_runs,
+)
 from tests.fakes import SteppingClock
 
 
@@ -104,21 +112,28 @@ def test_only_runs_with_a_supervisor_are_going_on(monkeypatch):
     assert going_on() == found[:1]
 
 
-def test_set_sends_numbers(answers):
-    set_run(run("a"), ["gain=0.5", "offset=-2"], 1.5)
-    (sent,) = answers
-    assert sent == ("a.sock", {"command": "set", "gain": 0.5, "offset": -2.0, "over_s": 1.5})
+def test_set_sends_what_is_to_change(answers):
+    set_run(run("a"), **assigned(["gain=0.5", "offset=-2"]), over_s=1.5)
+    set_run(run("a"), **assigned(["inverse=out"]))
+    first, second = answers
+    assert first == ("a.sock", {"command": "set", "gain": 0.5, "offset": -2.0, "over_s": 1.5})
+    assert second == ("a.sock", {"command": "set", "inverse": "out", "over_s": 1.0})
+
+
+def test_mark_sends_its_text(answers):
+    mark_run(run("a"), "tapped the stage")
+    assert answers == [("a.sock", {"command": "mark", "text": "tapped the stage"})]
 
 
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("gain", "must be gain=NUMBER or offset=NUMBER: 'gain'"),
+        ("gain", "must be gain=NUMBER, offset=NUMBER or inverse=in.out: 'gain'"),
         ("rate=1", "must be gain=NUMBER"),
         ("gain=high", "gain must be a number: 'high'"),
+        ("inverse=0", "inverse must be in or out: '0'"),
     ],
 )
-def test_what_is_no_setting_is_not_sent(answers, text, said):
+def test_what_is_no_setting_is_refused(text, said):
     with pytest.raises(InputError, match=said):
-        set_run(run("a"), ["offset=1", text], 1.0)
-    assert answers == []
+        assigned(["offset=1", text])

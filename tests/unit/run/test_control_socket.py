@@ -12,7 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hilctl.base.errors import InputError, RunError
-from hilctl.run.control_socket import MAX_BYTES, ControlServer, ask
+from hilctl.run.control_socket import ControlServer, ask
+from hilctl.run.protocol import MAX_BYTES, VERSION
 from tests.fakes import SteppingClock
 
 
@@ -75,18 +76,22 @@ def test_question_and_answer_are_one_line_each(server, tmp_path):
         client.sendall(b"lo\n")
         for _ in range(3):
             server.serve(0.0)
-        assert json.loads(client.recv(1000)) == {"ok": True, "heard": "hello"}
+        assert json.loads(client.recv(1000)) == {"protocol": VERSION, "ok": True, "heard": "hello"}
         assert client.recv(1000) == b""
 
 
 def test_a_question_without_its_end_is_one_when_its_client_has_said_all(server, tmp_path):
-    assert json.loads(exchange(server, tmp_path, b"hello")) == {"ok": True, "heard": "hello"}
+    assert json.loads(exchange(server, tmp_path, b"hello")) == {
+        "protocol": VERSION,
+        "ok": True,
+        "heard": "hello",
+    }
 
 
 def test_refusal_is_told_in_words(server, tmp_path):
     """What can't be followed comes back as an error text."""
     answer = json.loads(exchange(server, tmp_path, b"refuse\n"))
-    assert answer == {"ok": False, "error": "not today"}
+    assert answer == {"protocol": VERSION, "ok": False, "error": "not today"}
 
 
 def test_endless_question_is_cut_off(server, tmp_path):
@@ -96,7 +101,7 @@ def test_endless_question_is_cut_off(server, tmp_path):
         for _ in range(4):
             server.serve(0.0)
         answer = json.loads(client.recv(1000))
-    assert answer == {"ok": False, "error": f"longer than {MAX_BYTES} bytes"}
+    assert (answer["ok"], answer["error"]) == (False, f"longer than {MAX_BYTES} bytes")
 
 
 def test_silent_client_is_dropped(tmp_path):
@@ -197,8 +202,9 @@ def test_what_takes_time_is_answered_later_while_others_are_served(server, tmp_p
         assert json.loads(exchange(server, tmp_path, b"hello\n"))["ok"]
         Later.made[-2].found, Later.made[-1].found = {"n": 1}, InputError("no")
         server.serve(0.0)
-        assert json.loads(first.recv(1000)) == {"ok": True, "n": 1}
-        assert json.loads(second.recv(1000)) == {"ok": False, "error": "no"}
+        assert json.loads(first.recv(1000)) == {"protocol": VERSION, "ok": True, "n": 1}
+        refused = {"protocol": VERSION, "ok": False, "error": "no"}
+        assert json.loads(second.recv(1000)) == refused
         assert (first.recv(10), second.recv(10)) == (b"", b"")
         for each in crowd:
             each.close()
@@ -303,11 +309,15 @@ def test_a_question_that_was_pushed_out_is_asked_again(tmp_path):
             thread.start()
             return thread
 
-        thread = serving(6, b'{"ok": true, "n": 1}\n')
+        thread = serving(6, b'{"protocol": 1, "ok": true, "n": 1}\n')
         assert ask(path, {"say": "hello"}) == {"n": 1}
         thread.join(10)
         assert seen == [b'{"say": "hello"}\n'] * 3
-        thread = serving(2)
+        thread = serving(2, b'{"protocol": 9, "ok": false, "error": "set: ..."}\n')
+        with pytest.raises(RunError, match="speaks protocol 9, this hilctl 1"):
+            ask(path, {"say": "hello"})
+        thread.join(10)
+        serving(2)
         with pytest.raises(RunError, match="among a crowd"):
             ask(path, {"say": "hello"}, 5.0, SteppingClock(2.0))
         thread.join(10)

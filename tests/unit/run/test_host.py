@@ -2,7 +2,7 @@
 
 import pytest
 
-from hilctl.loop.host import Tuning
+from hilctl.loop.host import StraightLine, Tuning
 from hilctl.run.host import RingHost
 from hilctl.run.ring import SampleRing
 from hilctl.run.shared_page import Field, Phase, Stop
@@ -56,8 +56,11 @@ def test_a_tuning_is_taken_once(host, ring):
         page.put_float(Field.TUNE_GAIN, gain)
         page.put_float(Field.TUNE_OFFSET, -1.0)
         page.put(Field.TUNE_SAMPLES, 40)
+        page.put_float(Field.TUNE_INVERSE_SHARE, 0.25)
+        page.put_float(Field.TUNE_LINE_SLOPE, 0.1)
+        page.put_float(Field.TUNE_LINE_AT_ZERO, -2.0)
         page.put(Field.TUNE_WANTED, number)
-        assert host.tuning() == Tuning(gain, -1.0, 40)
+        assert host.tuning() == Tuning(gain, -1.0, 40, 0, 0.25, StraightLine(0.1, -2.0))
         assert host.tuning() is None
         assert page.get(Field.TUNE_TAKEN) == number
 
@@ -66,6 +69,7 @@ def test_a_tuning_waits_for_its_sample(host, ring):
     """It was worked out from there on; where a tick was skipped it begins at the next one."""
     page = ring.page
     page.put_float(Field.TUNE_GAIN, 0.5)
+    page.put_float(Field.TUNE_INVERSE_SHARE, 1.0)
     page.put(Field.TUNE_SAMPLES, 40)
     page.put(Field.TUNE_BEGINS_AT, 60)
     page.put(Field.TUNE_WANTED, 1)

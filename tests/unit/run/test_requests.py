@@ -4,12 +4,15 @@ import json
 from mmap import mmap
 from pathlib import Path
 from types import SimpleNamespace
+from typing import get_args
 
 import pytest
 
 from hilctl.base.errors import InputError
+from hilctl.base.events import MARK
+from hilctl.run import protocol
 from hilctl.run.changes import RequestedChange
-from hilctl.run.requests import Requests
+from hilctl.run.requests import REQUESTS, Requests
 from hilctl.run.run_folder import run_folder
 from hilctl.run.shared_page import SIZE, Field, Phase, SharedPage, Stop
 from hilctl.run.start import checked_experiment
@@ -31,10 +34,17 @@ def page():
 
 
 @pytest.fixture
-def requests(checked, page, tmp_path):
-    recorder = SimpleNamespace(samples=450, missing=0, error="")
+def recording():
+    made = SimpleNamespace(events=[], takes_marks=True)
+    made.recorder = SimpleNamespace(samples=450, missing=0, error="")
+    made.record_event = made.events.append
+    return made
+
+
+@pytest.fixture
+def requests(checked, page, recording, tmp_path):
     with run_folder("demo", tmp_path / "a.mcap", 12.0) as (folder, _):
-        yield Requests(checked, folder, page, recorder, SimpleNamespace())
+        yield Requests(checked, folder, page, recording, SimpleNamespace())
 
 
 def asked(requests, **message):
@@ -69,7 +79,7 @@ def test_nobody_stops_a_run_by_its_socket(requests):
     [
         (b"{", "message: "),
         (b'{"command": "fly"}', "message: "),
-        (b'{"command": "set"}', "gain or offset is required"),
+        (b'{"command": "set"}', "gain, offset or inverse is required"),
         (b'{"command": "set", "gain": "1"}', "gain: "),
         (b'{"command": "set", "gain": 1.0, "over_s": 0.0}', "over_s: "),
         (b'{"command": "set", "gain": 1.0, "over_s": 1e9}', "over_s: "),
@@ -96,3 +106,34 @@ def test_nothing_is_moved_on_the_way_out(requests, page, checked):
     page.put(Field.STOP, Stop.REQUEST)
     with pytest.raises(InputError, match="on its way to the safe value"):
         asked(requests, command="set", gain=0.5)
+
+
+def test_a_mark_is_an_event_at_the_present_sample(requests, page, recording):
+    """Counted from the start of the run, as every event is."""
+    page.put(Field.WAVEFORM_AT, 100)
+    answer = asked(requests, command="mark", text="tapped the stage")
+    assert answer == {"sample": 600, "text": "tapped the stage"}
+    (event,) = recording.events
+    assert (event.sample, event.level, event.code) == (600, "info", MARK)
+    assert event.text == "tapped the stage"
+
+
+@pytest.mark.parametrize("text", ["", "  ", "two\nlines", "\x1b[2J", "\u202eabc", "x" * 201])
+def test_a_mark_is_one_printable_line(requests, recording, text):
+    with pytest.raises(InputError, match=r"mark\.text: "):
+        asked(requests, command="mark", text=text)
+    assert recording.events == []
+
+
+def test_a_mark_that_would_be_lost_is_refused(requests, recording):
+    recording.takes_marks = False
+    with pytest.raises(InputError, match="takes none now, or is over"):
+        asked(requests, command="mark", text="late")
+    assert recording.events == []
+
+
+def test_the_protocol_names_every_request():
+    """What a client may send by it is what is read here."""
+    schema = REQUESTS.json_schema()
+    assert {*schema["discriminator"]["mapping"]} == {*get_args(protocol.Command)}
+    assert protocol.request("set", gain=0.5, offset=None) == {"command": "set", "gain": 0.5}

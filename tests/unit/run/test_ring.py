@@ -226,3 +226,53 @@ def test_slots_are_handed_out_clean(tmp_path):
         if number % 3 != 1:
             other.pop()
             other.release()
+
+
+def test_who_looks_on_sees_what_stands_there_and_takes_nothing(tmp_path):
+    """Also what was taken and kept; of what was cleaned for the loop, nothing."""
+    ring = make(tmp_path, slots=4)
+    consumer, seen = SampleRing(ring.path), SampleRing(ring.path, look_only=True)
+    for number in range(3):
+        push(ring, number)
+    batch, after = seen.look(1)
+    assert (batch.heads[:, Head.FIRST_SAMPLE].tolist(), after) == ([3, 6], 3)
+    consumer.pop()
+    consumer.release(keep=1)
+    batch, after = seen.look(0)
+    assert (batch.columns[:, 0, 0].tolist(), after) == ([2.0], 3)
+    assert np.isfinite(batch.columns).all()
+    push(ring, 3)
+    assert consumer.pop().heads[:, Head.FIRST_SAMPLE].tolist() == [9]
+    assert seen.look(7)[1] == 7
+    with pytest.raises(ValueError, match="read-only"):
+        seen.page.put(Field.STOP, 1)
+
+
+def test_a_block_that_is_cleaned_or_damaged_under_the_copy_is_left_out(tmp_path):
+    ring = make(tmp_path, slots=4)
+    for number in range(4):
+        push(ring, number)
+    seen = SampleRing(ring.path, look_only=True)
+    rows = seen._area.rows
+
+    class Area:
+        def rows(self, chosen):
+            ring.page.put(Field.CLEANED, 2)
+            return rows(chosen)
+
+    seen._area = Area()
+    ring._area.heads[3, Head.SEQUENCE] = 77
+    batch, after = seen.look(0)
+    assert (batch.heads[:, Head.FIRST_SAMPLE].tolist(), after) == ([6], 4)
+
+
+def test_what_is_safe_is_not_taken_again_though_it_stays(tmp_path):
+    ring = make(tmp_path, slots=4)
+    for number in range(2):
+        push(ring, number)
+    ring.pop()
+    ring.release(keep=1)
+    push(ring, 2)
+    ring.pop()
+    ring.take_again()
+    assert ring.pop().heads[:, Head.FIRST_SAMPLE].tolist() == [6]

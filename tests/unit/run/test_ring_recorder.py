@@ -72,7 +72,7 @@ def test_room_is_given_back_once_the_file_has_what_stood_there(ring, recording):
     exchange(ring, 3)
     recording._work()
     assert recording.recorder.firsts == [0, 1, 2]
-    assert ring.page.get(Field.TAIL) == 3
+    assert ring.page.get(Field.TAIL) == 2  # an eighth of the ring stays for those who look on
     assert recording.newest.heads[-1, Head.FIRST_SAMPLE] == 2
 
 
@@ -83,7 +83,7 @@ def test_what_an_emptied_file_has_lost_is_written_once_more(ring, recording):
     assert ring.page.get(Field.TAIL) == 0
     recording._work()
     assert recording.recorder.firsts == [0, 1, 0, 1]
-    assert ring.page.get(Field.TAIL) == 2
+    assert ring.page.get(Field.TAIL) == 1
 
 
 def test_events_of_both_sides_come_after_the_samples(ring, recording):
@@ -141,3 +141,19 @@ def test_nobody_waits_for_a_disk_that_stands_still(ring, recording, monkeypatch)
     recording.recorder.disk.set()
     recording._thread.join(30.0)
     assert recording.recorder.finished == ("waveform completed", 8)
+
+
+def test_marks_are_taken_as_long_as_they_will_be_in_the_file(recording):
+    """Not of a run that is over, on a disk that fails, or where too many wait for it."""
+    recording.recorder.error = ""
+    assert recording.takes_marks
+    for _ in range(64):
+        recording.record_event(Event(0, "info", "mark", "tapped"))
+    assert not recording.takes_marks
+    recording._drain()
+    assert recording.takes_marks
+    recording.recorder.error = "no room"
+    assert not recording.takes_marks
+    recording.recorder.error = ""
+    recording.end(ENDED, lost_loop=False)
+    assert not recording.takes_marks

@@ -77,3 +77,25 @@ def test_every_stop_has_its_words():
     """What the loop says of a stop."""
     assert all(stop.reason.startswith("stopped b") for stop in Stop)
     assert len({stop.reason for stop in Stop}) == len(Stop)
+
+
+def test_who_looks_on_sees_the_newest_events_and_takes_none(sides):
+    one, other = sides
+    for number in range(3):
+        one.push_event(Event(number, "info", f"e{number}", ""))
+    events, after = other.look_at_events(1)
+    assert ([event.code for event in events], after) == (["e1", "e2"], 3)
+    assert other.look_at_events(after) == ([], 3)
+    assert len(one.pop_events()) == 3
+
+
+def test_notes_are_seen_by_all_and_the_oldest_give_way(sides):
+    """Whatever their texts; nobody has to take them out."""
+    one, other = sides
+    for number in range(40):
+        one.leave_note(Event(number, "info", "mark", f"{number} " + "x" * 2000))
+    notes, after = other.look_at_notes(0)
+    assert [note.sample for note in notes] == list(range(9, 40))
+    assert (after, other.look_at_notes(after)) == (40, ([], 40))
+    one.leave_note(Event(40, "info", "mark", "more"))
+    assert [note.text for note in other.look_at_notes(after)[0]] == ["more"]

@@ -1,0 +1,16 @@
+"""Who looks on: the live page of a running experiment, its server, and the frames behind it.
+
+Nothing here is part of a run: it maps the run's ring so that it can't write to it, and asks for
+changes by the run's own control socket. Kill it at any time, and the run does not notice.
+
+signals.py    the columns that are shown
+envelope.py   lowest and highest of each signal in buckets of samples: no spike is lost
+scope.py      windows over time, rolling or triggered to the waveform's cycle, and its loops
+figures.py    running figures of quality; spectrum.py  of the error
+lateness.py   how late the ticks woke; headroom.py  what is left to each limit
+feed.py       all of it from one run's folder; frames.py  as bytes for a page, subscription.py
+              for programs
+server.py     the page and its connections, on loopback; static.py  its files, those of page/
+admission.py  who is let in; viewer.py  one page: what it asks for, and how much it gets
+live.py       the server as a process
+"""

@@ -1,0 +1,626 @@
+// The live page: it draws what the server sends, and asks for what is pressed. It keeps nothing: a
+// reload, a second page or none at all is the same to the run.
+
+const PROTOCOL = "hilctl.live.1";
+const WINDOWS_S = [0.02, 0.1, 0.5, 2, 10, 60, 600];
+const FIGURES = [
+  ["peak_hysteresis_percent", "peak hysteresis", "%", 2],
+  ["noise_floor_percent", "its noise floor", "%", 2],
+  ["peak_error_percent", "peak error", "%", 2],
+  ["rms_error_percent", "rms error", "%", 2],
+  ["peak_error_um", "peak error, each sample", "µm", 3],
+  ["rms_error_um", "rms error, each sample", "µm", 3],
+  ["peak_to_peak_um", "stroke", "µm", 2],
+  ["sensor_noise_um", "sensor noise", "µm", 4],
+];
+const FRESH_MS = 2000;
+const SHRINK_MS = 3000;
+
+const $ = (id) => document.getElementById(id);
+const token = location.hash.slice(1);
+const calm = matchMedia("(prefers-reduced-motion: reduce)");
+const view = { run: new URLSearchParams(location.search).get("run"), mode: "cycle", window_s: 2 };
+let socket = null;
+let status = null;
+let frame = null;
+let drawn = 0;
+let lastFrameMs = 0;
+let nextId = 1;
+const waiting = new Map();
+const counters = { frames: 0, errors: 0, acknowledgedMs: null };
+window.hilctlLive = counters; // what a test reads
+
+addEventListener("error", () => { counters.errors += 1; });
+addEventListener("unhandledrejection", () => { counters.errors += 1; });
+
+// ---- connection
+
+function connect() {
+  if (!token) {
+    notice("This address has no token: open the one that hilctl has printed.");
+    return;
+  }
+  socket = new WebSocket(`ws://${location.host}/live`, [PROTOCOL, `token.${token}`]);
+  socket.binaryType = "arraybuffer";
+  socket.onopen = () => { notice(""); ask("view", { view }); };
+  socket.onmessage = (message) => {
+    if (typeof message.data === "string") said(JSON.parse(message.data));
+    else frame = message.data;
+  };
+  socket.onclose = () => {
+    socket = null;
+    for (const [id] of waiting) answered({ id, ok: false, error: "the page's server is gone" });
+    if (!over()) {
+      notice("No connection to the page's server. The run goes on: end it by hilctl stop.");
+      badge("lost", "no connection");
+    }
+    setTimeout(connect, 1000);
+  };
+}
+
+function over() {
+  return status !== null && status.ended;
+}
+
+function ask(what, more, then = () => {}) {
+  const id = nextId++;
+  waiting.set(id, then);
+  if (socket === null || socket.readyState !== WebSocket.OPEN) {
+    answered({ id, ok: false, error: "no connection to the page's server" });
+  } else {
+    socket.send(JSON.stringify({ id, ask: what, ...more }));
+  }
+}
+
+function answered(answer) {
+  const then = waiting.get(answer.id);
+  waiting.delete(answer.id);
+  if (then) then(answer);
+}
+
+function said(message) {
+  if (message.kind === "answer") answered(message);
+  else { status = message; showStatus(); }
+}
+
+// ---- words and numbers
+
+function notice(text, kind = "bad") {
+  $("notice").hidden = !text;
+  $("notice").textContent = text;
+  $("notice").dataset.kind = kind;
+}
+
+function badge(kind, text) {
+  $("state").dataset.kind = kind;
+  $("state").textContent = text;
+}
+
+function say(text, kind = "good") {
+  $("said").textContent = text;
+  $("said").dataset.kind = kind;
+}
+
+function number(value, decimals, width = 8) {
+  const text = value === null || value === undefined ? "–" : value.toFixed(decimals);
+  return text.padStart(width, "\u2007");
+}
+
+function time(seconds) {
+  const minutes = Math.floor(seconds / 60);
+  return `${String(minutes).padStart(2, "0")}:${(seconds - 60 * minutes).toFixed(1).padStart(4, "0")}`;
+}
+
+function bytes(count) {
+  const units = ["B", "kB", "MB", "GB", "TB"];
+  let at = 0;
+  for (; count >= 1000 && at < units.length - 1; at += 1) count /= 1000;
+  return `${count.toPrecision(3)} ${units[at]}`;
+}
+
+function unit(kind) {
+  return kind === "um" ? "µm" : status.description.command_unit;
+}
+
+function showStatus() {
+  showRuns();
+  if (!status.description) {
+    badge("lost", "no run is going on");
+    return;
+  }
+  const { description } = status;
+  document.title = `${status.state} · ${description.name}`;
+  $("name").textContent = description.name;
+  badge(status.state, status.state);
+  $("clock").textContent = `${time(status.t_s)} of ${time(status.total_s)}`;
+  $("segment").textContent = status.segment;
+  $("done").value = Math.min(1, status.t_s / status.total_s);
+  $("recording").textContent = `recording: ${status.recording}`;
+  const disk = status.disk
+    ? `${bytes(status.disk.recorded_bytes)} recorded, ${bytes(status.disk.free_bytes)} free on disk · ` : "";
+  $("room").textContent = `${disk}ring ${(100 * status.ring_used).toFixed(0)} % full · `
+    + `${status.missed_samples} samples not seen`;
+  $("stop").disabled = status.ended;
+  if (status.ended) notice(`Run over: ${status.state}. ${status.reason}${safeText()}`, status.state === "fault" || status.safe === false ? "bad" : "calm");
+  showFigures();
+  showGauges();
+  showControls();
+  showEvents();
+  showKeys();
+  drawSmall();
+}
+
+function safeText() {
+  if (status.safe === null) return "";
+  return status.safe ? ". Output at its safe value, confirmed." : ". The output is NOT known to be safe: look at it.";
+}
+
+function showRuns() {
+  const others = status.runs.filter((run) => run.name !== status.run);
+  const key = others.map((run) => run.name).join();
+  if ($("runs").dataset.key === key) return;
+  $("runs").dataset.key = key;
+  $("runs").replaceChildren(...others.map((run) => {
+    const link = document.createElement("a");
+    link.href = `/?run=${encodeURIComponent(run.name)}#${token}`;
+    link.target = "_blank";
+    link.textContent = run.name;
+    return link;
+  }));
+}
+
+function showFigures() {
+  const tiles = $("tiles");
+  if (!tiles.childElementCount) {
+    tiles.replaceChildren(...FIGURES.map(([key, label]) => {
+      const tile = document.createElement("div");
+      const term = document.createElement("dt");
+      term.textContent = label;
+      const value = document.createElement("dd");
+      value.id = `figure-${key}`;
+      tile.append(term, value);
+      return tile;
+    }));
+  }
+  for (const [key, , what, decimals] of FIGURES) {
+    const small = document.createElement("small");
+    small.textContent = ` ${what}`;
+    $(`figure-${key}`).replaceChildren(number(status.figures[key], decimals), small);
+  }
+}
+
+function showGauges() {
+  const list = [...status.gauges,
+    { name: "ring", used: status.ring_used, value: 100 * status.ring_used, limit: 100, unit: "%" }];
+  const box = $("gauges");
+  const names = list.map((gauge) => gauge.name).join();
+  if (box.dataset.names !== names) {
+    box.dataset.names = names;
+    box.replaceChildren(...list.map((gauge) => {
+      const row = document.createElement("div");
+      row.className = "gauge";
+      const bar = document.createElement("i");
+      bar.append(document.createElement("b"));
+      const label = document.createElement("span");
+      label.textContent = gauge.name;
+      const part = document.createElement("span");
+      part.className = "num";
+      const text = document.createElement("small");
+      text.className = "num";
+      row.append(label, bar, part, text);
+      return row;
+    }));
+  }
+  list.forEach((gauge, at) => {
+    const [, bar, part, text] = box.children[at].children;
+    const kind = gauge.used > 0.95 ? "bad" : gauge.used > 0.8 ? "warn" : "";
+    box.children[at].dataset.kind = kind;
+    bar.firstChild.style.width = `${Math.min(100, 100 * gauge.used)}%`;
+    part.textContent = `${number(100 * gauge.used, 1, 6)} %`;
+    text.textContent = `${Number(gauge.value.toPrecision(3))} of ${Number(gauge.limit.toPrecision(4))} ${gauge.unit}`;
+  });
+}
+
+function showControls() {
+  const runs = status.state === "running";
+  for (const field of ["gain", "offset"]) {
+    const input = $(field);
+    if (document.activeElement !== input && !input.dataset.touched) input.value = status[field];
+  }
+  $("offset-unit").textContent = status.description.waveform_unit.replace("um", "µm");
+  $("inverse-row").hidden = !status.description.compensator;
+  $("inverse-in").setAttribute("aria-pressed", String(status.inverse === "in"));
+  $("inverse-out").setAttribute("aria-pressed", String(status.inverse === "out"));
+  for (const control of document.querySelectorAll("#controls button")) control.disabled = !runs;
+}
+
+function showEvents() {
+  const log = $("log");
+  const key = `${status.events.length} ${status.events.at(-1)?.t_s} ${status.events.at(-1)?.text}`;
+  if (log.dataset.key === key) return;
+  log.dataset.key = key;
+  log.replaceChildren(...status.events.toReversed().map((event) => {
+    const line = document.createElement("li");
+    line.dataset.kind = event.level;
+    const at = document.createElement("span");
+    at.className = "num";
+    at.textContent = time(event.t_s);
+    const text = document.createElement("span");
+    text.textContent = `${event.code}: ${event.text}`;
+    line.append(at, text);
+    return line;
+  }));
+}
+
+function showKeys() {
+  const body = $("keys");
+  const now = [["gain", String(status.gain)], ["offset", String(status.offset)]];
+  if (status.description.compensator) now.push(["inverse", status.inverse ?? "in"]);
+  const rows = [
+    ...now.map(([key, value]) => [key, value, "now"]),
+    ["mark", "", "now"],
+    ...status.description.settings.map((row) => [
+      row.key, row.value, row.settable ? `next run: --set ${row.key}=…` : "only in the file"]),
+  ];
+  const key = JSON.stringify(rows);
+  if (body.dataset.key === key) return;
+  body.dataset.key = key;
+  body.replaceChildren(...rows.map((cells) => {
+    const row = document.createElement("tr");
+    row.append(...cells.map((text) => {
+      const cell = document.createElement("td");
+      cell.textContent = text;
+      return cell;
+    }));
+    return row;
+  }));
+}
+
+// ---- plots
+
+const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
+const ranges = new Map();
+
+// A range grows at once and shrinks only after a while, by steps: axes that jump can't be read.
+function steady(name, low, high) {
+  if (!(low <= high)) { low = -1; high = 1; }
+  const now = performance.now();
+  const spare = 0.06 * (high - low) || 0.5 * Math.abs(high) || 1;
+  const wanted = [low - spare, high + spare];
+  const had = ranges.get(name);
+  if (!had) {
+    ranges.set(name, { range: wanted, small: now });
+    return wanted;
+  }
+  const [a, b] = had.range;
+  if (low < a || high > b) {
+    had.range = [Math.min(a, wanted[0]), Math.max(b, wanted[1])];
+    had.small = now;
+  } else if (high - low > 0.6 * (b - a)) {
+    had.small = now;
+  } else if (now - had.small > SHRINK_MS) {
+    had.range = wanted;
+    had.small = now;
+  }
+  return had.range;
+}
+
+function series(label, stroke, more = {}) {
+  return { label, stroke, width: 1.5, points: { show: false }, ...more };
+}
+
+function axes(yLabel, xLabel, more = {}) {
+  const look = { stroke: colour("quiet"), grid: { stroke: colour("line"), width: 1 }, ticks: { stroke: colour("line") } };
+  const size = parseFloat(getComputedStyle(document.documentElement).fontSize);
+  const font = `${Math.round(0.8 * size)}px system-ui, sans-serif`;
+  return [
+    { ...look, font, label: xLabel, labelFont: font, labelSize: 1.3 * size, size: 1.9 * size, ...more },
+    { ...look, font, label: yLabel, labelFont: font, labelSize: 1.4 * size, size: 4.2 * size },
+  ];
+}
+
+let plots = {};
+
+function build() {
+  for (const each of Object.values(plots)) each.plot.destroy();
+  ranges.clear();
+  plots = {};
+  const command = status.description.command_unit;
+  const dash = { dash: [6, 4] };
+  const measured = status.description.measures_command;
+  add("plot-um", [["reference", series("reference", colour("reference"), dash)],
+    ["displacement", series("displacement", colour("displacement"))]], "displacement, µm");
+  add("plot-error", [["error", series("error", colour("error"))]], "error, µm");
+  add("plot-command", [["command", series("command", colour("command"))],
+    ...(measured ? [["measured", series("measured", colour("measured"), dash)]] : [])], `command, ${command}`, "time, s");
+  const log = { distr: 3 };
+  small("plot-spectrum", [{}, series("error", colour("error"))], { x: { time: false, ...log }, y: { ...log, range: spectrumRange } },
+    axes("amplitude, µm", "frequency, Hz"));
+  small("plot-late", [{}, series("ticks", colour("bar"), { fill: `${colour("bar")}55`, paths: uPlot.paths.stepped({ align: 1 }) })],
+    { x: { time: false, ...log }, y: { range: (_, low, high) => [0, Math.max(1, high * 1.1)] } }, axes("ticks", "late by, µs"));
+}
+
+function spectrumRange(_, low, high) {
+  const top = 10 ** Math.ceil(Math.log10(Math.max(high || 1, 1e-9)));
+  return [top * 1e-5, top];
+}
+
+function sizes(box) {
+  // Without the legend, which stands below the plot.
+  return { width: box.clientWidth, height: Math.max(60, box.clientHeight - (box.dataset.legend ? 26 : 0)) };
+}
+
+function add(id, signals, yLabel, xLabel = "") {
+  const box = $(id);
+  const options = {
+    ...sizes(box), cursor: { drag: { x: false, y: false } }, legend: { show: false },
+    scales: { x: { time: false, range: (_, low, high) => [low, high] }, y: { range: (_, low, high) => steady(id, low, high) } },
+    axes: axes(yLabel, xLabel), series: [{}, ...signals.map(([, each]) => each)],
+  };
+  plots[id] = { plot: new uPlot(options, [[0, 1], ...signals.map(() => [null, null])], box), signals: signals.map(([name]) => name) };
+}
+
+function small(id, lines, scales, axis) {
+  const box = $(id);
+  const options = { ...sizes(box), legend: { show: false }, cursor: { drag: { x: false, y: false } }, scales, axes: axis, series: lines };
+  plots[id] = { plot: new uPlot(options, [[1, 10], [1, 1]], box) };
+}
+
+function drawSmall() {
+  if (!plots["plot-late"]) return;
+  const edges = status.lateness_edges_us;
+  const counts = status.lateness_counts;
+  let first = counts.findIndex((count) => count > 0);
+  if (first < 0) first = 1;
+  let last = counts.length - 1;
+  while (last > first && counts[last] === 0) last -= 1;
+  first = Math.max(1, first - 1);
+  last = Math.min(counts.length - 1, last + 1);
+  plots["plot-late"].plot.setData([edges.slice(first, last + 1), counts.slice(first, last + 1)]);
+  const late = status.lateness_us;
+  $("late-text").textContent = `p50 ${number(late.p50, 0, 5)}  p99 ${number(late.p99, 0, 6)}  max ${number(late.max, 0, 7)} µs · ${status.late_ticks} late`;
+  if (status.spectrum.hz.length) {
+    plots["plot-spectrum"].plot.setData([status.spectrum.hz, status.spectrum.um.map((um) => Math.max(um, 1e-12))]);
+  }
+}
+
+function unpack(buffer) {
+  const size = new DataView(buffer).getUint32(0, true);
+  const header = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 4, size)));
+  const values = new Float32Array(buffer, 4 + size);
+  const { n, signals, loop } = header;
+  const rows = (start) => Array.from({ length: signals }, (_, row) => values.subarray(start + row * n, start + (row + 1) * n));
+  const end = n + 2 * signals * n;
+  return { ...header, t: values.subarray(0, n), low: rows(n), high: rows(n + signals * n),
+    input: values.subarray(end, end + loop), output: values.subarray(end + loop, end + 2 * loop) };
+}
+
+// Each bucket is two points, so that what lies between its lowest and highest value is drawn; in
+// the order of the slope, or a smooth signal would look like a saw.
+function line(low, high) {
+  const found = new Array(2 * low.length);
+  let before = NaN;
+  for (let at = 0; at < low.length; at += 1) {
+    const a = low[at];
+    const b = high[at];
+    if (Number.isNaN(a)) {
+      found[2 * at] = found[2 * at + 1] = null;
+      continue;
+    }
+    const falls = a + b < before;
+    found[2 * at] = falls ? b : a;
+    found[2 * at + 1] = falls ? a : b;
+    before = a + b;
+  }
+  return found;
+}
+
+function draw(data) {
+  const names = status.signals.map(([name]) => name);
+  const times = new Array(2 * data.n);
+  for (let at = 0; at < data.n; at += 1) times[2 * at] = times[2 * at + 1] = data.t[at];
+  for (const id of ["plot-um", "plot-error", "plot-command"]) {
+    const { plot, signals } = plots[id];
+    plot.setData([times, ...signals.map((name) => {
+      const row = names.indexOf(name);
+      return line(data.low[row], data.high[row]);
+    })]);
+  }
+  $("mode").textContent = data.mode === "cycle" ? "triggered to the cycle" : "rolling";
+  $("window").disabled = data.mode === "cycle";
+  drawLoops(data);
+}
+
+// ---- loops
+
+function drawLoops(data) {
+  const inputUnit = status.description.waveform_unit === "um" ? "reference, µm" : `command, ${status.description.command_unit}`;
+  let lowest = Infinity, highest = -Infinity, atLowest = 0, atHighest = 0, least = Infinity, most = -Infinity;
+  for (let at = 0; at < data.loop; at += 1) {
+    const x = data.input[at], y = data.output[at];
+    if (Number.isNaN(x) || Number.isNaN(y)) continue;
+    if (x < lowest) { lowest = x; atLowest = y; }
+    if (x > highest) { highest = x; atHighest = y; }
+    least = Math.min(least, y);
+    most = Math.max(most, y);
+  }
+  const slope = highest > lowest ? (atHighest - atLowest) / (highest - lowest) : 0;
+  const straight = (x) => atLowest + slope * (x - lowest);
+  const across = steady("loop-x", lowest, highest);
+  curve($("loop"), data, (_, y) => y, across, steady("loop-y", least, most), inputUnit, "displacement, µm", straight);
+  let low = Infinity, high = -Infinity;
+  for (let at = 0; at < data.loop; at += 1) {
+    const off = data.output[at] - straight(data.input[at]);
+    if (off < low) low = off;
+    if (off > high) high = off;
+  }
+  curve($("off"), data, (x, y) => y - straight(x), across, steady("off-y", low, high), inputUnit, "µm", () => 0);
+}
+
+function curve(canvas, data, value, across, up, xLabel, yLabel, straight) {
+  const ratio = devicePixelRatio;
+  const width = Math.round(canvas.clientWidth * ratio);
+  const height = Math.round(canvas.clientHeight * ratio);
+  if (canvas.width !== width || canvas.height !== height) { canvas.width = width; canvas.height = height; }
+  const pen = canvas.getContext("2d");
+  const size = parseFloat(getComputedStyle(document.documentElement).fontSize) * ratio;
+  const left = 4.2 * size, bottom = 2.7 * size, top = 0.4 * size, right = 0.6 * size;
+  const toX = (x) => left + (x - across[0]) / (across[1] - across[0]) * (width - left - right);
+  const toY = (y) => height - bottom - (y - up[0]) / (up[1] - up[0]) * (height - bottom - top);
+  pen.clearRect(0, 0, width, height);
+  pen.font = `${0.8 * size}px system-ui, sans-serif`;
+  pen.lineWidth = ratio;
+  pen.strokeStyle = colour("line");
+  pen.fillStyle = colour("quiet");
+  pen.textAlign = "center";
+  for (const x of marks(across, 5)) { stroke(pen, [[toX(x), top], [toX(x), height - bottom]]); pen.fillText(tidy(x), toX(x), height - 1.6 * size); }
+  pen.fillText(xLabel, left + (width - left - right) / 2, height - 0.3 * size);
+  pen.textAlign = "right";
+  for (const y of marks(up, height / size / 4)) { stroke(pen, [[left, toY(y)], [width - right, toY(y)]]); pen.fillText(tidy(y), left - 0.4 * size, toY(y) + 0.3 * size); }
+  pen.save();
+  pen.translate(0.9 * size, top + (height - bottom - top) / 2);
+  pen.rotate(-Math.PI / 2);
+  pen.textAlign = "center";
+  pen.fillText(yLabel, 0, 0);
+  pen.restore();
+  pen.save();
+  pen.beginPath();
+  pen.rect(left, top, width - left - right, height - bottom - top);
+  pen.clip();
+  pen.setLineDash([6 * ratio, 4 * ratio]);
+  pen.strokeStyle = colour("reference");
+  stroke(pen, [[toX(across[0]), toY(straight(across[0]))], [toX(across[1]), toY(straight(across[1]))]]);
+  pen.setLineDash([]);
+  pen.strokeStyle = colour("displacement");
+  pen.lineWidth = 1.6 * ratio;
+  const cycles = Math.ceil(data.loop / data.cycle);
+  for (let cycle = cycles - 1; cycle >= 0; cycle -= 1) {
+    pen.globalAlpha = Math.max(0.12, 0.62 ** cycle);
+    const end = data.loop - cycle * data.cycle;
+    const points = [];
+    for (let at = Math.max(0, end - data.cycle - 1); at < end; at += 1) {
+      const x = data.input[at], y = data.output[at];
+      if (!Number.isNaN(x + y)) points.push([toX(x), toY(value(x, y))]);
+    }
+    stroke(pen, points);
+  }
+  pen.restore();
+}
+
+function stroke(pen, points) {
+  pen.beginPath();
+  points.forEach(([x, y], at) => (at ? pen.lineTo(x, y) : pen.moveTo(x, y)));
+  pen.stroke();
+}
+
+function marks([low, high], count) {
+  const raw = (high - low) / Math.max(2, count);
+  const power = 10 ** Math.floor(Math.log10(raw));
+  const step = [1, 2, 5, 10].map((each) => each * power).find((each) => each >= raw);
+  const found = [];
+  for (let value = Math.ceil(low / step) * step; value <= high; value += step) found.push(value);
+  return found;
+}
+
+function tidy(value) {
+  return String(Number(value.toPrecision(6)));
+}
+
+// ---- what is pressed
+
+function stop() {
+  const began = performance.now();
+  $("stop").textContent = "STOP …";
+  notice("STOP requested, not yet acknowledged.");
+  ask("stop", {}, (answer) => {
+    counters.acknowledgedMs = performance.now() - began;
+    $("stop").textContent = answer.ok ? "STOP ✓" : "STOP";
+    if (answer.ok) notice("STOP acknowledged: the run goes to its safe value.", "calm");
+    else notice(`STOP is NOT acknowledged: ${answer.error}. Use hilctl stop, or the rig's own switch.`);
+  });
+}
+
+function request(command, what) {
+  say(`${what} …`);
+  ask("run", { request: command }, (answer) => {
+    say(answer.ok ? `${what}: done` : `${what}: ${answer.error}`, answer.ok ? "good" : "bad");
+    if (answer.ok) for (const id of ["gain", "offset"]) delete $(id).dataset.touched;
+  });
+}
+
+function inverse(place) {
+  request({ command: "set", inverse: place, over_s: Number($("over").value) }, `inverse ${place}`);
+}
+
+function toggleMode() {
+  view.mode = view.mode === "cycle" ? "roll" : "cycle";
+  ranges.clear();
+  ask("view", { view });
+}
+
+$("stop").addEventListener("click", stop);
+$("inverse-in").addEventListener("click", () => inverse("in"));
+$("inverse-out").addEventListener("click", () => inverse("out"));
+$("mode").addEventListener("click", toggleMode);
+$("window").replaceChildren(...WINDOWS_S.map((seconds) => new Option(`${seconds} s`, seconds, false, seconds === view.window_s)));
+$("window").addEventListener("change", () => {
+  view.window_s = Number($("window").value);
+  ask("view", { view });
+});
+for (const id of ["gain", "offset"]) $(id).addEventListener("input", () => { $(id).dataset.touched = "1"; });
+$("tune").addEventListener("submit", (event) => {
+  event.preventDefault();
+  const [gain, offset, over_s] = ["gain", "offset", "over"].map((id) => Number($(id).value));
+  request({ command: "set", gain, offset, over_s }, `gain ${gain}, offset ${offset}`);
+});
+$("marking").addEventListener("submit", (event) => {
+  event.preventDefault();
+  request({ command: "mark", text: $("mark").value }, `mark "${$("mark").value}"`);
+  $("mark").value = "";
+  $("mark").blur();
+});
+addEventListener("keydown", (event) => {
+  if (event.key === "Escape") { event.preventDefault(); stop(); return; }
+  if (event.target.closest("input, select, textarea") || event.ctrlKey || event.metaKey || event.altKey) return;
+  const key = event.key.toLowerCase();
+  if (key === "i" && !$("inverse-row").hidden) inverse(status?.inverse === "out" ? "in" : "out");
+  else if (key === "m") { event.preventDefault(); $("mark").focus(); }
+  else if (key === "r") toggleMode();
+});
+
+// ---- look
+
+function theme(name) {
+  document.documentElement.dataset.theme = name;
+  if (status?.description) build();
+}
+const dark = matchMedia("(prefers-color-scheme: dark)");
+theme(dark.matches ? "dark" : "light");
+dark.addEventListener("change", () => theme(dark.matches ? "dark" : "light"));
+$("theme").addEventListener("click", () => theme(document.documentElement.dataset.theme === "dark" ? "light" : "dark"));
+new ResizeObserver(() => {
+  for (const [id, { plot }] of Object.entries(plots)) plot.setSize(sizes($(id)));
+}).observe(document.querySelector("main"));
+
+// ---- one frame a refresh at most, and none that nobody has seen before
+
+function refresh(now) {
+  requestAnimationFrame(refresh);
+  if (frame === null || !status?.description || (calm.matches && now - drawn < 250)) return;
+  const data = unpack(frame);
+  frame = null;
+  if (!plots["plot-um"] || plots.unit !== status.run) { build(); Object.defineProperty(plots, "unit", { value: status.run }); }
+  draw(data);
+  counters.frames += 1;
+  const gap = now - lastFrameMs;
+  lastFrameMs = now;
+  if (gap < FRESH_MS) rate += ((1000 / gap) - rate) * 0.05;
+  drawn = now;
+}
+let rate = 30;
+setInterval(() => {
+  const old = performance.now() - lastFrameMs > FRESH_MS;
+  $("rate").textContent = old ? "no new frames" : `${number(rate, 0, 2)} frames/s`;
+}, 1000);
+requestAnimationFrame(refresh);
+connect();

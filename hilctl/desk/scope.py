@@ -1,0 +1,125 @@
+"""Windows over time and loops, for an oscilloscope's two ways to look: rolling and triggered."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from hilctl.base.arrays import F64
+from hilctl.base.samples import NO_WAVEFORM
+from hilctl.base.segments import Segment
+from hilctl.desk.envelope import Buckets, Envelope
+from hilctl.desk.signals import ROW, Traces
+
+WINDOWS_S = (0.02, 0.1, 0.5, 2.0, 10.0, 60.0, 600.0)
+"""Lengths of a rolling window, in s."""
+BUCKETS = 600
+"""Buckets in a window."""
+CYCLES = 6
+"""Cycles of the loop that are kept."""
+_CYCLE_BUCKETS = 300
+_LONG_S = 1.0
+_LOOP_S = 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class Window:
+    """What a scope shows.
+
+    Attributes:
+        t_s: float64[n], when each bucket begins: before now where it rolls, after the cycle's
+            beginning where it is triggered.
+        buckets: The signals.
+    """
+
+    t_s: F64
+    buckets: Buckets
+
+
+class Scope:
+    """The windows of one run.
+
+    Args:
+        sample_rate_hz: Samples a second.
+        segments: Stretches of the run, in order.
+        loop_input: Signal on the loop's abscissa.
+    """
+
+    def __init__(self, sample_rate_hz: float, segments: list[Segment], loop_input: str) -> None:
+        self._rate_hz = sample_rate_hz
+        self._segments, self._input = segments, ROW[loop_input]
+        self._rolling = {
+            window_s: Envelope(0, max(1, math.ceil(window_s * sample_rate_hz / BUCKETS)), BUCKETS)
+            for window_s in WINDOWS_S
+        }
+        self._cycles: Envelope | None = None
+        self.segment: Segment | None = None
+        """The stretch that the newest sample of the waveform is in."""
+
+    def add(self, traces: Traces) -> None:
+        """Take the next samples."""
+        for envelope in self._rolling.values():
+            envelope.add(traces)
+        running = traces.index[(traces.flags & NO_WAVEFORM) == 0]
+        if running.size:
+            self._follow(int(running[-1]))
+        if self._cycles is not None and running.size:
+            self._cycles.add(traces.part(running[0], running[-1] + 1))
+
+    def _follow(self, sample: int) -> None:
+        here = next((each for each in self._segments if each.start <= sample < each.stop), None)
+        if here is None or here is self.segment:
+            return
+        self.segment = here
+        if here.period > 0.0:
+            width = max(1.0, here.period / _CYCLE_BUCKETS)
+        else:
+            width = max(1.0, _LOOP_S * self._rate_hz / _CYCLE_BUCKETS)
+        cycle = here.period / width if here.period > 0.0 else _CYCLE_BUCKETS
+        self._cycles = Envelope(here.start, width, math.ceil((CYCLES + 2) * cycle))
+
+    def rolling(self, window_s: float) -> Window:
+        """Return the newest ``window_s``, one of :data:`WINDOWS_S`."""
+        envelope = self._rolling[window_s]
+        count = min(BUCKETS, max(2, math.ceil(window_s * self._rate_hz / envelope.width)))
+        t_s = np.arange(1 - count, 1) * (envelope.width / self._rate_hz)
+        return Window(t_s.astype(np.float64), envelope.window(envelope.newest - count + 1, count))
+
+    def triggered(self, cycles: int = 2) -> Window | None:
+        """Return the newest whole cycles of the waveform; None where it has none yet.
+
+        A cycle that takes long is shown as it comes.
+        """
+        envelope, segment = self._cycles, self.segment
+        if envelope is None or segment is None or segment.period <= 0.0:
+            return None
+        cycle = segment.period / envelope.width
+        done = (envelope.newest + 1) / cycle
+        live = segment.period > _LONG_S * self._rate_hz
+        begin = math.floor(done) - (cycles - 1 if live else cycles)
+        if begin < 0:
+            return None
+        first = math.ceil(begin * cycle - 1e-9)
+        count = math.ceil(cycles * cycle)
+        t_s = (np.arange(first, first + count) - begin * cycle) * (envelope.width / self._rate_hz)
+        return Window(t_s.astype(np.float64), envelope.window(first, count))
+
+    def loops(self) -> F64:
+        """Return the newest loops: float64[2, n], oldest first.
+
+        Input and displacement; of one sample each, so that they belong together.
+        """
+        envelope, segment = self._cycles, self.segment
+        if envelope is None or segment is None:
+            return np.empty((2, 0))
+        cycle = segment.period / envelope.width if segment.period > 0.0 else _CYCLE_BUCKETS
+        count = min(math.ceil(CYCLES * cycle), envelope.newest + 1)
+        first = envelope.window(envelope.newest - count + 1, count).first
+        return first[[self._input, ROW["displacement"]]]
+
+    def points_a_cycle(self) -> int:
+        """Return how many points of :meth:`loops` are one cycle."""
+        segment = self.segment
+        if segment is None or segment.period <= 0.0 or self._cycles is None:
+            return _CYCLE_BUCKETS
+        return max(1, round(segment.period / self._cycles.width))

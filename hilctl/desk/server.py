@@ -1,0 +1,248 @@
+"""The server of the page: files, and one live connection for each page, on loopback only.
+
+It is a process of its own that only looks on. What is asked for goes the way of ``hilctl set`` and
+``hilctl stop``, so that a run needs no server, and a stop no more of it than to pass a signal on.
+"""
+
+import asyncio
+import json
+import logging
+import secrets
+import socket
+import time
+from collections.abc import Callable, Sequence
+from contextlib import AsyncExitStack, ExitStack, suppress
+from http import HTTPStatus
+from typing import Any
+
+from websockets.asyncio.server import ServerConnection, serve
+from websockets.http11 import Request, Response
+from websockets.typing import Subprotocol
+
+from hilctl.base.errors import HilctlError, InputError, RunError
+from hilctl.desk.admission import PROTOCOL, Admission, PendingConnections, bounded
+from hilctl.desk.feed import RunFeed
+from hilctl.desk.frames import frame_of, nearest_window_s
+from hilctl.desk.signals import SIGNALS
+from hilctl.desk.static import file_response, plain_response
+from hilctl.desk.viewer import MAX_MESSAGE_BYTES, PageMessage, Viewer
+from hilctl.run.client import going_on
+from hilctl.run.control_socket import ask
+from hilctl.run.run_folder import RunFolder
+from hilctl.run.stopping import request_stop
+
+_log = logging.getLogger(__name__)
+
+FRAME_S = 1.0 / 30.0
+_STATUS_FRAMES = 6  # figures that change more often can't be read
+_LOOK_S = 1.0
+_MOST_VIEWERS = 16
+_LIVE = "/live"
+_REQUEST_S = 30.0
+
+
+class LiveServer:
+    """Serves the page of all runs of this user.
+
+    Args:
+        chosen: Returns the run that a page shows unless it says another; None where there is none.
+        port: To listen at; 0 for any.
+        clock: Monotonic time in s.
+
+    Attributes:
+        port: That it listens at.
+
+    Raises:
+        RunError: The port can't be had.
+    """
+
+    def __init__(
+        self,
+        chosen: Callable[[list[RunFolder]], RunFolder | None],
+        port: int = 0,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._chosen, self._clock = chosen, clock
+        self._sockets = _listeners(port)
+        self.port = int(self._sockets[0].getsockname()[1])
+        self._token = secrets.token_hex(16)
+        self._admission = Admission(self.port, self._token)
+        self._pending = PendingConnections()
+        self._viewers: set[Viewer] = set()
+        self._runs: list[RunFolder] = []
+        self._feeds: dict[str, RunFeed] = {}
+        self._main = ""
+        self._looked_s = float("-inf")
+
+    @property
+    def url(self) -> str:
+        """Address of the page; the token is in its fragment, which no browser sends anywhere."""
+        return f"http://127.0.0.1:{self.port}/#{self._token}"
+
+    async def run(self, over: Callable[["LiveServer"], bool]) -> None:
+        """Serve until ``over`` says that it is."""
+        settings: dict[str, Any] = {
+            "process_request": self._let_in,
+            "select_subprotocol": _our_protocol,
+            "compression": None,  # it would take longer than loopback does
+            "server_header": None,
+            "open_timeout": 3.0,
+            "close_timeout": 1.0,
+            "max_size": MAX_MESSAGE_BYTES,
+            "max_queue": 4,
+            "create_connection": bounded(self._pending),
+            "logger": _quiet(),
+        }
+        async with AsyncExitStack() as stack:
+            for listener in self._sockets:
+                await stack.enter_async_context(serve(self._attend, sock=listener, **settings))
+            await self._tick(over)
+
+    def feed(self, name: str | None) -> RunFeed | None:
+        """Return the feed of a run that is going on, or was when it was first asked for."""
+        if name is None:
+            name = self._main = self._main_run()
+        if name in self._feeds:
+            return self._feeds[name]
+        found = next((run for run in self._runs if run.card.name == name), None)
+        if found is not None:
+            with suppress(RunError):  # being started or removed at this moment
+                self._feeds[name] = RunFeed(found)
+        return self._feeds.get(name)
+
+    def _main_run(self) -> str:
+        """Return the run of pages that name none; one that is over stays until there is another."""
+        feed = self._feeds.get(self._main)
+        if feed is not None and not feed.ended:
+            return self._main
+        chosen = self._chosen(self._runs)
+        return self._main if chosen is None else chosen.card.name
+
+    def _let_in(self, connection: ServerConnection, request: Request) -> Response | None:
+        upgrade = request.path == _LIVE
+        refused = self._admission.refusal(request.headers, upgrade=upgrade)
+        if refused is None and upgrade and len(self._viewers) >= _MOST_VIEWERS:
+            refused = (HTTPStatus.SERVICE_UNAVAILABLE, "too many pages look on")
+        if request.method != "GET":
+            refused = (HTTPStatus.METHOD_NOT_ALLOWED, "only GET is served")
+        if refused is not None:
+            return plain_response(*refused)
+        if not upgrade:
+            return file_response(request.path.partition("?")[0])
+        self._pending.remove(connection)
+        return None
+
+    async def _attend(self, connection: ServerConnection) -> None:
+        viewer = Viewer(connection, self._answer, self._clock)
+        self._viewers.add(viewer)
+        try:
+            await viewer.attend()
+        finally:
+            self._viewers.discard(viewer)
+
+    async def _answer(self, viewer: Viewer, message: PageMessage) -> str:
+        try:
+            answer = await self._followed(viewer, message)
+        except HilctlError as error:
+            answer = {"ok": False, "error": str(error)}
+        return json.dumps({"kind": "answer", "id": message.id, "ask": message.ask, **answer})
+
+    async def _followed(self, viewer: Viewer, message: PageMessage) -> dict[str, Any]:
+        feed = self.feed(viewer.view.run)
+        if message.ask == "view":
+            return {"ok": True}
+        if feed is None:
+            raise InputError("no such run is going on")
+        if message.ask == "stop":
+            # Without a supervisor its loop ramps down by itself.
+            requested = request_stop(feed.folder)
+            return {"ok": requested or not feed.folder.alive, "requested": requested}
+        place = feed.folder.socket
+        answer = await asyncio.to_thread(ask, place, message.request, _REQUEST_S)
+        return {"ok": True, **answer}
+
+    async def _tick(self, over: Callable[["LiveServer"], bool]) -> None:
+        number, due_s = 0, self._clock()
+        while not over(self):
+            self._show(number)
+            number, due_s = number + 1, due_s + FRAME_S
+            now_s = self._clock()
+            # Frames that there was no time for are left out.
+            due_s = max(due_s, now_s + FRAME_S / 4.0)
+            await asyncio.sleep(due_s - now_s)
+
+    def _show(self, number: int) -> None:
+        now_s = self._clock()
+        if now_s - self._looked_s >= _LOOK_S:
+            self._looked_s, self._runs = now_s, going_on()
+            self._forget()
+        self.feed(None)  # from its first sample on, though nobody may be looking yet
+        for feed in self._feeds.values():
+            feed.poll(now_s)
+        frames: dict[tuple[str, str, float], bytes] = {}
+        for viewer in [each for each in self._viewers if each.ready]:
+            shown, view = self.feed(viewer.view.run), viewer.view
+            status = [] if number % _STATUS_FRAMES else [self._status(shown)]
+            if shown is None:
+                viewer.offer(*status)
+                continue
+            key = (shown.folder.card.name, view.mode, nearest_window_s(view.window_s))
+            if key not in frames:
+                frames[key] = frame_of(shown.scope, view.mode, key[2])
+            viewer.offer(*status, frames[key])
+
+    def _forget(self) -> None:
+        """Let go of runs that are over and nobody looks at."""
+        shown = {self._main} | {
+            feed.folder.card.name for v in self._viewers if (feed := self.feed(v.view.run))
+        }
+        self._feeds = {
+            name: feed for name, feed in self._feeds.items() if not feed.ended or name in shown
+        }
+
+    def _status(self, feed: RunFeed | None) -> str:
+        runs = [{"name": run.card.name, "experiment": run.card.experiment} for run in self._runs]
+        state: dict[str, Any] = {"kind": "status", "runs": runs}
+        if feed is not None:
+            hz, um = feed.spectrum.points()
+            state |= feed.status()
+            state["spectrum"] = {"hz": hz.tolist(), "um": um.tolist()}
+            state["description"] = feed.description.model_dump()
+            state["signals"] = [[each.name, each.label, each.unit] for each in SIGNALS]
+        return json.dumps(state)
+
+
+def _our_protocol(
+    connection: ServerConnection, offered: Sequence[Subprotocol]
+) -> Subprotocol | None:
+    """Choose the one of the page; the token is offered too, and never chosen."""
+    del connection
+    return PROTOCOL if PROTOCOL in offered else None
+
+
+def _quiet() -> logging.Logger:
+    """Return a log for what strangers send: nobody should have to read it."""
+    log = _log.getChild("strangers")
+    log.propagate = False
+    log.addHandler(logging.NullHandler())
+    return log
+
+
+def _listeners(port: int) -> list[socket.socket]:
+    """Return sockets at one port of 127.0.0.1 and, where there is IPv6, of ::1.
+
+    Raises:
+        RunError: The port can't be had.
+    """
+    with ExitStack() as stack:
+        try:
+            first = stack.enter_context(socket.create_server(("127.0.0.1", port)))
+            found = [first]
+            if socket.has_ipv6:
+                with suppress(OSError):  # switched off on this machine
+                    address = ("::1", first.getsockname()[1])
+                    found.append(socket.create_server(address, family=socket.AF_INET6))
+        except OSError as error:
+            raise RunError(f"port {port} of 127.0.0.1: {error.strerror}") from None
+        stack.pop_all()
+        return found

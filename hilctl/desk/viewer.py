@@ -1,0 +1,139 @@
+"""One page that looks on: what it asks for, and the newest frame for it.
+
+Nothing waits in a queue for it: a frame is made when the one before has left, so that a slow page
+sees fewer of them, and the newest. One that takes nothing for seconds is cut.
+"""
+
+import asyncio
+import time
+from collections.abc import Awaitable, Callable
+from typing import Any, Literal
+
+from pydantic import Field, ValidationError
+from websockets.asyncio.server import ServerConnection
+from websockets.exceptions import ConnectionClosed
+
+from hilctl.base.strict import Strict
+from hilctl.desk.frames import ScopeMode
+
+MAX_MESSAGE_BYTES = 4096
+"""Longest message of a page."""
+SLOW_S = 5.0
+"""A page that takes nothing for so long is cut."""
+_RATE_HZ, _BURST = 20.0, 40.0
+
+
+class PageView(Strict):
+    """What a page shows.
+
+    Attributes:
+        run: Name of the run; None for the one that the server was started for.
+        mode: Of its scope.
+        window_s: Length of its window where it rolls.
+    """
+
+    run: str | None = None
+    mode: ScopeMode = "cycle"
+    window_s: float = 2.0
+
+
+class PageMessage(Strict):
+    """What a page says.
+
+    Attributes:
+        id: Number that the answer comes with.
+        ask: ``view`` changes what it shows, ``stop`` ends the run by its safe ramp, ``run`` passes
+            a request on to the run's control socket.
+        view: What it shows from now on.
+        request: The request to the run.
+    """
+
+    id: int
+    ask: Literal["view", "stop", "run"]
+    view: PageView = PageView()
+    request: dict[str, Any] = Field(default_factory=dict)
+
+
+class Allowance:
+    """A rate with a burst.
+
+    Args:
+        rate_hz: How many a second, in the long run.
+        burst: How many at once.
+        clock: Monotonic time in s.
+    """
+
+    def __init__(self, rate_hz: float, burst: float, clock: Callable[[], float]) -> None:
+        self._rate_hz, self._burst, self._clock = rate_hz, burst, clock
+        self._left, self._at = burst, clock()
+
+    def take(self) -> bool:
+        """Take one; False where there is none."""
+        now = self._clock()
+        self._left = min(self._burst, self._left + (now - self._at) * self._rate_hz)
+        self._at = now
+        if self._left < 1.0:
+            return False
+        self._left -= 1.0
+        return True
+
+
+class Viewer:
+    """A page that was let in.
+
+    Args:
+        connection: To it.
+        answer: Follows what it asks for, and returns the answer to send.
+        clock: Monotonic time in s.
+
+    Attributes:
+        view: What it shows.
+    """
+
+    def __init__(
+        self,
+        connection: ServerConnection,
+        answer: "Callable[[Viewer, PageMessage], Awaitable[str]]",
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.view = PageView()
+        self._connection, self._answer, self._clock = connection, answer, clock
+        self._allowance = Allowance(_RATE_HZ, _BURST, clock)
+        self._sending: asyncio.Task[None] | None = None
+        self._began_s = 0.0
+
+    @property
+    def ready(self) -> bool:
+        """Whether all that was sent before has left; a page that is too slow is cut."""
+        if self._sending is None or self._sending.done():
+            return True
+        if self._clock() - self._began_s > SLOW_S:
+            self._connection.transport.abort()
+        return False
+
+    def offer(self, *messages: str | bytes) -> None:
+        """Send messages, after one another; only to one that is :attr:`ready`."""
+        self._began_s = self._clock()
+        self._sending = asyncio.create_task(self._send(messages))
+
+    async def _send(self, messages: tuple[str | bytes, ...]) -> None:
+        try:
+            for message in messages:
+                await self._connection.send(message)
+        except ConnectionClosed:
+            return
+
+    async def attend(self) -> None:
+        """Follow what it asks for until it is gone."""
+        async for raw in self._connection:
+            if not self._allowance.take():
+                await self._connection.close(1008, "too many messages")
+                return
+            try:
+                message = PageMessage.model_validate_json(raw)
+            except ValidationError:
+                await self._connection.close(1008, "not a message of the page")
+                return
+            if message.ask == "view":
+                self.view = message.view
+            await self._connection.send(await self._answer(self, message))

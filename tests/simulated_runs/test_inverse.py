@@ -1,0 +1,87 @@
+"""The inverse out and in again in mid-run, at full stroke and 100 Hz, on the simulated rig."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hilctl.analysis.replay import replay
+from hilctl.base.errors import DataError
+from hilctl.base.metrics import fold, peak_hysteresis_percent
+from hilctl.loop.host import Tuning
+from hilctl.recording.reader import read
+from hilctl.run import unpaced
+from hilctl.run.start import checked_experiment
+
+DEMO = Path(__file__).parents[2] / "configs" / "demo.yaml"
+RATE_HZ = 50_000
+OUT_S, IN_S, FADE_S = 1.0, 2.0, 0.25
+
+
+class _Switched(unpaced.BatchHost):
+    """Takes the inverse out and in where a run stands at these times."""
+
+    changes: tuple[Tuning, ...] = ()
+
+    def heartbeat(self, next_sample, late_ticks):
+        self._now = next_sample
+        return super().heartbeat(next_sample, late_ticks)
+
+    def tuning(self):
+        return next((each for each in self.changes if each.begins_at == self._now), None)
+
+
+@pytest.fixture(scope="module")
+def switched(tmp_path_factory):
+    """The recording, and the experiment."""
+    settings = ["waveform.frequency_hz=100", "waveform.duration_s=3.0"]
+    checked = checked_experiment(DEMO, settings)
+    line, samples = checked.forecast.line, round(FADE_S * RATE_HZ)
+    changes = tuple(
+        Tuning(1.0, 0.0, samples, round(at_s * RATE_HZ), share, line)
+        for at_s, share in ((OUT_S, 0.0), (IN_S, 1.0))
+    )
+    output = tmp_path_factory.mktemp("inverse") / "run.mcap"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(_Switched, "changes", changes)
+        patch.setattr(unpaced, "BatchHost", _Switched)
+        assert unpaced.run_unpaced(checked, output).code == "completed"
+    return read(output), checked
+
+
+def figures(recording, from_s):
+    """Return peak hysteresis in percent and stroke in um of a fifth of a second."""
+    part = recording.samples.part(round(from_s * RATE_HZ), round((from_s + 0.2) * RATE_HZ))
+    signals = np.array((part.reference_um, part.displacement_um))
+    cycle = fold(part.index, RATE_HZ / 100.0, signals).signals
+    return peak_hysteresis_percent(*cycle), np.ptp(cycle[1])
+
+
+def test_the_loop_opens_and_closes_again(switched):
+    recording, _ = switched
+    (before, stroke_um), (out, stroke_out_um), (back, _) = (
+        figures(recording, at_s) for at_s in (0.6, OUT_S + 0.5, IN_S + 0.5)
+    )
+    assert before < 1.0
+    assert out == pytest.approx(30.0, abs=2.0)
+    assert stroke_out_um == pytest.approx(stroke_um, rel=0.01)
+    assert back < 1.0
+
+
+def test_no_step_is_beyond_the_slew_and_it_replays_bit_for_bit(switched):
+    recording, checked = switched
+    samples = recording.samples
+    step = np.abs(np.diff(samples.command)).max() * RATE_HZ
+    assert step <= checked.loaded.config.limits.slew_per_s
+    # No faster than either of the two commands is by itself, but for the time of the fade.
+    assert step <= 1.1 * checked.forecast.slew_per_s
+    assert [each.code for each in recording.events] == ["inverse", "inverse", "run_ended"]
+    assert replay(recording).identical
+
+
+def test_without_its_events_it_is_not_replayed(switched):
+    recording, _ = switched
+    for events in ((), recording.events[:1], recording.events[1:]):
+        with pytest.raises(DataError, match="when the inverse went out or in is not there"):
+            replay(replace(recording, events=events))

@@ -1,0 +1,43 @@
+"""``hilctl live``, without its server."""
+
+import json
+
+import pytest
+from typer.testing import CliRunner
+
+from hilctl.cli.application import app
+from hilctl.run.run_folder import run_folder
+
+
+@pytest.fixture
+def served(monkeypatch):
+    """What the server is given; it says its address and is over."""
+    given = {}
+
+    def serve_runs(chosen, over, on_url, port):
+        given.update(chosen=chosen, port=port)
+        on_url("http://127.0.0.1:5/#x")
+
+    monkeypatch.setattr("hilctl.desk.live.serve_runs", serve_runs)
+    return given
+
+
+def test_the_address_is_printed_and_any_run_is_shown(served):
+    said = CliRunner().invoke(app, ["live", "--port", "5"])
+    assert said.output == "live page: http://127.0.0.1:5/#x\n"
+    assert served["port"] == 5
+    assert served["chosen"]([]) is None
+    assert served["chosen"](["a", "b"]) == "a"
+    assert json.loads(CliRunner().invoke(app, ["live", "--json"]).output)["url"].endswith("/#x")
+
+
+def test_a_run_is_found_by_the_beginning_of_its_name(served, tmp_path):
+    with run_folder("demo", tmp_path / "a.mcap", 1.0) as (folder, _):
+        assert CliRunner().invoke(app, ["live", "de"]).exit_code == 0
+        assert served["chosen"]([]) == folder
+
+
+def test_a_run_that_is_not_there_is_refused(served):
+    said = CliRunner().invoke(app, ["live", "x"])
+    assert "no run is named 'x'" in str(said.exception)
+    assert not served

@@ -1,0 +1,54 @@
+"""The client for programs of one's own: what it passes on, and what it costs to import."""
+
+import subprocess
+import sys
+import time
+from types import SimpleNamespace
+
+import pytest
+
+from hilctl import api
+from hilctl.base.errors import RunError
+from tests.unit.cli.test_steering import HEAVY
+
+
+@pytest.fixture
+def run(monkeypatch):
+    """A run named by the test; what is sent to it comes back."""
+    card = SimpleNamespace(name="sine-7", recording="a.mcap")
+    monkeypatch.setattr(api, "find_run", lambda name: SimpleNamespace(card=card, asked=name))
+    for name in ("status_of", "mark_run", "set_run"):
+        monkeypatch.setattr(api, name, lambda folder, *given, **named: (*given, named))
+    return api.connect("sine")
+
+
+def test_what_is_wanted_is_passed_on(run):
+    assert (run.name, run.recording, run._folder.asked) == ("sine-7", "a.mcap", "sine")
+    assert run.mark("tapped") == ("tapped", {})
+    given = {"gain": None, "offset": 2.0, "inverse": "out", "over_s": 0.5}
+    assert run.set(offset=2.0, inverse="out", over_s=0.5) == (given,)
+    assert run.status() == ({},)
+
+
+def test_a_run_that_does_not_stop_is_an_error(run, monkeypatch):
+    stopped = {"ended": False, "error": ""}
+    monkeypatch.setattr(api, "stop_runs", lambda chosen, wait_s: [stopped])
+    with pytest.raises(RunError, match="sine-7 is still going after 2 s: it was requested to stop"):
+        run.stop(2.0)
+    stopped["ended"] = True
+    run.stop()
+
+
+def test_it_imports_nothing_heavy():
+    code = f"import sys, hilctl.api; print([m for m in {HEAVY!r} if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_frames_are_those_of_the_run(run, monkeypatch):
+    """Subscribed with what is asked for, on this machine's time."""
+    monkeypatch.setattr("hilctl.desk.feed.RunFeed", lambda folder: folder.card.name)
+    monkeypatch.setattr("hilctl.desk.subscription.frames_of", lambda *given: iter([given]))
+    ((feed, every_s, window_s, clock, sleep),) = run.frames(0.2, 2.0)
+    assert (feed, every_s, window_s) == ("sine-7", 0.2, 2.0)
+    assert (clock, sleep) == (time.monotonic, time.sleep)
