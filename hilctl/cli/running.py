@@ -44,7 +44,7 @@ def run(
     from hilctl.run.start import start_run
 
     finish_orphans()
-    with _served(wanted=live), LiveView(quiet=as_json) as view:
+    with _served(wanted=live) as addresses, LiveView(quiet=as_json, addresses=addresses) as view:
         result = start_run(experiment, settings, output, overwrite, view.update)
         if result.stop_signal:  # impatience must not cost the result of a run that has ended
             signal.signal(result.stop_signal, signal.SIG_IGN)
@@ -65,15 +65,15 @@ def run(
 
 
 @contextmanager
-def _served(*, wanted: bool) -> Iterator[None]:
+def _served(*, wanted: bool) -> Iterator[list[str]]:
+    """Serve the live page where it is wanted; yield its addresses that are to be printed."""
     if not wanted:
-        yield
+        yield []
         return
     from hilctl.desk.live import served_beside
 
     with served_beside() as url:
-        print(f"live page: {url}", file=sys.stderr)
-        yield
+        yield [url]
 
 
 def _detach(
