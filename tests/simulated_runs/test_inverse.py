@@ -10,7 +10,8 @@ from hilctl.analysis.replay import replay
 from hilctl.base.errors import DataError
 from hilctl.base.metrics import fold, peak_hysteresis_percent
 from hilctl.loop.host import Tuning
-from hilctl.recording.reader import read
+from hilctl.recording import reader
+from hilctl.recording.reader import Pieces, read
 from hilctl.run import unpaced
 from hilctl.run.start import checked_experiment
 
@@ -78,6 +79,14 @@ def test_no_step_is_beyond_the_slew_and_it_replays_bit_for_bit(switched):
     assert step <= 1.1 * checked.forecast.slew_per_s
     assert [each.code for each in recording.events] == ["inverse", "inverse", "run_ended"]
     assert replay(recording).identical
+
+
+def test_it_replays_in_pieces(switched, monkeypatch):
+    """A fade may begin in one piece and end in another, and its event stand behind its samples."""
+    recording, _ = switched
+    monkeypatch.setattr(reader, "PIECE_SAMPLES", 3000)
+    assert len(list(Pieces(recording.path))) > 20
+    assert replay(Pieces(recording.path)) == replay(recording)
 
 
 def test_without_its_events_it_is_not_replayed(switched):
