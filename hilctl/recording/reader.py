@@ -7,6 +7,7 @@ from pathlib import Path
 from hilctl.base.errors import DataError
 from hilctl.recording.data import Recording
 from hilctl.recording.gathering import Gathering
+from hilctl.recording.index import places_of
 from hilctl.recording.locks import is_being_recorded
 from hilctl.recording.salvage import Salvage
 from hilctl.recording.stretch import Stretch
@@ -22,7 +23,8 @@ def read(path: Path, stretch: Stretch | None = None) -> Recording:
 
     Nothing is written. That something is missing is logged as a warning, in one line. All that is
     given out is of one shape and rises where it must, whatever the file says; time and memory stay
-    in proportion to its size, or memory to that of a stretch of it.
+    in proportion to its size, or to that of a stretch of it: of a finished file, nothing else is
+    read, or found to be damaged.
 
     Args:
         path: The recording.
@@ -68,7 +70,9 @@ def _read(path: Path, stretch: Stretch | None, piece_samples: int | None) -> Ite
         with path.open("rb") as stream:
             salvage = Salvage(stream)
             gathered = Gathering(salvage, stretch)
-            for record in salvage.records():
+            places = places_of(stream, stretch) if stretch else None
+            records = salvage.records() if places is None else salvage.records_at(places)
+            for record in records:
                 gathered.take(record)
                 if piece_samples and gathered.waiting >= piece_samples:
                     yield gathered.piece(path)

@@ -8,7 +8,7 @@ behind it nothing is taken: any number in it may be wrong.
 """
 
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import BinaryIO, NamedTuple
 
@@ -152,6 +152,22 @@ class Salvage:
                 self._close(at, found.end, found.record)
                 return
             at = found.end
+
+    def records_at(self, places: Iterable[int]) -> Iterator[McapRecord]:
+        """Yield what stands at some places, which the index of a finished file has named.
+
+        Raises:
+            OSError: The file can't be read.
+            DataError: It asks for more work or memory than a recording of its size can.
+        """
+        for at in places:
+            found = self._whole(at)
+            if found is None:
+                self._note(at, 0, "damaged record")
+                continue
+            self._indexes = {}  # what follows a chunk is not looked at
+            yield from self._with_channels(self._take(at, found), at)
+        self.finished = True
 
     def _read(self, at: int, size: int) -> bytes:
         self._stream.seek(at)
