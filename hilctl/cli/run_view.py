@@ -103,17 +103,7 @@ def report_of(result: RunResult, *, whole: bool) -> RunReport | None:
 
 def run_mapping(result: RunResult, report: RunReport | None) -> dict[str, Any]:
     """Return a run's end and its report as plain values."""
-    return {
-        **(report.to_mapping() if report else {}),
-        "recorded_samples": result.samples,
-        "dropped": result.missing,  # a recording that was cut short can't say it
-        "output": str(result.path),
-        "code": result.code,
-        "reason": result.reason,
-        "output_safe": result.safe,
-        "deadline_misses": result.deadline_misses,
-        "adapted": dict(result.adapted),
-    }
+    return {**(report.to_mapping() if report else {}), **result.to_mapping()}
 
 
 def print_run(result: RunResult, report: RunReport | None) -> None:
@@ -131,6 +121,11 @@ def print_run(result: RunResult, report: RunReport | None) -> None:
         terminal.print(render(report))
     elif result.adapted:
         terminal.print(f"adapted: {adapted_text(result.adapted)}")
+    for each in result.on_end:
+        ended = "did not start" if each.exit_code is None else f"exit code {each.exit_code}"
+        text = f"on_end: {each.command[0]}: {ended} after {each.took_s:.1f} s"
+        style = "bold yellow" if each.error else None
+        terminal.print(text + (f": {each.error}" if each.error else ""), style=style)
     terminal.print(f"recorded: {result.path}", soft_wrap=True)
     path = shlex.quote(str(result.path))
     terminal.print(f"  hilctl report {path} --html run.html", soft_wrap=True)

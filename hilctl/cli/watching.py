@@ -6,7 +6,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Annotated
 
 import typer
@@ -20,7 +20,7 @@ from hilctl.run.client import find_run
 from hilctl.run.run_folder import RunFolder, runs
 
 _LOOK_S = 0.05
-_END_S = 5.0
+_END_S = 2.0
 
 
 def watch(
@@ -59,11 +59,16 @@ def watched_beside() -> Iterator[None]:
     with subprocess.Popen(command) as process:
         try:
             yield
-            process.wait(_END_S)  # it sees the end by itself, and puts the terminal back
-        except subprocess.TimeoutExpired:
-            pass
+            _wait(process)  # it sees the end by itself, and puts the terminal back
         finally:
             process.terminate()
+            _wait(process)
+            process.kill()  # of a terminal that stands still, nobody waits for its end
+
+
+def _wait(process: "subprocess.Popen[bytes]") -> None:
+    with suppress(subprocess.TimeoutExpired):
+        process.wait(_END_S)
 
 
 def main() -> None:
@@ -83,7 +88,8 @@ def main() -> None:
 
 def _shown_once(run: RunFolder) -> None:
     try:
-        _watched(run)
+        if _watched(run) is None:
+            print("the run goes on: Ctrl-C ends it by its safe ramp, hilctl watch shows it again")
     except RunError as error:
         print(f"hilctl: {error}", file=sys.stderr)
 

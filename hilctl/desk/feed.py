@@ -130,7 +130,7 @@ class RunFeed:
         self._headroom.add(traces)
 
     def events_since(self, seen: int) -> tuple[list[Event], int]:
-        """Return the events after the first ``seen``, as far as kept, and how many there were."""
+        """Return the events after the first ``seen`` of all, and how many there have been."""
         new = min(self._events_seen - seen, len(self.events))
         return self.events[len(self.events) - new :], self._events_seen
 

@@ -10,6 +10,7 @@ from hilctl.experiment.limits import Limits
 from hilctl.experiment.parts import (
     AdaptationConfig,
     Condition,
+    EndCommand,
     FeedbackConfig,
     Name,
     RecordingConfig,
@@ -91,6 +92,8 @@ class Experiment(Strict):
         timing: What happens to late ticks.
         recording: Where and how the run is recorded.
         realtime: How the loop's process asks for real time.
+        on_end: What is started, one after another, once the run is over: the output is safe and the
+            recording closed. Each gets the result as JSON on its standard input.
     """
 
     name: Name
@@ -114,6 +117,7 @@ class Experiment(Strict):
     timing: Timing = Field(default_factory=Timing)
     recording: RecordingConfig = Field(default_factory=RecordingConfig)
     realtime: Realtime = Field(default_factory=Realtime)
+    on_end: Annotated[tuple[EndCommand, ...], Field(max_length=8)] = ()
 
     @property
     def tick_s(self) -> float:

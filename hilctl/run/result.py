@@ -1,10 +1,28 @@
 """Where a run stands, and how it ended, for those who show it."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Any
 
 from hilctl.base.samples import Batch
+
+
+@dataclass(frozen=True, slots=True)
+class EndCommandResult:
+    """What became of a program that was started once a run was over.
+
+    Attributes:
+        command: The program and its arguments.
+        exit_code: Its exit code, minus the signal that ended it; None where it did not start.
+        took_s: Time that it took.
+        error: What was wrong, or what it said last where its exit code was not 0; else empty.
+    """
+
+    command: tuple[str, ...]
+    exit_code: int | None
+    took_s: float
+    error: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,6 +41,7 @@ class RunResult:
         deadline_misses: How many were skipped of all, for people; empty where none was.
         adapted: What adaptation made of the model by the end, by name, see
             :data:`hilctl.base.events.ADAPTED`; empty without it.
+        on_end: What became of what was started once it was over.
     """
 
     path: Path
@@ -35,6 +54,21 @@ class RunResult:
     late_ticks: int
     deadline_misses: str = ""
     adapted: Mapping[str, float] = field(default_factory=dict)
+    on_end: tuple[EndCommandResult, ...] = ()
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return what a program reads of it, as plain values."""
+        return {
+            "recorded_samples": self.samples,
+            "dropped": self.missing,  # a recording that was cut short can't say it
+            "output": str(self.path),
+            "code": self.code,
+            "reason": self.reason,
+            "output_safe": self.safe,
+            "deadline_misses": self.deadline_misses,
+            "adapted": dict(self.adapted),
+            "on_end": [asdict(each) for each in self.on_end],
+        }
 
 
 @dataclass(frozen=True, slots=True)

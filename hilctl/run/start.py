@@ -10,6 +10,7 @@ from hilctl.base.errors import InputError
 from hilctl.experiment.check import Checked, check
 from hilctl.experiment.load import load_experiment
 from hilctl.run.architecture import require_real_time_machine
+from hilctl.run.end_commands import with_end_commands
 from hilctl.run.result import Progress, RunResult
 
 _log = logging.getLogger(__name__)
@@ -79,7 +80,8 @@ def start_run(
     if checked.begun.begins and checked.loaded.device.info.holds:
         _log.warning("the compensator begins %s", checked.begun.begins)
     output = output_of(checked, output)
-    return Supervisor(checked, output, overwrite=overwrite, on_progress=on_progress).run()
+    result = Supervisor(checked, output, overwrite=overwrite, on_progress=on_progress).run()
+    return with_end_commands(result, checked.loaded)
 
 
 def default_output(name: str, folder: Path, now: time.struct_time) -> Path:

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from hilctl.cli.run_view import LiveView, print_run, report_of, run_mapping
-from hilctl.run.result import RunResult
+from hilctl.run.result import EndCommandResult, RunResult
 
 ENDED = RunResult(Path("a.mcap"), "stopped", "stopped by hilctl stop", True, 15, 0, 3, 2)
 
@@ -20,6 +20,7 @@ def test_a_program_reads_how_the_run_ended():
         "output_safe": True,
         "deadline_misses": "",
         "adapted": {},
+        "on_end": [],
     }
 
 
@@ -50,3 +51,17 @@ def test_what_was_adapted_is_said_of_a_run_without_a_report(capsys):
     adapted = {"offset_um": 1.25, "gain": 1.02, "weight_1": -0.005}
     print_run(RunResult(Path("a.mcap"), "completed", "", True, 0, 9, 0, 0, adapted=adapted), None)
     assert "adapted: offset +1.25 um, gain 1.0200, weights -0.0050" in capsys.readouterr().out
+
+
+def test_what_became_of_programs_after_the_run_is_said(capsys):
+    """A failure is no fault of the run, and is not passed over either."""
+    ended = (
+        EndCommandResult(("mail", "lab"), 0, 0.31),
+        EndCommandResult(("lamp",), 3, 0.1, "no lamp"),
+        EndCommandResult(("chat",), None, 0.0, "it is not there any more"),
+    )
+    print_run(RunResult(Path("a.mcap"), "completed", "", True, 0, 9, 0, 0, on_end=ended), None)
+    shown = capsys.readouterr().out
+    assert "on_end: mail: exit code 0 after 0.3 s\n" in shown
+    assert "on_end: lamp: exit code 3 after 0.1 s: no lamp" in shown
+    assert "on_end: chat: did not start after 0.0 s: it is not there any more" in shown

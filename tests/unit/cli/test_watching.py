@@ -50,7 +50,7 @@ def test_a_process_beside_shows_the_run_of_its_parent_only(run, monkeypatch):
     monkeypatch.setattr(watching.os, "getppid", lambda: 7)
     monkeypatch.setattr(watching.time, "sleep", lambda s: None)
     monkeypatch.setattr(watching.signal, "signal", lambda *given: None)
-    monkeypatch.setattr(watching, "_watched", seen.append)
+    monkeypatch.setattr(watching, "_watched", lambda run: seen.append(run) or "over")
     monkeypatch.setattr(sys, "argv", ["watching", "7"])
     watching.main()
     assert seen == [run]
@@ -68,14 +68,23 @@ def test_a_run_that_can_not_be_looked_at_is_said(run, monkeypatch, capsys):
     assert "can't be looked at" in capsys.readouterr().err
 
 
-def test_what_stands_beside_a_run_ends_with_it(monkeypatch):
+def test_who_leaves_the_view_beside_a_run_is_told_how_to_end_it(run, capsys):
+    run.feed.ended = False
+    watching._shown_once(run)
+    assert "Ctrl-C ends it" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("ignores", ["", "signal.signal(15, signal.SIG_IGN);"])
+def test_what_stands_beside_a_run_ends_with_it(monkeypatch, ignores):
     """By itself; where its terminal stands still, it is ended."""
-    monkeypatch.setattr(watching, "_END_S", 0.05)
+    monkeypatch.setattr(watching, "_END_S", 0.2)
     started = []
 
     class Started(subprocess.Popen):
         def __init__(self, command):
-            super().__init__([sys.executable, "-c", "import time; time.sleep(60)"])
+            code = f"import signal, time; {ignores} print(flush=True); time.sleep(60)"
+            super().__init__([sys.executable, "-c", code], stdout=subprocess.PIPE)
+            self.stdout.readline()
             started.append((command, self))
 
     monkeypatch.setattr(subprocess, "Popen", Started)
@@ -83,4 +92,4 @@ def test_what_stands_beside_a_run_ends_with_it(monkeypatch):
         assert started[0][1].poll() is None
     ((command, process),) = started
     assert command[-2:] == ["hilctl.cli.watching", str(watching.os.getpid())]
-    assert process.returncode == -15
+    assert process.returncode == (-9 if ignores else -15)

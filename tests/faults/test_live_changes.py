@@ -1,0 +1,93 @@
+"""A compensated run that is changed, marked, watched and stopped from outside."""
+
+import itertools
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from hilctl import api
+from hilctl.analysis.replay import replay
+from hilctl.base.errors import InputError
+from hilctl.recording.reader import read
+from tests.faults.test_daemon import await_state, hilctl, stop_all
+
+CONFIGS = Path(__file__).parents[2] / "configs"
+CHANGES = {"sample_rate_hz": 10000, "block": 20, "recording": {"flush_s": 0.2, "ring_s": 30.0}}
+
+
+def experiment(folder):
+    """Write the demo at a rate that a busy machine keeps, with programs for its end."""
+    made = yaml.safe_load((CONFIGS / "demo.yaml").read_text(encoding="utf-8")) | CHANGES
+    made["waveform"] |= {"frequency_hz": 20.0, "duration_s": 60.0}
+    made["compensator"]["model"] = str(CONFIGS / "models" / "terfenol_staged.yaml")
+    told = folder / "told.json"
+    made["on_end"] = [
+        {"command": ["sh", "-c", f"cat > {told}"]},
+        {"command": ["sleep", "60"], "timeout_s": 0.2},
+    ]
+    path = folder / "experiment.yaml"
+    path.write_text(yaml.safe_dump(made), encoding="utf-8")
+    return path
+
+
+@pytest.fixture
+def recording(tmp_path):
+    """The recording of a run that goes on; the test may end it."""
+    started = hilctl("run", experiment(tmp_path), "--output", tmp_path / "run.mcap", "--detach")
+    await_state("running")
+    yield Path(started["recording"])
+    stop_all()
+
+
+def test_a_run_is_switched_marked_watched_and_stopped(recording):
+    run = api.connect()
+    assert run.status()["inverse"] == "in"
+    assert hilctl("set", "inverse=out", "--over", "0.3")["inverse"] == "out"
+    assert hilctl("mark", "tapped the stage")["text"] == "tapped the stage"
+    with pytest.raises(InputError, match=r"mark\.text: "):
+        run.mark("two\nlines")
+    frames = [*itertools.islice(run.frames(every_s=0.2), 6)]
+    assert frames[-1].status["inverse"] == "out"
+    assert "mark" in {event.code for frame in frames for event in frame.events}
+    assert np.nanmax(np.abs(frames[-1].high["error"])) > 3.0
+    run.set(inverse="in", over_s=0.3)
+    with subprocess.Popen(
+        [sys.executable, "-m", "hilctl.cli", "watch"], stdout=subprocess.PIPE, text=True
+    ) as watching:
+        assert "s  mark: tapped the stage" in "".join(itertools.islice(watching.stdout, 4))
+        run.stop()
+        *_, last = watching.stdout.read().splitlines()
+    assert ": stopped: stopped by hilctl stop" in last
+    left = read(recording)
+    codes = [event.code for event in left.events]
+    assert codes == ["inverse", "mark", "inverse", "run_ended"]
+    assert replay(left).identical
+    step = np.abs(np.diff(left.samples.command)).max() * left.sample_rate_hz
+    assert step <= 20_000.0
+
+
+def test_programs_get_the_result_and_one_that_hangs_is_ended(recording):
+    """Once the run is over: its folder is gone before, and its recording whole."""
+    assert hilctl("stop")["ended"]
+    beside = recording.with_name("run.on_end.json")
+    for _ in range(200):
+        if beside.exists():
+            break
+        subprocess.run(["sleep", "0.05"], check=True)
+    first, second = json.loads(beside.read_text())["on_end"]
+    assert (first["exit_code"], second["error"]) == (0, "killed after 0.2 s")
+    told = json.loads((recording.parent / "told.json").read_text())
+    assert (told["code"], told["output"]) == ("stopped", str(recording))
+    assert told["recorded_samples"] == read(recording).samples.index.size
+
+
+def test_a_program_that_is_not_there_is_found_before_anything_moves(tmp_path):
+    path = experiment(tmp_path)
+    setting = "on_end=[{command: [no-such-program]}]"
+    said = hilctl("check", path, "--set", setting, code=2)
+    assert "on_end.0.command: must begin with a program that can be run" in said
