@@ -4,6 +4,7 @@ The rooms, top to bottom; each sees those below it:
 
 cli          commands, messages and tables; the only room that prints
 campaign     many runs of one experiment, kept and resumed
+series       many runs side by side: what varied, figures and page of all of them
 characterise from a wired device to its model: a campaign of runs
 learning     corrections from run to run
 comparison   models of the literature on the same loops

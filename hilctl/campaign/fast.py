@@ -13,7 +13,6 @@ from pathlib import Path
 from hilctl.base.errors import HilctlError, InputError
 from hilctl.base.files import TextFiles, write_file
 from hilctl.base.yaml.document import Document
-from hilctl.campaign.figures import RunFigures, figures_of
 from hilctl.campaign.folder import new_recording, standing_runs
 from hilctl.campaign.plan import PlannedStep, SeriesPlan, planned
 from hilctl.campaign.session import Series, SeriesHost, SeriesResult, is_harmless
@@ -24,6 +23,7 @@ from hilctl.experiment.load import resolve
 from hilctl.identify.workers import streams
 from hilctl.recording.reader import read
 from hilctl.run.unpaced import run_unpaced
+from hilctl.series.run_figures import RunFigures, figures_of
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,8 +8,6 @@ from pathlib import Path
 from typing import Protocol
 
 from hilctl.base.errors import ConfigError, DataError, InputError, RunError
-from hilctl.campaign.drift import SeriesDrift, drift_of
-from hilctl.campaign.figures import figures_of
 from hilctl.campaign.folder import (
     await_runs,
     held_folder,
@@ -28,6 +26,8 @@ from hilctl.recording.reader import read
 from hilctl.run.orphans import recover_orphans
 from hilctl.run.result import RunResult
 from hilctl.run.step import OnPart, RunKey, StepStoppedError, paced
+from hilctl.series.drift import SeriesDrift, drift_of
+from hilctl.series.run_figures import figures_of
 
 HARMLESS = frozenset({"late", "dropped", "invalid_command"})
 """Codes of events that end a run, and say nothing of device or rig: the next step may do better."""
@@ -100,7 +100,8 @@ class SeriesResult:
     @property
     def drift(self) -> SeriesDrift | None:
         """What its reference runs say of drift."""
-        return drift_of(self.ordered)
+        references = [row for step, row in self.ordered if step.is_reference]
+        return drift_of([row.figures for row in references if row.code == COMPLETED])
 
     def count(self, code: str) -> int:
         """Return how many steps have come to a code."""

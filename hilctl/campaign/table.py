@@ -11,9 +11,9 @@ from typing import Any, BinaryIO
 
 from hilctl.analysis.export import write_parquet
 from hilctl.base.files import write_file, write_text
-from hilctl.campaign.figures import FIGURES, RunFigures
 from hilctl.campaign.plan import SeriesPlan
 from hilctl.campaign.steps import SeriesStep, cell
+from hilctl.series.run_figures import FIGURES, RunFigures
 
 PLANNED = "planned"
 COMPLETED = "completed"

@@ -9,13 +9,14 @@ from hilctl.analysis.report import summarize, worst_segment
 from hilctl.analysis.steady import steady_part
 from hilctl.base.arrays import F64
 from hilctl.base.events import OFFSET
+from hilctl.base.samples import Samples
 from hilctl.base.segments import Segment
-from hilctl.campaign.minor_loops import minor_loops
-from hilctl.campaign.ringing import ringing
 from hilctl.characterise.problem import RigProblemError
-from hilctl.characterise.response import small_signal
+from hilctl.characterise.response import SmallSignal, small_signal
 from hilctl.recording.data import Recording
 from hilctl.recording.facts import HEAT_FACT
+from hilctl.series.minor_loops import minor_loops
+from hilctl.series.ringing import Ringing, ringing
 from hilctl.waveforms.spec import Multisine, Step
 
 
@@ -78,6 +79,11 @@ def figures_of(recording: Recording, waveform: Any) -> RunFigures:
     Raises:
         DataError: A fact of it is no number.
     """
+    return figures_with(recording, structure_of(recording, waveform))
+
+
+def figures_with(recording: Recording, structure: SmallSignal | Ringing | None) -> RunFigures:
+    """Work out the figures of a whole run whose structure is known; see :func:`figures_of`."""
     report = summarize(recording)
     worst = recording.segments[worst_segment(report.segments)] if recording.segments else None
     measured = [event.values.get("offset_um") for event in recording.events if event.code == OFFSET]
@@ -89,7 +95,8 @@ def figures_of(recording: Recording, waveform: Any) -> RunFigures:
         peak_to_peak_um=report.peak_to_peak_um,
         **(_cycle(recording, worst) if worst else {}),
         offset_um=measured[0] if measured else None,
-        **_structure(recording, waveform),
+        natural_hz=structure.natural_hz if structure else None,
+        damping_ratio=structure.damping_ratio if structure else None,
         deadline_misses=report.skipped_ticks,
         heat_before_a=_rms_a(recording.run.get(HEAT_FACT)),
         heat_after_a=_rms_a(recording.end.get(HEAT_FACT)),
@@ -129,28 +136,32 @@ def _minor(loop_input: F64, output: F64) -> dict[str, float]:
     return found
 
 
-def _structure(recording: Recording, waveform: Any) -> dict[str, float | None]:
-    """Return natural frequency and damping, where a waveform is one to see them by."""
-    found = None
+def structure_of(recording: Recording, waveform: Any) -> SmallSignal | Ringing | None:
+    """Return natural frequency and damping, where a waveform is one to see them by.
+
+    Args:
+        recording: The run.
+        waveform: Its waveform, as the experiment has it.
+    """
     if isinstance(waveform, Multisine):
         try:
-            found = small_signal(recording)
+            return small_signal(recording)
         except RigProblemError:  # lost in noise: there is nothing to say
-            return {}
-    elif isinstance(waveform, Step):
-        found = _ringing(recording, waveform)
-    if found is None or found.natural_hz is None:
-        return {}
-    return {"natural_hz": found.natural_hz, "damping_ratio": found.damping_ratio}
+            return None
+    return _ringing(recording, waveform) if isinstance(waveform, Step) else None
 
 
-def _ringing(recording: Recording, waveform: Step) -> Any:
-    """Return the ringing after the largest step of the waveform."""
+def _ringing(recording: Recording, waveform: Step) -> Ringing | None:
+    samples = after_step(recording, waveform)
+    whole = samples.index.size and np.isfinite(samples.displacement_um).all()
+    return ringing(samples.displacement_um, recording.sample_rate_hz) if whole else None
+
+
+def after_step(recording: Recording, waveform: Step) -> Samples:
+    """Return the samples from the end of the largest step of a waveform up to the next one."""
     segment, rate_hz = recording.segments[0], recording.sample_rate_hz
     levels = np.array([0.0, *waveform.levels])
     largest = int(np.argmax(np.abs(np.diff(levels))))
     dwell = round(waveform.dwell_s * rate_hz)
     begin = segment.start + largest * dwell + round(waveform.rise_s * rate_hz) + 1
-    samples = recording.samples.part(begin, segment.start + (largest + 1) * dwell)
-    whole = samples.index.size and np.isfinite(samples.displacement_um).all()
-    return ringing(samples.displacement_um, rate_hz) if whole else None
+    return recording.samples.part(begin, segment.start + (largest + 1) * dwell)
