@@ -58,8 +58,8 @@ def demo(
     as_json: AsJson = False,
 ) -> None:
     """Run the simulated rig without and with the inverse, and show what it does."""
-    from hilctl.analysis.html import write_html
     from hilctl.analysis.report import summarize
+    from hilctl.analysis.run_page import write_html
     from hilctl.experiment.examples import copy_example, examples_folder
     from hilctl.recording.reader import read
 

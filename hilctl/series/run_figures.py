@@ -85,15 +85,16 @@ def figures_of(recording: Recording, waveform: Any) -> RunFigures:
 def figures_with(recording: Recording, structure: SmallSignal | Ringing | None) -> RunFigures:
     """Work out the figures of a whole run whose structure is known; see :func:`figures_of`."""
     report = summarize(recording)
+    loops = not isinstance(structure, SmallSignal)  # of many sines at once there is only a tangle
     worst = recording.segments[worst_segment(report.segments)] if recording.segments else None
     measured = [event.values.get("offset_um") for event in recording.events if event.code == OFFSET]
     return RunFigures(
-        peak_hysteresis_percent=report.peak_hysteresis_percent,
+        peak_hysteresis_percent=report.peak_hysteresis_percent if loops else None,
         peak_error_percent=report.peak_error_percent,
         rms_error_percent=report.rms_error_percent,
-        loop_area=report.loop_area,
+        loop_area=report.loop_area if loops else None,
         peak_to_peak_um=report.peak_to_peak_um,
-        **(_cycle(recording, worst) if worst else {}),
+        **(_cycle(recording, worst, minor=loops) if worst else {}),
         offset_um=measured[0] if measured else None,
         natural_hz=structure.natural_hz if structure else None,
         damping_ratio=structure.damping_ratio if structure else None,
@@ -107,7 +108,7 @@ def _rms_a(heat: str | None) -> float | None:
     return None if heat is None else float(np.sqrt(float(heat)))
 
 
-def _cycle(recording: Recording, segment: Segment) -> dict[str, float]:
+def _cycle(recording: Recording, segment: Segment, *, minor: bool) -> dict[str, float]:
     part = steady_part(recording, segment)
     if part.cycle is None or not part.loop.size:
         return {}
@@ -117,7 +118,7 @@ def _cycle(recording: Recording, segment: Segment) -> dict[str, float]:
         "high_um": float(output.max()),
         "mean_um": float(output.mean()),
     }
-    return found | _minor(loop_input, output)
+    return found | _minor(loop_input, output) if minor else found
 
 
 def _minor(loop_input: F64, output: F64) -> dict[str, float]:
