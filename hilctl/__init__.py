@@ -6,6 +6,7 @@ cli          commands, messages and tables; the only room that prints
 api.py       a run from a program of one's own
 desk         who looks on: the live page of a run, and its server
 campaign     many runs of one experiment, kept and resumed
+series       many runs side by side: what varied, figures and page of all of them
 characterise from a wired device to its model: a campaign of runs
 learning     corrections from run to run
 comparison   models of the literature on the same loops

@@ -1,42 +1,59 @@
-"""A run as one self-contained page: no scripts, nothing fetched, figures as PNG within it."""
+"""Parts of self-contained pages: no scripts, nothing fetched, figures within as SVG.
+
+Figures have the width of a journal's column, and letters of 8 points: so many stand abreast as have
+room, on paper two, on a phone one, and none is shrunk. In the dark they are turned: light becomes
+dark and hues stay.
+"""
 
 import base64
 import html
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-import numpy as np
 from matplotlib.figure import Figure
 
-from hilctl.analysis import canvas, loops, plots, table
-from hilctl.analysis.figures import RunReport
-from hilctl.analysis.report import worst_segment
-from hilctl.base.events import Event
+from hilctl.analysis import canvas
+from hilctl.analysis.sheet import Sheet, drawn
+from hilctl.analysis.vector import svg
 from hilctl.base.files import write_text
 from hilctl.base.printable import printable
-from hilctl.recording.data import Recording
-
-_MOST_EVENTS = 200
 
 _CSS = """
-:root { color-scheme: light; }
-body { font: 15px/1.45 system-ui, "DejaVu Sans", sans-serif; color: #1c1c1c; background: #fff;
-  max-width: 1120px; margin: 0 auto; padding: 1.5rem; }
-h1 { font-size: 1.5rem; margin: 0 0 .2rem; }
-h2 { font-size: 1.1rem; margin: 2rem 0 .5rem; border-bottom: 1px solid #ddd; }
-.file { color: #666; margin: 0 0 1rem; overflow-wrap: anywhere; }
-.note { background: #fff4d6; border-left: 4px solid #e69f00; padding: .5rem .8rem; }
-.side { display: flex; flex-wrap: wrap; gap: 0 2.5rem; align-items: flex-start; }
+:root { color-scheme: light dark; --ink: #1c1c1c; --quiet: #666; --paper: #fff; --line: #ddd;
+  --pale: #f5f5f5; --note: #fff4d6; --bad: #fde4e1; }
+@media screen and (prefers-color-scheme: dark) {
+  :root { --ink: #e6e6e6; --quiet: #a2a2a2; --paper: #131416; --line: #3a3c40; --pale: #1e2023;
+    --note: #3d3212; --bad: #4a1d18; }
+  figure svg, img { filter: invert(0.93) hue-rotate(180deg); }
+}
+body { font: 15px/1.45 system-ui, "DejaVu Sans", sans-serif; color: var(--ink);
+  background: var(--paper); max-width: 1160px; margin: 0 auto; padding: 1.2rem; }
+h1 { font-size: 1.5rem; margin: 0 0 .2rem; overflow-wrap: anywhere; }
+h2 { font-size: 1.1rem; margin: 1.8rem 0 .5rem; border-bottom: 1px solid var(--line); }
+.file { color: var(--quiet); margin: 0 0 1rem; overflow-wrap: anywhere; }
+.headline { font-size: 1.1rem; margin: .8rem 0; }
+.note, .bad { border-left: 4px solid #e69f00; padding: .5rem .8rem; background: var(--note); }
+.bad { border-color: #d55e00; background: var(--bad); }
+.side { display: grid; gap: 0 2.5rem; align-items: start;
+  grid-template-columns: repeat(auto-fit, minmax(min(100%, 27rem), 1fr)); }
+.figures { columns: 20.1rem; column-gap: 1.5rem; }
+figure { margin: 0 0 1.2rem; break-inside: avoid; }
+figure svg { display: block; width: 100%; height: auto; max-width: 30rem; }
+figcaption { color: var(--quiet); font-size: .85rem; max-width: 30rem; }
 table { border-collapse: collapse; margin: .3rem 0; }
 th, td { text-align: left; vertical-align: top; padding: .2rem .9rem .2rem 0;
-  border-bottom: 1px solid #eee; }
+  border-bottom: 1px solid var(--line); }
 th { font-weight: 600; white-space: nowrap; }
-td { font-variant-numeric: tabular-nums; }
+td { font-variant-numeric: tabular-nums; overflow-wrap: anywhere; }
+.numbers td, .numbers th { overflow-wrap: normal; white-space: nowrap; }
 .numbers td:not(:first-child), .numbers th:not(:first-child) { text-align: right; }
 img { max-width: 100%; height: auto; display: block; margin: .6rem 0; }
-pre { background: #f6f6f6; padding: .8rem; overflow-x: auto; font-size: 13px; }
+pre { background: var(--pale); padding: .8rem; overflow-x: auto; font-size: 13px; }
 summary { cursor: pointer; }
+dt { font-weight: 600; } dd { margin: 0 0 .4rem 1rem; }
 .wide { overflow-x: auto; }
+@media print { body { max-width: none; padding: 0; font-size: 10pt; }
+  .figures { columns: 2; column-gap: 5mm; } details { display: none; } }
 """
 
 _HEAD = """<!DOCTYPE html>
@@ -45,48 +62,13 @@ _HEAD = """<!DOCTYPE html>
 <title>{title}</title><style>{css}</style></head><body>"""
 
 
-def write_html(recording: Recording, report: RunReport, path: Path) -> None:
-    """Write the page of a run; a page of that name is replaced.
-
-    Args:
-        recording: The run.
-        report: Its figures.
-        path: File to write.
-
-    Raises:
-        InputError: It can't be written.
-    """
-    write_page(page(recording, report), path)
-
-
-def write_page(text: str, path: Path) -> None:
+def write_page(page: str, path: Path) -> None:
     """Write a page; one of that name is replaced.
 
     Raises:
         InputError: It can't be written.
     """
-    write_text(path, text, overwrite=True)
-
-
-@np.errstate(over="ignore", invalid="ignore")  # of readings near the end of all numbers
-def page(recording: Recording, report: RunReport) -> str:
-    """Return the page of a run as HTML."""
-    title = _text(report.name or "run")
-    body = [
-        f"<h1>{title}</h1>",
-        f'<p class="file">{_text(report.path)}</p>',
-        *_notes(report),
-        '<div class="side">',
-        _rows("Figures", table.quality_rows(report)),
-        _rows("Run", table.run_rows(report)),
-        "</div>",
-        *_segments(report),
-        *_figures(recording, report),
-        *_events(recording.events),
-        *_details("Experiment", recording.experiment_yaml),
-        *_details("Model", recording.model_yaml),
-    ]
-    return document(title, body)
+    write_text(path, page, overwrite=True)
 
 
 def document(title: str, body: Iterable[str]) -> str:
@@ -94,76 +76,55 @@ def document(title: str, body: Iterable[str]) -> str:
     return "\n".join((_HEAD.format(title=title, css=_CSS), *body, "</body></html>\n"))
 
 
-def _text(text: str, *, lines: bool = False) -> str:
+def text(plain: str, *, lines: bool = False) -> str:
     """Return a text, perhaps from a file, as HTML that shows it."""
-    return html.escape(printable(text, lines=lines))
+    return html.escape(printable(plain, lines=lines))
 
 
-def _notes(report: RunReport) -> list[str]:
-    notes = []
-    if report.simulated:
-        notes.append(f"The device is {table.SIMULATED}.")
-    if not report.complete:
-        notes.append(f"The run is not complete: {report.reason}.")
-    return [f'<p class="note">{_text(note)}</p>' for note in notes]
+def paragraph(plain: str, css: str = "") -> str:
+    """Return a plain text as a paragraph."""
+    return f'<p class="{css}">{text(plain)}</p>' if css else f"<p>{text(plain)}</p>"
 
 
-def _rows(heading: str, rows: Sequence[tuple[str, str]]) -> str:
-    cells = "\n".join(
-        f"<tr><th>{_text(name)}</th><td>{_text(value)}</td></tr>" for name, value in rows
-    )
-    return f"<section><h2>{heading}</h2><table>{cells}</table></section>"
-
-
-def grid(headings: Iterable[str], rows: Iterable[Iterable[str]], css: str = "") -> str:
-    """Return a table of plain texts."""
-    head = "".join(f"<th>{_text(heading)}</th>" for heading in headings)
+def rows(heading: str, cells: Sequence[tuple[str, str]]) -> str:
+    """Return a section with a table of names and values."""
     body = "\n".join(
-        f"<tr>{''.join(f'<td>{_text(cell)}</td>' for cell in row)}</tr>" for row in rows
+        f"<tr><th>{text(name)}</th><td>{text(value)}</td></tr>" for name, value in cells
     )
+    return f"<section><h2>{text(heading)}</h2><table>{body}</table></section>"
+
+
+def grid(headings: Iterable[str], cells: Iterable[Iterable[str]], css: str = "") -> str:
+    """Return a table of plain texts."""
+    head = "".join(f"<th>{text(heading)}</th>" for heading in headings)
+    lines = ("".join(f"<td>{text(cell)}</td>" for cell in row) for row in cells)
+    body = "\n".join(f"<tr>{line}</tr>" for line in lines)
     return f'<div class="wide"><table class="{css}"><tr>{head}</tr>\n{body}</table></div>'
 
 
-def _segments(report: RunReport) -> list[str]:
-    if len(report.segments) < 2:
-        return []
-    note = "<p>The figures above are the worst of these.</p>"
-    headings, rows = table.segment_table(report)
-    return ["<h2>By segment</h2>", note, grid(headings, rows, "numbers")]
-
-
-def _figures(recording: Recording, report: RunReport) -> list[str]:
-    focus = worst_segment(report.segments)
-    no_error = "No error is drawn: no sample has a reference displacement."
-    drawn: list[tuple[str, Figure | None, str]] = [
-        ("History", plots.time_history(recording, focus), "No samples were recorded."),
-        ("Hysteresis", loops.hysteresis_loop(recording, focus), "No steady samples were recorded."),
-        ("Error", plots.error(recording, focus), no_error),
-        ("Timing", plots.lateness(recording), "No ticks were recorded."),
-    ]
-    parts = []
-    for heading, figure, otherwise in drawn:
-        parts.append(f"<h2>{heading}</h2>")
-        parts.append(f"<p>{otherwise}</p>" if figure is None else image(heading, figure))
-    return parts
+def figures(sheets: Iterable[Sheet]) -> str:
+    """Return figures with their captions, as many abreast as have room."""
+    blocks = "\n".join(
+        f'<figure role="img" aria-label="{text(sheet.caption)}">{svg(drawn(sheet))}'
+        f"<figcaption>{text(sheet.caption)}</figcaption></figure>"
+        for sheet in sheets
+    )
+    return f'<div class="figures">{blocks}</div>'
 
 
 def image(alternative: str, figure: Figure) -> str:
-    """Return a figure as a PNG within the page."""
+    """Return a figure of any size as a PNG within the page."""
     data = base64.b64encode(canvas.png(figure)).decode("ascii")
     return f'<img alt="{alternative}" src="data:image/png;base64,{data}">'
 
 
-def _events(events: Sequence[Event]) -> list[str]:
-    if not events:
-        return []
-    rows = [(str(e.sample), e.level, e.code, e.text) for e in events[-_MOST_EVENTS:]]
-    left_out = len(events) - len(rows)
-    note = [f"<p>The first {left_out} are left out.</p>"] if left_out else []
-    return ["<h2>Events</h2>", *note, grid(("sample", "level", "code", "text"), rows)]
+def details(heading: str, plain: str) -> str:
+    """Return a text that is folded away."""
+    shown = text(plain, lines=True)
+    return f"<details><summary>{text(heading)}</summary><pre>{shown}</pre></details>"
 
 
-def _details(heading: str, text: str) -> list[str]:
-    if not text:
-        return []
-    return [f"<details><summary>{heading}</summary><pre>{_text(text, lines=True)}</pre></details>"]
+def definitions(heading: str, terms: Sequence[tuple[str, str]]) -> str:
+    """Return what terms mean."""
+    body = "".join(f"<dt>{text(term)}</dt><dd>{text(meaning)}</dd>" for term, meaning in terms)
+    return f"<h2>{text(heading)}</h2><dl>{body}</dl>"

@@ -1,28 +1,31 @@
 """The hysteresis loop as a figure, with the peak hysteresis marked in it."""
 
+from collections.abc import Sequence
+from functools import partial
+
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
-from hilctl.analysis.canvas import DISPLACEMENT, MARK, REFERENCE, STYLE
+from hilctl.analysis.canvas import COMMAND, DISPLACEMENT, MARK, REFERENCE
+from hilctl.analysis.sheet import Panel, Sheet
 from hilctl.analysis.steady import SteadyPart, steady_part
 from hilctl.base import metrics
 from hilctl.base.arrays import F64
 from hilctl.base.printable import short_name
+from hilctl.base.quantity import quantity
 from hilctl.recording.data import Recording
 
-_LONGEST_PATH = 200_000
-_MARK_LABEL = "peak hysteresis"
-_FEW_LABELS = 3
-_MOST_LABELS = 24
+_LONGEST_PATH = 5_000
+_MOST_LABELS = 12
+_SQUARE = 0.85
+_DISPLACEMENT_AXIS = "displacement, µm"
 
 
-@mpl.rc_context(STYLE)
-def hysteresis_loop(recording: Recording, focus: int = 0) -> Figure | None:
-    """Draw displacement against the loop's input, one average cycle a segment.
+def hysteresis_loop(recording: Recording, focus: int = 0) -> Sheet | None:
+    """Return displacement against the loop's input, one average cycle a segment.
 
-    Beside it stands what is left when a straight line is taken off: the line that a compensated run
+    Below it stands what is left when a straight line is taken off: the line that a compensated run
     should follow, otherwise the closest one. What does not repeat is drawn as it was measured.
 
     Args:
@@ -33,34 +36,30 @@ def hysteresis_loop(recording: Recording, focus: int = 0) -> Figure | None:
         None where no segment has steady samples.
     """
     parts = [steady_part(recording, segment) for segment in recording.segments]
-    loops = [_loop(part) for part in parts]
-    everything = np.concatenate([np.empty((2, 0)), *loops], axis=1)
+    everything = np.concatenate([np.empty((2, 0)), *map(_loop, parts)], axis=1)
     if everything.size == 0:
         return None
     line = np.array([1.0, 0.0]) if recording.compensated else _closest_line(everything)
-    ends = np.array([everything[0].min(), everything[0].max()])
-    figure = Figure(figsize=(11.0, 4.8))
-    panels = figure.subplots(1, 2)
-    for axes, taken_off in zip(panels, (np.zeros(2), line), strict=True):
-        for segment, loop, colour in zip(
-            recording.segments, loops, _colours(len(loops)), strict=True
-        ):
-            label = short_name(segment.label) if loop[0].size else "_not reached"
-            axes.plot(loop[0], loop[1] - np.polyval(taken_off, loop[0]), color=colour, label=label)
-        straight = np.polyval(line - taken_off, ends)
-        axes.plot(ends, straight, color=REFERENCE, linestyle=":", linewidth=0.9)
-        if focus < len(parts):
-            _mark_gap(axes, parts[focus], taken_off)
-    _name_axes(panels[0], panels[1], recording, any(part.cycle is not None for part in parts))
-    _legend(figure, panels[0])
-    return figure
+    averaged = any(part.cycle is not None for part in parts)
+    title = "average steady cycle" if averaged else "as measured, not averaged"
+    draw = partial(_draw, recording=recording, parts=parts, focus=focus, line=line)
+    panels = (
+        Panel(partial(draw, taken_off=np.zeros(2)), title, _SQUARE),
+        Panel(partial(draw, taken_off=line), "off the straight line"),
+    )
+    caption = f"Displacement against {_input_name(recording)}, and what is off a straight line."
+    return Sheet("hysteresis", caption, panels)
+
+
+def _input_name(recording: Recording) -> str:
+    return "reference" if recording.compensated else "command"
 
 
 def _loop(part: SteadyPart) -> F64:
     """Return one loop, float64[2, m]: input and displacement, closed where it is an average."""
     if part.cycle is not None:
         return np.concatenate((part.loop, part.loop[:, :1]), axis=1)
-    return part.loop[:, -_LONGEST_PATH:]
+    return part.loop[:, :: max(1, part.loop.shape[1] // _LONGEST_PATH)]
 
 
 def _closest_line(everything: F64) -> F64:
@@ -71,11 +70,40 @@ def _closest_line(everything: F64) -> F64:
     return np.asarray(np.polyfit(x, y, 1), dtype=np.float64)
 
 
+def _draw(
+    axes: Axes,
+    recording: Recording,
+    parts: Sequence[SteadyPart],
+    focus: int,
+    line: F64,
+    taken_off: F64,
+) -> None:
+    loops = [_loop(part) for part in parts]
+    reached = [k for k, loop in enumerate(loops) if loop[0].size]
+    for k, colour in zip(reached, _colours(len(reached)), strict=True):
+        named = len(reached) <= _MOST_LABELS or k in (reached[0], reached[-1], focus)
+        label = short_name(recording.segments[k].label) if named else "_unnamed"
+        off = loops[k][1] - np.polyval(taken_off, loops[k][0])
+        axes.plot(loops[k][0], off, color=colour, linewidth=0.9, label=label)
+    everything = np.concatenate(loops, axis=1)
+    ends = np.array([everything[0].min(), everything[0].max()])
+    straight = np.polyval(line - taken_off, ends)
+    axes.plot(ends, straight, color=REFERENCE, linestyle=":", linewidth=0.8)
+    if focus < len(parts):
+        _mark_gap(axes, parts[focus], taken_off)
+    unit = "µm" if recording.compensated else recording.command_unit
+    left = "less line" if taken_off.any() else ""
+    axes.set(
+        xlabel=f"{_input_name(recording)}, {unit}",
+        ylabel=f"displacement {left}, µm" if left else _DISPLACEMENT_AXIS,
+    )
+
+
 def _colours(loops: int) -> list[object]:
     """Return a colour a loop; many of them in viridis, which keeps its order in grey too."""
     if loops == 1:
         return [DISPLACEMENT]
-    return list(mpl.colormaps["viridis"](np.linspace(0.0, 0.9, loops)))
+    return list(mpl.colormaps["viridis"](np.linspace(0.0, 0.85, loops)))
 
 
 def _mark_gap(axes: Axes, part: SteadyPart, taken_off: F64) -> None:
@@ -88,26 +116,55 @@ def _mark_gap(axes: Axes, part: SteadyPart, taken_off: F64) -> None:
     if gap is None or hysteresis is None:
         return
     shift = float(np.polyval(taken_off, gap.at_input))
-    text = f"{_MARK_LABEL} {hysteresis:.3g} %\n({gap.height:.3g} um)"
+    text = f"peak hysteresis {quantity(hysteresis, '%')} ({quantity(gap.height, 'um')})"
     ends = (gap.low - shift, gap.high - shift)
     axes.plot((gap.at_input,) * 2, ends, "_-", color=MARK, linewidth=2.0, label=text, zorder=5)
 
 
-def _name_axes(left: Axes, right: Axes, recording: Recording, averaged: bool) -> None:
-    name = "reference, um" if recording.compensated else f"command, {recording.command_unit}"
-    title = "average steady cycle" if averaged else "as measured, not averaged"
-    left.set(title=title, xlabel=name, ylabel="displacement, um")
-    right.set(title="off the straight line", xlabel=name, ylabel="displacement less line, um")
+def before_and_after(before: Recording, after: Recording) -> Sheet | None:
+    """Return the loops of one motion without and with a compensator, and the errors of both.
+
+    Each is shown over its own range, as command and reference have different units: a straight line
+    from corner to corner is what a compensator is for.
+
+    Args:
+        before: The run without one.
+        after: The run with one.
+
+    Returns:
+        None where one of them has no average cycle.
+    """
+    loops = [_worst_loop(before), _worst_loop(after)]
+    if any(loop is None for loop in loops):
+        return None
+    shown = [_of_range(loop) for loop in loops if loop is not None]
+
+    def draw(axes: Axes, off_line: float) -> None:
+        for (x, y), colour, label in zip(
+            shown, (COMMAND, DISPLACEMENT), ("without compensator", "with it"), strict=True
+        ):
+            axes.plot(x, y - off_line * x, color=colour, linewidth=1.0, label=label)
+        straight = [0.0, 100.0 * (1.0 - off_line)]
+        axes.plot([0.0, 100.0], straight, color=REFERENCE, linestyle=":", linewidth=0.8)
+        left = " less line" if off_line else ""
+        axes.set(xlabel="input, % of its range", ylabel=f"displacement{left}, % of its range")
+
+    panels = (
+        Panel(partial(draw, off_line=0.0), "loops", _SQUARE),
+        Panel(partial(draw, off_line=1.0), "off the straight line"),
+    )
+    caption = "Before and after compensation, each over its own range; dotted: no hysteresis."
+    return Sheet("before_and_after", caption, panels)
 
 
-def _legend(figure: Figure, axes: Axes) -> None:
-    """Name the loops: in the corner that they leave free, or beside them where they are many."""
-    entries = list(zip(*axes.get_legend_handles_labels(), strict=True))
-    if not entries:  # matplotlib takes labels that begin with an underscore for private ones
-        return
-    entries.sort(key=lambda entry: not entry[1].startswith(_MARK_LABEL))
-    handles, labels = zip(*entries[:_MOST_LABELS], strict=True)
-    if len(handles) <= _FEW_LABELS:
-        axes.legend(handles, labels, loc="upper left")
-    else:
-        figure.legend(handles, labels, loc="outside right upper")
+def _worst_loop(recording: Recording) -> F64 | None:
+    """Return the closed loop of a run that has the widest gap; None without any."""
+    parts = [steady_part(recording, segment) for segment in recording.segments]
+    loops = [_loop(part) for part in parts if part.cycle is not None]
+    return max(loops, key=lambda loop: metrics.peak_hysteresis_percent(*loop) or 0.0, default=None)
+
+
+def _of_range(loop: F64) -> F64:
+    low, whole = loop.min(axis=1, keepdims=True), np.ptp(loop, axis=1)[:, None]
+    percent: F64 = 100.0 * (loop - low) / np.where(whole > 0.0, whole, 1.0)
+    return percent

@@ -1,12 +1,12 @@
-"""Figures of a run over time, drawn without a display: history, error, lateness.
+"""Figures of a run over time and frequency: history, error and its spectrum, lateness.
 
 ``focus`` is the number of the segment that is looked at closely.
 """
 
-import matplotlib as mpl
+from functools import partial
+
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
 from hilctl.analysis import timing
@@ -17,51 +17,76 @@ from hilctl.analysis.canvas import (
     MARK,
     QUIET,
     REFERENCE,
-    STYLE,
     draw_line,
     draw_over_time,
-    legend,
 )
+from hilctl.analysis.sheet import Panel, Sheet
+from hilctl.analysis.spectrum import ErrorSpectrum, error_spectrum, thinned
 from hilctl.analysis.steady import SteadyPart, steady_part, steady_samples
 from hilctl.base.arrays import F64, I64
+from hilctl.base.metrics import MAX_BINS
 from hilctl.base.printable import short_name
+from hilctl.base.quantity import quantity
 from hilctl.base.samples import Samples
 from hilctl.base.segments import Segment
 from hilctl.recording.data import Recording
 
 _ZOOM_CYCLES = 2
-_MOST_DOTS = 10_000
 _BINS = 80
+_SPREAD_BINS = 200
+_SPECTRUM_POINTS = 800
+_DECADES = 5.0  # of amplitude that a spectrum shows
+_LOW = 0.5
 
 
-@mpl.rc_context(STYLE)
-def time_history(recording: Recording, focus: int = 0) -> Figure | None:
-    """Draw reference, displacement and command, over the whole run and over two steady cycles.
-
-    Returns:
-        None where there are no samples.
-    """
+def time_history(recording: Recording) -> Sheet | None:
+    """Return reference, displacement and command over the whole run; None without samples."""
     if recording.samples.index.size == 0:
         return None
-    figure = Figure(figsize=(11.0, 5.0))
-    zoom = _zoom(recording, focus)
-    widths = [1.6, 1.0] if zoom is not None else [1.0]
-    axes = figure.subplots(2, len(widths), squeeze=False, sharex="col", width_ratios=widths)
-    upper, lower = axes[0, 0], axes[1, 0]
+    panels = (
+        Panel(partial(_draw_history, recording=recording)),
+        Panel(partial(_draw_command, recording=recording), height=_LOW),
+    )
+    caption = "Whole run: displacement, reference and command; grey: the part that is judged."
+    return Sheet("history", caption, panels, stacked=True)
+
+
+def _draw_history(axes: Axes, recording: Recording) -> None:
     samples = recording.samples
-    draw_over_time(upper, recording, samples.displacement_um, DISPLACEMENT, "displacement")
-    draw_over_time(upper, recording, samples.reference_um, REFERENCE, "reference", outline=True)
-    draw_over_time(lower, recording, samples.command, COMMAND, "command")
-    upper.set(title="whole run", ylabel="displacement, um")
-    lower.set(xlabel="time, s", ylabel=f"command, {recording.command_unit}")
-    for each in (upper, lower):
-        _mark_judged(each, recording)
-    legend(upper)
-    if zoom is not None:
-        _draw_zoom(axes[0, 1], axes[1, 1], zoom, recording.sample_rate_hz)
-        label = short_name(recording.segments[focus].label)
-        axes[0, 1].set_title(f"end of the steady part: {label}")
-    return figure
+    draw_over_time(axes, recording, samples.displacement_um, DISPLACEMENT, "displacement")
+    draw_over_time(axes, recording, samples.reference_um, REFERENCE, "reference", outline=True)
+    axes.set(xlabel="time, s", ylabel="displacement, µm")
+    _mark_judged(axes, recording)
+
+
+def _draw_command(axes: Axes, recording: Recording) -> None:
+    draw_over_time(axes, recording, recording.samples.command, COMMAND, "command")
+    axes.set(xlabel="time, s", ylabel=f"command, {recording.command_unit}")
+    _mark_judged(axes, recording)
+
+
+def steady_cycles(recording: Recording, focus: int = 0) -> Sheet | None:
+    """Return the same over the last two steady cycles of a segment; None where there is none."""
+    zoom = _zoom(recording, focus)
+    if zoom is None:
+        return None
+    t = zoom.index / recording.sample_rate_hz
+
+    def moved(axes: Axes) -> None:
+        draw_line(axes, t, zoom.displacement_um, DISPLACEMENT, "displacement")
+        draw_line(axes, t, zoom.reference_um, REFERENCE, "reference", dashed=True)
+        axes.set(xlabel="time, s", ylabel="displacement, µm")
+
+    def commanded(axes: Axes) -> None:
+        draw_line(axes, t, zoom.command, COMMAND, "command")
+        axes.set(xlabel="time, s", ylabel=f"command, {recording.command_unit}")
+        axes.ticklabel_format(axis="x", useOffset=False)
+        axes.locator_params(axis="x", nbins=5)
+
+    label = short_name(recording.segments[focus].label)
+    caption = f"End of the steady part: {label}."
+    panels = (Panel(moved), Panel(commanded, height=_LOW))
+    return Sheet("steady_cycles", caption, panels, stacked=True)
 
 
 def _zoom(recording: Recording, focus: int) -> Samples | None:
@@ -76,16 +101,6 @@ def _zoom(recording: Recording, focus: int) -> Samples | None:
     return recording.samples.part(stop - round(cycles * recording.segments[focus].period), stop)
 
 
-def _draw_zoom(upper: Axes, lower: Axes, samples: Samples, rate_hz: float) -> None:
-    t = samples.index / rate_hz
-    draw_line(upper, t, samples.displacement_um, DISPLACEMENT)
-    draw_line(upper, t, samples.reference_um, REFERENCE, dashed=True)
-    draw_line(lower, t, samples.command, COMMAND)
-    lower.set(xlabel="time, s")
-    lower.ticklabel_format(axis="x", useOffset=False)
-    lower.locator_params(axis="x", nbins=5)
-
-
 def _mark_judged(axes: Axes, recording: Recording) -> None:
     """Shade the samples that the figures of each segment are taken from."""
     label = "judged"
@@ -97,9 +112,8 @@ def _mark_judged(axes: Axes, recording: Recording) -> None:
             label = "_again"
 
 
-@mpl.rc_context(STYLE)
-def error(recording: Recording, focus: int = 0) -> Figure | None:
-    """Draw displacement less reference, over the run and over one cycle.
+def error(recording: Recording, focus: int = 0) -> Sheet | None:
+    """Return displacement less reference, over the run and over one cycle.
 
     Returns:
         None where no sample has a reference displacement.
@@ -107,75 +121,119 @@ def error(recording: Recording, focus: int = 0) -> Figure | None:
     error_um = recording.samples.displacement_um - recording.samples.reference_um
     if not recording.compensated or not np.isfinite(error_um).any():
         return None
-    figure = Figure(figsize=(11.0, 3.4))
-    part = None
+
+    def over_time(axes: Axes) -> None:
+        draw_over_time(axes, recording, error_um, ERROR, "error")
+        axes.set(xlabel="time, s", ylabel="error, µm")
+        _mark_judged(axes, recording)
+
+    panels = [Panel(over_time, "whole run")]
     if focus < len(recording.segments):
-        part = steady_part(recording, recording.segments[focus])
-    cycle = part is not None and part.cycle is not None
-    widths = [1.6, 1.0] if cycle else [1.0]
-    axes = figure.subplots(1, len(widths), squeeze=False, width_ratios=widths)[0]
-    draw_over_time(axes[0], recording, error_um, ERROR, "error")
-    _mark_judged(axes[0], recording)
-    legend(axes[0])
-    axes[0].set(title="error over the whole run", xlabel="time, s", ylabel="error, um")
-    if part is not None and cycle:
-        _draw_phase(axes[1], part, recording.segments[focus])
-    return figure
+        segment = recording.segments[focus]
+        part = steady_part(recording, segment)
+        if part.cycle is not None:
+            panels.append(Panel(partial(_draw_phase, part=part, segment=segment), "over one cycle"))
+    caption = "Error: displacement less reference, over the run and over one cycle."
+    return Sheet("error", caption, tuple(panels))
 
 
 def _draw_phase(axes: Axes, part: SteadyPart, segment: Segment) -> None:
-    """Draw the average cycle's error over phase, with some of the samples it is the average of."""
+    """Draw the average cycle's error over phase, in the band that all samples fill."""
     if part.cycle is None:
         return
-    phase, error_um = _dots(part, segment)
-    axes.plot(phase, error_um, ".", color=ERROR, alpha=0.4, markersize=2.5, label="samples")
+    phase, low, high = _spread(part, segment)
+    axes.fill_between(phase, low, high, color=ERROR, alpha=0.35, linewidth=0.0, label="all samples")
     reference_um, displacement_um = part.cycle.signals
     average = displacement_um - reference_um
-    axes.plot(part.cycle.phase, average, color=REFERENCE, linewidth=1.1, label="average cycle")
+    axes.plot(part.cycle.phase, average, color=REFERENCE, linewidth=1.0, label="average cycle")
     worst = int(np.argmax(np.abs(average)))
     axes.plot(part.cycle.phase[worst], average[worst], "o", color=MARK, label="peak error")
-    axes.set(title="over one cycle", xlabel="phase, cycles", xlim=(0.0, 1.0), ylabel="error, um")
-    axes.legend(frameon=True, edgecolor="none", framealpha=0.8)
+    axes.set(xlabel="phase, cycles", xlim=(0.0, 1.0), ylabel="error, µm")
 
 
-def _dots(part: SteadyPart, segment: Segment) -> tuple[F64, F64]:
-    samples = part.samples
-    some = slice(None, None, max(1, samples.index.size // _MOST_DOTS))
-    phase = np.mod(samples.index[some] - segment.start, segment.period) / segment.period
-    return phase, samples.displacement_um[some] - samples.reference_um[some]
+def _spread(part: SteadyPart, segment: Segment) -> tuple[F64, F64, F64]:
+    """Return the middles of bins of phase, and the lowest and highest error of samples in each."""
+    error_um = part.samples.displacement_um - part.samples.reference_um
+    finite = np.isfinite(error_um)
+    cycles = np.mod(part.samples.index[finite] - segment.start, segment.period) / segment.period
+    bins = max(1, min(_SPREAD_BINS, int(segment.period), MAX_BINS))
+    of = np.minimum((cycles * bins).astype(np.int64), bins - 1)
+    low, high = np.full(bins, np.inf), np.full(bins, -np.inf)
+    np.minimum.at(low, of, error_um[finite])
+    np.maximum.at(high, of, error_um[finite])
+    filled = low <= high
+    return ((np.arange(bins) + 0.5) / bins)[filled], low[filled], high[filled]
 
 
-@mpl.rc_context(STYLE)
-def lateness(recording: Recording) -> Figure | None:
-    """Draw how late ticks woke and how long exchanges took, as histograms with log counts.
+def spectrum(recording: Recording, focus: int = 0) -> Sheet | None:
+    """Return spectrum and harmonics of the error; None where there is none, or no steady part."""
+    if not recording.compensated or focus >= len(recording.segments):
+        return None
+    segment = recording.segments[focus]
+    samples = steady_samples(recording, segment)[0]
+    error_um = samples.displacement_um - samples.reference_um
+    found = error_spectrum(recording, segment, samples.index, error_um)
+    if found is None:
+        return None
+    panels = [Panel(partial(_draw_spectrum, found=found), "spectrum")]
+    caption = "Spectrum of the error."
+    if found.harmonics_um.size:
+        caption = "Spectrum of the error, and its harmonics in the average cycle."
+        panels.append(Panel(partial(_draw_harmonics, found=found), "harmonics", 0.5))
+    return Sheet("error_spectrum", caption, tuple(panels))
+
+
+def _draw_spectrum(axes: Axes, found: ErrorSpectrum) -> None:
+    x, y = thinned(found, _SPECTRUM_POINTS)
+    axes.loglog(x, np.maximum(1e3 * y, 1e-12), color=ERROR, linewidth=0.8)
+    highest = 1e3 * float(y.max())
+    if highest > 0.0:
+        axes.set_ylim(max(1e3 * float(y.min()), highest * 10.0**-_DECADES), 2.0 * highest)
+    axes.set(xlabel="frequency, Hz", ylabel="amplitude, nm", xlim=(x[0], x[-1]))
+    _plain_numbers(axes)
+
+
+def _draw_harmonics(axes: Axes, found: ErrorSpectrum) -> None:
+    order = np.arange(1, found.harmonics_um.size + 1)
+    axes.bar(order, 1e3 * found.harmonics_um, color=ERROR, width=0.7)
+    axes.set(xlabel="harmonic of the waveform's frequency", ylabel="amplitude, nm")
+    axes.set_xticks([1, *range(5, int(order[-1]) + 1, 5)])
+
+
+def lateness(recording: Recording) -> Sheet | None:
+    """Return how late ticks woke and how long exchanges took, as histograms with log counts.
 
     Returns:
-        None where there are no ticks.
+        None where there are no ticks, or the run did not keep real time.
     """
-    ticks = recording.ticks
-    if ticks.late_ns.size == 0:
+    if recording.ticks.late_ns.size == 0 or recording.run.get("paced") == "false":
         return None
-    figure = Figure(figsize=(11.0, 3.4))
-    axes = figure.subplots()
+    caption = "How late ticks woke up, and how long exchanges with the device took."
+    return Sheet("lateness", caption, (Panel(partial(_draw_lateness, recording=recording)),))
+
+
+def _draw_lateness(axes: Axes, recording: Recording) -> None:
+    ticks = recording.ticks
     late_us, exchange_us = _microseconds(ticks.late_ns), _microseconds(ticks.exchange_ns)
     everything = np.concatenate((late_us, exchange_us))
     highest = max(float(everything.max()) * 1.05, float(everything.min()) * 2.0)
     bins = np.geomspace(float(everything.min()), highest, _BINS).tolist()
-    axes.hist(late_us, bins, color=DISPLACEMENT, alpha=0.6, label="lateness of ticks")
-    axes.hist(exchange_us, bins, histtype="step", color=COMMAND, label="time of exchanges")
+    axes.hist(late_us, bins, color=DISPLACEMENT, alpha=0.6, label="lateness")
+    axes.hist(exchange_us, bins, histtype="step", color=COMMAND, label="exchange")
     marks = timing.percentiles_us(ticks.late_ns)
     for name in ("p50", "p99", "max"):
-        _mark(axes, max(marks[name], 1.0), f"{name} {marks[name]:.4g} us")
+        _mark(axes, max(marks[name], 1.0), f"{name} {quantity(marks[name], 'us')}")
     period_ns = timing.tick_period_ns(ticks)
     if period_ns is not None and period_ns * 0.5e-3 < bins[-1]:
         axes.axvline(period_ns * 0.5e-3, color=MARK, linewidth=1.4, label="half a tick period")
-    axes.set(xscale="log", yscale="log", xlabel="time, us (below 1 us counts as 1)", ylabel="ticks")
-    axes.set_title("wake-ups and exchanges")
+    axes.set(xscale="log", yscale="log", xlabel="time, µs (below 1 µs counts as 1)", ylabel="ticks")
+    _plain_numbers(axes)
+
+
+def _plain_numbers(axes: Axes) -> None:
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_formatter(lambda value, _: f"{value:g}")
         axis.set_minor_formatter(NullFormatter())
-    legend(axes)
-    return figure
 
 
 def _microseconds(times_ns: I64) -> F64:
@@ -193,7 +251,7 @@ def _mark(axes: Axes, x: float, text: str) -> None:
         textcoords="offset points",
         rotation=90,
         va="top",
-        fontsize=8,
+        fontsize=7,
         color=QUIET,
         bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.0},
     )

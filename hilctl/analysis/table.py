@@ -3,8 +3,8 @@
 from hilctl.analysis.figures import RunReport, SegmentReport
 from hilctl.base.events import adapted_text
 from hilctl.base.printable import printable
+from hilctl.base.quantity import MISSING, quantity
 
-MISSING = "-"
 SIMULATED = "simulated: no hardware was driven"
 
 _SEGMENT_HEADINGS = (
@@ -12,7 +12,7 @@ _SEGMENT_HEADINGS = (
     "start s",
     "freq. Hz",
     "cycles",
-    "p-p um",
+    "p-p µm",
     "peak hyst. %",
     "floor %",
     "peak err. %",
@@ -22,10 +22,8 @@ _SEGMENT_HEADINGS = (
 
 
 def number(value: float | None, unit: str = "") -> str:
-    """Return a number with four digits and its unit; a dash for None."""
-    if value is None:
-        return MISSING
-    return f"{value:.4g} {unit}".rstrip()
+    """Return a number with four significant digits and its unit; a dash for None."""
+    return quantity(value, unit, 4)
 
 
 def run_rows(report: RunReport) -> list[tuple[str, str]]:
@@ -43,7 +41,7 @@ def run_rows(report: RunReport) -> list[tuple[str, str]]:
             f"{report.samples:,} of the waveform, {report.ramp_samples:,} of ramps",
         ),
         ("missing samples", f"{report.dropped:,}"),
-        ("rate, length", f"{report.sample_rate_hz:g} Hz, {report.duration_s:.6g} s"),
+        ("rate, length", f"{report.sample_rate_hz:g} Hz, {quantity(report.duration_s, 's', 4)}"),
         ("loop", f"displacement against {held_against}"),
         ("command", _range(report.command_min, report.command_max, report.command_unit)),
         ("displacement", _range(report.displacement_min_um, report.displacement_max_um, "um")),
@@ -92,8 +90,8 @@ def segment_table(report: RunReport) -> tuple[list[str], list[list[str]]]:
 def _segment_cells(segment: SegmentReport) -> list[str]:
     return [
         printable(segment.label),
-        number(segment.start_s),
-        number(segment.frequency_hz),
+        f"{segment.start_s:g}",
+        MISSING if segment.frequency_hz is None else f"{segment.frequency_hz:g}",
         str(segment.steady_cycles),
         number(segment.peak_to_peak_um),
         number(segment.peak_hysteresis_percent),
@@ -105,7 +103,7 @@ def _segment_cells(segment: SegmentReport) -> list[str]:
 
 
 def _range(low: float | None, high: float | None, unit: str) -> str:
-    return MISSING if low is None else f"{number(low)} to {number(high, unit)}"
+    return MISSING if low is None else f"{number(low, unit)} to {number(high, unit)}"
 
 
 def _count(value: int | None) -> str:
@@ -113,10 +111,10 @@ def _count(value: int | None) -> str:
 
 
 def _nanometres(noise_um: float | None) -> str:
-    return number(None if noise_um is None else noise_um * 1e3, "nm rms")
+    return MISSING if noise_um is None else f"{number(noise_um, 'um')} rms"
 
 
 def _percentiles(figures: dict[str, float]) -> str:
     if not figures:
         return MISSING
-    return ", ".join(f"{name} {value:.4g}" for name, value in figures.items()) + " us"
+    return ", ".join(f"{name} {quantity(value, 'us')}" for name, value in figures.items())

@@ -7,10 +7,7 @@ file.py        what a campaign file may say
 vary.py        pure: values and ranges of keys, crossed or together, and their order
 steps.py       the steps in order, each as settings over the base experiment
 plan.py        every step held against device, model and limits; time, heat and disk
-figures.py     what a recording says of its step, as one row of the table
-minor_loops.py pure: the minor loops of an average cycle
-ringing.py     pure: natural frequency and damping of a step's ringing
-table.py       CSV and Parquet of all steps; drift.py  what reference runs say of it
+table.py       CSV and Parquet of all steps
 folder.py      the recordings in a campaign's folder, and who works on it
 session.py     the runs, one after the other in real time; fast.py  at once, on simulated devices
 """

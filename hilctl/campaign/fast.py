@@ -13,17 +13,19 @@ from pathlib import Path
 from hilctl.base.errors import HilctlError, InputError
 from hilctl.base.files import TextFiles, write_file
 from hilctl.base.yaml.document import Document
-from hilctl.campaign.figures import RunFigures, figures_of
 from hilctl.campaign.folder import new_recording, standing_runs
 from hilctl.campaign.plan import PlannedStep, SeriesPlan, planned
 from hilctl.campaign.session import Series, SeriesHost, SeriesResult, is_harmless
 from hilctl.campaign.steps import CampaignSteps
-from hilctl.campaign.table import COMPLETED, SeriesRow
+from hilctl.campaign.table import SeriesRow
 from hilctl.experiment.check import check
 from hilctl.experiment.load import resolve
 from hilctl.identify.workers import streams
 from hilctl.recording.reader import read
 from hilctl.run.unpaced import run_unpaced
+from hilctl.series.columns import COMPLETED
+from hilctl.series.digest import RunDigest, digest_of
+from hilctl.series.run_figures import RunFigures
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,14 +54,14 @@ class FastRun:
         code: ``completed``, ``fault`` or ``refused``.
         reason: One line for people.
         harmless: Whether it says nothing against running the next one.
-        figures: What its recording says.
+        digest: What its recording says; None where it was not completed.
     """
 
     recording: bytes
     code: str
     reason: str
     harmless: bool
-    figures: RunFigures = RunFigures()  # noqa: RUF009  frozen
+    digest: RunDigest | None = None
 
 
 def run_task(task: FastTask) -> FastRun:
@@ -74,10 +76,8 @@ def run_task(task: FastTask) -> FastRun:
             return FastRun(b"", "refused", str(error), harmless=True)
         content, recording = output.read_bytes(), read(output)
         harmless = result.code == COMPLETED or is_harmless(result)
-        figures = RunFigures()
-        if result.code == COMPLETED:
-            figures = figures_of(recording, loaded.config.waveform)
-        return FastRun(content, result.code, result.reason, harmless, figures)
+        digest = digest_of(recording) if result.code == COMPLETED else None
+        return FastRun(content, result.code, result.reason, harmless, digest)
 
 
 def planned_fast(campaign: CampaignSteps, folder: Path) -> SeriesPlan:
@@ -135,4 +135,5 @@ def _take(series: Series, each: PlannedStep, run: FastRun) -> None:
     path = new_recording(series.plan.folder, name, each.step.number)
     write_file(path, lambda stream: stream.write(run.recording), overwrite=False)
     result = COMPLETED if run.code == COMPLETED else f"{run.code}: {run.reason}"
-    series.add(each, SeriesRow(result, run.figures, path.name, run.code))
+    figures = run.digest.figures if run.digest else RunFigures()
+    series.add(each, SeriesRow(result, figures, path.name, run.code, digest=run.digest))

@@ -8,8 +8,6 @@ from pathlib import Path
 from typing import Protocol
 
 from hilctl.base.errors import ConfigError, DataError, InputError, RunError
-from hilctl.campaign.drift import SeriesDrift, drift_of
-from hilctl.campaign.figures import figures_of
 from hilctl.campaign.folder import (
     await_runs,
     held_folder,
@@ -20,7 +18,7 @@ from hilctl.campaign.folder import (
 )
 from hilctl.campaign.plan import PlannedStep, SeriesPlan, planned
 from hilctl.campaign.steps import CampaignSteps, SeriesStep
-from hilctl.campaign.table import COMPLETED, SeriesRow, write_table
+from hilctl.campaign.table import SeriesRow, entry_of, write_table
 from hilctl.experiment.heat import CoolingCoil
 from hilctl.experiment.history import heat_after, heat_before
 from hilctl.recording.data import Recording
@@ -28,11 +26,17 @@ from hilctl.recording.reader import read
 from hilctl.run.orphans import recover_orphans
 from hilctl.run.result import RunResult
 from hilctl.run.step import OnPart, RunKey, StepStoppedError, paced
+from hilctl.series.collect import series_of
+from hilctl.series.columns import COMPLETED
+from hilctl.series.digest import digest_of
+from hilctl.series.drift import SeriesDrift, drift_of
 
 HARMLESS = frozenset({"late", "dropped", "invalid_command"})
 """Codes of events that end a run, and say nothing of device or rig: the next step may do better."""
 
 _WAIT_SHOWN_S = 1.0
+_FIRST_PAGE_S = 60.0
+_PAGE_SHARE = 30.0  # times what it takes to write the page, until it is written again
 
 
 class SeriesRunner(Protocol):
@@ -83,6 +87,7 @@ class SeriesResult:
         tables: Files of the table.
         reason: Why it ended before its last step; empty where it did not.
         stop_signal: Number of the signal that stopped it, or 0.
+        page: Its page; None where it could not be written.
     """
 
     plan: SeriesPlan
@@ -90,6 +95,7 @@ class SeriesResult:
     tables: tuple[Path, ...]
     reason: str = ""
     stop_signal: int = 0
+    page: Path | None = None
 
     @property
     def ordered(self) -> list[tuple[SeriesStep, SeriesRow]]:
@@ -100,7 +106,8 @@ class SeriesResult:
     @property
     def drift(self) -> SeriesDrift | None:
         """What its reference runs say of drift."""
-        return drift_of(self.ordered)
+        references = [row for step, row in self.ordered if step.is_reference]
+        return drift_of([row.figures for row in references if row.code == COMPLETED])
 
     def count(self, code: str) -> int:
         """Return how many steps have come to a code."""
@@ -108,7 +115,10 @@ class SeriesResult:
 
 
 class Series:
-    """The state of a campaign while it is run: rows, and a table on the disk that follows them.
+    """The state of a campaign while it is run: rows, and table and page that follow them.
+
+    The table is written after every step. To draw the page takes seconds: it is written at the end,
+    and between steps as long as that stays a small part of the time.
 
     Args:
         plan: What is planned.
@@ -119,7 +129,9 @@ class Series:
         self.plan = plan
         self.rows: dict[int, SeriesRow] = {}
         self.tables: list[Path] = []
+        self._page: Path | None = None
         self._host = host
+        self._next_page_s = host.now_s() + _FIRST_PAGE_S
         config = plan.campaign.config
         self._facts = {
             "campaign": config.name,
@@ -131,7 +143,7 @@ class Series:
         """Take the rows of what stands already; nothing is run for them."""
         for each in self.plan.steps:
             if each.kept is not None:
-                row = measured(each, read(each.kept))
+                row = measured(read(each.kept))
                 self.add(each, replace(row, kept=True), write=False)
         self._write()
 
@@ -140,20 +152,44 @@ class Series:
         self.rows[each.step.number] = row
         if write:
             self._write()
+            self._write_page(only_when_due=True)
         self._host.on_row(each.step, row)
 
     def result(self, reason: str = "", stop_signal: int = 0) -> SeriesResult:
-        """Return what came of it so far."""
-        return SeriesResult(self.plan, self.rows, tuple(self.tables), reason, stop_signal)
+        """Return what came of it so far, and write its page."""
+        self._write_page()
+        tables = tuple(self.tables)
+        return SeriesResult(self.plan, self.rows, tables, reason, stop_signal, self._page)
+
+    def _write_page(self, *, only_when_due: bool = False) -> None:
+        from hilctl.series.page import write_series
+
+        begun_s = self._host.now_s()
+        if only_when_due and begun_s < self._next_page_s:
+            return
+        name = self.plan.campaign.config.name
+        path = self.plan.folder / f"{name}.html"
+        steps = [each.step for each in self.plan.steps]
+        rows = [(step, self.rows.get(step.number, SeriesRow())) for step in steps]
+        digests = {row.recording: row.digest for _, row in rows if row.digest is not None}
+        try:
+            write_series(series_of(name, [entry_of(*each) for each in rows], digests), path)
+        except InputError as error:  # recordings and table have all that is on it
+            self._host.on_note(f"no page: {error}")
+            return
+        self._page = path
+        now_s = self._host.now_s()
+        self._next_page_s = now_s + max(_FIRST_PAGE_S, _PAGE_SHARE * (now_s - begun_s))
 
     def _write(self) -> None:
         self.tables = write_table(self.plan, self.rows, self._facts)
 
 
-def measured(each: PlannedStep, recording: Recording) -> SeriesRow:
+def measured(recording: Recording) -> SeriesRow:
     """Return the row of a step whose run was completed."""
-    figures = figures_of(recording, each.loaded.config.waveform)
-    return SeriesRow(COMPLETED, figures, recording.path.name, COMPLETED)
+    digest = digest_of(recording)
+    name = recording.path.name
+    return SeriesRow(COMPLETED, digest.figures, name, COMPLETED, digest=digest)
 
 
 @contextmanager
@@ -221,6 +257,9 @@ def run_series(plan: SeriesPlan, host: SeriesHost) -> SeriesResult:
         return series.result(str(error), error.signal)
     except RunError as error:
         return series.result(str(error))
+    except KeyboardInterrupt:  # between two steps
+        series.result()
+        raise
     return series.result()
 
 
@@ -279,7 +318,7 @@ class _Steps:
                     f"{each.step.text}: the experiment, or a file that it names, has changed since "
                     "the campaign began: run it again"
                 )
-            self._series.add(each, measured(each, recording))
+            self._series.add(each, measured(recording))
             return
         row = SeriesRow(f"fault: {result.reason}", recording=result.path.name, code="fault")
         self._series.add(each, row)

@@ -4,19 +4,26 @@ import csv
 import io
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, BinaryIO
 
 from hilctl.analysis.export import write_parquet
 from hilctl.base.files import write_file, write_text
-from hilctl.campaign.figures import FIGURES, RunFigures
 from hilctl.campaign.plan import SeriesPlan
 from hilctl.campaign.steps import SeriesStep, cell
-
-PLANNED = "planned"
-COMPLETED = "completed"
+from hilctl.series.columns import (
+    PLANNED,
+    RECORDING,
+    REFERENCE,
+    REPEAT,
+    RESULT,
+    STEP,
+    SeriesEntry,
+)
+from hilctl.series.digest import RunDigest
+from hilctl.series.run_figures import FIGURES, RunFigures
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,6 +36,7 @@ class SeriesRow:
         recording: Name of its recording in the campaign's folder; empty where there is none.
         code: ``planned``, ``completed``, ``refused``, ``fault`` or ``stopped``.
         kept: Whether it stood already.
+        digest: What its recording gives to figures; None where there is none.
     """
 
     result: str = PLANNED
@@ -36,6 +44,7 @@ class SeriesRow:
     recording: str = ""
     code: str = PLANNED
     kept: bool = False
+    digest: RunDigest | None = field(default=None, compare=False, repr=False)
 
 
 def columns_of(
@@ -48,16 +57,16 @@ def columns_of(
         rows: The steps in order, each with what became of it.
     """
     columns: dict[str, list[Any]] = {
-        "step": [step.number for step, _ in rows],
-        "repeat": [step.repeat for step, _ in rows],
-        "reference_run": [step.is_reference for step, _ in rows],
+        STEP: [step.number for step, _ in rows],
+        REPEAT: [step.repeat for step, _ in rows],
+        REFERENCE: [step.is_reference for step, _ in rows],
     }
     for key in keys:
         columns[key] = _one_type([cell(step.point.get(key)) for step, _ in rows])
     for name in FIGURES:
         columns[name] = [getattr(row.figures, name) for _, row in rows]
-    columns["result"] = [row.result for _, row in rows]
-    columns["recording"] = [row.recording for _, row in rows]
+    columns[RESULT] = [row.result for _, row in rows]
+    columns[RECORDING] = [row.recording for _, row in rows]
     return columns
 
 
@@ -111,3 +120,11 @@ def csv_text(table: Mapping[str, Sequence[Any]]) -> str:
     writer.writerow(table)
     writer.writerows(zip(*table.values(), strict=True))
     return stream.getvalue()
+
+
+def entry_of(step: SeriesStep, row: SeriesRow) -> SeriesEntry:
+    """Return a step and what became of it, as it is read back from the table."""
+    return SeriesEntry(
+        step.number, step.repeat, step.is_reference, step.point, row.figures, row.result,
+        row.recording,
+    )  # fmt: skip

@@ -8,8 +8,9 @@ from rich.text import Text
 from hilctl.campaign.plan import SeriesPlan
 from hilctl.campaign.session import SeriesResult
 from hilctl.campaign.steps import SeriesStep, cell
-from hilctl.campaign.table import COMPLETED, SeriesRow
+from hilctl.campaign.table import SeriesRow
 from hilctl.cli.console import console
+from hilctl.series.columns import COMPLETED
 
 
 def plan_mapping(plan: SeriesPlan) -> dict[str, Any]:
@@ -113,6 +114,7 @@ def result_mapping(result: SeriesResult) -> dict[str, Any]:
         "campaign": result.plan.campaign.config.name,
         "folder": str(result.plan.folder),
         "tables": [str(path) for path in result.tables],
+        "page": str(result.page) if result.page else None,
         "steps": len(codes),
         "results": {code: codes.count(code) for code in sorted(set(codes))},
         "drift": result.drift.to_mapping() if result.drift else None,
@@ -130,3 +132,5 @@ def print_result(result: SeriesResult) -> None:
         terminal.print(str(result.drift), soft_wrap=True)
     for path in result.tables:
         terminal.print(f"table: {path}", soft_wrap=True)
+    if result.page is not None:
+        terminal.print(f"page: {result.page}", soft_wrap=True)

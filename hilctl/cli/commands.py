@@ -73,7 +73,12 @@ COMMANDS: dict[str, CommandEntry] = {
         "List the recordings below a folder, by what their first and last bytes say.",
     ),
     "report": CommandEntry(
-        "hilctl.cli.recordings:report", "Judge a recording: hysteresis, error, noise, lateness."
+        "hilctl.cli.recordings:report",
+        "Judge a recording: hysteresis, error, noise, lateness; or many, or a campaign's folder.",
+    ),
+    "figures": CommandEntry(
+        "hilctl.cli.series:figures",
+        "Draw the figures that apply to runs, by what varied among them: loops, trends, errors.",
     ),
     "replay": CommandEntry(
         "hilctl.cli.recordings:replay",

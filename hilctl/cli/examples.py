@@ -10,6 +10,7 @@ from hilctl.cli.options import AsJson
 from hilctl.cli.output import finish_orphans, print_json
 
 if TYPE_CHECKING:
+    from hilctl.recording.data import Recording
     from hilctl.run.result import RunResult
 
 _SECONDS = 3.0
@@ -58,14 +59,15 @@ def demo(
     as_json: AsJson = False,
 ) -> None:
     """Run the simulated rig without and with the inverse, and show what it does."""
-    from hilctl.analysis.html import write_html
     from hilctl.analysis.report import summarize
+    from hilctl.analysis.run_page import write_html
     from hilctl.experiment.examples import copy_example, examples_folder
     from hilctl.recording.reader import read
 
     finish_orphans()
     files = [copy_example(name, folder, examples_folder())[0] for _, name, _ in _SHOWN]
     found: dict[str, Any] = {}
+    before: Recording | None = None
     for (which, _, settings), experiment in zip(_SHOWN, files, strict=True):
         result = _run(experiment, folder, settings, quiet=as_json)
         if result.stop_signal:
@@ -73,7 +75,8 @@ def demo(
         contents = read(result.path)
         summary = summarize(contents)
         page = result.path.with_suffix(".html")
-        write_html(contents, summary, page)
+        write_html(contents, summary, page, before)
+        before = contents
         found[which] = {
             "recording": str(result.path),
             "page": str(page),

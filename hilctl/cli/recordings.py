@@ -12,6 +12,7 @@ from hilctl.base.errors import InputError
 from hilctl.cli.comparing import check_page
 from hilctl.cli.options import AsJson, FromS, Overwrite, RecordingFile, ToS
 from hilctl.cli.output import finish_orphans, print_json
+from hilctl.cli.series import OtherModel, RunsInput, report_series
 
 if TYPE_CHECKING:
     from hilctl.recording.stretch import Stretch
@@ -38,28 +39,53 @@ FitTexts = Annotated[
 
 
 def report(
-    recording: RecordingFile,
+    runs: RunsInput,
     html: Annotated[Path | None, typer.Option(help="Page with figures to write.")] = None,
+    before: Annotated[
+        Path | None, typer.Option(help="The same motion without a compensator, for the page.")
+    ] = None,
+    model: OtherModel = None,
     from_s: FromS = None,
     to_s: ToS = None,
     overwrite: Overwrite = False,
     as_json: AsJson = False,
 ) -> None:
-    """Judge a recording: hysteresis, error, noise, lateness."""
+    """Judge a recording: hysteresis, error, noise, lateness; or many, or a campaign's folder."""
+    if len(runs) > 1 or runs[0].is_dir():
+        if from_s is not None or to_s is not None or before is not None:
+            raise InputError("--from, --to and --before are for the report of one recording")
+        report_series(runs, html, model, overwrite=overwrite, as_json=as_json)
+        return
+    if model is not None:
+        raise InputError("--model is for the report of several recordings")
+    _report_one(runs[0], html, before, _stretch(from_s, to_s), overwrite=overwrite, as_json=as_json)
+
+
+def _report_one(
+    recording: Path,
+    html: Path | None,
+    before: Path | None,
+    stretch: "Stretch | None",
+    *,
+    overwrite: bool,
+    as_json: bool,
+) -> None:
     from hilctl.analysis.report import summarize
     from hilctl.cli.console import print_rich
     from hilctl.cli.report_view import render
     from hilctl.recording.reader import Pieces
 
     finish_orphans()
-    pieces = Pieces(recording, _stretch(from_s, to_s))
+    if before is not None and html is None:
+        raise InputError("--before is drawn on the page: name one with --html")
+    pieces = Pieces(recording, stretch)
     summary = summarize(pieces)
     if html is not None:
-        from hilctl.analysis.html import write_html
+        from hilctl.analysis.run_page import write_html
         from hilctl.recording.reader import read
 
         check_page(html, overwrite=overwrite)
-        write_html(read(recording, pieces.stretch), summary, html)
+        write_html(read(recording, stretch), summary, html, read(before) if before else None)
     if as_json:
         print_json(summary.to_mapping())
     else:

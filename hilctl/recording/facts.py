@@ -16,6 +16,8 @@ END_FIGURES = (
     "rms_error_percent",
 )
 """Facts of the end of a run: the worst figure of its segments, where any has it; as in a report."""
+OVERRIDES_FACT = "overrides"
+"""Fact of a run: JSON list of the key=value texts that were set over its file."""
 RECORDINGS = "recordings"
 """Folder of recordings, relative to where hilctl runs, where no other is given."""
 

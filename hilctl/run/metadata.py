@@ -22,7 +22,7 @@ from hilctl.base.yaml.plain import dump
 from hilctl.loop.pacer import Lateness
 from hilctl.loop.plan import Outcome
 from hilctl.machine.diagnosis import machine_facts
-from hilctl.recording.facts import HEAT_FACT, HOLDS_FACT, LABELS_FACT
+from hilctl.recording.facts import HEAT_FACT, HOLDS_FACT, LABELS_FACT, OVERRIDES_FACT
 
 if TYPE_CHECKING:
     from hilctl.experiment.check import Checked
@@ -49,6 +49,7 @@ def run_facts(
         "name": config.name,
         "description": config.description,
         LABELS_FACT: json.dumps(config.labels, ensure_ascii=False),
+        OVERRIDES_FACT: json.dumps(loaded.document.assignments, ensure_ascii=False),
         "started": started,
         "hilctl": __version__,
         "python": sys.version.split()[0],

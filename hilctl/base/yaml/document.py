@@ -23,6 +23,9 @@ _UNREADABLE = "is not readable YAML"
 class Document:
     """A YAML file's content with the place of every value.
 
+    Attributes:
+        assignments: What :meth:`set` was called with, in order.
+
     Args:
         name: File name as it should appear in messages.
         text: The YAML text.
@@ -33,6 +36,7 @@ class Document:
 
     def __init__(self, name: str, text: str) -> None:
         self.name = name
+        self.assignments: list[str] = []
         self._places: dict[Loc, str] = {}
         self._duplicates: list[Problem] = []
         try:
@@ -88,6 +92,7 @@ class Document:
         self.data = _replaced(
             self.data, parts, lambda loc: self._set_value(node, loc, where), where
         )
+        self.assignments.append(assignment)
         for end in range(1, len(parts)):
             self._places.setdefault(tuple(parts[:end]), where)
         if self._duplicates:

@@ -1,171 +1,37 @@
-"""The page: everything in it, nothing fetched, nothing taken for markup."""
+"""Parts of pages."""
 
-import base64
-from dataclasses import replace
-from html.parser import HTMLParser
-from pathlib import Path
-
-import numpy as np
 import pytest
 
-from hilctl.analysis.html import page, write_html
-from hilctl.analysis.report import summarize
-from hilctl.base.errors import InputError
-from hilctl.base.events import Event
-from hilctl.base.segments import Segment
-from hilctl.recording.data import Recording
+from hilctl.analysis import html
+from hilctl.analysis.sheet import Panel, Sheet
 
-NASTY = """<script>alert("x")</script>&amp;<img src=x onerror='y'>"""
+NASTY = "<b onclick='x'>&\x1b"
 
 
-class Page(HTMLParser):
-    """What a browser would make of the page: tags, what they refer to, and visible text."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.tags: list[str] = []
-        self.references: list[str] = []
-        self.text = ""
-        self.open: list[str] = []
-        self.feed(text)
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.append(tag)
-        if tag not in {"meta", "img"}:
-            self.open.append(tag)
-        names = {"src", "href", "data", "action", "srcset", "poster", "background"}
-        self.references += [value or "" for name, value in attrs if name in names]
-        assert not any(name.startswith("on") for name, _ in attrs)
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self.open.pop() == tag
-
-    def handle_data(self, data: str) -> None:
-        self.text += data
-
-
-@pytest.fixture(scope="module")
-def recording(make_recording) -> Recording:
-    """Return a run of two segments whose every text wants to be markup."""
-    phase = 2.0 * np.pi * np.arange(8000) / 1000
-    lag = np.where(np.arange(8000) < 4000, 0.02, 0.1)
-    recording = make_recording(
-        40.0 * np.sin(phase - lag),
-        reference_um=40.0 * np.sin(phase),
-        segments=[
-            Segment(f"first {NASTY}", 0, 4000, 0, 4000, 1000.0),
-            Segment("second", 4000, 8000, 4000, 8000, 1000.0),
-        ],
-        run={"name": f"name {NASTY}", "device": f"simulated_{NASTY}", "simulated": "true"},
-        end={"reason": f"reason {NASTY}"},
-        events=(Event(17, "error", f"code {NASTY}", f"event {NASTY}"),),
-        experiment_yaml=f"name: {NASTY}\n",
-    )
-    return replace(recording, model_yaml=f"model: {NASTY}\n", path=Path(f"{NASTY}.mcap"))
-
-
-@pytest.fixture(scope="module")
-def shown(recording: Recording) -> str:
-    """Return the page of that run; to draw it takes seconds."""
-    return page(recording, summarize(recording))
-
-
-def test_fetches_nothing(shown: str) -> None:
-    """All that it refers to is PNG within the page; there is no script, link or address."""
-    seen = Page(shown)
-    assert len(seen.references) == 4
-    for reference in seen.references:
-        head, _, data = reference.partition(",")
-        assert head == "data:image/png;base64"
-        assert base64.b64decode(data, validate=True).startswith(b"\x89PNG")
-    assert not {"script", "link", "iframe", "object", "embed", "base"} & set(seen.tags)
-    for address in ("http:", "https:", "url(", "@import"):
-        assert address not in shown
-
-
-def test_texts_are_shown_as_they_are(shown: str) -> None:
-    """Names, labels, reasons, events and YAML can't become markup, and none is lost."""
-    seen = Page(shown)
-    assert seen.open == []
-    for start in ("name ", "first ", "reason ", "code ", "event ", "name: ", "model: "):
-        assert start + NASTY in seen.text
-
-
-def test_holds_figures_segments_events_and_experiment(recording: Recording, shown: str) -> None:
-    """The figures of the report are on the page, by segment too, with the YAML folded away."""
-    report = summarize(recording)
-    seen = Page(shown)
-    for segment in report.segments:
-        assert f"{segment.peak_hysteresis_percent:.4g}" in seen.text
-    assert "noise floor" in seen.text
-    assert "no hardware was driven" in seen.text
-    assert seen.tags.count("details") == 2
-    assert "17" in seen.text
+def test_no_part_takes_a_text_for_markup():
+    parts = [
+        html.paragraph(NASTY, "note"),
+        html.rows(NASTY, [(NASTY, NASTY)]),
+        html.grid([NASTY], [[NASTY]]),
+        html.details(NASTY, NASTY),
+        html.definitions(NASTY, [(NASTY, NASTY)]),
+    ]
+    for part in parts:
+        assert "<b " not in part
+        assert "\x1b" not in part
+        assert "&lt;b onclick" in part
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_one_segment_has_no_table_of_its_own(recording: Recording) -> None:
-    """What is said above is not said twice."""
-    single = replace(recording, segments=recording.segments[1:])
-    assert "By segment" not in page(single, summarize(single))
+def test_figures_stand_with_their_captions():
+    text = html.figures([Sheet("a", "what it <shows>", (Panel(lambda axes: None),))])
+    assert text.count("<figure") == text.count("</figure>") == 1
+    assert 'aria-label="what it &lt;shows&gt;"' in text
+    assert "<figcaption>what it &lt;shows&gt;</figcaption>" in text
 
 
-@pytest.mark.slow
-def test_is_small(make_recording) -> None:
-    """A minute at 50 kHz with noise makes less than a megabyte."""
-    n = 3_000_000
-    phase = 2.0 * np.pi * np.arange(n) / 5000
-    noise_um = np.random.default_rng(1).normal(0.0, 0.04, n)
-    recording = make_recording(
-        40.0 * np.sin(phase - 0.02) + noise_um,
-        reference_um=40.0 * np.sin(phase),
-        segments=[Segment("sine", 0, n, 5000, n - 5000, 5000.0)],
-    )
-    assert len(page(recording, summarize(recording))) < 1_000_000
-
-
-@pytest.mark.usefixtures("undrawn")
-def test_cut_short_recording_has_a_page(recording: Recording) -> None:
-    """What is missing is told in words instead of figures."""
-    empty = replace(recording, samples=recording.samples.part(0, 0), end={}, events=())
-    text = Page(page(empty, summarize(empty))).text
-    for said in ("not complete", "No samples were recorded", "No steady samples"):
-        assert said in text
-
-
-@pytest.mark.usefixtures("undrawn")
-def test_only_the_last_events_are_listed(recording: Recording) -> None:
-    """Thousands of warnings don't drown the page, and it says so."""
-    many = tuple(Event(k, "warning", "late", f"tick {k} was late") for k in range(1000))
-    text = Page(page(replace(recording, events=many), summarize(recording))).text
-    assert "tick 999 was late" in text
-    assert "tick 799 was late" not in text
-    assert "The first 800 are left out" in text
-
-
-@pytest.mark.usefixtures("undrawn")
-def test_is_written_whole_and_replaces(recording: Recording, tmp_path: Path) -> None:
-    """A page of that name is replaced, and nothing else is left in the folder."""
-    path = tmp_path / "page.html"
-    path.write_text("old")
-    write_html(recording, summarize(recording), path)
-    assert path.read_text(encoding="utf-8").startswith("<!DOCTYPE html>")
-    assert list(tmp_path.iterdir()) == [path]
-
-
-@pytest.mark.usefixtures("undrawn")
-def test_folder_that_is_not_there_is_an_input_error(recording: Recording, tmp_path: Path) -> None:
-    """The message names the file."""
-    path = tmp_path / "missing" / "page.html"
-    with pytest.raises(InputError, match=r"page\.html: can't be written"):
-        write_html(recording, summarize(recording), path)
-
-
-def test_what_steers_a_browser_or_a_plot_is_written_out(recording: Recording) -> None:
-    """Names from a file may hold anything; a formula, a page of text or an escape among it."""
-    label = "$\\frac{$ \x1b[31m \u202e" + "x" * 100_000
-    named = tuple(replace(segment, label=label) for segment in recording.segments)
-    changed = replace(recording, segments=named)
-    text = page(changed, summarize(changed))
-    assert "\x1b" not in text
-    assert "\u202e" not in text
+def test_a_page_is_readable_in_the_dark_on_paper_and_on_a_phone():
+    page = html.document("t", ["<p>x</p>"])
+    for needed in ("prefers-color-scheme: dark", "@media print", 'name="viewport"'):
+        assert needed in page
+    assert page.endswith("<p>x</p>\n</body></html>\n")

@@ -7,6 +7,7 @@ import pytest
 from matplotlib.collections import FillBetweenPolyCollection
 
 from hilctl.analysis import canvas, loops, plots
+from hilctl.analysis.sheet import drawn
 from hilctl.base.segments import Segment
 from hilctl.recording.data import Recording, Ticks
 
@@ -42,16 +43,16 @@ class TestTimeHistory:
     def test_few_cycles_are_lines_with_units(self, run) -> None:
         """Displacement, reference and command are drawn over the whole run, units on the axes."""
         recording = run()
-        upper, _, lower, _ = plots.time_history(recording).axes
+        upper, lower = drawn(plots.time_history(recording)).axes
         assert {"displacement", "reference"} <= set(lines(upper))
-        assert upper.get_ylabel() == "displacement, um"
+        assert upper.get_ylabel() == "displacement, µm"
         assert lower.get_ylabel() == "command, A"
         assert lower.get_xlabel() == "time, s"
         assert lower.get_xlim()[1] >= 4300 / 50_000
 
     def test_many_cycles_are_a_band(self, run) -> None:
         """Cycles too narrow for a line fill a band of constant height, and beat with nothing."""
-        upper = plots.time_history(run(cycles=400)).axes[0]
+        upper = drawn(plots.time_history(run(cycles=400))).axes[0]
         bands = [c for c in upper.collections if isinstance(c, FillBetweenPolyCollection)]
         assert len(bands) == 1
         heights = bands[0].get_paths()[0].vertices[:, 1]
@@ -60,8 +61,8 @@ class TestTimeHistory:
     def test_no_line_is_longer_than_a_plot_can_show(self, run) -> None:
         """Long runs are reduced before they are drawn."""
         recording = replace(run(cycles=100), segments=())
-        for figure in (plots.time_history(recording), plots.error(recording)):
-            for axes in figure.axes:
+        for sheet in (plots.time_history(recording), plots.error(recording)):
+            for axes in drawn(sheet).axes:
                 for line in axes.get_lines():
                     assert line.get_xdata().size <= canvas.MAX_POINTS
 
@@ -69,12 +70,12 @@ class TestTimeHistory:
         """One odd reading in half a million is drawn."""
         recording = replace(run(cycles=500), segments=())
         recording.samples.displacement_um[123_456] = 90.0
-        line = lines(plots.time_history(recording).axes[0])["displacement"]
+        line = lines(drawn(plots.time_history(recording)).axes[0])["displacement"]
         assert np.nanmax(line.get_ydata()) == 90.0
 
     def test_last_steady_cycles_stand_beside(self, run) -> None:
         """The two cycles before the ramp are drawn again by themselves."""
-        close = plots.time_history(run()).axes[1]
+        close = drawn(plots.steady_cycles(run())).axes[0]
         start, stop = close.get_lines()[0].get_xdata()[[0, -1]]
         assert start == pytest.approx(2000 / 50_000)
         assert stop == pytest.approx(3999 / 50_000)
@@ -89,7 +90,7 @@ class TestHysteresisLoop:
     @pytest.mark.parametrize("compensated", [True, False])
     def test_peak_hysteresis_is_marked_at_its_height(self, run, compensated: bool) -> None:
         """The mark is 2 B sin(lag) high in both panels, and says its percentage."""
-        figure = loops.hysteresis_loop(run(compensated=compensated))
+        figure = drawn(loops.hysteresis_loop(run(compensated=compensated)))
         for axes in figure.axes:
             label = next(name for name in lines(axes) if name.startswith("peak hysteresis"))
             assert label.startswith(f"peak hysteresis {100.0 * np.sin(0.1):.3g} %")
@@ -98,22 +99,23 @@ class TestHysteresisLoop:
 
     def test_compensated_run_is_held_against_its_reference(self, run) -> None:
         """What is left beside is the error over the reference, the loop closed."""
-        right = loops.hysteresis_loop(run()).axes[1]
+        right = drawn(loops.hysteresis_loop(run())).axes[1]
         x, y = right.get_lines()[0].get_data()
-        assert right.get_xlabel() == "reference, um"
+        assert right.get_xlabel() == "reference, µm"
         assert (x[0], y[0]) == (x[-1], y[-1])
         assert np.abs(y).max() == pytest.approx(80.0 * np.sin(0.05), rel=1e-3)
 
     def test_uncompensated_run_is_held_against_its_command(self, run) -> None:
         """The axis says command and its unit."""
-        assert loops.hysteresis_loop(run(compensated=False)).axes[0].get_xlabel() == "command, A"
+        axes = drawn(loops.hysteresis_loop(run(compensated=False))).axes[0]
+        assert axes.get_xlabel() == "command, A"
 
     def test_each_segment_has_its_loop(self, run) -> None:
         """Segments are told apart by colour and label; the legend leaves out one not reached."""
         recording = run(cycles=9)
         ends = [(3000 * k, 3000 * k + 3000) for k in range(4)]
         parts = [Segment(f"part {k}", *ends[k], *ends[k], PERIOD) for k in range(4)]
-        figure = loops.hysteresis_loop(replace(recording, segments=tuple(parts)))
+        figure = drawn(loops.hysteresis_loop(replace(recording, segments=tuple(parts))))
         axes = figure.axes[0]
         shown = {text.get_text() for text in figure.legends[0].get_texts()}
         assert {"part 0", "part 1", "part 2"} <= shown
@@ -124,7 +126,7 @@ class TestHysteresisLoop:
         """Without a period there is a path and no mark."""
         recording = run()
         once = replace(recording.segments[0], period=0.0)
-        axes = loops.hysteresis_loop(replace(recording, segments=(once,))).axes[0]
+        axes = drawn(loops.hysteresis_loop(replace(recording, segments=(once,)))).axes[0]
         assert axes.get_lines()[0].get_xdata().size == 4000
         assert not any(name.startswith("peak") for name in lines(axes))
         assert "not averaged" in axes.get_title("left")
@@ -140,15 +142,20 @@ class TestHysteresisLoop:
 class TestError:
     def test_peak_error_is_marked_on_the_average_cycle(self, run) -> None:
         """Its mark is where displacement less reference is largest."""
-        _, phase = plots.error(run()).axes
+        _, phase = drawn(plots.error(run())).axes
         mark = lines(phase)["peak error"]
         assert abs(mark.get_ydata()[0]) == pytest.approx(80.0 * np.sin(0.05), rel=1e-3)
 
-    def test_dots_are_samples_at_their_phase(self, run) -> None:
-        """They lie on the curve of the closed form."""
-        phase, error_um = lines(plots.error(run()).axes[1])["samples"].get_data()
-        expected = 40.0 * (np.sin(2 * np.pi * phase - 0.1) - np.sin(2 * np.pi * phase))
-        np.testing.assert_allclose(error_um, expected, atol=1e-9)
+    def test_the_band_holds_every_sample_at_its_phase(self, run) -> None:
+        """Its edges lie on the curve of the closed form, as close as a bin is wide."""
+        recording = run()
+        recording.samples.displacement_um[1250] += 5.0
+        axes = drawn(plots.error(recording)).axes[1]
+        band = axes.collections[0].get_paths()[0].vertices
+        phase = np.abs(band[:, 0] - 0.25) < 0.004
+        assert band[phase, 1].max() == pytest.approx(
+            40.0 * (np.sin(np.pi / 2 - 0.1) - 1.0) + 5.0, abs=0.02
+        )
 
     def test_run_without_reference_has_none(self, run) -> None:
         """There is no error to draw in a current run."""
@@ -161,18 +168,18 @@ class TestLateness:
         late_ns = np.array([-5_000, 0, 40_000, 41_000, 3_000_000], dtype=np.int64)
         first = 50 * np.arange(5, dtype=np.int64)
         ticks = Ticks(first, 20_000 * first, late_ns, np.full(5, 30_000, dtype=np.int64))
-        axes = plots.lateness(replace(run(), ticks=ticks)).axes[0]
+        axes = drawn(plots.lateness(replace(run(), ticks=ticks))).axes[0]
         bars = axes.containers[0]
         assert sum(bar.get_height() for bar in bars) == 5
         assert (bars[0].get_x(), bars[0].get_height()) == (pytest.approx(1.0), 2)
         assert (axes.get_xscale(), axes.get_yscale()) == ("log", "log")
-        assert {text.get_text() for text in axes.texts} >= {"p50 40 us", "max 3000 us"}
+        assert {text.get_text() for text in axes.texts} >= {"p50 40.0 µs", "max 3.00 ms"}
 
     def test_ticks_that_are_all_alike_can_be_drawn(self, run) -> None:
         """A histogram of one value has a width all the same."""
         same = np.full(5, 30_000, dtype=np.int64)
         ticks = Ticks(same, same, same, same)
-        assert plots.lateness(replace(run(), ticks=ticks)) is not None
+        assert drawn(plots.lateness(replace(run(), ticks=ticks))).axes
 
     def test_no_ticks_draw_nothing(self, run) -> None:
         """Without ticks there is nothing to count."""
@@ -182,14 +189,34 @@ class TestLateness:
 def test_png_of_every_figure_can_be_drawn(run) -> None:
     """Labels with dollar signs and angle brackets are text, not formulas; nothing warns."""
     recording = run()
-    figures = [
+    sheets = [
         plots.time_history(recording),
+        plots.steady_cycles(recording),
         loops.hysteresis_loop(recording),
         plots.error(recording),
+        plots.spectrum(recording),
         plots.lateness(recording),
     ]
-    for figure in figures:
-        assert canvas.png(figure).startswith(b"\x89PNG\r\n\x1a\n")
+    for sheet in sheets:
+        assert canvas.png(drawn(sheet)).startswith(b"\x89PNG\r\n\x1a\n")
+
+
+class TestSpectrum:
+    def test_harmonics_are_bars_in_nanometres(self, run) -> None:
+        """An error at the waveform's own frequency is the first one."""
+        axes = drawn(plots.spectrum(run())).axes[1]
+        heights = [bar.get_height() for bar in axes.containers[0]]
+        assert heights[0] == pytest.approx(1e3 * 80.0 * np.sin(0.05), rel=1e-3)
+        assert max(heights[1:]) < 1.0
+        assert axes.get_ylabel() == "amplitude, nm"
+
+    def test_a_run_without_reference_has_none(self, run) -> None:
+        assert plots.spectrum(run(compensated=False)) is None
+
+
+def test_a_run_out_of_real_time_has_no_lateness(run) -> None:
+    """It waited for nobody: its numbers would say nothing."""
+    assert plots.lateness(replace(run(), run={"paced": "false"})) is None
 
 
 def test_pieces_cover_a_run_without_overlap(run) -> None:

@@ -18,7 +18,7 @@ def report():
 
 
 def test_numbers_have_four_digits_and_their_unit():
-    assert number(1234.567, "um") == "1235 um"
+    assert number(1234.567, "um") == "1.235 mm"
     assert number(0.0001234) == "0.0001234"
     assert number(None, "um") == "-"
 

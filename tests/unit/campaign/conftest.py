@@ -24,6 +24,19 @@ vary:
 """
 
 
+@pytest.fixture(autouse=True)
+def drawn_pages(monkeypatch) -> list[tuple[str, int]]:
+    """Leave pages undrawn, which takes seconds; return name and completed runs of each."""
+    pages: list[tuple[str, int]] = []
+
+    def write(series, path):
+        path.write_text("page", encoding="utf-8")
+        pages.append((path.name, len(series.done)))
+
+    monkeypatch.setattr("hilctl.series.page.write_series", write)
+    return pages
+
+
 @pytest.fixture
 def experiment(tmp_path) -> Path:
     """Return an experiment file."""

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 
-from hilctl.base.errors import DeviceError
+from hilctl.base.errors import DeviceError, InputError
 from hilctl.base.events import Event
 from hilctl.campaign import session
 from hilctl.campaign.session import (
@@ -59,10 +59,11 @@ class Rig:
 def run(campaign, tmp_path):
     """Run a campaign on a rig."""
 
-    def go(rig, text=CAMPAIGN):
+    def go(rig, text=CAMPAIGN, host=None):
         folder = tmp_path / "runs"
         folder.mkdir(exist_ok=True)
-        return run_series(planned_in_real_time(campaign(text), folder, rig.time_s), rig.host)
+        plan = planned_in_real_time(campaign(text), folder, rig.time_s)
+        return run_series(plan, host or rig.host)
 
     return go
 
@@ -78,7 +79,8 @@ def test_every_step_is_run_and_recorded(run, tmp_path):
     assert [name for name, _ in rig.runs] == [f"few-000{k}.mcap" for k in range(1, 5)]
     assert (result.reason, result.stop_signal, result.drift) == ("", 0, None)
     assert all(each.is_file() for each in result.tables)
-    assert {path.suffix for path in (tmp_path / "runs").iterdir()} == {".mcap", ".csv", ".parquet"}
+    suffixes = {path.suffix for path in (tmp_path / "runs").iterdir()}
+    assert suffixes == {".mcap", ".csv", ".parquet", ".html"}
 
 
 def test_what_stands_is_kept_and_nothing_is_overwritten(run, tmp_path):
@@ -216,3 +218,44 @@ def test_a_folder_is_prepared_for_one(tmp_path):
     with prepared(tmp_path / "runs", host):
         assert (tmp_path / "runs").is_dir()
     assert notes == []
+
+
+def test_the_page_follows_as_long_as_it_takes_little_of_the_time(run, drawn_pages):
+    """Within the first minute it is written at the end only; then between steps as well."""
+    rig = Rig()
+    run(rig)
+    assert drawn_pages == [("few.html", 4)]
+    slow = Rig()
+    told = slow.__call__
+
+    def slower(*given, **keys):
+        result = told(*given, **keys)
+        slow.time_s += 50.0
+        return result
+
+    drawn_pages.clear()
+    host = replace(slow.host, run=slower)
+    assert host.run is slower
+    run(slow, CAMPAIGN.replace("name: few", "name: long"), host)
+    assert drawn_pages == [("long.html", 2), ("long.html", 4), ("long.html", 4)]
+
+
+def test_a_page_that_can_t_be_written_ends_nothing(run, monkeypatch):
+    """Recordings and table have all that is on it; it is said."""
+
+    def fail(series, path):
+        raise InputError(f"{path.name}: no space left")
+
+    monkeypatch.setattr("hilctl.series.page.write_series", fail)
+    rig, notes = Rig(), []
+    result = run(rig, CAMPAIGN, replace(rig.host, on_note=notes.append))
+    assert codes(result) == ["completed"] * 4
+    assert result.page is None
+    assert notes == ["no page: few.html: no space left"]
+
+
+def test_ctrl_c_between_two_steps_leaves_a_page(run, drawn_pages):
+    rig = Rig(ends_at=3, error=KeyboardInterrupt())
+    with pytest.raises(KeyboardInterrupt):
+        run(rig)
+    assert drawn_pages == [("few.html", 2)]

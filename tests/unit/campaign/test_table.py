@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import pytest
 
-from hilctl.campaign.figures import FIGURES, RunFigures
 from hilctl.campaign.plan import planned
 from hilctl.campaign.table import SeriesRow, write_table
+from hilctl.series.run_figures import FIGURES, RunFigures
 from tests.unit.campaign.conftest import CAMPAIGN
 
 DONE = SeriesRow("completed", RunFigures(peak_to_peak_um=0.1 + 0.2), "few-0001.mcap", "completed")

@@ -1,11 +1,11 @@
 """Campaigns for people."""
 
-from hilctl.campaign.figures import RunFigures
 from hilctl.campaign.plan import planned
 from hilctl.campaign.session import SeriesResult
 from hilctl.campaign.steps import SeriesStep, load_campaign
 from hilctl.campaign.table import SeriesRow
 from hilctl.cli.campaign_view import plan_mapping, print_plan, print_result, print_row
+from hilctl.series.run_figures import RunFigures
 from tests.unit.campaign.conftest import CAMPAIGN, EXPERIMENT
 
 

@@ -11,6 +11,8 @@ from hilctl.cli import campaigning
 from hilctl.cli.campaigning import campaign, sweep, sweep_document
 from tests.unit.campaign.conftest import CAMPAIGN, EXPERIMENT
 
+pytestmark = pytest.mark.usefixtures("undrawn")
+
 
 @pytest.fixture
 def file(tmp_path):

@@ -46,10 +46,10 @@ def runs(tmp_path, monkeypatch):
 
     monkeypatch.setattr("hilctl.run.start.start_run", start_run)
 
-    def write(contents, summary, page):
-        page.write_text(summary.name)
+    def write(contents, summary, page, before):
+        page.write_text(f"{summary.name}{' beside the one before' if before else ''}")
 
-    monkeypatch.setattr("hilctl.analysis.html.write_html", write)
+    monkeypatch.setattr("hilctl.analysis.run_page.write_html", write)
     return seen, ends
 
 
@@ -59,10 +59,10 @@ def test_the_demonstration_runs_the_same_sine_without_and_with(tmp_path, runs, c
     assert [name for name, _ in seen] == ["terfenol_sine_6a_uncompensated.yaml", "demo.yaml"]
     assert "waveform.frequency_hz=50" in seen[0][1]
     found = json.loads(capsys.readouterr().out)
-    for which in ("without", "with"):
+    for which, beside in (("without", ""), ("with", " beside the one before")):
         assert found[which]["code"] == "completed"
         assert found[which]["peak_hysteresis_percent"] > 0.0
-        assert Path(found[which]["page"]).read_text() == "terfenol_sine_6a_uncompensated"
+        assert Path(found[which]["page"]).read_text() == f"terfenol_sine_6a_uncompensated{beside}"
 
 
 @pytest.mark.parametrize(("code", "stop_signal", "left"), [("fault", 0, 3), ("stopped", 2, 130)])

@@ -26,7 +26,7 @@ def printed(capsys):
 
 def test_report_replay_recover_and_export_agree_on_the_samples(recording, tmp_path, capsys):
     """One object each, on standard output, of one recording."""
-    report(recording, as_json=True)
+    report([recording], as_json=True)
     samples = printed(capsys)["recorded_samples"]
     replay(recording, as_json=True)
     assert printed(capsys)["samples"] == samples

@@ -13,6 +13,7 @@ from hilctl.base.arrays import F64
 
 _LEAST = 0.01  # of the input's span: smaller turns are noise of a measured input
 _GRID = 200
+_FEWEST = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,14 +40,31 @@ def minor_loops(loop_input: F64, output_um: F64) -> tuple[MinorLoop, ...]:
         loop_input: float64[m], one cycle in order of phase.
         output_um: float64[m].
     """
+    u, y, closed = _found(loop_input, output_um)
+    found = [_minor_loop(u, y, *turns) for turns in closed]
+    return tuple(sorted(found, key=lambda loop: loop.middle))
+
+
+def minor_parts(loop_input: F64, output_um: F64) -> list[F64]:
+    """Return the stretches of a cycle that are minor loops: float64[2, k] each.
+
+    Args:
+        loop_input: float64[m], one cycle in order of phase.
+        output_um: float64[m].
+    """
+    u, y, closed = _found(loop_input, output_um)
+    return [np.array((u[begin : over + 1], y[begin : over + 1])) for begin, _, over in closed]
+
+
+def _found(loop_input: F64, output_um: F64) -> tuple[F64, F64, list[tuple[int, int, int]]]:
+    """Return a cycle from its highest input on, and its minor loops as :func:`_closed` does."""
     span = float(np.ptp(loop_input))
-    if loop_input.size < 8 or span <= 0.0:
-        return ()
+    if loop_input.size < _FEWEST or span <= 0.0:
+        return loop_input, output_um, []
     first = int(np.argmax(loop_input))
     u = np.append(np.roll(loop_input, -first), loop_input[first])
     y = np.append(np.roll(output_um, -first), output_um[first])
-    found = [_minor_loop(u, y, *turns) for turns in _closed(u, _turns(u, _LEAST * span))]
-    return tuple(sorted(found, key=lambda loop: loop.middle))
+    return u, y, _closed(u, _turns(u, _LEAST * span))
 
 
 def _turns(u: F64, least: float) -> list[int]:

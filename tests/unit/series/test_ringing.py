@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hilctl.campaign.ringing import ringing
+from hilctl.series.ringing import ringing
 
 RATE_HZ = 50_000.0
 T = np.arange(10_000) / RATE_HZ

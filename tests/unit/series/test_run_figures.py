@@ -6,8 +6,8 @@ from pydantic import TypeAdapter
 
 from hilctl.base.events import OFFSET, Event
 from hilctl.base.segments import Segment
-from hilctl.campaign.figures import FIGURES, figures_of
 from hilctl.recording.facts import HEAT_FACT
+from hilctl.series.run_figures import FIGURES, figures_of
 from hilctl.waveforms.spec import AnyWaveform
 
 RATE_HZ = 50_000.0
@@ -99,6 +99,6 @@ def test_a_step_s_ringing(make_recording):
 
 
 def test_every_figure_has_its_meaning():
-    from hilctl.campaign.figures import RunFigures
+    from hilctl.series.run_figures import RunFigures
 
     assert all(f"        {name}: " in RunFigures.__doc__ for name in FIGURES)

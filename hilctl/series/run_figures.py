@@ -9,13 +9,14 @@ from hilctl.analysis.report import summarize, worst_segment
 from hilctl.analysis.steady import steady_part
 from hilctl.base.arrays import F64
 from hilctl.base.events import OFFSET
+from hilctl.base.samples import Samples
 from hilctl.base.segments import Segment
-from hilctl.campaign.minor_loops import minor_loops
-from hilctl.campaign.ringing import ringing
 from hilctl.characterise.problem import RigProblemError
-from hilctl.characterise.response import small_signal
+from hilctl.characterise.response import SmallSignal, small_signal
 from hilctl.recording.data import Recording
 from hilctl.recording.facts import HEAT_FACT
+from hilctl.series.minor_loops import minor_loops
+from hilctl.series.ringing import Ringing, ringing
 from hilctl.waveforms.spec import Multisine, Step
 
 
@@ -78,18 +79,25 @@ def figures_of(recording: Recording, waveform: Any) -> RunFigures:
     Raises:
         DataError: A fact of it is no number.
     """
+    return figures_with(recording, structure_of(recording, waveform))
+
+
+def figures_with(recording: Recording, structure: SmallSignal | Ringing | None) -> RunFigures:
+    """Work out the figures of a whole run whose structure is known; see :func:`figures_of`."""
     report = summarize(recording)
+    loops = not isinstance(structure, SmallSignal)  # of many sines at once there is only a tangle
     worst = recording.segments[worst_segment(report.segments)] if recording.segments else None
     measured = [event.values.get("offset_um") for event in recording.events if event.code == OFFSET]
     return RunFigures(
-        peak_hysteresis_percent=report.peak_hysteresis_percent,
+        peak_hysteresis_percent=report.peak_hysteresis_percent if loops else None,
         peak_error_percent=report.peak_error_percent,
         rms_error_percent=report.rms_error_percent,
-        loop_area=report.loop_area,
+        loop_area=report.loop_area if loops else None,
         peak_to_peak_um=report.peak_to_peak_um,
-        **(_cycle(recording, worst) if worst else {}),
+        **(_cycle(recording, worst, minor=loops) if worst else {}),
         offset_um=measured[0] if measured else None,
-        **_structure(recording, waveform),
+        natural_hz=structure.natural_hz if structure else None,
+        damping_ratio=structure.damping_ratio if structure else None,
         deadline_misses=report.skipped_ticks,
         heat_before_a=_rms_a(recording.run.get(HEAT_FACT)),
         heat_after_a=_rms_a(recording.end.get(HEAT_FACT)),
@@ -100,7 +108,7 @@ def _rms_a(heat: str | None) -> float | None:
     return None if heat is None else float(np.sqrt(float(heat)))
 
 
-def _cycle(recording: Recording, segment: Segment) -> dict[str, float]:
+def _cycle(recording: Recording, segment: Segment, *, minor: bool) -> dict[str, float]:
     part = steady_part(recording, segment)
     if part.cycle is None or not part.loop.size:
         return {}
@@ -110,7 +118,7 @@ def _cycle(recording: Recording, segment: Segment) -> dict[str, float]:
         "high_um": float(output.max()),
         "mean_um": float(output.mean()),
     }
-    return found | _minor(loop_input, output)
+    return found | _minor(loop_input, output) if minor else found
 
 
 def _minor(loop_input: F64, output: F64) -> dict[str, float]:
@@ -129,28 +137,32 @@ def _minor(loop_input: F64, output: F64) -> dict[str, float]:
     return found
 
 
-def _structure(recording: Recording, waveform: Any) -> dict[str, float | None]:
-    """Return natural frequency and damping, where a waveform is one to see them by."""
-    found = None
+def structure_of(recording: Recording, waveform: Any) -> SmallSignal | Ringing | None:
+    """Return natural frequency and damping, where a waveform is one to see them by.
+
+    Args:
+        recording: The run.
+        waveform: Its waveform, as the experiment has it.
+    """
     if isinstance(waveform, Multisine):
         try:
-            found = small_signal(recording)
+            return small_signal(recording)
         except RigProblemError:  # lost in noise: there is nothing to say
-            return {}
-    elif isinstance(waveform, Step):
-        found = _ringing(recording, waveform)
-    if found is None or found.natural_hz is None:
-        return {}
-    return {"natural_hz": found.natural_hz, "damping_ratio": found.damping_ratio}
+            return None
+    return _ringing(recording, waveform) if isinstance(waveform, Step) else None
 
 
-def _ringing(recording: Recording, waveform: Step) -> Any:
-    """Return the ringing after the largest step of the waveform."""
+def _ringing(recording: Recording, waveform: Step) -> Ringing | None:
+    samples = after_step(recording, waveform)
+    whole = samples.index.size and np.isfinite(samples.displacement_um).all()
+    return ringing(samples.displacement_um, recording.sample_rate_hz) if whole else None
+
+
+def after_step(recording: Recording, waveform: Step) -> Samples:
+    """Return the samples from the end of the largest step of a waveform up to the next one."""
     segment, rate_hz = recording.segments[0], recording.sample_rate_hz
     levels = np.array([0.0, *waveform.levels])
     largest = int(np.argmax(np.abs(np.diff(levels))))
     dwell = round(waveform.dwell_s * rate_hz)
     begin = segment.start + largest * dwell + round(waveform.rise_s * rate_hz) + 1
-    samples = recording.samples.part(begin, segment.start + (largest + 1) * dwell)
-    whole = samples.index.size and np.isfinite(samples.displacement_um).all()
-    return ringing(samples.displacement_um, rate_hz) if whole else None
+    return recording.samples.part(begin, segment.start + (largest + 1) * dwell)

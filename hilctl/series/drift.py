@@ -4,8 +4,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from hilctl.campaign.steps import SeriesStep
-from hilctl.campaign.table import COMPLETED, SeriesRow
+from hilctl.series.run_figures import RunFigures
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,13 +37,12 @@ class SeriesDrift:
         return f"drift over {self.runs} reference runs: {known or 'nothing to compare'}"
 
 
-def drift_of(rows: Sequence[tuple[SeriesStep, SeriesRow]]) -> SeriesDrift | None:
-    """Return the drift; None with fewer than two completed reference runs.
+def drift_of(done: Sequence[RunFigures]) -> SeriesDrift | None:
+    """Return the drift; None with fewer than two reference runs.
 
     Args:
-        rows: Steps in the order in which they were run, each with what became of it.
+        done: Figures of the reference runs that were completed, in the order of their runs.
     """
-    done = [row.figures for step, row in rows if step.is_reference and row.code == COMPLETED]
     if len(done) < 2:
         return None
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hilctl.campaign.minor_loops import minor_loops
+from hilctl.series.minor_loops import minor_loops
 
 TURN = np.arange(1000) / 1000.0 * 2.0 * np.pi
 

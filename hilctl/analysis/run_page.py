@@ -1,0 +1,137 @@
+"""A run as one self-contained page: what came out first, and a fault on top of it."""
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from hilctl.analysis import html, loops, plots, table
+from hilctl.analysis.definitions import definitions_of
+from hilctl.analysis.figures import RunReport
+from hilctl.analysis.provenance import FAULT, provenance_rows
+from hilctl.analysis.report import worst_segment
+from hilctl.analysis.sheet import Sheet
+from hilctl.base.events import Event
+from hilctl.base.quantity import quantity
+from hilctl.recording.data import Recording
+
+_MOST_EVENTS = 200
+_MOST_FAULTS = 3
+
+
+def write_html(
+    recording: Recording, report: RunReport, path: Path, before: Recording | None = None
+) -> None:
+    """Write the page of a run; a page of that name is replaced.
+
+    Args:
+        recording: The run.
+        report: Its figures.
+        path: File to write.
+        before: The same motion without a compensator, to be shown beside it.
+
+    Raises:
+        InputError: It can't be written.
+    """
+    html.write_page(page(recording, report, before), path)
+
+
+@np.errstate(over="ignore", invalid="ignore")  # of readings near the end of all numbers
+def page(recording: Recording, report: RunReport, before: Recording | None = None) -> str:
+    """Return the page of a run as HTML."""
+    title = html.text(report.name or "run")
+    body = [
+        f"<h1>{title}</h1>",
+        html.paragraph(report.path, "file"),
+        *_fault(recording, report),
+        html.paragraph(headline(report), "headline"),
+        html.paragraph(f"The device is {table.SIMULATED}.", "note") if report.simulated else "",
+        *_figures(recording, report, before),
+        '<div class="side">',
+        html.rows("Figures", table.quality_rows(report)),
+        html.rows("Run", provenance_rows(recording)),
+        html.rows("Samples and timing", table.run_rows(report)),
+        "</div>",
+        *_segments(report),
+        *_events(recording.events),
+        html.definitions("What the figures mean", _terms(report)),
+        html.details("Experiment", recording.experiment_yaml) if recording.experiment_yaml else "",
+        html.details("Model", recording.model_yaml) if recording.model_yaml else "",
+    ]
+    return html.document(title, filter(None, body))
+
+
+def headline(report: RunReport) -> str:
+    """Return what came out of a run, in a line."""
+    parts = []
+    if report.peak_hysteresis_percent is not None:
+        floor = quantity(report.noise_floor_percent, "%")
+        text = quantity(report.peak_hysteresis_percent, "%")
+        parts.append(f"peak hysteresis {text} (noise floor {floor})")
+    if report.peak_error_percent is not None:
+        rms = quantity(report.rms_error_percent, "%")
+        parts.append(f"peak error {quantity(report.peak_error_percent, '%')}, rms {rms}")
+    if report.peak_to_peak_um is not None:
+        parts.append(f"peak-to-peak {quantity(report.peak_to_peak_um, 'um')}")
+    ended = report.reason or "its end is not known"
+    timing = f"; {report.deadline_misses}" if report.deadline_misses else ""
+    found = "; ".join(parts) or "no figure: nothing steady was recorded"
+    return f"{found[0].upper()}{found[1:]}. Ended: {ended}{timing}."
+
+
+def _fault(recording: Recording, report: RunReport) -> Iterator[str]:
+    """Yield why a run did not come to its end, above everything else."""
+    errors = [event for event in recording.events if event.level == "error"]
+    if recording.end.get("code") == FAULT:
+        yield html.paragraph(f"Ended by a fault: {report.reason}.", "bad")
+        for event in errors[-_MOST_FAULTS:]:
+            at_s = event.sample / recording.sample_rate_hz
+            yield html.paragraph(f"{quantity(at_s, 's', 4)}: {event.code}: {event.text}", "bad")
+    elif not report.complete:
+        yield html.paragraph(f"The run is not complete: {report.reason}.", "bad")
+    if recording.end.get("output_safe") == "false":
+        yield html.paragraph("The output was NOT confirmed to be safe at the end.", "bad")
+
+
+def _figures(recording: Recording, report: RunReport, before: Recording | None) -> Iterator[str]:
+    focus = worst_segment(report.segments)
+    no_error = "No error is drawn: no sample has a reference displacement."
+    drawn: list[tuple[Sheet | None, str]] = [
+        (loops.before_and_after(before, recording) if before else None, ""),
+        (loops.hysteresis_loop(recording, focus), "No steady samples were recorded."),
+        (plots.steady_cycles(recording, focus), ""),
+        (plots.error(recording, focus), no_error),
+        (plots.spectrum(recording, focus), ""),
+        (plots.time_history(recording), "No samples were recorded."),
+        (plots.lateness(recording), "No ticks were recorded, or the run did not keep real time."),
+    ]
+    sheets = [sheet for sheet, _ in drawn if sheet is not None]
+    if sheets:
+        yield html.figures(sheets)
+    for sheet, otherwise in drawn:
+        if sheet is None and otherwise:
+            yield html.paragraph(otherwise)
+
+
+def _segments(report: RunReport) -> list[str]:
+    if len(report.segments) < 2:
+        return []
+    note = html.paragraph("The figures above are the worst of these.")
+    headings, rows = table.segment_table(report)
+    return ["<h2>By segment</h2>", note, html.grid(headings, rows, "numbers")]
+
+
+def _events(events: Sequence[Event]) -> list[str]:
+    if not events:
+        return []
+    rows = [(str(e.sample), e.level, e.code, e.text) for e in events[-_MOST_EVENTS:]]
+    left_out = len(events) - len(rows)
+    note = [html.paragraph(f"The first {left_out} are left out.")] if left_out else []
+    return ["<h2>Events</h2>", *note, html.grid(("sample", "level", "code", "text"), rows)]
+
+
+def _terms(report: RunReport) -> list[tuple[str, str]]:
+    errors = ("peak and rms error", "harmonics of the error") if report.compensated else ()
+    return definitions_of(
+        "average cycle", "peak hysteresis", "noise floor", "loop area", "lateness", *errors
+    )

@@ -1,0 +1,59 @@
+"""Numbers for people: fixed significant digits, and units that can be read."""
+
+import math
+
+_DIGITS = 3
+_SCALES: dict[str, tuple[tuple[float, str], ...]] = {
+    "s": ((86400.0, "d"), (3600.0, "h"), (60.0, "min"), (1.0, "s"), (1e-3, "ms"), (1e-6, "µs"),
+          (1e-9, "ns")),
+    "us": ((1e6, "s"), (1e3, "ms"), (1.0, "µs"), (1e-3, "ns")),
+    "um": ((1e3, "mm"), (1.0, "µm"), (1e-3, "nm")),
+}  # fmt: skip
+_SHOWN = {"um": "µm", "us": "µs", "um*um": "µm²", "ohm": "Ω", "degrees": "°"}
+MISSING = "-"
+
+
+def unit_text(unit: str) -> str:
+    """Return a unit as people read it: ``um*A`` is µm·A."""
+    if unit in _SHOWN:
+        return _SHOWN[unit]
+    for divider in "*/":
+        if divider in unit:
+            sign = "·" if divider == "*" else "/"
+            return sign.join(unit_text(part) for part in unit.split(divider))
+    return unit
+
+
+def significant(value: float, digits: int = _DIGITS) -> str:
+    """Return a number with that many significant digits, zeros at the end included.
+
+    Numbers of 1e6 and more, and those below 1e-4, have an exponent.
+    """
+    if value == 0.0:
+        return "0"
+    if not math.isfinite(value):
+        return str(value)
+    rounded = float(f"{value:.{digits - 1}e}")
+    exponent = math.floor(math.log10(abs(rounded)))
+    if not -5 < exponent < 6:
+        return f"{value:.{digits - 1}e}"
+    return f"{rounded:.{max(0, digits - 1 - exponent)}f}"
+
+
+def quantity(value: float | None, unit: str = "", digits: int = _DIGITS) -> str:
+    """Return a value with its unit: 39910 us is 39.9 ms; a dash for None.
+
+    Args:
+        value: The value, in ``unit``.
+        unit: Its unit; s, us and um go to the multiple that fits.
+        digits: Significant digits.
+    """
+    if value is None:
+        return MISSING
+    if unit in _SCALES and value != 0.0 and math.isfinite(value):
+        rounded = abs(float(f"{value:.{digits - 1}e}"))
+        scale, name = next(
+            (each for each in _SCALES[unit] if rounded >= each[0]), _SCALES[unit][-1]
+        )
+        return f"{significant(value / scale, digits)} {name}"
+    return f"{significant(value, digits)} {unit_text(unit)}".rstrip()

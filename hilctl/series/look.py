@@ -1,0 +1,51 @@
+"""How runs are told apart in figures: colours in order, signs, and which of many are shown."""
+
+from collections.abc import Hashable, Mapping, Sequence
+from typing import Any, TypeVar
+
+import matplotlib as mpl
+import numpy as np
+
+from hilctl.analysis.canvas import COMMAND, DISPLACEMENT, ERROR, MARK, QUIET, REFERENCE
+from hilctl.series.dimension import Dimension
+
+Item = TypeVar("Item")
+
+_SIGNS = ("o", "s", "^", "D", "v", "P", "X", "<", ">")
+_LINES = ("-", "--", "-.", ":")
+_NAMED = (DISPLACEMENT, COMMAND, ERROR, MARK, "#E69F00", "#56B4E9", REFERENCE, QUIET)
+_MOST_CURVES = 7
+"""More loops than that can't be told apart."""
+
+
+def spread(items: Sequence[Item], most: int = _MOST_CURVES) -> list[Item]:
+    """Return at most so many of a sequence, its ends among them, evenly spread."""
+    if len(items) <= most:
+        return list(items)
+    return [items[k] for k in np.unique(np.linspace(0, len(items) - 1, most).round().astype(int))]
+
+
+def looks(dimension: Dimension | None, values: Sequence[Hashable]) -> Mapping[Hashable, Any]:
+    """Return how a line of each value is drawn.
+
+    Numbers go through viridis, which keeps its order in grey and for colour-blind people; names
+    have colours of Okabe and Ito. Signs differ too.
+
+    Args:
+        dimension: What the values are of; None where they are names.
+        values: The values.
+    """
+    if dimension is not None and dimension.numeric and len(values) > 1:
+        shades = mpl.colormaps["viridis"](np.linspace(0.0, 0.85, len(values)))
+        colours = [mpl.colors.to_hex(shade) for shade in shades]
+    else:
+        colours = [_NAMED[k % len(_NAMED)] for k in range(len(values))]
+    return {
+        value: {"color": colour, "marker": _SIGNS[k % len(_SIGNS)]}
+        for k, (value, colour) in enumerate(zip(values, colours, strict=True))
+    }
+
+
+def line_of(look: Mapping[str, Any], number: int = 0) -> dict[str, Any]:
+    """Return a look without its sign, for a long line, dashed otherwise by its number."""
+    return {"color": look["color"], "linestyle": _LINES[number % len(_LINES)]}
