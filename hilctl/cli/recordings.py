@@ -46,20 +46,20 @@ def report(
     as_json: AsJson = False,
 ) -> None:
     """Judge a recording: hysteresis, error, noise, lateness."""
-    from hilctl.analysis.report import summarize
+    from hilctl.analysis.report import summarize_windows
     from hilctl.cli.console import print_rich
     from hilctl.cli.report_view import render
     from hilctl.recording.reader import Pieces
 
     finish_orphans()
     pieces = Pieces(recording, _stretch(from_s, to_s))
-    summary = summarize(pieces)
+    summary, windows = summarize_windows(pieces)
     if html is not None:
         from hilctl.analysis.html import write_html
-        from hilctl.recording.reader import read
+        from hilctl.analysis.overview import overview
 
         check_page(html, overwrite=overwrite)
-        write_html(read(recording, pieces.stretch), summary, html)
+        write_html(overview(pieces, windows), summary, html)
     if as_json:
         print_json(summary.to_mapping())
     else:
