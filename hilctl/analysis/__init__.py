@@ -4,7 +4,7 @@ timing.py   lateness percentiles, late ticks; quantiles.py  percentiles in bound
 steady.py   which part of a recording is judged, and its average cycle
 figures.py  what a report holds
 report.py   from a recording, whole or in pieces, to a report; segment_figures.py  those of one
-            segment
+            segment; overview.py  what plots need of a recording of any length
 table.py    a report for people, as rows of text
 canvas.py   what all plots share: style, colours, signals over time, PNG
 plots.py    plots over time: history, error, lateness

@@ -31,6 +31,7 @@ _WORST = (
 
 
 Windows: TypeAlias = list[tuple[Segment, tuple[int, int, int]]]
+"""Segments, each with the samples that are judged: first, after the last, whole cycles."""
 
 
 def summarize(recording: Recording | Iterable[Recording]) -> RunReport:
@@ -47,15 +48,16 @@ def summarize(recording: Recording | Iterable[Recording]) -> RunReport:
     if isinstance(recording, Recording):
         windows = _windows(recording, recording.events, waveform_end(recording.samples))
         return _gathered([recording], windows)[1]
-    first, report, actual = _first_pass(recording)
-    # How far the run got and how it was tuned is known only now.
-    return report if actual == first else _gathered(recording, actual)[1]
+    return summarize_windows(recording)[0]
 
 
-def _first_pass(pieces: Iterable[Recording]) -> tuple[Windows, RunReport, Windows]:
-    """Gather figures as if the run ends as planned; return the windows taken, and the right."""
+def summarize_windows(pieces: Iterable[Recording]) -> tuple[RunReport, Windows]:
+    """Return the figures of a recording in pieces, and what was judged, see :func:`summarize`."""
     gathering, report = _gathered(pieces, None)
-    return gathering.windows, report, gathering.right_windows()
+    windows = gathering.right_windows()
+    # How far the run got and how it was tuned is known only now.
+    right = windows == gathering.windows
+    return (report if right else _gathered(pieces, windows)[1]), windows
 
 
 def _gathered(

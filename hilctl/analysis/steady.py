@@ -1,7 +1,7 @@
 """Which part of a recording is judged, and the average cycle of that part."""
 
-from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -39,6 +39,21 @@ class SteadyPart:
         return error[np.isfinite(error)]
 
 
+@dataclass(frozen=True, slots=True)
+class Overview(Recording):
+    """What plots show of a recording too long for memory, see :mod:`hilctl.analysis.overview`.
+
+    Its samples are thinned out. What is judged has been worked out from all of them.
+
+    Attributes:
+        windows: Judged samples of each segment: first, after the last, whole cycles.
+        parts: The steady part of each segment, with only its last samples.
+    """
+
+    windows: Mapping[Segment, tuple[int, int, int]] = field(default_factory=dict)
+    parts: Mapping[Segment, SteadyPart] = field(default_factory=dict)
+
+
 def waveform_end(samples: Samples) -> int:
     """Return the index after the last sample of the waveform; 0 without any."""
     waveform = samples.index[(samples.flags & NO_WAVEFORM) == 0]
@@ -73,7 +88,10 @@ def steady_samples(recording: Recording, segment: Segment) -> tuple[Samples, int
 
     They are :func:`judged`, and :func:`trusted`.
     """
-    start, stop, cycles = judged(segment, recording.events, waveform_end(recording.samples))
+    if isinstance(recording, Overview):
+        start, stop, cycles = recording.windows[segment]
+    else:
+        start, stop, cycles = judged(segment, recording.events, waveform_end(recording.samples))
     return trusted(recording.samples.part(start, stop)), cycles
 
 
@@ -92,6 +110,8 @@ def _tuned_until(events: Iterable[Event], segment: Segment) -> int:
 
 def steady_part(recording: Recording, segment: Segment) -> SteadyPart:
     """Return what there is to judge of a segment, with its average cycle."""
+    if isinstance(recording, Overview):
+        return recording.parts[segment]
     samples, cycles = steady_samples(recording, segment)
     loop_input = samples.reference_um if recording.compensated else samples.command
     signals = np.array((loop_input, samples.displacement_um))

@@ -321,9 +321,12 @@ class TestOtherCommands:
         (place / "folder.mcap").mkdir()
         (place / "text.mcap").write_text("no recording")
         before = contents(place)
+        folder = "can't be read: Is a directory"
+        if arguments[0] == "report":  # of a folder it judges all that is in it
+            folder = "holds no recordings (*.mcap)"
         for name, message in [
             ("lost.mcap", "lost.mcap: no such file"),
-            ("folder.mcap", "folder.mcap: can't be read: Is a directory"),
+            ("folder.mcap", f"folder.mcap: {folder}"),
             ("text.mcap", "text.mcap: is not an MCAP file"),
         ]:
             filled = [argument.format(name) for argument in arguments]
