@@ -6,9 +6,11 @@ figures.py  what a report holds
 report.py   from a recording to a report
 table.py    a report for people, as rows of text
 canvas.py   what all plots share: style, colours, signals over time, PNG
-plots.py    plots over time: history, error, lateness
-loops.py    the hysteresis loop
-html.py     one self-contained page
+sheet.py    a figure before its size is known; vector.py  figures as files, and as SVG of a page
+plots.py    plots over time and frequency: history, error, spectrum.py, lateness
+loops.py    the hysteresis loop, and before and after
+html.py     parts of self-contained pages; definitions.py  what their figures mean
+run_page.py the page of a run; provenance.py  when, by whom and with what it was made
 replay.py   the same commands again
 export.py   CSV, Parquet, NPZ, MAT; export_all.py  all recordings of a folder as one data set
 catalogue.py  the recordings below a folder, over catalogue_cache.py; run_entry.py  what is known
