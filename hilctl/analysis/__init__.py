@@ -7,9 +7,11 @@ report.py   from a recording, whole or in pieces, to a report; segment_figures.p
             segment; overview.py  what plots need of a recording of any length
 table.py    a report for people, as rows of text
 canvas.py   what all plots share: style, colours, signals over time, PNG
-plots.py    plots over time: history, error, lateness
-loops.py    the hysteresis loop
-html.py     one self-contained page
+sheet.py    a figure before its size is known; vector.py  figures as files, and as SVG of a page
+plots.py    plots over time and frequency: history, error, spectrum.py, lateness
+loops.py    the hysteresis loop, and before and after
+html.py     parts of self-contained pages; definitions.py  what their figures mean
+run_page.py the page of a run; provenance.py  when, by whom and with what it was made
 replay.py   the same commands again
 export.py   samples as a table; export_files.py  CSV, Parquet, NPZ, MAT; export_all.py  all
             recordings of a folder as one data set

@@ -103,7 +103,7 @@ def _colours(loops: int) -> list[object]:
     """Return a colour a loop; many of them in viridis, which keeps its order in grey too."""
     if loops == 1:
         return [DISPLACEMENT]
-    return list(mpl.colormaps["viridis"](np.linspace(0.0, 0.85, loops)))
+    return list(mpl.colormaps["viridis"](np.linspace(0.0, 0.78, loops)))
 
 
 def _mark_gap(axes: Axes, part: SteadyPart, taken_off: F64) -> None:

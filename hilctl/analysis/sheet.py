@@ -26,7 +26,7 @@ _SPARE_MM = 4.0
 _CHARACTER_MM = 1.5  # of a letter, on the average
 _HANDLE_MM = 9.0
 _NAMES_MM = 14.0  # of an axis and its ticks, beside a title
-_LEAST_MM = 38.0
+_LEAST_MM = 48.0
 _FEWEST_NAMED = 2  # what stands alone is named by its axes
 
 

@@ -14,5 +14,7 @@ dimension.py     pure: what varied, and in which words
 trend.py         pure: a figure against what varied, with linear fit and direction
 headline.py      what came out, in a line or two
 sheets.py        which figures apply; loop_sheets.py, trend_sheets.py, response_sheets.py draw them
+look.py          how runs are told apart in figures
+files.py         figures as files
 page.py          one page of many runs; result.py  the same for programs
 """

@@ -36,7 +36,7 @@ def looks(dimension: Dimension | None, values: Sequence[Hashable]) -> Mapping[Ha
         values: The values.
     """
     if dimension is not None and dimension.numeric and len(values) > 1:
-        shades = mpl.colormaps["viridis"](np.linspace(0.0, 0.85, len(values)))
+        shades = mpl.colormaps["viridis"](np.linspace(0.0, 0.78, len(values)))
         colours = [mpl.colors.to_hex(shade) for shade in shades]
     else:
         colours = [_NAMED[k % len(_NAMED)] for k in range(len(values))]

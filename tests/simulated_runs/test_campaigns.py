@@ -6,6 +6,7 @@ Equation, figure and section numbers are those of the dissertation (chapters 2, 
 import csv
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -19,6 +20,10 @@ from hilctl.campaign.fast import planned_fast, run_fast
 from hilctl.campaign.session import SeriesHost
 from hilctl.campaign.steps import load_campaign
 from hilctl.recording.reader import read
+from hilctl.series.collect import collect
+from hilctl.series.headline import headline
+from hilctl.series.sheets import sheets_of
+from hilctl.series.trend import AREA, ASYMMETRY, DAMPING, HYSTERESIS, NATURAL, STROKE, trends
 
 CAMPAIGNS = Path(__file__).parents[2] / "configs" / "campaigns"
 
@@ -285,3 +290,79 @@ def test_killed_in_real_time_it_loses_one_run_and_goes_on(tmp_path):
     assert len(begun) == 5
     assert sum(each.end["code"] == "completed" for each in begun) == 4
     assert all(float(each.run["coil_heat_a2"]) > 0.0 for each in begun[1:])
+
+
+def trends_of(series, figure, name):
+    """Trends of what nothing compensated, along a dimension by its name."""
+    along = next(each for each in series.dimensions if each.name == name)
+    plain = [run for run in series.done if run.digest.is_plain_loop]
+    return trends(series, figure, along, plain)
+
+
+class TestFiguresAndTrends:
+    """What page and figures say of the shipped campaigns is what the dissertation states."""
+
+    @pytest.fixture
+    def series(self, ran):
+        return lambda name: collect([ran(name)[1].tables[0].parent])
+
+    @pytest.mark.parametrize(
+        ("name", "along", "groups"),
+        [
+            ("amplitude", "frequency", 9),
+            ("bias", "frequency", 6),
+            ("waveforms", "frequency of sine 1", 3),
+            ("compensation", "frequency", 1),
+        ],
+    )
+    def test_area_and_peak_hysteresis_are_linear_in_frequency(self, series, name, along, groups):
+        """4.2.3, figures 4.5 (b), 5.5, 6.4: r2 = 0.99, and both grow; the stroke does not."""
+        found = series(name)
+        for figure in (AREA, HYSTERESIS):
+            lines = trends_of(found, figure, along)
+            assert len(lines) == groups
+            assert min(line.r2 for line in lines) >= 0.99
+            assert {line.direction for line in lines} == {"rises"}
+        strokes = trends_of(found, STROKE, along)
+        assert {line.direction for line in strokes} == {"does not change"}
+        assert any(f"linear in {along} (r² " in text for text in headline(found))
+
+    def test_more_bias_more_saturation(self, series):
+        """Figure 4.6: from 35 kA/m on loops lose their symmetry, and the stroke gets less."""
+        found = series("bias")
+        for line in trends_of(found, ASYMMETRY, "bias current"):
+            assert (np.diff(line.y[1:]) > 0.0).all()
+        for line in trends_of(found, STROKE, "bias current"):
+            assert (np.diff(line.y[1:]) < 0.0).all()
+
+    def test_the_natural_frequency_falls_with_the_load_and_the_damping_stays(self, series):
+        """Section 3.4.4 of chapter 2; 0.12 without load."""
+        found = series("loads")
+        load = next(each for each in found.dimensions if each.name == "load")
+        assert {line.direction for line in trends(found, NATURAL, load)} == {"falls"}
+        assert all(np.ptp(line.y) < 0.1 * line.y.mean() for line in trends(found, DAMPING, load))
+        assert "With load, natural frequency falls." in headline(found)
+
+    def test_hysteresis_before_and_after_stands_in_the_first_line(self, series):
+        """Figure 6.13: 18.2 to 49.1 % before, 3.7 % at most after."""
+        text = " ".join(headline(series("compensation")))
+        found = re.search(r"without compensator ([\d.]+) to ([\d.]+) %", text)
+        assert [float(each) for each in found.groups()] == pytest.approx([18.2, 49.1], abs=1.0)
+        after = re.search(r"with terfenol_staged [\d.]+ to ([\d.]+) %, worst at", text)
+        assert float(after[1]) <= 3.7
+
+    @pytest.mark.parametrize(
+        ("name", "figures"),
+        [
+            ("amplitude", {"loops_by_amplitude", "hysteresis_against_frequency", "in_order",
+                           "sensitivity"}),
+            ("bias", {"loops_by_bias_current", "hysteresis_against_bias_current"}),
+            ("waveforms", {"minor_loops", "minor_loops_against_frequency_of_sine_1"}),
+            ("loads", {"resonance", "frequency_response", "step_response"}),
+            ("loads_sines", {"loops_by_load", "hysteresis_against_frequency"}),
+            ("compensation", {"before_and_after", "model_against_measured", "error_history"}),
+            ("compensation_complex", {"before_and_after", "error_history", "minor_loops"}),
+        ],
+    )  # fmt: skip
+    def test_each_campaign_has_the_figures_that_it_is_run_for(self, series, name, figures):
+        assert figures <= {sheet.name for sheet in sheets_of(series(name))}
