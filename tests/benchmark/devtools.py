@@ -95,6 +95,8 @@ class Tab:
     def hurry(self, nice):
         """Set the niceness of the browser's threads, which it sets itself when it starts."""
         for process in self._processes():
+            with suppress(OSError):  # where sessions have shares, their niceness counts
+                (process / "autogroup").write_text(str(nice))
             for thread in (process / "task").iterdir():
                 with suppress(OSError):
                     os.setpriority(os.PRIO_PROCESS, int(thread.name), nice)

@@ -78,11 +78,13 @@ class LiveRun:
         said, _ = await asyncio.to_thread(self.process.communicate)
         return json.loads(said)
 
-    def server(self):
-        """Return the process number of the page's server."""
+    def server(self, nice=0):
+        """Return the process number of the page's server; give it that niceness."""
         children = Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children").read_text()
         for number in map(int, children.split()):
             if b"hilctl.desk.live" in Path(f"/proc/{number}/cmdline").read_bytes():
+                if nice:
+                    Path(f"/proc/{number}/autogroup").write_text(str(nice))
                 return number
         raise RuntimeError("it has no page")
 
@@ -98,6 +100,7 @@ async def frames(folder, given):
     with LiveRun(folder, given.seconds + 20, "recording.on_failure=go_on") as run:
         async with browser(await run.url()) as tab:
             tab.hurry(given.nice)
+            run.server(given.nice)
             await tab.until("hilctlLive.frames > 30")
             rates, memory = [], []
             until = time.monotonic() + given.seconds
@@ -197,6 +200,7 @@ async def stop(folder, given):
     with LiveRun(folder, 300) as run:
         async with browser(await run.url()) as tab:
             tab.hurry(given.nice)
+            run.server(given.nice)
             await tab.until("hilctlLive.frames > 30")
             server = run.server()
             await tab.value("document.getElementById('stop').click()")
@@ -376,6 +380,7 @@ async def pictures(folder, given):
         }
         async with browser(await run.url()) as tab:
             tab.hurry(given.nice)
+            run.server(given.nice)
             await tab.until("hilctlLive.frames > 20")
             for inverse in ("in", "out"):
                 await tab.value(f"document.getElementById('inverse-{inverse}').click()")
@@ -408,6 +413,7 @@ def main():
     given = parser.parse_args()
     if given.nice:
         os.setpriority(os.PRIO_PROCESS, 0, given.nice)
+        Path("/proc/self/autogroup").write_text(str(given.nice))
     measure = next(each for each in MEASURED if each.__name__ == given.what)
     with tempfile.TemporaryDirectory(prefix="hilctl-live-", dir="/dev/shm") as folder:
         print(json.dumps(asyncio.run(measure(folder, given)), indent=1))

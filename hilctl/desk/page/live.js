@@ -315,7 +315,7 @@ function steady(name, low, high) {
 }
 
 function series(label, stroke, more = {}) {
-  return { label, stroke, width: 1.5, points: { show: false }, ...more };
+  return { label, stroke, width: Math.max(1.5, 0.1 * letter), points: { show: false }, ...more };
 }
 
 function axes(yLabel, xLabel, more = {}) {
@@ -323,7 +323,7 @@ function axes(yLabel, xLabel, more = {}) {
   const size = letter;
   const font = `${Math.round(0.8 * size)}px system-ui, sans-serif`;
   return [
-    { ...look, font, label: xLabel, labelFont: font, labelSize: 1.3 * size, size: 1.9 * size, ...more },
+    { ...look, font, label: xLabel, labelFont: font, labelSize: 1.3 * size, size: 1.9 * size, space: 5 * size, ...more },
     { ...look, font, label: yLabel, labelFont: font, labelSize: 1.4 * size, size: 4.2 * size },
   ];
 }
@@ -503,7 +503,7 @@ function curve(canvas, data, value, across, up, xLabel, yLabel, straight) {
   stroke(pen, [[toX(across[0]), toY(straight(across[0]))], [toX(across[1]), toY(straight(across[1]))]]);
   pen.setLineDash([]);
   pen.strokeStyle = colour("displacement");
-  pen.lineWidth = 1.6 * ratio;
+  pen.lineWidth = Math.max(1.6, 0.11 * letter) * ratio;
   const cycles = Math.ceil(data.loop / data.cycle);
   for (let cycle = cycles - 1; cycle >= 0; cycle -= 1) {
     pen.globalAlpha = Math.max(0.12, 0.62 ** cycle);
