@@ -1,7 +1,9 @@
 """Runs for people, in a terminal: progress, forecast, and how it ended."""
 
 import shlex
+import sys
 import time
+from collections.abc import Sequence
 from types import TracebackType
 from typing import Any, Self
 
@@ -28,10 +30,12 @@ class LiveView:
     """A progress line on standard error: samples, error, command, late ticks.
 
     Args:
-        quiet: Show nothing.
+        quiet: Show nothing of it.
+        addresses: Of pages that show the run; printed once there is something to look at.
     """
 
-    def __init__(self, *, quiet: bool) -> None:
+    def __init__(self, *, quiet: bool, addresses: Sequence[str] = ()) -> None:
+        self._addresses = list(addresses)
         terminal = console(stderr=True)
         self._progress = Progress(
             TextColumn("[bold]run"),
@@ -59,6 +63,8 @@ class LiveView:
 
     def update(self, progress: RunProgress) -> None:
         """Show the newest samples, a few times a second."""
+        while self._addresses:
+            print(f"live page: {self._addresses.pop()}", file=sys.stderr)
         if self._progress.disable:
             return
         now = time.monotonic()

@@ -50,7 +50,11 @@ def run(
 
     finish_orphans()
     quiet = as_json or watch
-    with _served(wanted=live), _watched(wanted=watch), LiveView(quiet=quiet) as view:
+    with (
+        _served(wanted=live) as addresses,
+        _watched(wanted=watch),
+        LiveView(quiet=quiet, addresses=addresses) as view,
+    ):
         result = start_run(experiment, settings, output, overwrite, view.update)
         if result.stop_signal:  # impatience must not cost the result of a run that has ended
             signal.signal(result.stop_signal, signal.SIG_IGN)
@@ -82,15 +86,15 @@ def _watched(*, wanted: bool) -> Iterator[None]:
 
 
 @contextmanager
-def _served(*, wanted: bool) -> Iterator[None]:
+def _served(*, wanted: bool) -> Iterator[list[str]]:
+    """Serve the live page where it is wanted; yield its addresses that are to be printed."""
     if not wanted:
-        yield
+        yield []
         return
     from hilctl.desk.live import served_beside
 
     with served_beside() as url:
-        print(f"live page: {url}", file=sys.stderr)
-        yield
+        yield [url]
 
 
 def _detach(

@@ -27,8 +27,9 @@ let drawn = 0;
 let lastFrameMs = 0;
 let nextId = 1;
 const waiting = new Map();
-const counters = { frames: 0, errors: 0, acknowledgedMs: null };
-window.hilctlLive = counters; // what a test reads
+const counters = { frames: 0, received: 0, drawMs: 0, errors: 0, acknowledgedMs: null };
+window.hilctlLive = counters; // what a measurement reads
+counters.highest = (id) => plots[id].plot.data[1].reduce((most, value) => Math.max(most, value ?? most), -Infinity);
 
 addEventListener("error", () => { counters.errors += 1; });
 addEventListener("unhandledrejection", () => { counters.errors += 1; });
@@ -45,7 +46,7 @@ function connect() {
   socket.onopen = () => { notice(""); ask("view", { view }); };
   socket.onmessage = (message) => {
     if (typeof message.data === "string") said(JSON.parse(message.data));
-    else frame = message.data;
+    else { frame = message.data; counters.received += 1; }
   };
   socket.onclose = () => {
     socket = null;
@@ -278,7 +279,15 @@ function showKeys() {
 
 // ---- plots
 
-const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
+// Read once a theme: asking the style for one at each frame costs as much as the drawing.
+const colours = new Map();
+function colour(name) {
+  if (!colours.has(name)) {
+    colours.set(name, getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim());
+  }
+  return colours.get(name);
+}
+let letter = 16;
 const ranges = new Map();
 
 // A range grows at once and shrinks only after a while, by steps: axes that jump can't be read.
@@ -311,7 +320,7 @@ function series(label, stroke, more = {}) {
 
 function axes(yLabel, xLabel, more = {}) {
   const look = { stroke: colour("quiet"), grid: { stroke: colour("line"), width: 1 }, ticks: { stroke: colour("line") } };
-  const size = parseFloat(getComputedStyle(document.documentElement).fontSize);
+  const size = letter;
   const font = `${Math.round(0.8 * size)}px system-ui, sans-serif`;
   return [
     { ...look, font, label: xLabel, labelFont: font, labelSize: 1.3 * size, size: 1.9 * size, ...more },
@@ -324,6 +333,8 @@ let plots = {};
 function build() {
   for (const each of Object.values(plots)) each.plot.destroy();
   ranges.clear();
+  colours.clear();
+  letter = parseFloat(getComputedStyle(document.documentElement).fontSize);
   plots = {};
   const command = status.description.command_unit;
   const dash = { dash: [6, 4] };
@@ -463,7 +474,7 @@ function curve(canvas, data, value, across, up, xLabel, yLabel, straight) {
   const height = Math.round(canvas.clientHeight * ratio);
   if (canvas.width !== width || canvas.height !== height) { canvas.width = width; canvas.height = height; }
   const pen = canvas.getContext("2d");
-  const size = parseFloat(getComputedStyle(document.documentElement).fontSize) * ratio;
+  const size = letter * ratio;
   const left = 4.2 * size, bottom = 2.7 * size, top = 0.4 * size, right = 0.6 * size;
   const toX = (x) => left + (x - across[0]) / (across[1] - across[0]) * (width - left - right);
   const toY = (y) => height - bottom - (y - up[0]) / (up[1] - up[0]) * (height - bottom - top);
@@ -581,7 +592,7 @@ $("marking").addEventListener("submit", (event) => {
 });
 addEventListener("keydown", (event) => {
   if (event.key === "Escape") { event.preventDefault(); stop(); return; }
-  if (event.target.closest("input, select, textarea") || event.ctrlKey || event.metaKey || event.altKey) return;
+  if (event.target.closest?.("input, select, textarea") || event.ctrlKey || event.metaKey || event.altKey) return;
   const key = event.key.toLowerCase();
   if (key === "i" && !$("inverse-row").hidden) inverse(status?.inverse === "out" ? "in" : "out");
   else if (key === "m") { event.preventDefault(); $("mark").focus(); }
@@ -610,7 +621,9 @@ function refresh(now) {
   const data = unpack(frame);
   frame = null;
   if (!plots["plot-um"] || plots.unit !== status.run) { build(); Object.defineProperty(plots, "unit", { value: status.run }); }
+  const began = performance.now();
   draw(data);
+  counters.drawMs += performance.now() - began;
   counters.frames += 1;
   const gap = now - lastFrameMs;
   lastFrameMs = now;

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from hilctl.cli.run_view import print_run, report_of, run_mapping
+from hilctl.cli.run_view import LiveView, print_run, report_of, run_mapping
 from hilctl.run.result import EndCommandResult, RunResult
 
 ENDED = RunResult(Path("a.mcap"), "stopped", "stopped by hilctl stop", True, 15, 0, 3, 2)
@@ -22,6 +22,14 @@ def test_a_program_reads_how_the_run_ended():
         "adapted": {},
         "on_end": [],
     }
+
+
+def test_the_address_of_a_page_is_printed_once_there_is_something_to_look_at(capsys):
+    with LiveView(quiet=True, addresses=["http://127.0.0.1:5/#x"]) as view:
+        assert capsys.readouterr().err == ""
+        view.update(None)
+        view.update(None)
+        assert capsys.readouterr().err == "live page: http://127.0.0.1:5/#x\n"
 
 
 def test_no_report_is_made_of_no_sample():

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 import typer
 
+from hilctl.base.errors import InputError
 from hilctl.cli.running import check, run, safe
 from hilctl.run.by_hand import SafeByHand
 from hilctl.run.result import RunResult
@@ -78,3 +79,9 @@ def test_a_confirmed_safe_value_is_said(monkeypatch, capsys):
     monkeypatch.setattr("hilctl.run.by_hand.put_safe", lambda path, settings: put)
     safe(DEMO)
     assert capsys.readouterr().out == "a device: at its safe value, 0.25 A, confirmed\n"
+
+
+def test_an_address_with_its_token_goes_into_no_log():
+    """That of a run in the background may be read by others."""
+    with pytest.raises(InputError, match="hilctl live"):
+        run(DEMO, detach=True, live=True)
