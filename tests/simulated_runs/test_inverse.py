@@ -94,3 +94,34 @@ def test_without_its_events_it_is_not_replayed(switched):
     for events in ((), recording.events[:1], recording.events[1:]):
         with pytest.raises(DataError, match="when the inverse went out or in is not there"):
             replay(replace(recording, events=events))
+
+
+@pytest.mark.parametrize(
+    "learns",
+    [
+        "feedback={kind: integral, limit_um: 5.0, bandwidth_hz: 2.0}",
+        "adaptation={time_constant_s: 0.3, noise_um: 0.03}",
+    ],
+)
+def test_what_learns_from_the_error_stands_still_meanwhile(learns, tmp_path, monkeypatch):
+    """The compensator's input repeats while it is out, and its way back is clean."""
+    rate_hz, cycle = 10_000, 500
+    settings = [f"sample_rate_hz={rate_hz}", "block=10", "waveform.amplitude=15.0", learns]
+    settings += ["waveform.frequency_hz=20", "waveform.duration_s=2.5"]
+    checked = checked_experiment(DEMO, settings)
+    line = checked.forecast.line
+    out, back = (
+        Tuning(1.0, 0.0, 1000, at, share, line) for at, share in ((8000, 0.0), (14000, 1.0))
+    )
+    monkeypatch.setattr(_Switched, "changes", (out, back))
+    monkeypatch.setattr(unpaced, "BatchHost", _Switched)
+    unpaced.run_unpaced(checked, tmp_path / "run.mcap")
+    recording = read(tmp_path / "run.mcap")
+    samples = recording.samples
+    # From the second cycle on: the first begins within a block that still learns.
+    inputs = samples.input_um[8500:14000].reshape(-1, cycle)
+    assert np.abs(np.diff(inputs, axis=0)).max() < 1e-9
+    error_um = samples.displacement_um - samples.reference_um
+    assert np.abs(error_um[9500:14000]).max() > 2.0
+    assert np.abs(error_um[15500:24000].mean()) < 0.02
+    assert replay(recording).identical
