@@ -160,7 +160,7 @@ def test_an_underrun_is_told_with_its_length(board):
 )
 def test_a_bad_answer_is_an_error_and_the_output_can_still_be_made_safe(board, fault, text):
     """No wrong reading is taken, and what is queued is dropped for the safe value."""
-    driven = board(faults=[f"{fault}@15"])
+    driven = board(faults=[f"{fault}@15"], fifo_blocks=15)
     driven.open()
     with pytest.raises(DeviceError, match=text):
         driven.hold(2.0, 20)
