@@ -62,7 +62,7 @@ GONE = 'mkdir gone; cd gone; rmdir ../gone; exec "$@"'
     [
         ("demo.yaml", "/run.mcap", 3, "the folder that it is started in has been deleted: change"),
         ("/demo.yaml", "run.mcap", 2, "run.mcap: can't be written: No such file or directory"),
-        ("/demo.yaml", "/run.mcap", 0, ""),
+        pytest.param("/demo.yaml", "/run.mcap", 0, "", marks=pytest.mark.long),
     ],
 )
 def test_working_folder_that_is_gone_before_the_start(tmp_path, experiment, output, code, said):

@@ -48,7 +48,18 @@ def assert_made_safe(device):
     )
 
 
-@pytest.mark.parametrize("fault", FAULTS)
+@pytest.mark.parametrize(
+    "fault",
+    [
+        "silence",
+        "corrupt",
+        *(
+            pytest.param(each, marks=pytest.mark.long)
+            for each in FAULTS
+            if each not in {"silence", "corrupt"}
+        ),
+    ],
+)
 def test_fault_ends_the_run_safely(emulate, run, fault):
     """The run says in one line what happened where; what was queued gives way to the safe value."""
     device = emulate("labjack_t7", "--fault", f"{fault}@{FAULT_AT}")

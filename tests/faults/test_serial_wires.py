@@ -187,7 +187,7 @@ def test_silent_reader_is_named(emulate, run):
     assert samples.measured[:10] == pytest.approx(samples.command[:10], abs=1e-3)
 
 
-@pytest.mark.parametrize("kind", ["dcon", "fifo"])
+@pytest.mark.parametrize("kind", ["dcon", pytest.param("fifo", marks=pytest.mark.long)])
 def test_second_run_on_the_same_port_is_refused(meet, run, tmp_path, boards, kind):
     """Also where it has another name for the port; the first run is not disturbed."""
     device, first, output = meet(kind)

@@ -99,7 +99,9 @@ def test_pulled_cable_leaves_it_to_the_watchdog(emulate, run):
     ("fault", "words", "safe"),
     [
         ("silence", "no answer within 0.5 s", True),
-        ("exception", "function 23 refused with exception 4", True),
+        pytest.param(
+            "exception", "function 23 refused with exception 4", True, marks=pytest.mark.long
+        ),
         ("corrupt", "CRC of 9 bytes is wrong", True),
         ("unplug", "port lost, unplugged?", False),
     ],

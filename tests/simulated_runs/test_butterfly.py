@@ -99,6 +99,7 @@ def test_butterflies_are_identified_by_the_command(tmp_path):
     assert load_model(model).kind == "butterfly"
 
 
+@pytest.mark.long
 def test_compensation_on_a_wing(found, tmp_path):
     """An offset biases the run to one wing: error and hysteresis within the published 3.7 %."""
     (tmp_path / "model.yaml").write_text(dump_model(found.model))

@@ -51,6 +51,7 @@ def test_a_rig_of_any_physics_gets_a_model(tmp_path, physics, within_percent):
     assert summarize(read(run.path)).peak_error_percent < within_percent
 
 
+@pytest.mark.long
 def test_a_piezo_that_begins_at_0_v_gets_a_model(tmp_path):
     """It may go no further than its sensor shows, 38 um."""
     found = characterised(

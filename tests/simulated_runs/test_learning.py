@@ -88,6 +88,7 @@ class Late:
         self._held = both[displacement_um.size :]
 
 
+@pytest.mark.long
 def test_the_delay_of_a_link_is_found(tmp_path):
     """40 samples more of delay are reported as such, and learned away."""
 

@@ -35,10 +35,18 @@ RATES_HZ = {
     "COBS FIFO": 10_000.0,
 }
 PER_CYCLE = {"SCPI": 20, "SCPI, measured": 20, "COBS FIFO": 500}
+LIKE_OTHERS = {"Modbus RTU", "SCPI, measured"}
+"""Wires whose parts the others have, each in a run that takes its time."""
 CYCLES = 3
 
 
-@pytest.mark.parametrize("name", RATES_HZ)
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(each, marks=pytest.mark.long if each in LIKE_OTHERS else ())
+        for each in RATES_HZ
+    ],
+)
 def test_compensated_run_is_complete(tmp_path, name):
     """Every sample of the waveform is recorded or counted, and the commands replay bit for bit."""
     wire = next(each for each in RUNS.WIRES if each.name == name)
