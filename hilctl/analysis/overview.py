@@ -145,6 +145,10 @@ class _Part:
         self._compensated = False
 
     def add(self, piece: Recording) -> None:
+        index = piece.samples.index
+        elsewhere = index.size == 0 or index[-1] < self._start or index[0] >= self._stop
+        if elsewhere and self._kept is not None:
+            return
         part = trusted(piece.samples.part(self._start, self._stop))
         self._compensated = piece.compensated
         if self._folding and part.index.size:

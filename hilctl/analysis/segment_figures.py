@@ -40,8 +40,10 @@ class SegmentGathering:
         self._noise = _Noise()
 
     def add(self, samples: Samples) -> None:
-        """Take the next samples of the run."""
+        """Take the next samples of the run; at least one."""
         segment = self._segment
+        if samples.index[-1] < segment.start or samples.index[0] >= segment.stop:
+            return  # a run may have a thousand segments, and each piece is of one or two
         first, end = np.searchsorted(samples.index, (segment.start, segment.stop)).tolist()
         self._samples += end - first
         part = trusted(samples.part(self._start, self._stop))

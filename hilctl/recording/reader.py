@@ -82,7 +82,8 @@ def _read(path: Path, stretch: Stretch | None, piece_samples: int | None) -> Ite
     except OSError as error:
         raise DataError(f"{path}: can't be read: {error.strerror}") from None
     except DataError as error:
-        raise DataError(f"{path}: {error}") from None
+        text = str(error).removeprefix(f"{path}: ")  # of a piece, it is there already
+        raise DataError(f"{path}: {text}") from None
     last = gathered.piece(path, last=True)
     if not salvage.sound:
         problem = "is still being recorded" if live else salvage.describe()

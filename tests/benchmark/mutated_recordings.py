@@ -31,8 +31,9 @@ from mcap.records import Attachment, Channel, Message, Metadata, Schema
 from mcap.writer import CompressionType, Writer
 
 from hilctl.analysis.export import export
+from hilctl.analysis.overview import overview
 from hilctl.analysis.replay import replay
-from hilctl.analysis.report import summarize
+from hilctl.analysis.report import summarize, summarize_windows
 from hilctl.analysis.run_entry import entry_of
 from hilctl.analysis.run_page import page
 from hilctl.base.errors import ConfigError, HilctlError
@@ -49,11 +50,12 @@ from hilctl.models.kp import KrasnoselskiiPokrovskiiModel
 from hilctl.models.plays import PpiModel
 from hilctl.models.preisach import PreisachModel
 from hilctl.models.staged import FieldLag, StagedModel, Structure
-from hilctl.recording import schema
+from hilctl.recording import reader, schema
 from hilctl.recording.data import Recording
 from hilctl.recording.reader import read
 from hilctl.recording.recover import recover_recording
 from hilctl.recording.salvage import Salvage
+from hilctl.recording.stretch import Stretch
 from tests.published import terfenol_rdpi
 
 GOLDEN = sorted((Path(__file__).parents[2] / "recordings" / "golden").glob("*.mcap"))
@@ -330,6 +332,22 @@ def _export(recording: Recording, path: Path) -> None:
         export(recording, path.with_suffix(suffix), overwrite=True)
 
 
+def _pieces(_recording: Recording, path: Path) -> None:
+    """Read it in pieces, as the commands do: refused where the whole is not, never otherwise."""
+    reader.PIECE_SAMPLES, usual = 300, reader.PIECE_SAMPLES
+    try:
+        for stretch in (None, Stretch(0.01, 0.05)):
+            pieces = reader.Pieces(path, stretch)
+            summary, windows = summarize_windows(pieces)
+            json.dumps(summary.to_mapping())
+            overview(pieces, windows)
+            with suppress(HilctlError):
+                json.dumps(replay(pieces).to_mapping())
+            export(pieces, path.with_suffix(".npz"), overwrite=True)
+    finally:
+        reader.PIECE_SAMPLES = usual
+
+
 def _identify(recording: Recording, _path: Path) -> None:
     with suppress(HilctlError):
         history_from_recording(recording)
@@ -346,6 +364,7 @@ def _initial_state(recording: Recording, path: Path) -> None:
 COMMANDS: dict[str, Callable[[Recording, Path], None]] = {
     "report": _report,
     "replay": _replay,
+    "pieces": _pieces,
     "export": _export,
     "identify": _identify,
     "initial_state": _initial_state,

@@ -37,7 +37,7 @@ def test_mutated_recordings_are_refused_in_words(tmp_path: Path, part: int) -> N
     found = []
     for number in range(part, FILES, 4):
         path.write_bytes(mutant(number, seed=3))
-        commands = ("report", "replay", "identify", "initial_state", "export")
+        commands = ("report", "replay", "pieces", "identify", "initial_state", "export")
         results = list(outcomes(path, commands if number % 8 == 0 else commands[:-1]))
         defects = [(name, text) for name, how, text in results if how not in {"done", "refused"}]
         assert not defects, f"file {number}: {defects[0][0]}\n{defects[0][1]}"

@@ -31,9 +31,8 @@ def recording(make_recording):
 def figures(recording, segment, window, bounds):
     gathering = SegmentGathering(recording, segment, window)
     for part in np.split(np.arange(N), bounds):
-        gathering.add(
-            recording.samples.rows(slice(part[0], part[-1] + 1) if part.size else slice(0))
-        )
+        if part.size:
+            gathering.add(recording.samples.rows(slice(part[0], part[-1] + 1)))
     found = asdict(gathering.report())
     assert found.pop("label") == "sine"
     return {name: value for name, value in found.items() if value is not None}
