@@ -175,12 +175,13 @@ async def spikes(folder, given):
     wanted = {4000 + 2400 * each: each for each in range(10)}
     async with ringing(folder, wanted) as run:
         server = subprocess.Popen(
-            [sys.executable, "-m", "hilctl.cli", "live", run.card.name, "--json"],
+            [sys.executable, "-m", "hilctl.cli", "live", run.card.name],
             stdout=subprocess.PIPE,
         )
-        url = json.loads(await asyncio.to_thread(server.stdout.readline))["url"]
         seen = set()
         try:
+            said = await asyncio.to_thread(server.stdout.readline)
+            url = re.search(r"http\S+", said.decode())[0]
             async with browser(url) as tab:
                 tab.hurry(given.nice)
                 await tab.until("hilctlLive.frames > 5")
