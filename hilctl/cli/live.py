@@ -22,6 +22,7 @@ def live(
 ) -> None:
     """Serve a page that shows runs as they go on, until Ctrl-C or the end of RUN."""
     from hilctl.desk.live import UntilEnded, serve_runs
+    from hilctl.desk.server import LiveServer
     from hilctl.run.client import find_run
     from hilctl.run.run_folder import RunFolder
 
@@ -33,9 +34,16 @@ def live(
         return runs[0] if runs else None
 
     ended = UntilEnded()
+
+    def over(server: LiveServer) -> bool:
+        if first is None:
+            return False
+        # One that has ended before it could be looked at leaves nothing to wait for.
+        return ended(server) or (server.feed(None) is None and not first.alive)
+
     serve_runs(
         chosen,
-        lambda server: first is not None and ended(server),
+        over,
         lambda url: print_json({"url": url}) if as_json else print(f"live page: {url}", flush=True),
         port,
     )

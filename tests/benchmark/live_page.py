@@ -134,7 +134,7 @@ async def ringing(folder, spikes):
     description = RunDescription.of(checked_experiment(EXPERIMENT, []))
     with run_folder("spikes", Path(folder) / "run.mcap", time.time()) as (run, _):
         description.write(run.description)
-        ring = SampleRing.create(run.ring, slots=2048, block=50, state_size=1)
+        ring = SampleRing.create(run.ring, slots=10_000, block=50, state_size=1)
         ring.page.put(Field.PHASE, Phase.RUNNING)
 
         async def loop():
@@ -146,7 +146,7 @@ async def ringing(folder, spikes):
                     if number % 500 == 0:
                         while ring.pop() is not None:
                             pass
-                        ring.release(keep=256)
+                        ring.release(keep=ring.slots // 8)
                 await asyncio.sleep(0.005)
 
         task = asyncio.create_task(loop())
@@ -172,27 +172,31 @@ def _exchange(ring, number, spikes):
 
 async def spikes(folder, given):
     """Spikes of one sample each, and how many of them the page has drawn."""
-    wanted = {4000 + 2400 * each: each for each in range(10)}
+    wanted = {}
     async with ringing(folder, wanted) as run:
         server = subprocess.Popen(
-            [sys.executable, "-m", "hilctl.cli", "live", run.card.name, "--json"],
+            [sys.executable, "-m", "hilctl.cli", "live", run.card.name],
             stdout=subprocess.PIPE,
         )
-        url = json.loads(await asyncio.to_thread(server.stdout.readline))["url"]
         seen = set()
         try:
+            said = await asyncio.to_thread(server.stdout.readline)
+            url = re.search(r"http\S+", said.decode())[0]
             async with browser(url) as tab:
                 tab.hurry(given.nice)
                 await tab.until("hilctlLive.frames > 5")
                 await tab.value("document.getElementById('mode').click()")
                 ring = SampleRing(run.ring, look_only=True)
+                begin = ring.page.get(Field.HEAD) + 1000
+                wanted |= {begin + 2400 * each: each for each in range(10)}
                 while ring.page.get(Field.HEAD) < max(wanted) + 1500:
                     seen.add(round(await tab.value("hilctlLive.highest('plot-error')") - 50.0))
                     await asyncio.sleep(0.2)
         finally:
             server.terminate()
             server.communicate()
-    return {"spikes": len(wanted), "drawn": len(seen & set(wanted.values()))}
+    missing = sorted(set(wanted.values()) - seen)
+    return {"spikes": len(wanted), "not_drawn": missing}
 
 
 async def stop(folder, given):

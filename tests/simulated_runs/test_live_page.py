@@ -26,6 +26,7 @@ async def messages(url):
             yield json.loads(message) if isinstance(message, str) else message
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kill", [False, True])
 def test_a_run_is_seen_and_stopped_by_its_page(tmp_path, kill):
     """STOP is acknowledged, and holds though the page's server dies at once."""

@@ -366,7 +366,8 @@ function add(id, signals, yLabel, xLabel = "") {
   const options = {
     ...sizes(box), cursor: { drag: { x: false, y: false } }, legend: { show: false },
     scales: { x: { time: false, range: (_, low, high) => [low, high] }, y: { range: (_, low, high) => steady(id, low, high) } },
-    axes: axes(yLabel, xLabel), series: [{}, ...signals.map(([, each]) => each)],
+    // By their own digits: the default rounds 0.0025 to 0.003.
+    axes: axes(yLabel, xLabel).map((axis) => ({ ...axis, values: (_, splits) => splits.map(tidy) })), series: [{}, ...signals.map(([, each]) => each)],
   };
   plots[id] = { plot: new uPlot(options, [[0, 1], ...signals.map(() => [null, null])], box), signals: signals.map(([name]) => name) };
 }

@@ -1,6 +1,7 @@
 """``hilctl live``, without its server."""
 
 import json
+from types import SimpleNamespace
 
 import pytest
 from typer.testing import CliRunner
@@ -15,7 +16,7 @@ def served(monkeypatch):
     given = {}
 
     def serve_runs(chosen, over, on_url, port):
-        given.update(chosen=chosen, port=port)
+        given.update(chosen=chosen, over=over, port=port)
         on_url("http://127.0.0.1:5/#x")
 
     monkeypatch.setattr("hilctl.desk.live.serve_runs", serve_runs)
@@ -28,6 +29,7 @@ def test_the_address_is_printed_and_any_run_is_shown(served):
     assert served["port"] == 5
     assert served["chosen"]([]) is None
     assert served["chosen"](["a", "b"]) == "a"
+    assert not served["over"](None)
     assert json.loads(CliRunner().invoke(app, ["live", "--json"]).output)["url"].endswith("/#x")
 
 
@@ -41,3 +43,11 @@ def test_a_run_that_is_not_there_is_refused(served):
     said = CliRunner().invoke(app, ["live", "x"])
     assert "no run is named 'x'" in str(said.exception)
     assert not served
+
+
+def test_it_is_over_where_its_run_ended_before_it_could_be_looked_at(served, tmp_path):
+    nothing = SimpleNamespace(feed=lambda name: None)
+    with run_folder("demo", tmp_path / "a.mcap", 1.0) as (folder, _):
+        CliRunner().invoke(app, ["live", folder.card.name])
+        assert not served["over"](nothing)
+    assert served["over"](nothing)
