@@ -102,7 +102,7 @@ def _ended(command: Sequence[str], text: str, timeout_s: float, said: IO[bytes])
             # Only where it goes on: the number of one that has ended may be another's by now.
             if process.poll() is None:
                 os.killpg(process.pid, signal.SIGKILL)
-                # Here: of one that is interrupted, Popen waits for a quarter of a second only.
+                # Not left to Popen, which waits no longer than a moment after Ctrl-C.
                 process.wait()
     return process.returncode, error
 
