@@ -31,10 +31,10 @@ from mcap.records import Attachment, Channel, Message, Metadata, Schema
 from mcap.writer import CompressionType, Writer
 
 from hilctl.analysis.export import export
-from hilctl.analysis.html import page
 from hilctl.analysis.replay import replay
 from hilctl.analysis.report import summarize
 from hilctl.analysis.run_entry import entry_of
+from hilctl.analysis.run_page import page
 from hilctl.base.errors import ConfigError, HilctlError
 from hilctl.base.segments import Segment
 from hilctl.cli.report_view import render
