@@ -17,6 +17,7 @@ from hilctl.recording.data import Recording
 
 _MOST_EVENTS = 200
 _MOST_FAULTS = 3
+_LARGEST = 1e100
 
 
 def write_html(
@@ -94,6 +95,9 @@ def _fault(recording: Recording, report: RunReport) -> Iterator[str]:
 
 
 def _figures(recording: Recording, report: RunReport, before: Recording | None) -> Iterator[str]:
+    if not _drawable(recording):
+        yield html.paragraph("No figure is drawn: readings are near the end of all numbers.")
+        return
     focus = worst_segment(report.segments)
     no_error = "No error is drawn: no sample has a reference displacement."
     drawn: list[tuple[Sheet | None, str]] = [
@@ -111,6 +115,13 @@ def _figures(recording: Recording, report: RunReport, before: Recording | None) 
     for sheet, otherwise in drawn:
         if sheet is None and otherwise:
             yield html.paragraph(otherwise)
+
+
+def _drawable(recording: Recording) -> bool:
+    """Return whether axes can be found for all signals: matplotlib has none near 1e308."""
+    samples = recording.samples
+    signals = (samples.displacement_um, samples.reference_um, samples.command)
+    return not any(np.any(np.abs(signal) > _LARGEST) for signal in signals)
 
 
 def _segments(report: RunReport) -> list[str]:

@@ -11,6 +11,7 @@ from hilctl.recording.data import Recording
 
 MOST_HARMONICS = 20
 _MOST_SAMPLES = 2**20
+_LARGEST_UM = 1e100  # readings near the end of all numbers have no spectrum
 _WIDEST_GAP = 0.02  # of the samples that may be missing
 
 
@@ -47,7 +48,7 @@ def error_spectrum(recording: Recording, segment: Segment, index: I64, error_um:
         return None
     index, error_um = index[finite][-_MOST_SAMPLES:], error_um[finite][-_MOST_SAMPLES:]
     span = int(index[-1] - index[0]) + 1
-    if span - index.size > _WIDEST_GAP * span:
+    if span - index.size > _WIDEST_GAP * span or np.abs(error_um).max() > _LARGEST_UM:
         return None
     even = np.interp(np.arange(index[0], index[-1] + 1), index, error_um)
     window = np.hanning(span + 1)[:-1]

@@ -33,11 +33,11 @@ def significant(value: float, digits: int = _DIGITS) -> str:
         return "0"
     if not math.isfinite(value):
         return str(value)
-    rounded = float(f"{value:.{digits - 1}e}")
-    exponent = math.floor(math.log10(abs(rounded)))
+    rounded = f"{value:.{digits - 1}e}"
+    exponent = int(rounded.partition("e")[2])
     if not -5 < exponent < 6:
-        return f"{value:.{digits - 1}e}"
-    return f"{rounded:.{max(0, digits - 1 - exponent)}f}"
+        return rounded
+    return f"{float(rounded):.{max(0, digits - 1 - exponent)}f}"
 
 
 def quantity(value: float | None, unit: str = "", digits: int = _DIGITS) -> str:

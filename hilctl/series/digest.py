@@ -30,7 +30,6 @@ POINTS = 300
 _STEP_POINTS = 800
 _STEP_CYCLES = 12.0  # of the ringing
 _NO_LOOP = np.empty((2, 0))
-_FAULT = "error"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -50,7 +49,6 @@ class RunDigest:
         compensated: Whether a compensator stood before the actuator.
         command_unit: ``A`` or ``V``.
         waveform: What ran, for people, in the segment that is judged.
-        frequency_hz: Of its period; None where it does not repeat.
         figures: Figures of the run.
         loop: float64[2, m], the loop that is judged, input and displacement, closed; see
             :class:`hilctl.analysis.steady.SteadyPart`. Empty where nothing repeats.
@@ -60,7 +58,6 @@ class RunDigest:
         model_error_percent: Largest of their difference, of the peak-to-peak; None without.
         step: float64[2, k], time in s and displacement in um after the largest step; empty without.
         response: Small-signal response; None without one.
-        events: Texts of errors, in order.
     """
 
     name: str
@@ -75,7 +72,6 @@ class RunDigest:
     compensated: bool
     command_unit: str
     waveform: str
-    frequency_hz: float | None
     figures: RunFigures
     loop: F64 = field(default_factory=_NO_LOOP.copy)
     error_um: F64 = field(default_factory=_NO_LOOP.copy)
@@ -83,7 +79,6 @@ class RunDigest:
     model_error_percent: float | None = None
     step: F64 = field(default_factory=_NO_LOOP.copy)
     response: SmallSignal | None = None
-    events: tuple[str, ...] = ()
 
     @property
     def is_plain_loop(self) -> bool:
@@ -105,7 +100,6 @@ def digest_of(recording: Recording, model: HysteresisModel | None = None) -> Run
     waveform = _waveform(values)
     structure = structure_of(recording, waveform)
     segment = _worst(recording)
-    rate_hz = recording.sample_rate_hz
     return RunDigest(
         name=recording.run.get("name", ""),
         path=str(recording.path),
@@ -119,12 +113,10 @@ def digest_of(recording: Recording, model: HysteresisModel | None = None) -> Run
         compensated=recording.compensated,
         command_unit=recording.command_unit,
         waveform=segment.label if segment else "",
-        frequency_hz=rate_hz / segment.period if segment and segment.period > 0.0 else None,
         figures=figures_with(recording, structure),
         **(_of_cycle(recording, segment, model) if _is_loop(segment, waveform) else {}),
         step=_after_step(recording, waveform, structure),
         response=structure if isinstance(structure, SmallSignal) else None,
-        events=tuple(event.text for event in recording.events if event.level == _FAULT),
     )
 
 

@@ -108,6 +108,8 @@ def _last(series: RunSeries, *, short: bool) -> dict[str, Callable[[SeriesRun], 
     if not short or series.failed or series.planned:
         found["result"] = lambda run: run.result
     if not series.is_campaign and not short:
+        found["name"] = lambda run: run.digest.name if run.digest else ""
+        found["waveform"] = lambda run: run.digest.waveform if run.digest else ""
         found["started (UTC)"] = _started
     if not short:
         found["recording"] = lambda run: run.recording

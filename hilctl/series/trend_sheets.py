@@ -115,7 +115,8 @@ def draw_trends(axes: Axes, series: RunSeries, found: Sequence[Trend], *, fitted
             axes.plot(ends, trend.slope * ends + trend.offset, **{**_FIT, "color": style["color"]})
     r2 = [trend.r2 for trend in found if trend.r2 is not None]
     if fitted and r2:
-        span = f"{min(r2):.4f}" if len(r2) == 1 else f"{min(r2):.4f} to {max(r2):.4f}"
+        texts = dict.fromkeys(f"{value:.4f}" for value in (min(r2), max(r2)))
+        span = " to ".join(texts)
         axes.annotate(f"r² = {span}", (0.03, 0.97), xycoords="axes fraction", va="top",
                       fontsize=7, color=QUIET)  # fmt: skip
     if logarithmic:

@@ -188,6 +188,17 @@ def test_folder_that_is_not_there_is_an_input_error(recording: Recording, tmp_pa
         write_html(recording, summarize(recording), path)
 
 
+@pytest.mark.usefixtures("undrawn")
+def test_readings_near_the_end_of_all_numbers_are_told_in_words(recording: Recording) -> None:
+    """No axis can show them; the figures in words stay."""
+    samples = recording.samples
+    huge = replace(samples, displacement_um=np.where(samples.index % 2, 1.7e308, -1.7e308))
+    changed = replace(recording, samples=huge)
+    text = page(changed, summarize(changed))
+    assert "No figure is drawn" in text
+    assert "<figure" not in text
+
+
 def test_what_steers_a_browser_or_a_plot_is_written_out(recording: Recording) -> None:
     """Names from a file may hold anything; a formula, a page of text or an escape among it."""
     label = "$\\frac{$ \x1b[31m \u202e" + "x" * 100_000

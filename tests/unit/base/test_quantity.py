@@ -35,6 +35,7 @@ def test_digits_are_the_same_whatever_the_size():
     ]  # fmt: skip
     assert significant(2291.4, 4) == "2291"
     assert significant(math.nan) == "nan"
+    assert significant(1.7976931348623157e308) == "1.80e+308"
 
 
 def test_units_have_their_signs():

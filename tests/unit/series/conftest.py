@@ -33,7 +33,6 @@ def digest(
         "compensated": compensated,
         "command_unit": "A",
         "waveform": "sine",
-        "frequency_hz": 10.0,
         "figures": RunFigures(),
         "loop": np.array((wave, moved)),
         "error_um": error_um,

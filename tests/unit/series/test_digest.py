@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilctl.base.events import Event
 from hilctl.base.segments import Segment
 from hilctl.models.files import load_model
 from hilctl.series.digest import POINTS, digest_of
@@ -30,7 +29,7 @@ def test_a_loop_of_any_length_is_a_few_kilobytes(make_recording):
     assert np.array_equal(found.loop[:, 0], found.loop[:, -1])
     assert found.is_plain_loop
     assert found.values["waveform"]["amplitude"] == 6.0
-    assert found.frequency_hz == pytest.approx(10.0)
+    assert found.waveform == "sine 6 A 10 Hz"
     assert found.error_um.size == found.modelled.size == found.step.size == 0
 
 
@@ -64,10 +63,8 @@ def test_many_sines_at_once_are_no_loop(make_recording):
 
 
 def test_a_damaged_experiment_takes_only_its_settings_away(make_recording):
-    events = (Event(3, "error", "lost", "no answer"), Event(4, "info", "x", "y"))
-    recording = make_recording(40.0 * WAVE, command=WAVE, segments=[SEGMENT], events=events,
+    recording = make_recording(40.0 * WAVE, command=WAVE, segments=[SEGMENT],
                                experiment_yaml="[broken")  # fmt: skip
     found = digest_of(recording)
     assert found.values == {}
     assert found.figures.peak_to_peak_um == pytest.approx(80.0, rel=1e-3)
-    assert found.events == ("no answer",)

@@ -20,7 +20,7 @@ def test_fits_are_drawn_along_frequency_only(crossed):
     assert list(sheets) == ["hysteresis_against_frequency", "hysteresis_against_amplitude"]
     stroke, area, hysteresis = map(drawn, sheets["hysteresis_against_frequency"].panels)
     assert area.get_ylabel() == "loop area, µm·A"
-    assert [text.get_text() for text in area.texts] == ["r² = 1.0000 to 1.0000"]
+    assert [text.get_text() for text in area.texts] == ["r² = 1.0000"]
     assert [line.get_label() for line in area.lines[::2]] == ["3 A", "6 A"]
     assert len(stroke.lines) == 2
     assert len(hysteresis.lines) == 4
