@@ -2,6 +2,8 @@
 
 import math
 
+import numpy as np
+
 from hilctl.base.arrays import F64, I64
 from hilctl.kernels.jit import kernel
 
@@ -102,6 +104,34 @@ def turning_points(u: F64, distance: float, out: I64) -> int:
     return count
 
 
+@kernel("int64(float64[::1], int64[::1], int64[::1], int64[::1])")
+def needed_points(u: F64, rows: I64, points: I64, places: I64) -> int:
+    """Find the rows of a path and all samples at which it turns: operators need no others.
+
+    Args:
+        u: float64[n].
+        rows: int64[N], rising.
+        points: int64[n], filled with samples.
+        places: int64[N], filled with where each row stands among these.
+
+    Returns:
+        How many points there are.
+    """
+    count = row = 0
+    for k in range(u.size):
+        if row == rows.size:
+            break
+        is_row = rows[row] == k
+        turns = k == 0 or k + 1 == u.size or (u[k] - u[k - 1]) * (u[k + 1] - u[k]) < 0.0
+        if is_row:
+            places[row] = count
+            row += 1
+        if is_row or turns:
+            points[count] = k
+            count += 1
+    return count
+
+
 @kernel("void(float64, float64, float64, float64, float64[::1])")
 def _add_splines(u: float, lowest: float, width: float, sign: float, out: F64) -> None:
     """Add the integral of each quadratic spline from the lowest u to this one, times a sign."""
@@ -137,6 +167,8 @@ def play_columns(
         splines: How many there are, c >= 3, over c - 2 pieces.
         out: float64[N, m], of which the first p c columns are filled.
     """
+    rest = np.zeros(splines)
+    _add_splines(0.0, lowest, width, -1.0, rest)
     for i in range(thresholds.size):
         held = 0.0
         first, k = i * splines, 0
@@ -145,6 +177,5 @@ def play_columns(
                 held = max(min(held, u[k] + thresholds[i]), u[k] - thresholds[i])
                 k += 1
             columns = out[row, first : first + splines]
-            columns[:] = 0.0
+            columns[:] = rest
             _add_splines(held, lowest, width, 1.0, columns)
-            _add_splines(0.0, lowest, width, -1.0, columns)

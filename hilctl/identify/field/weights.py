@@ -14,7 +14,7 @@ from scipy.linalg import cholesky, solve_triangular
 from scipy.optimize import nnls
 
 from hilctl.base.arrays import F64, I64
-from hilctl.identify.field.columns import play_columns
+from hilctl.identify.field.columns import needed_points, play_columns
 from hilctl.identify.field.descent import Place
 from hilctl.identify.linear import RIDGE
 from hilctl.kernels.field import drag_columns
@@ -109,7 +109,9 @@ def table(paths: Sequence[F64], kept: Sequence[I64], grid: Grid) -> F64:
     """
     plays, cells = grid.thresholds.size, grid.cells
     parts: list[F64] = []
-    for u, rows in zip(paths, kept, strict=True):
+    for path, samples in zip(paths, kept, strict=True):
+        points, rows = np.empty(path.size, dtype=np.int64), np.empty_like(samples)
+        u = path[points[: needed_points(path, samples, points, rows)]]
         out = np.empty((rows.size, grid.lines * cells))
         play_columns(u, rows, grid.thresholds, grid.lowest, grid.piece, cells, out)
         for i, length in enumerate(grid.lengths):

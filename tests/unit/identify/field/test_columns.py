@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hilctl.identify.field.columns import bare_displacement, corners, turning_points
+from hilctl.identify.field.columns import bare_displacement, corners, needed_points, turning_points
 from hilctl.identify.field.fits import FINER, tabled
 from hilctl.identify.field.weights import Grid, table
 from hilctl.models.field import FieldModel, OutputCurve
@@ -51,6 +51,14 @@ def test_turning_points_and_rows_are_enough_of_a_path() -> None:
     whole = table([u], [kept], GRID)
     few = table([np.ascontiguousarray(u[kept])], [np.arange(kept.size)], GRID)
     assert few == pytest.approx(whole, abs=0.02)
+
+
+def test_points_are_the_rows_and_all_turns() -> None:
+    u = np.array([0.0, 1.0, 2.0, 1.5, 1.0, 3.0, 4.0, 5.0, 6.0])
+    points, places = np.empty(9, dtype=np.int64), np.empty(3, dtype=np.int64)
+    count = needed_points(u, np.array([1, 4, 6]), points, places)
+    assert points[:count].tolist() == [0, 1, 2, 4, 6]
+    assert places.tolist() == [1, 3, 4]
 
 
 def test_straight_lines_between_corners_are_near_both_signals() -> None:
