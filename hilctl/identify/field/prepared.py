@@ -70,6 +70,11 @@ class Run:
 class Prepared:
     """All records.
 
+    Args:
+        records: The records.
+        points: Samples that are left of the fastest cycle.
+        command_off: Of the peak-to-peak command: how far straight lines may be from it.
+
     Attributes:
         runs: The records.
         reach: Half the largest peak-to-peak command.
@@ -77,8 +82,11 @@ class Prepared:
         top_hz: Frequency of a sine that is as fast as the fastest record.
     """
 
-    def __init__(self, records: Sequence[History]) -> None:
+    def __init__(
+        self, records: Sequence[History], points: int = POINTS, command_off: float = COMMAND_OFF
+    ) -> None:
         """Smooth and thin records."""
+        self._points, self._command_off = points, command_off
         self.reach = max(0.5 * float(np.ptp(record.command)) for record in records)
         self.stroke_um = max(float(np.ptp(record.displacement_um)) for record in records)
         self.top_hz = max(_speed(record) for record in records) / (2.0 * math.pi * self.reach)
@@ -94,10 +102,10 @@ class Prepared:
         derivatives = np.stack(
             [np.convolve(padded, weights[::-1], "valid") for weights in (plain, by_slope, by_bend)]
         )
-        thin = max(1, math.floor(rate_hz / (POINTS * self.top_hz)))
+        thin = max(1, math.floor(rate_hz / (self._points * self.top_hz)))
         furthest = max(thin, math.floor(LONGEST * rate_hz / self.top_hz))
         kept = np.empty(command.size, dtype=np.int64)
-        off = 2.0 * COMMAND_OFF * self.reach, OFF * self.stroke_um
+        off = 2.0 * self._command_off * self.reach, OFF * self.stroke_um
         count = corners(np.ascontiguousarray(command), derivatives[0], *off, thin, furthest, kept)
         kept = kept[:count].copy()
         steps = np.diff(kept, prepend=kept[0])
