@@ -5,8 +5,8 @@ import pytest
 
 from hilctl.identify.data.records import History
 from hilctl.identify.field.prepared import OFF, Prepared
-from hilctl.identify.generalised_duhem.fits import POINTS
 from hilctl.identify.field.stages import HIGH, LOW, STEP, Stages
+from hilctl.identify.generalised_duhem.fits import POINTS
 from hilctl.identify.generalised_duhem.signals import (
     FIRST,
     HIGHEST,
