@@ -33,7 +33,7 @@ PUBLISHED: Mapping[str, Choices] = {
     "staged": {"plays": 20, "deadbands": 12, "offset": True, "starts": 4},
     "preisach": {"lines": 16},
     "butterfly": {"plays": 16},
-    "field": {"plays": 16},
+    "field": {"plays": 32, "cells": 12},
 }
 """Defaults of a kind that are not those of all; sections 3.4.2 (PPI), 5.3 (RDPI), 6.4."""
 
@@ -85,9 +85,9 @@ class FitSettings(Strict):
         "field",
         "generalised_duhem",
         default=24,
-        ge=2,
+        ge=3,
         le=60,
-        description="Cells of each table, along the effective field or the displacement.",
+        description="Pieces of each table, along the effective field or the displacement.",
     )
     across: int = _of(
         "generalised_duhem",

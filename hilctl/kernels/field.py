@@ -2,11 +2,13 @@
 
 Notation: ``v`` is a command, ``w`` the field that is left of it, ``m`` what the operators give,
 ``u = w + coupling m`` the effective field that they act on, ``T`` the sample period. All operators
-are tables over the same even cells of ``u``, so that next to one another in memory they are quick.
+are tables over even cells of ``u``, so that next to one another in memory they are quick.
 
 A *play* of threshold r gives q(F_r[u]); a line of them for each r is Preisach's triangle. A *drag*
 of length k follows how far u is through a cell, s, as u travels: ds/d|u| = (s_u - s) / k where that
 is the way that u goes, else ds = 0. Its small loops creep from one to the next, as plays' never do.
+Each sample moves every cell of a drag but one place in the table of a play, so drags have cells of
+their own, which may be wider.
 
 The command is ahead of the field by what the losses take, in the mean over a sample::
 
@@ -32,11 +34,13 @@ from hilctl.base.arrays import F64, I64
 from hilctl.kernels.jit import kernel
 
 Bank: TypeAlias = tuple[F64, F64, F64, F64, F64]
-"""Thresholds float64[p], lengths float64[d], tables of the plays at the edges of c cells, float64[
-p (c + 1)], weights of the drags in these, float64[d c], and the grid: lowest edge, width, c."""
+"""Thresholds float64[p], lengths float64[d], tables of the plays at the edges of n cells, float64[
+p (n + 1)], weights of the drags in c cells, float64[d c], and the grid, float64[5]: lowest edge,
+width and n for the plays, width and c for the drags."""
 Span: TypeAlias = tuple[float, float, float]
-Losses: TypeAlias = tuple[float, float, float, float, float, float, float]
-"""tau_0 / T, tau_1 / T, what is left of z after a sample, b, c, x, e_0."""
+Losses: TypeAlias = tuple[float, float, float, float, float, float, float, float]
+"""tau_0 / T, tau_1 / T, what is left of z after a sample, b, c, x, e_0, and the part that z before
+a sample has in its mean over the sample; the rest is h's."""
 
 _STEPS = 100
 _NARROWEST = 1e-14
@@ -45,7 +49,7 @@ _OUTPUT, _COMMAND, _FIELD = 0, 1, 2
 _SPAN = "UniTuple(float64, 3)"
 _CURVE = "UniTuple(float64[::1], 2)"
 _BANK = "UniTuple(float64[::1], 5)"
-_LOSSES = "UniTuple(float64, 7)"
+_LOSSES = "UniTuple(float64, 8)"
 
 
 @kernel("int64(float64, float64)", inline=True)
@@ -176,7 +180,7 @@ def _drag(u: float, last: float, i: int, memory: F64, bank: Bank) -> tuple[float
     In the cells that the field has passed all goes alike, so their sums do.
     """
     thresholds, lengths, _, weights, grid = bank
-    lowest, width, cells = grid[0], grid[1], int(grid[2])
+    lowest, width, cells = grid[0], grid[3], int(grid[4])
     start, first = i * cells, thresholds.size + i * cells
     sums = thresholds.size + lengths.size * cells + 3 * i
     length = lengths[i]
@@ -185,7 +189,7 @@ def _drag(u: float, last: float, i: int, memory: F64, bank: Bank) -> tuple[float
     passed = memory[sums + side]
     total = memory[sums] + gone * passed
     slope = (1.0 - gone) * abs(passed)
-    here, there = _cell((last - lowest) / width, grid[2]), _cell((u - lowest) / width, grid[2])
+    here, there = _cell((last - lowest) / width, grid[4]), _cell((u - lowest) / width, grid[4])
     for j in range(min(here, there), max(here, there) + 1):
         low, rest = lowest + j * width, _rest(j, lowest, width)
         held = memory[first + j] + rest
@@ -200,11 +204,11 @@ def _drag(u: float, last: float, i: int, memory: F64, bank: Bank) -> tuple[float
 def _move_drag(u: float, last: float, i: int, memory: F64, bank: Bank) -> None:
     """Bring a drag to a next u, and keep what :func:`_drag` needs from there on."""
     thresholds, lengths, _, weights, grid = bank
-    lowest, width, cells = grid[0], grid[1], int(grid[2])
+    lowest, width, cells = grid[0], grid[3], int(grid[4])
     start, first = i * cells, thresholds.size + i * cells
     sums = thresholds.size + lengths.size * cells + 3 * i
     gone = _gone(abs(u - last) / lengths[i])
-    here, there = _cell((last - lowest) / width, grid[2]), _cell((u - lowest) / width, grid[2])
+    here, there = _cell((last - lowest) / width, grid[4]), _cell((u - lowest) / width, grid[4])
     total = up = down = 0.0
     for j in range(cells):
         rest = _rest(j, lowest, width)
@@ -259,7 +263,7 @@ def _settle(u: float, memory: F64, bank: Bank) -> None:
 @kernel(f"UniTuple(float64, 2)(float64, {_LOSSES})", inline=True)
 def lost_field(e: float, losses: Losses) -> tuple[float, float]:
     """Return h(e) and its slope."""
-    growth, bend, excess, even = losses[3:]
+    growth, bend, excess, even = losses[3:7]
     size = abs(e)
     root = math.sqrt(size + even)
     more = growth * size + bend * size * size
@@ -277,7 +281,8 @@ def field_left(v: F64, late: F64, step_s: F64, m: F64, losses: Losses, w: F64) -
         late: float64[n], that part.
         step_s: float64[n], time of each step.
         m: float64[n], the operators' output at each sample.
-        losses: See :data:`Losses`; the first three are in s, tau_b itself the third.
+        losses: See :data:`Losses`; the first three are in s, tau_b itself the third, and the last
+            is worked out for each step.
         w: float64[n], filled; the first is the first command.
     """
     w[0] = v[0]
@@ -285,13 +290,14 @@ def field_left(v: F64, late: F64, step_s: F64, m: F64, losses: Losses, w: F64) -
     for k in range(1, v.size):
         was, step = w[k - 1], step_s[k]
         left = math.exp(-step / losses[2]) if losses[2] > 0.0 else 0.0
+        mean = (1.0 - left) * losses[2] / step if step > 0.0 else 0.0
         field, output = losses[0] / step, losses[1] * (m[k] - m[k - 1]) / step
         change *= step / before if before > 0.0 else 0.0
         before = step
         for _ in range(_STEPS):
             lost, slope = lost_field(field * change + output, losses)
-            command = was + late[k] * change + left * z + (1.0 - left) * lost
-            more = (v[k] - command) / (late[k] + (1.0 - left) * slope * field)
+            command = was + late[k] * change + mean * z + (1.0 - mean) * lost
+            more = (v[k] - command) / (late[k] + (1.0 - mean) * slope * field)
             change += more
             if abs(more) <= _NEAR * (abs(change) + _NEAR):
                 break
@@ -311,9 +317,9 @@ def _given(
     k = memory.size - 6
     e = losses[0] * (w - memory[k + 3]) + losses[1] * (m - memory[k + 1])
     lost, lost_slope = lost_field(e, losses)
-    command = 0.5 * (w + memory[k + 3]) + losses[2] * memory[k + 2] + (1.0 - losses[2]) * lost
+    command = 0.5 * (w + memory[k + 3]) + losses[7] * memory[k + 2] + (1.0 - losses[7]) * lost
     e_slope = losses[0] * w_slope + losses[1] * slope
-    command_slope = 0.5 * w_slope + (1.0 - losses[2]) * lost_slope * e_slope
+    command_slope = 0.5 * w_slope + (1.0 - losses[7]) * lost_slope * e_slope
     value = m if what == _OUTPUT else (w if what == _FIELD else command)
     by_u = slope if what == _OUTPUT else (w_slope if what == _FIELD else command_slope)
     return value, by_u, m
@@ -376,8 +382,9 @@ def _advance(
     e = losses[0] * (w - memory[k + 3]) + losses[1] * (m - memory[k + 1])
     if fresh:
         memory[k + 3], e = w, 0.0
-    memory[k + 2] = losses[2] * memory[k + 2] + (1.0 - losses[2]) * lost_field(e, losses)[0]
-    command = 0.5 * (w + memory[k + 3]) + memory[k + 2]
+    lost = lost_field(e, losses)[0]
+    command = 0.5 * (w + memory[k + 3]) + losses[7] * memory[k + 2] + (1.0 - losses[7]) * lost
+    memory[k + 2] = losses[2] * memory[k + 2] + (1.0 - losses[2]) * lost
     before = memory[k]
     _settle(u, memory, bank)
     if m != memory[k + 1]:

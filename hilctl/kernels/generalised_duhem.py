@@ -37,14 +37,15 @@ Band: TypeAlias = tuple[F64, F64, F64, F64]
 """Slopes float64[2, k, l], rising then falling, at k nodes of y and l across the band; longest step
 of y that begins in each cell, float64[2, k - 1, l - 1]; centre line and flux at these y, float64[2,
 k]; lowest y, distance of nodes of y, half the band's width b, distance of nodes across it."""
-Losses: TypeAlias = tuple[float, float, float, float, float, float, float]
-"""tau_0 / T, tau_1 / T, what is left of z after a sample, b, c, x, e_0."""
+Losses: TypeAlias = tuple[float, float, float, float, float, float, float, float]
+"""tau_0 / T, tau_1 / T, what is left of z after a sample, b, c, x, e_0, and the part that z before
+a sample has in its mean over the sample; the rest is h's."""
 
 _STEPS = 100
 _MOST_STEPS = 1000  # of y in a sample; the rest of a jump goes by the slope that it begins with
 _NEAR_UM = 1e-9
 _BAND = "Tuple((float64[:, :, ::1], float64[:, :, ::1], float64[:, ::1], float64[::1]))"
-_LOSSES = "UniTuple(float64, 7)"
+_LOSSES = "UniTuple(float64, 8)"
 
 
 @kernel("int64(float64, float64)", inline=True)
@@ -196,7 +197,8 @@ def _moved(y: float, memory: F64, band: Band, losses: Losses) -> tuple[float, fl
     z = losses[2] * memory[2] + (1.0 - losses[2]) * lost
     i = _cell((y - grid[0]) / grid[1], lines.shape[1] - 1.0)
     e_by_y = losses[0] * by_y + losses[1] * (lines[1, i + 1] - lines[1, i]) / grid[1]
-    return w, z, 0.5 * (w + memory[1]) + z, 0.5 * by_y + (1.0 - losses[2]) * steeper * e_by_y
+    command = 0.5 * (w + memory[1]) + losses[7] * memory[2] + (1.0 - losses[7]) * lost
+    return w, z, command, 0.5 * by_y + (1.0 - losses[7]) * steeper * e_by_y
 
 
 @kernel(f"float64(float64, float64[::1], {_BAND}, {_LOSSES})")

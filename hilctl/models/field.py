@@ -1,5 +1,6 @@
 """Hysteresis of an effective field, with the losses that follow the permeability."""
 
+import math
 from collections.abc import Iterator
 from typing import Annotated, Literal, Self
 
@@ -10,7 +11,7 @@ from hilctl.base.arrays import F64
 from hilctl.base.strict import Strict
 from hilctl.kernels.field import Bank, Losses, field_forward, field_inverse
 from hilctl.models.base import HysteresisModel, Operator, Thresholds, Weights, refuse
-from hilctl.models.preisach import cell_problems
+from hilctl.models.preisach import cell_problems, table_problems
 
 _TOLERANCE_UM = 1e-6
 _EVEN = 1e-3
@@ -44,6 +45,25 @@ class FieldLosses(Strict):
     growth: NotNegative = 0.0
     bend: NotNegative = 0.0
     excess: NotNegative = 0.0
+
+    def sampled(self, sample_rate_hz: float, span: float) -> Losses:
+        """Return them as kernels take them, for a span of effective fields.
+
+        Commands are means over a sample, and so must what is lost of them be: that at its end
+        would be later the shorter the samples are.
+        """
+        lags = self.decay_s * sample_rate_hz
+        left = math.exp(-1.0 / lags) if lags > 0.0 else 0.0
+        return (
+            self.field_s * sample_rate_hz,
+            self.output_s * sample_rate_hz,
+            left,
+            self.growth,
+            self.bend,
+            self.excess,
+            even_excess(span),
+            (1.0 - left) * lags,
+        )
 
 
 class OutputCurve(Strict):
@@ -84,9 +104,10 @@ class FieldModel(HysteresisModel):
         thresholds: r of each line of plays, rising from 0; the first is 0.
         lengths: k of each drag, > 0.
         lowest: Lower end of the first cell of u, in the input unit.
-        cell: Width of a cell, > 0.
+        cell: Width of a cell of the plays, > 0.
         slopes: For each line of plays, then for each drag, what it rises by in each cell, um per
             input unit, >= 0; > 0 throughout the first line, which is what makes the inverse exist.
+            All plays have the same cells, and all drags have: over the same range as the plays'.
         coupling: Effective field for each um of the operators', in input units a um.
         curve: From the operators' output to displacement.
         losses: What the command is ahead by.
@@ -104,7 +125,14 @@ class FieldModel(HysteresisModel):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        refuse((*self._operator_problems(), *cell_problems(self.cell, self.slopes)))
+        plays, drags = self._lines()
+        refuse(
+            (
+                *self._operator_problems(),
+                *cell_problems(self.cell, plays),
+                *table_problems(drags),
+            )
+        )
         return self
 
     def _operator_problems(self) -> Iterator[str]:
@@ -120,25 +148,30 @@ class FieldModel(HysteresisModel):
                 f"{len(self.thresholds)} and {len(self.lengths)}"
             )
 
+    def _lines(self) -> tuple[tuple[Weights, ...], tuple[Weights, ...]]:
+        """Return the slopes of the plays, and those of the drags."""
+        plays = len(self.thresholds)
+        return self.slopes[:plays], self.slopes[plays:]
+
     @property
     def operators(self) -> int:
         """Number of plays, and of cells of drags, each of which remembers something."""
-        return len(self.thresholds) + len(self.lengths) * len(self.slopes[0])
+        return len(self.thresholds) + sum(map(len, self._lines()[1]))
 
     def _numbers(self) -> int:
         """Return how many numbers the memory has before the previous input."""
         return self.operators + 3 * len(self.lengths) + 5
 
     def _bank(self) -> Bank:
-        plays = len(self.thresholds)
-        slopes, drags = np.array(self.slopes[:plays]), np.array(self.slopes[plays:])
+        slopes, drags = map(np.array, self._lines())
         lines, cells = slopes.shape
+        wide = drags.shape[1] if drags.size else cells
         values = np.zeros((lines, cells + 1))
         np.cumsum(slopes * self.cell, axis=1, out=values[:, 1:])
         place = -self.lowest / self.cell
         of_rest = int(min(max(np.floor(place), 0.0), cells - 1.0))
         values -= values[:, [of_rest]] + slopes[:, [of_rest]] * self.cell * (place - of_rest)
-        grid = np.array([self.lowest, self.cell, float(cells)])
+        grid = np.array([self.lowest, self.cell, cells, self.cell * (cells / wide), wide])
         lengths = np.array(self.lengths, dtype=np.float64)
         return np.array(self.thresholds), lengths, values.ravel(), drags.ravel(), grid
 
@@ -147,26 +180,13 @@ class FieldModel(HysteresisModel):
         width = self.cell * len(self.slopes[0])
         return self.lowest - width, self.lowest + 2.0 * width, _TOLERANCE_UM
 
-    def _losses(self, sample_rate_hz: float) -> Losses:
-        lost = self.losses
-        left = float(np.exp(-1.0 / (lost.decay_s * sample_rate_hz))) if lost.decay_s > 0.0 else 0.0
-        even = even_excess(self.cell * len(self.slopes[0]))
-        return (
-            lost.field_s * sample_rate_hz,
-            lost.output_s * sample_rate_hz,
-            left,
-            lost.growth,
-            lost.bend,
-            lost.excess,
-            even,
-        )
-
     def _curve(self) -> tuple[F64, F64]:
         return np.array(self.curve.operators_um), np.array(self.curve.displacement_um)
 
     def forward(self, sample_rate_hz: float) -> Operator:
         """Return the operator from command to um, at rest."""
-        span, bank, losses = self._span(), self._bank(), self._losses(sample_rate_hz)
+        span, bank = self._span(), self._bank()
+        losses = self.losses.sampled(sample_rate_hz, self.cell * len(self.slopes[0]))
         coupling, curve = self.coupling, self._curve()
 
         def run(v: F64, memory: F64, out: F64) -> None:
@@ -176,7 +196,8 @@ class FieldModel(HysteresisModel):
 
     def inverse(self, sample_rate_hz: float) -> Operator:
         """Return the operator from um to command, at rest."""
-        span, bank, losses = self._span(), self._bank(), self._losses(sample_rate_hz)
+        span, bank = self._span(), self._bank()
+        losses = self.losses.sampled(sample_rate_hz, self.cell * len(self.slopes[0]))
         coupling, curve = self.coupling, self._curve()
 
         def run(y: F64, memory: F64, out: F64) -> None:

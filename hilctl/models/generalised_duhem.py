@@ -9,7 +9,7 @@ from pydantic import model_validator
 from hilctl.base.arrays import F64
 from hilctl.kernels.generalised_duhem import Band, Losses, duhem_forward, duhem_inverse
 from hilctl.models.base import HysteresisModel, Operator, Weights, refuse
-from hilctl.models.field import FieldLosses, even_excess
+from hilctl.models.field import FieldLosses
 
 Slopes: TypeAlias = tuple[Weights, ...]
 _LEAST_STEPS = 2.0  # steps of y from node to node, at least
@@ -97,17 +97,7 @@ class GeneralisedDuhemModel(HysteresisModel):
         return band_of(slopes, lines, self.lowest_um, self.cell_um, self.half_width)
 
     def _losses(self, sample_rate_hz: float) -> Losses:
-        lost = self.losses
-        left = float(np.exp(-1.0 / (lost.decay_s * sample_rate_hz))) if lost.decay_s > 0.0 else 0.0
-        return (
-            lost.field_s * sample_rate_hz,
-            lost.output_s * sample_rate_hz,
-            left,
-            lost.growth,
-            lost.bend,
-            lost.excess,
-            even_excess(self.centre[-1] - self.centre[0]),
-        )
+        return self.losses.sampled(sample_rate_hz, self.centre[-1] - self.centre[0])
 
     def forward(self, sample_rate_hz: float) -> Operator:
         """Return the operator from command to um, at rest."""

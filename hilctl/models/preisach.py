@@ -73,10 +73,15 @@ def cell_problems(cell: float, slopes: Sequence[Weights]) -> Iterator[str]:
     """Give what keeps lines of slopes over even cells from having an inverse."""
     if not cell > 0.0:
         yield f"cell must be > 0: {cell!r}"
+    yield from table_problems(slopes)
+    if slopes and not all(slope > 0.0 for slope in slopes[0]):
+        yield "slopes of the first line must be > 0 for the inverse to exist"
+
+
+def table_problems(slopes: Sequence[Weights]) -> Iterator[str]:
+    """Give what keeps lines of slopes from standing beside one another."""
     for i, line in enumerate(slopes):
         if len(line) != len(slopes[0]) or not line:
             yield f"every line of slopes must have the same cells: {len(line)} in line {i}"
         if any(slope < 0.0 for slope in line):
             yield f"slopes must be >= 0 for the inverse to exist: {min(line)!r} in line {i}"
-    if slopes and not all(slope > 0.0 for slope in slopes[0]):
-        yield "slopes of the first line must be > 0 for the inverse to exist"

@@ -293,7 +293,9 @@ def summary(results: Sequence[Result], name: str) -> tuple[str, bool]:
 
 def show(rig: Rig, options: argparse.Namespace) -> tuple[dict[str, Any], bool]:
     """Print the table of one physics; return it as mappings, and whether every goal is met."""
-    fit, took_s = identified(rig, options.model, seed=3)
+    fit, took_s = identified(rig, options.model, options.seed)
+    provenance = fit.model.provenance
+    taken = provenance.method if provenance else ""
     low_um, high_um = fit.model.output_range_um or (-50.0, 35.0)
     margin = MARGIN * (high_um - low_um)
     inside = Stroke(low_um + margin, high_um - margin)
@@ -302,7 +304,7 @@ def show(rig: Rig, options: argparse.Namespace) -> tuple[dict[str, Any], bool]:
     also = [name for name in ("conditioned", "floor") if getattr(options, name)]
     names = ["from rest", *also]
     say = partial(print, file=sys.stderr if options.json else sys.stdout, flush=True)
-    say(f"\n{' '.join([rig.physics, *options.options])}, {options.model}: "
+    say(f"\n{' '.join([rig.physics, *options.options])}, {options.model}, {taken}: "
         f"{took_s:.1f} s of processor time, inverse {cost:.2f} us a sample")  # fmt: skip
     say(f"{'reference':20} {'peak %':>7} {'no mean':>8} {'rms %':>6} {'noise':>6}"
         + "".join(f" | {name:>13}" for name in names) + " | goal")  # fmt: skip
@@ -317,7 +319,7 @@ def show(rig: Rig, options: argparse.Namespace) -> tuple[dict[str, Any], bool]:
     table = {
         "physics": rig.physics,
         "options": list(options.options),
-        "model": getattr(fit.model, "kind"),  # noqa: B009
+        "model": taken,
         "fit_s": took_s,
         "inverse_us": cost,
         "rows": [result.to_mapping() for result in results],
@@ -335,6 +337,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
     parser.add_argument("--physics", nargs="*", default=list(PHYSICS), choices=list(PHYSICS))
     parser.add_argument("--model", default="field", help="kind of model, or auto")
+    parser.add_argument("--seed", type=int, default=3, help="noise that it is identified under")
     parser.add_argument("--rows", nargs="*", default=[], help="parts of names of references")
     parser.add_argument("--options", nargs="*", default=[], choices=list(EXTRAS))
     parser.add_argument("--condition", dest="conditioned", action="store_true")

@@ -2,6 +2,8 @@
 
 import math
 
+import numpy as np
+
 from hilctl.base.arrays import F64, I64
 from hilctl.kernels.jit import kernel
 
@@ -102,34 +104,78 @@ def turning_points(u: F64, distance: float, out: I64) -> int:
     return count
 
 
-@kernel("float64(float64, float64, float64)", inline=True)
-def _ramp(u: float, low: float, width: float) -> float:
-    return min(max(u - low, 0.0), width)
+@kernel("int64(float64[::1], int64[::1], int64[::1], int64[::1])")
+def needed_points(u: F64, rows: I64, points: I64, places: I64) -> int:
+    """Find the rows of a path and all samples at which it turns: operators need no others.
+
+    Args:
+        u: float64[n].
+        rows: int64[N], rising.
+        points: int64[n], filled with samples.
+        places: int64[N], filled with where each row stands among these.
+
+    Returns:
+        How many points there are.
+    """
+    count = row = 0
+    for k in range(u.size):
+        if row == rows.size:
+            break
+        is_row = rows[row] == k
+        turns = k == 0 or k + 1 == u.size or (u[k] - u[k - 1]) * (u[k + 1] - u[k]) < 0.0
+        if is_row:
+            places[row] = count
+            row += 1
+        if is_row or turns:
+            points[count] = k
+            count += 1
+    return count
+
+
+@kernel("void(float64, float64, float64, float64, float64[::1])")
+def _add_splines(u: float, lowest: float, width: float, sign: float, out: F64) -> None:
+    """Add the integral of each quadratic spline from the lowest u to this one, times a sign."""
+    pieces = out.size - 2
+    place = (u - lowest) / width
+    j = int(min(max(math.floor(place), 0.0), pieces - 1.0))
+    for i in range(j):
+        out[i] += width * sign / 6.0
+        out[i + 1] += width * sign * 2.0 / 3.0
+        out[i + 2] += width * sign / 6.0
+    t = min(max(place - j, 0.0), 1.0)
+    below, above = min(place, 0.0), max(place - pieces, 0.0)
+    cube = t * t * t
+    out[j] += width * sign * ((1.0 - (1.0 - t) ** 3) / 6.0 + 0.5 * below)
+    out[j + 1] += width * sign * (0.5 * (t + t * t) - cube / 3.0 + 0.5 * (below + above))
+    out[j + 2] += width * sign * (cube / 6.0 + 0.5 * above)
 
 
 @kernel("void(float64[::1], int64[::1], float64[::1], float64, float64, int64, float64[:, ::1])")
 def play_columns(
-    u: F64, rows: I64, thresholds: F64, lowest: float, width: float, cells: int, out: F64
+    u: F64, rows: I64, thresholds: F64, lowest: float, width: float, splines: int, out: F64
 ) -> None:
-    """Fill in how far each play has gone through each cell.
+    """Fill in what each play gives from rest for slopes that are a quadratic B-spline.
+
+    Sums of these are as smooth as what rods do, and not negative where their weights are not.
 
     Args:
         u: float64[n], a path from rest; it need hold no more than its turning points.
         rows: int64[N], samples of the path that are filled in, rising.
         thresholds: float64[p].
-        lowest: Lower end of the first cell; the first and the last go on for ever.
-        width: Of a cell.
-        cells: Number of cells c.
-        out: float64[N, p c], filled.
+        lowest: Where the pieces of the splines begin; slopes go on even before it.
+        width: Of a piece.
+        splines: How many there are, c >= 3, over c - 2 pieces.
+        out: float64[N, m], of which the first p c columns are filled.
     """
+    rest = np.zeros(splines)
+    _add_splines(0.0, lowest, width, -1.0, rest)
     for i in range(thresholds.size):
         held = 0.0
-        first, k = i * cells, 0
+        first, k = i * splines, 0
         for row in range(rows.size):
             while k <= rows[row]:
                 held = max(min(held, u[k] + thresholds[i]), u[k] - thresholds[i])
                 k += 1
-            for j in range(cells):
-                out[row, first + j] = _ramp(held, lowest + j * width, width)
-            out[row, first] += min(held - lowest, 0.0)
-            out[row, first + cells - 1] += max(held - lowest - cells * width, 0.0)
+            columns = out[row, first : first + splines]
+            columns[:] = rest
+            _add_splines(held, lowest, width, 1.0, columns)

@@ -27,6 +27,10 @@ class Place:
     slope: F64
     normal: F64
 
+    def scaled(self, factor: float) -> "Place":
+        """Return the place of that many times the sum."""
+        return Place(factor * self.squares, factor * self.slope, factor * self.normal)
+
 
 def settle(
     sum_of: Callable[[F64], float],

@@ -2,6 +2,9 @@
 
 import math
 
+import numpy as np
+
+from hilctl.base.arrays import F64
 from hilctl.base.errors import DataError
 from hilctl.identify.data.records import History, SteadyLoop
 from hilctl.identify.field.prepared import Prepared
@@ -10,6 +13,8 @@ from hilctl.identify.field.stages import Stages
 from hilctl.identify.job import FitJob, FoundModel
 from hilctl.models.field import FieldModel, OutputCurve
 from hilctl.models.staged import StagedModel, Structure
+
+FINER = 8  # cells of the model's tables to each piece of a spline
 
 
 def fit_field(job: FitJob) -> FoundModel:
@@ -36,12 +41,14 @@ def fit_field(job: FitJob) -> FoundModel:
 
 def _model(job: FitJob, found: FieldEnd) -> StagedModel:
     grid, weights, known = found.grid, found.weights, found.known
+    drags = weights.slopes[grid.thresholds.size :].tolist()
+    lines = (*tabled(weights.slopes[: grid.thresholds.size]), *drags)
     hysteresis = FieldModel(
         thresholds=tuple(grid.thresholds.tolist()),
         lengths=tuple(grid.lengths.tolist()),
         lowest=grid.lowest,
-        cell=grid.width,
-        slopes=tuple(tuple(line) for line in weights.slopes.tolist()),
+        cell=grid.piece / FINER,
+        slopes=tuple(tuple(line) for line in lines),
         coupling=known.coupling,
         curve=OutputCurve(
             operators_um=tuple(weights.curve.operators.tolist()),
@@ -54,6 +61,19 @@ def _model(job: FitJob, found: FieldEnd) -> StagedModel:
         natural_hz=0.5 / (math.pi * known.radian_s), damping_ratio=known.damping_ratio
     )
     return StagedModel.around(hysteresis, structure=structure, delay_s=known.delay_s)
+
+
+def tabled(splines: F64) -> list[list[float]]:
+    """Return the slopes that splines come to, in FINER cells to each of their pieces.
+
+    Args:
+        splines: float64[p, c], weights of the splines of each play.
+    """
+    t = (np.arange(FINER) + 0.5) / FINER
+    parts = 0.5 * (1.0 - t) ** 2, 0.5 + t - t**2, 0.5 * t**2
+    pieces = splines.shape[1] - 2
+    found = sum(splines[:, k : k + pieces, None] * part for k, part in enumerate(parts))
+    return np.reshape(found, (len(splines), -1)).tolist()
 
 
 def _parameters(found: FieldEnd) -> dict[str, float]:

@@ -11,9 +11,10 @@ from hilctl.identify.data.records import History
 from hilctl.identify.field.columns import bare_displacement, corners
 from hilctl.models.chain import smoothing_weights
 
-POINTS = 45  # samples that are left of the fastest cycle
+POINTS = 90  # samples that are left of the fastest cycle
 SMOOTHED = 0.09  # of a radian of the fastest cycle: how far the displacement is smoothed
-OFF = 5e-4  # of a signal's peak-to-peak: how far straight lines between samples may be from it
+OFF = 5e-4  # of the displacement's peak-to-peak: how far straight lines may be from it
+COMMAND_OFF = 1e-4  # the same for commands, on which the operators turn
 LONGEST = 0.3  # cycles of the fastest: longest step
 
 
@@ -25,9 +26,8 @@ class Run:
         rate_hz: Of the record.
         kept: int64[n], the samples that are left.
         step_s: float64[n], time since the one before.
-        late: float64[n], part of the step after which each command is taken: a half in the shortest
-            steps, nearly 1 in those over which every loss has gone.
-        command: float64[n].
+        command: float64[n], at the end of each step.
+        mean: float64[n], the command's mean over each step.
         derivatives: float64[3, N], displacement of all samples in um and its derivatives by time.
         judged: First sample of ``kept`` that counts.
     """
@@ -35,8 +35,8 @@ class Run:
     rate_hz: float
     kept: I64
     step_s: F64
-    late: F64
     command: F64
+    mean: F64
     derivatives: F64
     judged: int
 
@@ -44,6 +44,20 @@ class Run:
     def time_s(self) -> F64:
         """Time of each sample that is left."""
         return self.kept / self.rate_hz
+
+    def late_command(self, lag_s: float) -> tuple[F64, F64]:
+        """Return when in each step to take its command, and the command there: float64[n] each.
+
+        A lag's steps are exact for commands that go straight if their ends are weighed as its
+        answer to a constant asks: the middle of a short step, the end of one that it has settled
+        in. Steps are of all lengths, so no one rule does.
+
+        Args:
+            lag_s: Time constant, > 0.
+        """
+        lags = np.maximum(self.step_s / lag_s, 1e-3)
+        late = -1.0 / np.expm1(-lags) - 1.0 / lags
+        return late, self.mean + (2.0 * late - 1.0) * (self.command - self.mean)
 
     def bare_um(self, delay_s: float, slope_s: float, bend_s2: float) -> F64:
         """Return the displacement before delay and structure: float64[n]."""
@@ -56,6 +70,11 @@ class Run:
 class Prepared:
     """All records.
 
+    Args:
+        records: The records.
+        points: Samples that are left of the fastest cycle.
+        command_off: Of the peak-to-peak command: how far straight lines may be from it.
+
     Attributes:
         runs: The records.
         reach: Half the largest peak-to-peak command.
@@ -63,8 +82,11 @@ class Prepared:
         top_hz: Frequency of a sine that is as fast as the fastest record.
     """
 
-    def __init__(self, records: Sequence[History]) -> None:
+    def __init__(
+        self, records: Sequence[History], points: int = POINTS, command_off: float = COMMAND_OFF
+    ) -> None:
         """Smooth and thin records."""
+        self._points, self._command_off = points, command_off
         self.reach = max(0.5 * float(np.ptp(record.command)) for record in records)
         self.stroke_um = max(float(np.ptp(record.displacement_um)) for record in records)
         self.top_hz = max(_speed(record) for record in records) / (2.0 * math.pi * self.reach)
@@ -80,33 +102,26 @@ class Prepared:
         derivatives = np.stack(
             [np.convolve(padded, weights[::-1], "valid") for weights in (plain, by_slope, by_bend)]
         )
-        thin = max(1, math.floor(rate_hz / (POINTS * self.top_hz)))
+        thin = max(1, math.floor(rate_hz / (self._points * self.top_hz)))
         furthest = max(thin, math.floor(LONGEST * rate_hz / self.top_hz))
         kept = np.empty(command.size, dtype=np.int64)
-        off = 2.0 * OFF * self.reach, OFF * self.stroke_um
+        off = 2.0 * self._command_off * self.reach, OFF * self.stroke_um
         count = corners(np.ascontiguousarray(command), derivatives[0], *off, thin, furthest, kept)
         kept = kept[:count].copy()
         steps = np.diff(kept, prepend=kept[0])
-        late = 1.0 - 0.5 * thin / np.maximum(steps, thin)
+        at_end = 0.5 * (command[kept] + command[np.maximum(kept - 1, 0)])
+        held = np.cumsum(np.concatenate(([command[0]], command)))
+        mean = np.full(kept.size, command[0])
+        mean[1:] = np.diff(held[kept]) / np.diff(kept)
         return Run(
             rate_hz,
             kept,
             steps / rate_hz,
-            late,
-            _late_command(command, kept, late),
+            at_end,
+            mean,
             np.ascontiguousarray(derivatives),
             int(np.searchsorted(kept, record.ignore)),
         )
-
-
-def _late_command(command: F64, kept: I64, late: F64) -> F64:
-    """Return the command after a part of each step: half of it is the mean over the step."""
-    held = np.cumsum(np.concatenate(([command[0]], command)))
-    at_end = 0.5 * (command[kept] + command[np.maximum(kept - 1, 0)])
-    mean = np.empty(kept.size)
-    mean[0] = command[0]
-    mean[1:] = np.diff(held[kept]) / np.diff(kept)
-    return np.asarray(mean + (2.0 * late - 1.0) * (at_end - mean))
 
 
 def _speed(record: History) -> float:

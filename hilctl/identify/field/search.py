@@ -1,5 +1,6 @@
 """From a few starts to the stages; the weights follow from them, round by round."""
 
+import math
 from dataclasses import dataclass, replace
 from typing import TypeAlias
 
@@ -8,6 +9,7 @@ import numpy as np
 from hilctl.base.arrays import F64, I64
 from hilctl.identify.field.columns import turning_points
 from hilctl.identify.field.descent import Place, settle
+from hilctl.identify.field.polish import TRIED, Polish, Rows
 from hilctl.identify.field.prepared import Prepared
 from hilctl.identify.field.stages import (
     HIGH,
@@ -27,14 +29,11 @@ from hilctl.identify.job import OnProgress
 SEARCH_WAY, FINAL_WAY = 0.06, 0.02  # of the span: furthest way between two samples of a path
 MARGIN = 0.1  # of the span: room of the tables beyond what the data reach
 LENGTHS = (0.05, 0.4)  # of half the span: shortest and longest drag
-SPREAD = 1.4  # exponent: thresholds are closer together near 0
-SEARCH_ROWS, FINAL_ROWS = 2500, 12_000
+SEARCH_ROWS, POLISH_ROWS, FINAL_ROWS = 2500, 4000, 12_000
 ROUNDS = 2
-TRIED = 0.2  # of a unit: change that slopes are taken by; kinks of single rows are smoothed
 FIRST_LAGS = (0.02, 0.1, 0.4)  # starts: lag of the field
 NEAR_BOUND = 0.95
 STIFFER = (0.02, 0.05)  # radians of other starts, where the first leads to a bound
-FIRST_COUPLINGS = (-0.6, -0.3, 0.0, 0.3)
 LEAST_WIDEST = 0.1  # of half the span
 TAIL = 0.02  # of all weights: those of thresholds beyond the widest that is worth its place
 
@@ -113,8 +112,7 @@ class FieldSearch:
         coarse = self._size.coarse
         tried = [self._tried(replace(first, field=lag), coarse) for lag in FIRST_LAGS]
         first = min(tried, key=_error)[1]
-        tried = [self._tried(replace(first, coupling=c), coarse) for c in FIRST_COUPLINGS]
-        x = row(min(tried, key=_error)[1])
+        x = row(first)
         self._forget()
         for turn in range(ROUNDS):
             part = (turn + 0.2) / (ROUNDS + 1)
@@ -156,6 +154,16 @@ class FieldSearch:
 
         return settle(sum_of, place_of, x, (row(LOW), row(HIGH)), row(STEP))
 
+    def _polished(self, x: F64, paths: Paths) -> F64:
+        """Return better stages; better thresholds stand in the grid."""
+
+        def rows_of(stages: F64) -> Rows:
+            fields, y, known = self._rows(stages, paths)
+            return Rows(fields, y, self._swelling(fields, known) * self._scale(y))
+
+        x, self._grid = Polish(rows_of, paths, self._laid(), self._least).follow(x)
+        return x
+
     def _slopes(self, x: F64, here: F64, paths: Paths) -> F64:
         out = np.empty((here.size, len(NAMES)))
         for i, step in enumerate(TRIED * row(STEP)):
@@ -173,9 +181,12 @@ class FieldSearch:
         explains the output by itself would look best.
         """
         fields, y, known = self._rows(x, paths)
+        return self._weights(fields, y, paths).errors_um * self._swelling(fields, known)
+
+    def _swelling(self, fields: list[F64], known: Physical) -> float:
         reach = max(float(np.ptp(u)) for u in fields)
         alone = max(reach - known.coupling * self._data.stroke_um, 0.1 * reach)
-        return self._weights(fields, y, paths).errors_um * (reach / alone)
+        return reach / alone
 
     def _solved(self, x: F64, paths: Paths) -> Weights:
         fields, y, _ = self._rows(x, paths)
@@ -236,35 +247,37 @@ class FieldSearch:
         high = max(float(u.max()) for u in fields)
         span = high - low
         lowest, width = low - MARGIN * span, (1.0 + 2.0 * MARGIN) * span / size.cells
-        spread = (np.arange(size.plays) / size.plays) ** SPREAD
+        spread = np.arange(size.plays) / size.plays
         lengths = 0.5 * span * np.array(_lengths(size.drags))
         self._grid = Grid(
             0.5 * span * self._widest * spread, lengths, lowest, width, size.cells, size.knots
         )
 
-    def _paths(self, *, final: bool = False) -> Paths:
+    def _paths(self, way: float = SEARCH_WAY, most: int = SEARCH_ROWS) -> Paths:
         """Return the rows: where commands turn, and as far apart as they go."""
-        way, most = (FINAL_WAY, FINAL_ROWS) if final else (SEARCH_WAY, SEARCH_ROWS)
         rows = []
         for run in self._data.runs:
             out = np.empty(run.command.size, dtype=np.int64)
             count = turning_points(run.command, way * 2.0 * self._data.reach, out)
             rows.append(out[:count][out[:count] >= run.judged])
-        step = max(1, sum(each.size for each in rows) // most)
+        step = max(1, math.ceil(sum(each.size for each in rows) / most))
         return tuple(np.ascontiguousarray(each[::step]) for each in rows)
 
     def _end(self, x: F64) -> FieldEnd:
-        self._lay(stages_in(x), self._size)
-        paths = self._paths(final=True)
+        paths = self._paths(FINAL_WAY, POLISH_ROWS)
+        for _ in range(2):
+            self._lay(stages_in(x), self._size)
+            self._learn(x, paths)
+        x = self._polished(x, paths)
+        paths = self._paths(FINAL_WAY, FINAL_ROWS)
         self._learn(x, paths)
         found = self._solved(x, paths)
         return FieldEnd(physical(stages_in(x), self._data), self._laid(), found)
 
 
 def _at_bound(stages: Stages) -> bool:
-    """Return whether structure or coupling have come about as far as they may go."""
-    far = NEAR_BOUND * HIGH.radian, NEAR_BOUND * LOW.coupling, NEAR_BOUND * HIGH.coupling
-    return stages.radian > far[0] or not far[1] < stages.coupling < far[2]
+    """Return whether the structure has become about as soft as it may."""
+    return stages.radian > NEAR_BOUND * HIGH.radian
 
 
 def _error(tried: tuple[float, Stages]) -> float:

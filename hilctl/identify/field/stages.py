@@ -41,9 +41,11 @@ class Stages:
     delay: float = 0.03
 
 
+SHORTEST_S = 1e-9  # of lags
+
 NAMES = tuple(field.name for field in fields(Stages))
 LOW = Stages(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -0.95, 0.01, 0.02, 0.0)
-HIGH = Stages(2.0, 2.0, 0.3, 3.0, 5.0, 0.5, 0.6, 0.3, 2.0, 0.3)
+HIGH = Stages(2.0, 2.0, 0.3, 10.0, 20.0, 0.5, 0.6, 0.3, 2.0, 0.3)
 STEP = Stages(0.02, 0.02, 0.01, 0.05, 0.05, 0.01, 0.05, 0.02, 0.05, 0.01)
 """Bounds, and changes that make about as much difference as each other."""
 
@@ -60,13 +62,14 @@ def stages_in(x: F64) -> Stages:
 
 @dataclass(frozen=True, slots=True)
 class Physical:
-    """The same in s, um and the unit of the command."""
+    """The same in s, um and the unit of the command; and the lag of small, slow changes in all."""
 
     losses: FieldLosses
     coupling: float
     radian_s: float
     damping_ratio: float
     delay_s: float
+    lag_s: float
 
 
 def physical(stages: Stages, data: Prepared) -> Physical:
@@ -87,6 +90,7 @@ def physical(stages: Stages, data: Prepared) -> Physical:
         stages.radian * unit_s,
         stages.damping,
         stages.delay * unit_s,
+        (stages.field + stages.output) * unit_s,
     )
 
 
@@ -111,7 +115,9 @@ def signals(run: Run, known: Physical, curve: Curve | None, span: float) -> tupl
         lost.bend,
         lost.excess,
         even_excess(span),
+        0.0,
     )
     w = np.empty_like(y)
-    field_left(run.command, run.late, run.step_s, m, losses, w)
+    late, command = run.late_command(max(known.lag_s, SHORTEST_S))
+    field_left(command, late, run.step_s, m, losses, w)
     return w + known.coupling * m, y

@@ -6,21 +6,25 @@ both sides makes no difference. What data leave open, smoothness decides, so the
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.linalg import cholesky, solve_triangular
 from scipy.optimize import nnls
 
 from hilctl.base.arrays import F64, I64
-from hilctl.identify.field.columns import play_columns
+from hilctl.identify.field.columns import needed_points, play_columns
+from hilctl.identify.field.descent import Place
 from hilctl.identify.linear import RIDGE
 from hilctl.kernels.field import drag_columns
 
 STEEPEST = 6.0  # slope of the curve, of its mean
 SMOOTH = 0.01  # weight of a difference of neighbours, relative to the longest column
+SMOOTH_PLAYS = 10  # lines beyond which it falls with their number, as their densities do
 CURVE_SMOOTH = 0.02  # the same for the curve's slopes
 EDGE = 0.1  # of half a turn: how much closer they lie
+CHANGED = 0.05  # of the way to the next threshold: change of one that its slope is taken by
 MOVED = 1e-3  # of the furthest: a column that moves less is left out
 
 
@@ -33,7 +37,7 @@ class Grid:
         lengths: float64[d], of the drags.
         lowest: Lower end of the first cell of the effective field.
         width: Of a cell.
-        cells: Number of cells.
+        cells: Number of cells of the drags, and of splines of the plays over the same range, >= 3.
         knots: Corners of the curve.
     """
 
@@ -48,6 +52,11 @@ class Grid:
     def lines(self) -> int:
         """Plays and drags."""
         return int(self.thresholds.size + self.lengths.size)
+
+    @property
+    def piece(self) -> float:
+        """Width of a piece of the splines."""
+        return self.width * self.cells / (self.cells - 2)
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,16 +80,23 @@ class Weights:
     """What was found.
 
     Attributes:
-        slopes: float64[lines, cells], um per command unit.
+        slopes: float64[lines, cells], um per command unit; of plays those of their splines.
         curve: From the operators' output to displacement, without the offset.
         offset_um: Displacement at rest.
         errors_um: float64[N], modelled less measured displacement of the rows.
+        squares: Sum of the weighted squares of the operators' errors, and of the prior's.
     """
 
     slopes: F64
     curve: Curve
     offset_um: float
     errors_um: F64
+    squares: float = 0.0
+
+    def errors_of(self, columns: F64, y: F64) -> F64:
+        """Return errors of the operators' output at rows that may be others: float64[N]."""
+        curve = Curve(self.curve.operators, self.curve.displacement_um + self.offset_um)
+        return np.asarray(columns @ self.slopes.ravel() - curve.operators_of(y))
 
 
 def table(paths: Sequence[F64], kept: Sequence[I64], grid: Grid) -> F64:
@@ -93,9 +109,11 @@ def table(paths: Sequence[F64], kept: Sequence[I64], grid: Grid) -> F64:
     """
     plays, cells = grid.thresholds.size, grid.cells
     parts: list[F64] = []
-    for u, rows in zip(paths, kept, strict=True):
+    for path, samples in zip(paths, kept, strict=True):
+        points, rows = np.empty(path.size, dtype=np.int64), np.empty_like(samples)
+        u = path[points[: needed_points(path, samples, points, rows)]]
         out = np.empty((rows.size, grid.lines * cells))
-        play_columns(u, rows, grid.thresholds, grid.lowest, grid.width, cells, out)
+        play_columns(u, rows, grid.thresholds, grid.lowest, grid.piece, cells, out)
         for i, length in enumerate(grid.lengths):
             first = (plays + i) * cells
             drag_columns(u, rows, length, grid.lowest, grid.width, cells, first, out)
@@ -103,8 +121,31 @@ def table(paths: Sequence[F64], kept: Sequence[I64], grid: Grid) -> F64:
     return np.concatenate(parts)
 
 
-def solve(columns: F64, y: F64, grid: Grid, least: float, scale: F64) -> Weights:
-    """Find all weights.
+def by_threshold(paths: Sequence[F64], kept: Sequence[I64], grid: Grid, slopes: F64) -> F64:
+    """Return by how much the operators' output changes with each threshold but the first.
+
+    Args:
+        paths: See :func:`table`.
+        kept: See :func:`table`.
+        grid: The operators.
+        slopes: float64[lines, cells].
+
+    Returns:
+        float64[N, p - 1].
+    """
+    step = CHANGED * float(np.diff(grid.thresholds).min())
+    out = []
+    for i in range(1, grid.thresholds.size):
+        both = []
+        for r in (grid.thresholds[i] - step, grid.thresholds[i] + step):
+            one = replace(grid, thresholds=np.array([r]), lengths=np.empty(0))
+            both.append(table(paths, kept, one) @ slopes[i])
+        out.append((both[1] - both[0]) / (2.0 * step))
+    return np.stack(out, axis=1)
+
+
+class Equations:
+    """Linear equations of all weights, of which the operators' output and the curve's differ least.
 
     Args:
         columns: What :func:`table` returned.
@@ -113,65 +154,105 @@ def solve(columns: F64, y: F64, grid: Grid, least: float, scale: F64) -> Weights
         least: Smallest slope of the first line, um per command unit.
         scale: float64[N], square root of each row's weight.
     """
-    stroke = float(np.ptp(y))
-    moved = np.ptp(columns, axis=0)
-    used = moved > MOVED * float(moved.max())
-    used[: grid.cells] = True
-    # Magnetostriction begins and ends flat: there the inverse bends most, so corners lie closer.
-    even = 0.5 - 0.5 * np.cos(np.pi * np.linspace(EDGE, 1.0 - EDGE, grid.knots + 1))
-    knots = float(y.min()) + float(np.ptp(y)) * (even - even[0]) / (even[-1] - even[0])
-    parts = _segments(y, knots)
-    anchor = int(np.clip(np.searchsorted(knots, 0.0) - 1, 0, grid.knots - 1))
-    others = np.delete(np.arange(grid.knots), anchor)
-    share = np.diff(knots) / np.diff(knots)[anchor]
-    left = np.hstack([columns[:, used], parts[:, [anchor]] * share[others] - parts[:, others]])
-    lows = np.zeros(left.shape[1])
-    lows[: grid.cells] = least
-    lows[left.shape[1] - others.size :] = 1.0 / STEEPEST
-    target = float(share.sum()) * parts[:, anchor]
-    longest = float(np.linalg.norm(columns * scale[:, None], axis=0).max())
-    held = CURVE_SMOOTH * stroke / grid.knots * float(np.linalg.norm(scale))
-    prior, wanted = _prior(used, grid, longest, (others, anchor, share, held))
-    found, constant = _bounded(left, target, scale, (prior, wanted), lows)
-    curve_slopes = np.empty(grid.knots)
-    curve_slopes[others] = found[left.shape[1] - others.size :]
-    rest = float(share.sum() - share[others] @ curve_slopes[others])
-    curve_slopes[anchor] = max(rest, 1.0 / STEEPEST)
-    slopes = np.zeros(columns.shape[1])
-    slopes[used] = found[: left.shape[1] - others.size]
-    errors = (left @ found + constant - target) / (
-        curve_slopes[np.clip(np.searchsorted(knots, y) - 1, 0, grid.knots - 1)]
-    )
-    lines = slopes.reshape(grid.lines, grid.cells)
-    values = np.concatenate(([0.0], np.cumsum(curve_slopes * np.diff(knots))))
-    edges = grid.lowest + grid.width * np.arange(grid.cells)
-    plays = lines[: grid.thresholds.size]
-    at_rest = float((plays @ np.clip(-edges, 0.0, grid.width)).sum())
-    # A model's operators give 0 at rest, where the columns give what the field has passed by then.
-    operators = values - constant - at_rest
-    offset_um = float(Curve(knots, operators).operators_of(np.zeros(1))[0])
-    return Weights(lines, Curve(operators, knots - offset_um), offset_um, errors)
+
+    def __init__(self, columns: F64, y: F64, grid: Grid, least: float, scale: F64) -> None:
+        """Leave out what does not move, and lay the curve's corners."""
+        self._y, self._grid, self._scale = y, grid, scale
+        moved = np.ptp(columns, axis=0)
+        self._used = moved > MOVED * float(moved.max())
+        self._used[: grid.cells] = True
+        # Magnetostriction begins and ends flat: there its inverse bends most, corners lie closer.
+        even = 0.5 - 0.5 * np.cos(np.pi * np.linspace(EDGE, 1.0 - EDGE, grid.knots + 1))
+        self._knots = float(y.min()) + float(np.ptp(y)) * (even - even[0]) / (even[-1] - even[0])
+        parts = _segments(y, self._knots)
+        anchor = int(np.clip(np.searchsorted(self._knots, 0.0) - 1, 0, grid.knots - 1))
+        self._anchor, self._others = anchor, np.delete(np.arange(grid.knots), anchor)
+        self._share = np.diff(self._knots) / np.diff(self._knots)[anchor]
+        bends = parts[:, [anchor]] * self._share[self._others] - parts[:, self._others]
+        self._left = np.hstack([columns[:, self._used], bends])
+        self._target = float(self._share.sum()) * parts[:, anchor]
+        self._lows = np.zeros(self._left.shape[1])
+        self._lows[: grid.cells] = least
+        self._lows[self._left.shape[1] - self._others.size :] = 1.0 / STEEPEST
+        longest = float(np.linalg.norm(columns * scale[:, None], axis=0).max())
+        held = CURVE_SMOOTH * float(np.ptp(y)) / grid.knots * float(np.linalg.norm(scale))
+        curve = self._others, anchor, self._share, held
+        self._prior, self._wanted = _prior(self._used, grid, longest, curve)
+
+    def solve(self) -> Weights:
+        """Find all weights."""
+        found, constant = self._found
+        grid, others = self._grid, self._others
+        curve_slopes = np.empty(grid.knots)
+        curve_slopes[others] = found[found.size - others.size :]
+        rest = float(self._share.sum() - self._share[others] @ curve_slopes[others])
+        curve_slopes[self._anchor] = max(rest, 1.0 / STEEPEST)
+        slopes = np.zeros(self._used.size)
+        slopes[self._used] = found[: found.size - others.size]
+        errors = (self._left @ found + constant - self._target) / (
+            curve_slopes[np.clip(np.searchsorted(self._knots, self._y) - 1, 0, grid.knots - 1)]
+        )
+        values = np.concatenate(([0.0], np.cumsum(curve_slopes * np.diff(self._knots))))
+        operators = values - constant  # these give 0 at rest
+        offset_um = float(Curve(self._knots, operators).operators_of(np.zeros(1))[0])
+        curve = Curve(operators, self._knots - offset_um)
+        residual = (self._left @ found + constant - self._target) * self._scale
+        held = self._prior @ found - self._wanted
+        squares = float(residual @ residual + held @ held)
+        lines = slopes.reshape(grid.lines, grid.cells)
+        return Weights(lines, curve, offset_um, errors, squares)
+
+    def place(self, errors: F64, changes: F64) -> Place:
+        """Return the sum of squares where changes of the rows lead, the weights following.
+
+        The weights that are free take up what they can of each change (Kaufman's variable
+        projection), so a step down from here needs no other solution.
+
+        Args:
+            errors: float64[N], of the operators' output with the weights of :meth:`solve`.
+            changes: float64[N, p], of these errors.
+        """
+        found, _ = self._found
+        free = found > self._lows
+        means = self._means(self._left[:, free])
+        left = (self._left[:, free] - means) * self._scale[:, None]
+        rows = self._prior[:, free]
+        normal = left.T @ left + rows.T @ rows
+        corner = cholesky(normal + 1e-12 * float(normal.diagonal().max()) * np.eye(len(normal)))
+        here = errors * self._scale
+        moved = (changes - self._means(changes)) * self._scale[:, None]
+        taken = solve_triangular(corner, left.T @ moved, trans=1)
+        held = self._prior @ found - self._wanted
+        squares = float(here @ here + held @ held)
+        return Place(squares, moved.T @ here, moved.T @ moved - taken.T @ taken)
+
+    @cached_property
+    def _found(self) -> tuple[F64, float]:
+        """Minimise |scale (left w + c - target)|^2 + |prior w - wanted|^2 over w >= lows, and c.
+
+        On normal equations: the prior keeps them well conditioned, and a search solves many of
+        them.
+        """
+        means, mean = self._means(self._left), float(self._means(self._target))
+        left = (self._left - means) * self._scale[:, None]
+        right = (self._target - mean - (self._left - means) @ self._lows) * self._scale
+        rows = self._prior
+        normal = left.T @ left + rows.T @ rows
+        normal[np.diag_indices_from(normal)] += 1e-12 * float(normal.diagonal().max())
+        corner = cholesky(normal)
+        downhill = left.T @ right + rows.T @ (self._wanted - rows @ self._lows)
+        more, _ = nnls(corner, solve_triangular(corner, downhill, trans=1))
+        found = self._lows + more
+        return found, mean - float(means @ found)
+
+    def _means(self, rows: F64) -> F64:
+        weight = self._scale**2 / float(np.sum(self._scale**2))
+        return np.asarray(weight @ rows)
 
 
-def _bounded(
-    columns: F64, target: F64, scale: F64, prior: tuple[F64, F64], lows: F64
-) -> tuple[F64, float]:
-    """Minimise |scale (columns w + c - target)|^2 + |prior w - wanted|^2 over w >= lows, and c.
-
-    On normal equations: the prior keeps them well conditioned, and a search solves many of them.
-    """
-    weight = scale**2 / float(np.sum(scale**2))
-    means, mean = weight @ columns, float(weight @ target)
-    left = (columns - means) * scale[:, None]
-    right = (target - mean - (columns - means) @ lows) * scale
-    rows, wanted = prior
-    normal = left.T @ left + rows.T @ rows
-    normal[np.diag_indices_from(normal)] += 1e-12 * float(normal.diagonal().max())
-    corner = cholesky(normal)
-    downhill = left.T @ right + rows.T @ (wanted - rows @ lows)
-    more, _ = nnls(corner, solve_triangular(corner, downhill, trans=1))
-    found = lows + more
-    return found, mean - float(means @ found)
+def solve(columns: F64, y: F64, grid: Grid, least: float, scale: F64) -> Weights:
+    """Find all weights; see :class:`Equations` for the arguments."""
+    return Equations(columns, y, grid, least, scale).solve()
 
 
 def _segments(y: F64, knots: F64) -> F64:
@@ -190,9 +271,10 @@ def _prior(
     others, anchor, share, held = curve
     count = int(used.sum())
     number = np.where(used, np.cumsum(used) - 1, -1).reshape(grid.lines, grid.cells)
-    pairs = [(number[:, :-1], number[:, 1:], SMOOTH)]
+    smooth = SMOOTH * min(1.0, SMOOTH_PLAYS / grid.thresholds.size)
+    pairs = [(number[:, :-1], number[:, 1:], smooth)]
     plays = number[1 : grid.thresholds.size]
-    pairs.append((plays[:-1], plays[1:], 0.5 * SMOOTH))
+    pairs.append((plays[:-1], plays[1:], 0.5 * smooth))
     width = count + others.size
     out: list[F64] = []
     for first, second, weight in pairs:

@@ -6,12 +6,14 @@ import numpy as np
 
 from hilctl.base.errors import DataError
 from hilctl.identify.data.records import History, SteadyLoop
-from hilctl.identify.field.prepared import Prepared
+from hilctl.identify.field.prepared import OFF, Prepared
 from hilctl.identify.generalised_duhem.search import DuhemEnd, DuhemSearch
 from hilctl.identify.generalised_duhem.signals import NAMES
 from hilctl.identify.job import FitJob, FoundModel
 from hilctl.models.generalised_duhem import GeneralisedDuhemModel
 from hilctl.models.staged import StagedModel, Structure
+
+POINTS = 45  # samples that are left of the fastest cycle; a table has no thresholds to turn on
 
 
 def fit_generalised_duhem(job: FitJob) -> FoundModel:
@@ -28,7 +30,7 @@ def fit_generalised_duhem(job: FitJob) -> FoundModel:
             f" {loops[0]}; configs/identify_any.yaml is a campaign for it, --model staged takes"
             " loops"
         )
-    data = Prepared([r for r in job.data.records if isinstance(r, History)])
+    data = Prepared([r for r in job.data.records if isinstance(r, History)], POINTS, OFF)
     settings = job.settings
     found = DuhemSearch(data, settings.cells, settings.across, job.least).find(job.progress)
     parameters = _parameters(found)

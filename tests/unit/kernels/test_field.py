@@ -27,11 +27,11 @@ BANK = (
     LENGTHS,
     (VALUES - VALUES[:, [2]]).ravel(),  # the third edge is at 0
     DRAGS.ravel(),
-    np.array([LOWEST, WIDTH, CELLS]),
+    np.array([LOWEST, WIDTH, CELLS, WIDTH, CELLS]),
 )
 SPAN = (-12.0, 12.0, 1e-10)
-LOSSES = (3.0, 0.4, 0.6, 0.1, 0.02, 0.05, 0.01)
-NO_LOSSES = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+LOSSES = (3.0, 0.4, 0.6, 0.1, 0.02, 0.05, 0.01, -0.4 / math.log(0.6))
+NO_LOSSES = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0)
 CURVE = (np.array([-50.0, 0.0, 50.0]), np.array([-40.0, 0.0, 60.0]))
 SAME = (np.array([0.0, 1.0]), np.array([0.0, 1.0]))
 LINE = (  # one play without a threshold, of slope 2
@@ -39,7 +39,7 @@ LINE = (  # one play without a threshold, of slope 2
     np.zeros(0),
     np.array([-8.0, 8.0]),
     np.zeros(0),
-    np.array([-4.0, 8.0, 1.0]),
+    np.array([-4.0, 8.0, 1.0, 8.0, 1.0]),
 )
 
 
@@ -82,7 +82,7 @@ def operators(u):
 
 
 def h(e, losses):
-    _, _, _, b, c, x, e_0 = losses
+    _, _, _, b, c, x, e_0, _ = losses
     return e * (1.0 + b * abs(e) + c * e**2 + x / math.sqrt(abs(e) + e_0))
 
 
@@ -91,8 +91,9 @@ def commands(w, m, losses):
     out, z = [w[0]], 0.0
     for k in range(1, w.size):
         e = losses[0] * (w[k] - w[k - 1]) + losses[1] * (m[k] - m[k - 1])
+        mean = losses[7] * z + (1.0 - losses[7]) * h(e, losses)
         z = losses[2] * z + (1.0 - losses[2]) * h(e, losses)
-        out.append(0.5 * (w[k] + w[k - 1]) + z)
+        out.append(0.5 * (w[k] + w[k - 1]) + mean)
     return np.array(out)
 
 
@@ -114,6 +115,25 @@ def test_the_first_command_counts_as_having_stood_for_ever():
     held = np.full(4, 1.5)
     out = run(field_forward, held, LINE, coupling=0.1, curve=SAME)
     assert out == pytest.approx(2.0 * 1.5 / (1.0 - 0.1 * 2.0))
+
+
+def test_drags_have_cells_of_their_own():
+    """One drag over one cell, by hand, beside plays whose cells are half as wide."""
+    length, u = 2.0, np.array([0.5, 1.5, -1.0])
+    plays = np.array([-8.0, -4.0, 0.0, 4.0, 8.0])
+    bank = (
+        np.zeros(1), np.array([length]), 2.0 * plays, np.array([3.0]),
+        np.array([-8.0, 4.0, 4.0, -4.0 + 20.0, 1.0]),
+    )  # fmt: skip
+    held, m, last = 8.0, [], 0.0
+    for now in u:
+        held = drag_step(held, -8.0, 16.0, last, now, length)
+        m.append(2.0 * now + 3.0 * (held - 8.0))
+        last = now
+    m = np.array(m)
+    command = commands(u, m, NO_LOSSES)
+    given = {"bank": bank, "coupling": 0.0, "losses": NO_LOSSES, "curve": SAME}
+    np.testing.assert_allclose(run(field_inverse, m, **given), command, atol=1e-7)
 
 
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
@@ -194,7 +214,7 @@ def test_a_line_through_points_goes_on_straight():
 
 
 def test_lost_field_by_hand():
-    losses = (0.0, 0.0, 0.0, 0.1, 0.02, 0.5, 0.25)
+    losses = (0.0, 0.0, 0.0, 0.1, 0.02, 0.5, 0.25, 0.0)
     assert lost_field(2.0, losses)[0] == pytest.approx(2.0 * (1.0 + 0.2 + 0.08 + 0.5 / 1.5))
     assert lost_field(-2.0, losses) == (-lost_field(2.0, losses)[0], lost_field(2.0, losses)[1])
 
@@ -202,7 +222,7 @@ def test_lost_field_by_hand():
 @pytest.mark.parametrize("only", [3, 4, 5])
 @pytest.mark.parametrize("e", [-3.0, -0.2, 0.0, 0.01, 0.4, 5.0])
 def test_the_slope_of_the_losses_is_their_derivative(only, e):
-    losses = (*(0.7 if i == only else 0.0 for i in range(6)), 0.25)
+    losses = (*(0.7 if i == only else 0.0 for i in range(6)), 0.25, 0.0)
     rise = lost_field(e + 1e-5, losses)[0] - lost_field(e - 1e-5, losses)[0]
     assert lost_field(e, losses)[1] == pytest.approx(rise / 2e-5, rel=1e-4)
 

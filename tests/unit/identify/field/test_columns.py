@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from hilctl.identify.field.columns import bare_displacement, corners, turning_points
+from hilctl.identify.field.columns import bare_displacement, corners, needed_points, turning_points
+from hilctl.identify.field.fits import FINER, tabled
 from hilctl.identify.field.weights import Grid, table
 from hilctl.models.field import FieldModel, OutputCurve
 
@@ -23,9 +24,10 @@ def path() -> np.ndarray:
 def test_columns_times_slopes_are_the_model() -> None:
     u = np.ascontiguousarray(path())
     line = OutputCurve(operators_um=(-1.0, 1.0), displacement_um=(-1.0, 1.0))
+    slopes = (*tabled(SLOPES[:3]), *SLOPES[3:].tolist())
     model = FieldModel(
         thresholds=tuple(GRID.thresholds), lengths=tuple(GRID.lengths), lowest=GRID.lowest,
-        cell=GRID.width, slopes=tuple(map(tuple, SLOPES.tolist())), curve=line,
+        cell=GRID.piece / FINER, slopes=tuple(map(tuple, slopes)), curve=line,
     )  # fmt: skip
     # Without losses the field is the mean of the command over a sample: so feed what gives u.
     command = np.empty_like(u)
@@ -37,7 +39,8 @@ def test_columns_times_slopes_are_the_model() -> None:
     rows = np.arange(u.size)
     columns = table([u], [rows], GRID)
     given = columns @ SLOPES.ravel()
-    assert given - given[0] == pytest.approx(modelled - modelled[0], abs=1e-4)
+    # The model's slopes are even in each of its cells, so that it is a line through the splines.
+    assert given == pytest.approx(modelled, abs=0.02)
 
 
 def test_turning_points_and_rows_are_enough_of_a_path() -> None:
@@ -48,6 +51,14 @@ def test_turning_points_and_rows_are_enough_of_a_path() -> None:
     whole = table([u], [kept], GRID)
     few = table([np.ascontiguousarray(u[kept])], [np.arange(kept.size)], GRID)
     assert few == pytest.approx(whole, abs=0.02)
+
+
+def test_points_are_the_rows_and_all_turns() -> None:
+    u = np.array([0.0, 1.0, 2.0, 1.5, 1.0, 3.0, 4.0, 5.0, 6.0])
+    points, places = np.empty(9, dtype=np.int64), np.empty(3, dtype=np.int64)
+    count = needed_points(u, np.array([1, 4, 6]), points, places)
+    assert points[:count].tolist() == [0, 1, 2, 4, 6]
+    assert places.tolist() == [1, 3, 4]
 
 
 def test_straight_lines_between_corners_are_near_both_signals() -> None:

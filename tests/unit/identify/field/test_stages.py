@@ -38,8 +38,8 @@ def history(command: float = 1.0, um: float = 1.0, rate: float = 1.0) -> History
 def plain_run(command: np.ndarray, derivatives: np.ndarray) -> Run:
     size = command.size
     steps = np.full(size, 1.0 / RATE_HZ)
-    kept, late = np.arange(size), np.full(size, 0.5)
-    return Run(RATE_HZ, kept, steps, late, np.ascontiguousarray(command), derivatives, 0)
+    held = np.ascontiguousarray(command)
+    return Run(RATE_HZ, np.arange(size), steps, held, held, derivatives, 0)
 
 
 def test_a_row_is_the_stages_in_the_order_of_their_names() -> None:
@@ -117,7 +117,7 @@ def test_of_a_model_s_record_the_effective_field_is_the_model_s(
     )  # fmt: skip
     y_um = model.forward(RATE_HZ).process(COMMAND)
     run = plain_run(COMMAND, np.stack([y_um, np.zeros_like(y_um), np.zeros_like(y_um)]))
-    known = Physical(losses, coupling, 1e-4, 0.3, 0.0)
+    known = Physical(losses, coupling, 1e-4, 0.3, 0.0, 1.0)
     u, bare_um = signals(run, known, Curve(operators, displacement_um), 20.0)
     np.testing.assert_array_equal(bare_um, y_um)
     np.testing.assert_allclose(2.0 * u, np.interp(y_um, displacement_um, operators), atol=1e-4)
@@ -128,7 +128,7 @@ def test_structure_and_delay_are_taken_off_the_displacement() -> None:
     w, r, d, late = 2.0 * np.pi * 200.0, 3e-4, 0.4, 7
     sine, cosine = np.sin(w * TIME_S), np.cos(w * TIME_S)
     run = plain_run(np.zeros_like(sine), np.stack([sine, w * cosine, -(w**2) * sine]))
-    known = Physical(FieldLosses(), 0.25, r, d, late / RATE_HZ)
+    known = Physical(FieldLosses(), 0.25, r, d, late / RATE_HZ, 1.0)
     u, y = signals(run, known, None, 20.0)
     before = (1.0 - (r * w) ** 2) * sine + 2.0 * d * r * w * cosine
     np.testing.assert_allclose(y[:-late], before[late:], atol=1e-9)

@@ -22,9 +22,8 @@ def columns() -> F64:
 
 
 def operators(slopes: F64, given: F64) -> F64:
-    """Return the operators' output: 0 at rest, where the plays have passed two cells of 3."""
-    plays = slopes[: GRID.thresholds.size]
-    return np.asarray(given @ slopes.ravel() - 3.0 * plays[:, :2].sum())
+    """Return the operators' output, which is 0 at rest."""
+    return np.asarray(given @ slopes.ravel())
 
 
 def displacement_um(given: F64) -> F64:
@@ -50,9 +49,14 @@ def test_plays_and_drags_by_hand_each_record_from_rest() -> None:
     got = table([far, up], [np.array([0]), np.array([0, 1])], grid)
     first, second = (1.0 - k * (1.0 - math.exp(-1.0 / k)) for k in (1.5, 0.5))
     assert got.shape == (3, grid.lines * grid.cells)
-    assert got[0, :8].tolist() == [3.0, 3.0, 3.0, 4.0, 3.0, 3.0, 3.0, 3.0]
-    assert got[1].tolist() == [3.0, 3.0, 0.0, 0.0, 3.0, 3.0, *[0.0] * 10]
-    assert got[2, :8].tolist() == [3.0, 3.0, 1.0, 0.0, 3.0, 3.0, 0.0, 0.0]
+    # Two pieces of 6, the second from rest on: up by 1 is a sixth of it, and 7 is 1 beyond its end.
+    t = 1.0 / 6.0
+    sixth = [0.0, (1.0 - (1.0 - t) ** 3) / 6.0, 0.5 * (t + t**2) - t**3 / 3.0, t**3 / 6.0]
+    assert got[0, :4] == pytest.approx([0.0, 1.0, 4.5, 1.5])
+    assert got[0, 4:8] == pytest.approx([0.0, 1.0, 4.0, 1.0])
+    assert got[1] == pytest.approx(np.zeros(16))
+    assert got[2, :4] == pytest.approx(6.0 * np.array(sixth))
+    assert got[2, 4:8] == pytest.approx(np.zeros(4))
     assert got[2, 8:] == pytest.approx([0.0, 0.0, first, 0.0, 0.0, 0.0, second, 0.0])
 
 
@@ -104,18 +108,18 @@ def test_a_column_that_does_not_move_has_no_weight() -> None:
     u = np.ascontiguousarray(2.5 * np.sin(np.linspace(0.0, 30.0, 500)))
     given = table([u], [np.arange(u.size)], GRID)
     found = solve(given, given.sum(axis=1), GRID, LEAST, np.ones(u.size))
-    assert (found.slopes[1:, [0, 3]] == 0.0).all()
+    assert (found.slopes[2, [0, 3]] == 0.0).all()  # cells of the drag that are never reached
     assert (found.slopes[0] >= LEAST).all()
-    assert found.slopes[1:, 1:3].min() > 0.0
+    assert found.slopes[2, 1:3].min() > 0.0
 
 
 def test_units_of_the_displacement_make_no_difference() -> None:
     y = displacement_um(columns()) + 5.0
     one, ten = solved(y), solved(10.0 * y, least=10.0 * LEAST)
-    assert ten.slopes == pytest.approx(10.0 * one.slopes, rel=1e-6, abs=1e-6)
-    assert ten.curve.operators == pytest.approx(10.0 * one.curve.operators, rel=1e-6, abs=1e-6)
+    assert ten.slopes == pytest.approx(10.0 * one.slopes, rel=1e-4, abs=1e-6)
+    assert ten.curve.operators == pytest.approx(10.0 * one.curve.operators, rel=1e-5, abs=1e-4)
     assert ten.offset_um == pytest.approx(10.0 * one.offset_um, rel=1e-6)
-    assert ten.errors_um == pytest.approx(10.0 * one.errors_um, abs=1e-4)
+    assert ten.errors_um == pytest.approx(10.0 * one.errors_um, abs=1e-3)
 
 
 @pytest.mark.parametrize("shift_um", [-20.0, 60.0])

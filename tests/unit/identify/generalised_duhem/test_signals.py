@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from hilctl.identify.data.records import History
-from hilctl.identify.field.prepared import Prepared
+from hilctl.identify.field.prepared import OFF, Prepared
 from hilctl.identify.field.stages import HIGH, LOW, STEP, Stages
+from hilctl.identify.generalised_duhem.fits import POINTS
 from hilctl.identify.generalised_duhem.signals import (
     FIRST,
     HIGHEST,
@@ -22,7 +23,7 @@ def data(unit: float = 1.0, um: float = 1.0) -> Prepared:
     """Return a record in other units of the command and the displacement."""
     v = command(1)[:6000]
     y = truth().forward(RATE_HZ).process(v)
-    return Prepared([History("random", unit * v, um * y, RATE_HZ)])
+    return Prepared([History("random", unit * v, um * y, RATE_HZ)], POINTS, OFF)
 
 
 def test_the_row_is_made_of_the_stages_that_the_field_has() -> None:
