@@ -23,6 +23,19 @@ from hilctl.recording.reader import read
 from tests.fakes import loop_of
 
 PROFILES = Path(__file__).parents[1] / "data"
+
+
+def each_kind(cases, shown):
+    """Return cases for ``parametrize``; those that are much like one shown are long tests."""
+    return [
+        pytest.param(
+            *(case if isinstance(case, tuple) else (case,)),
+            marks=() if case in shown else pytest.mark.long,
+        )
+        for case in cases
+    ]
+
+
 EXPERIMENT = {
     "name": "wire_fault",
     "sample_rate_hz": 500,

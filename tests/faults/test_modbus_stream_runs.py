@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from hilctl.base.samples import Flag
+from tests.faults.conftest import each_kind
 
 TIMEOUT_S = 0.5
 WATCHDOG_S = 2.0
@@ -48,18 +49,7 @@ def assert_made_safe(device):
     )
 
 
-@pytest.mark.parametrize(
-    "fault",
-    [
-        "silence",
-        "corrupt",
-        *(
-            pytest.param(each, marks=pytest.mark.long)
-            for each in FAULTS
-            if each not in {"silence", "corrupt"}
-        ),
-    ],
-)
+@pytest.mark.parametrize("fault", each_kind(FAULTS, {"silence", "corrupt"}))
 def test_fault_ends_the_run_safely(emulate, run, fault):
     """The run says in one line what happened where; what was queued gives way to the safe value."""
     device = emulate("labjack_t7", "--fault", f"{fault}@{FAULT_AT}")

@@ -9,6 +9,7 @@ import yaml
 
 from hilctl.run.start import checked_experiment
 from hilctl.run.supervisor import Supervisor
+from tests.faults.conftest import each_kind
 
 EXPERIMENT = {
     "name": "exchanged",
@@ -57,7 +58,7 @@ TCP_FAULTS: dict[str, str] = {
 """Ways in which a run meets trouble; more, without a run, are in ``test_modbus_dac.py``."""
 
 
-@pytest.mark.parametrize("fault", TCP_FAULTS)
+@pytest.mark.parametrize("fault", each_kind(TCP_FAULTS, {"silence", "late:0.8", "corrupt"}))
 def test_tcp_fault_ends_the_run_safely(emulate, run, fault):
     """The run stops in time, says in one line what happened where, and the output is safe."""
     device = emulate("labjack_t7", "--fault", f"{fault}@{FAULT_AT}")
