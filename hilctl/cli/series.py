@@ -82,7 +82,7 @@ def report_series(
 ) -> None:
     """Say what came out of several runs, and write the page of all of them where one is wanted."""
     from hilctl.cli.console import print_rich
-    from hilctl.cli.report_view import render_series
+    from hilctl.cli.series_view import render_series
     from hilctl.series.page import write_series
     from hilctl.series.result import series_mapping
 

@@ -64,8 +64,10 @@ def test_a_run_is_switched_marked_watched_and_stopped(recording):
         *_, last = watching.stdout.read().splitlines()
     assert ": stopped: stopped by hilctl stop" in last
     left = read(recording)
-    codes = [event.code for event in left.events]
-    assert codes == ["inverse", "mark", "inverse", "run_ended"]
+    # A change begins some time after it was asked for: a mark may come between.
+    *codes, last_code = [event.code for event in left.events]
+    assert sorted(codes) == ["inverse", "inverse", "mark"]
+    assert last_code == "run_ended"
     assert replay(left).identical
     step = np.abs(np.diff(left.samples.command)).max() * left.sample_rate_hz
     assert step <= 20_000.0

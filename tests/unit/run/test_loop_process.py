@@ -245,10 +245,15 @@ def test_all_that_it_has_to_say_is_in_the_page(prepared, monkeypatch, raised, co
 
 
 @pytest.mark.slow
-def test_it_has_nothing_that_only_fits_and_figures_need():
-    """What is imported here is locked in memory in each run: SciPy's larger parts are 80 MB."""
+@pytest.mark.parametrize(
+    "modules",
+    ["hilctl.run.loop_process, hilctl_drivers.simulated.rigs", "hilctl.cli.run_view"],
+    ids=["loop", "supervisor"],
+)
+def test_it_has_nothing_that_only_fits_and_figures_need(modules):
+    """It is locked in memory in each run, or starts with it: SciPy's larger parts are 80 MB."""
     program = (
-        "import sys, hilctl.run.loop_process, hilctl_drivers.simulated.rigs;"
+        f"import sys, {modules};"
         "heavy = ('scipy.optimize', 'scipy.signal', 'scipy.sparse', 'matplotlib', 'pandas');"
         "print([name for name in heavy if name in sys.modules])"
     )
