@@ -25,6 +25,11 @@ from tests.fakes import loop_of
 PROFILES = Path(__file__).parents[1] / "data"
 
 
+PATIENT_DEVICE = {"timeout_s": 20.0, "watchdog": "none"}
+PATIENT_TIMING = {"on_misses": "warn", "max_late_s": 30.0, "hang_s": 30.0}
+"""Of runs whose device or loop may be kept waiting by a busy machine: nothing of it is tested."""
+
+
 def each_kind(cases, shown):
     """Return cases for ``parametrize``; those that are much like one shown are long tests."""
     return [

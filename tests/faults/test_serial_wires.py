@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from hilctl_drivers.profile import shipped_profiles
-from tests.faults.conftest import each_kind
+from tests.faults.conftest import PATIENT_DEVICE, PATIENT_TIMING, each_kind
 
 TIMEOUT_S = 0.5
 WATCHDOG_S = 1.0
@@ -59,12 +59,15 @@ def boards(tmp_path, profile):
 def meet(emulate, run, boards):
     """Return a function that starts an emulated device of a kind and a run on it."""
 
-    def start(kind, *faults):
+    def start(kind, *faults, patient=False):
         words = [word for fault in faults for word in ("--fault", f"{fault}@{FAULT_AT[kind]}")]
         device = emulate(boards[kind], *words)
         options, changes = SETUPS[kind]
         section = {**DEVICE, "profile": boards[kind], "serial_port": device.address, **options}
         section["amplifier"] = GAINS.get(kind, section["amplifier"])
+        if patient:
+            section |= PATIENT_DEVICE
+            changes = {**changes, "timing": PATIENT_TIMING}
         return device, run(section, waveform=WAVEFORM, **changes), options["output"]
 
     return start
@@ -194,7 +197,7 @@ def test_silent_reader_is_named(emulate, run):
 @pytest.mark.parametrize("kind", ["dcon", pytest.param("fifo", marks=pytest.mark.long)])
 def test_second_run_on_the_same_port_is_refused(meet, run, tmp_path, boards, kind):
     """Also where it has another name for the port; the first run is not disturbed."""
-    device, first, output = meet(kind)
+    device, first, output = meet(kind, patient=True)
     device.log.await_events(output, 40)
     other = tmp_path / "by-id"
     other.symlink_to(device.address)

@@ -9,7 +9,7 @@ import yaml
 
 from hilctl.run.start import checked_experiment
 from hilctl.run.supervisor import Supervisor
-from tests.faults.conftest import each_kind
+from tests.faults.conftest import PATIENT_DEVICE, PATIENT_TIMING, each_kind
 
 EXPERIMENT = {
     "name": "exchanged",
@@ -152,8 +152,8 @@ def test_dead_host_is_noticed_by_the_device(emulate, run):
 def test_second_run_on_the_same_device_is_refused(emulate, run):
     """It is told who has the device, whatever it is called there, and the first goes on."""
     device = emulate("labjack_t7")
-    section = over_tcp(device.address)
-    first = run(section)
+    section = {**over_tcp(device.address), **PATIENT_DEVICE}
+    first = run(section, timing=PATIENT_TIMING)
     device.log.await_events("DAC0", FAULT_AT)
     said = run({**section, "host": "localhost"}, name="second").refused()
     who = f"run wire_fault (process {first.process.pid}, recording {first.output})"
