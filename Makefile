@@ -11,15 +11,15 @@ run: $(VENV)/.ready
 	$(BIN)/hilctl run configs/demo.yaml
 
 test: $(VENV)/.ready
-	@echo "Takes 3 to 4 minutes of processor time, shared by up to 4 cores; whole runs: make test-slow."
+	@echo "Takes 5 to 6 minutes of processor time, shared by up to 4 cores; whole runs: make test-slow."
 	$(BIN)/pytest -n auto --maxprocesses 4 --dist loadfile -m "not slow"
 
 test-slow: $(VENV)/.ready
-	@echo "Takes about 20 minutes: most of them real time, in which runs go on."
+	@echo "Takes about 13 minutes on two cores: whole runs, in processes of their own."
 	$(BIN)/pytest -n 2 --dist loadfile -m "slow and not long"
 
 test-long: $(VENV)/.ready
-	@echo "Takes about 20 minutes: campaigns, published figures and rigs of other physics, as a whole."
+	@echo "Takes about 35 minutes: campaigns, published figures, rigs of other physics, and what repeats other runs."
 	$(BIN)/pytest -n 2 --dist loadfile -m long
 
 lint: $(VENV)/.ready

@@ -150,6 +150,8 @@ def main() -> None:
     parser.add_argument("--goal", type=float, default=5.0, help="Million samples a second.")
     parser.add_argument("--commands", default="replay,report,report --html,export")
     options = parser.parse_args()
+    if options.folder is not None:
+        options.folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=options.folder) as temporary:
         folder = options.folder if options.keep and options.folder else Path(temporary)
         missed = judge(folder, options)
