@@ -19,7 +19,7 @@ test-slow: $(VENV)/.ready
 	$(BIN)/pytest -n 2 --dist loadfile -m "slow and not long"
 
 test-long: $(VENV)/.ready
-	@echo "Takes about 35 minutes: campaigns, published figures, rigs of other physics, and what repeats other runs."
+	@echo "Takes more than half an hour: campaigns, published figures, rigs of other physics, and what repeats other runs."
 	$(BIN)/pytest -n 2 --dist loadfile -m long
 
 lint: $(VENV)/.ready
