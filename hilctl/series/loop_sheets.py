@@ -91,13 +91,20 @@ def minor_loop_sheet(series: RunSeries) -> Sheet | None:
     ]
     if not runs:
         return None
-    panels = tuple(
-        Panel(partial(_draw_minor, run=run), series.text(run), _SQUARE)
-        for run in spread(runs, _MOST_PANELS)
-    )
-    more = f"; {len(panels)} of {len(runs)} runs" if len(panels) < len(runs) else ""
+    panels, more = _panels(series, runs, _draw_minor)
     caption = f"Minor loops, where the input turns back within the cycle{more}."
     return Sheet("minor_loops", caption, panels, alike=True)
+
+
+def _panels(
+    series: RunSeries, runs: Sequence[SeriesRun], draw: Callable[..., None]
+) -> tuple[tuple[Panel, ...], str]:
+    """Return a panel a run, spread over all where they are many, and what to say of that."""
+    panels = tuple(
+        Panel(partial(draw, run=run), series.text(run), _SQUARE)
+        for run in spread(runs, _MOST_PANELS)
+    )
+    return panels, f"; {len(panels)} of {len(runs)} runs" if len(panels) < len(runs) else ""
 
 
 def _draw_minor(axes: Axes, run: SeriesRun) -> None:
@@ -115,11 +122,7 @@ def model_sheet(series: RunSeries) -> Sheet | None:
     runs = [run for run in series.done if run.digest is not None and run.digest.modelled.size]
     if not runs:
         return None
-    panels = tuple(
-        Panel(partial(_draw_model, run=run), series.text(run), _SQUARE)
-        for run in spread(runs, _MOST_PANELS)
-    )
-    more = f"; {len(panels)} of {len(runs)} runs" if len(panels) < len(runs) else ""
+    panels, more = _panels(series, runs, _draw_model)
     caption = f"Measured loops and the model's, command against displacement{more}."
     return Sheet("model_against_measured", caption, panels, alike=True)
 
