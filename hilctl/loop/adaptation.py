@@ -23,6 +23,7 @@ from hilctl.base.arrays import F64
 from hilctl.base.errors import InputError
 from hilctl.base.events import ADAPTED, Event, adapted_text
 from hilctl.kernels import adaptation as kernel
+from hilctl.kernels.jit import load
 from hilctl.loop.block import Block
 
 THRESHOLDS = (0.15, 0.4, 0.7)
@@ -190,6 +191,7 @@ class Adaptation:
         self._fed: F64 | None = None
         self._seen: F64 | None = None
         self._event_after = math.ceil(_EVENT_S * rate_hz)
+        load(kernel.adapted_input, kernel.adapt_block)
         self._said, self._said_at = np.zeros(m), 0
         self._ready = False
         if noise_um is not None:

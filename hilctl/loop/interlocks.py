@@ -18,6 +18,7 @@ from hilctl.base.samples import Flag
 from hilctl.base.strict import Strict
 from hilctl.kernels import interlock as kernels
 from hilctl.kernels.interlock import InterlockFlag
+from hilctl.kernels.jit import load
 
 TripCode: TypeAlias = Literal[
     "stroke", "sensor_range", "sensor_frozen", "deviation", "thermal", "tracking_error"
@@ -155,6 +156,7 @@ class Interlocks:
         self._memory[kernels.COMMAND] = context.safe
         self._memory[kernels.HEAT] = max(context.heat_a2, context.safe**2)
         self._next_sample = 0
+        load(kernels.interlock_block)
 
     def begin_at(self, command: float) -> None:
         """Begin with the output at ``command``; its coil is as hot as that keeps it, at least."""

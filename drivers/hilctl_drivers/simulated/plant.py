@@ -54,6 +54,11 @@ class Plant(ABC):
             noise *= self._noise_um
             self._advance(held, noise, displacement_um[part], measured[part])
 
+    def warm_up(self) -> None:
+        """Go on by one sample and back to rest, so that nothing is compiled or loaded later."""
+        self.hold(1, 0.0)
+        self.reset()
+
     def hold(self, n_samples: int, command: float) -> None:
         """Let ``n_samples`` sample periods pass with the output at ``command``."""
         unread = np.empty((2, CHUNK))

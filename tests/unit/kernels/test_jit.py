@@ -160,6 +160,7 @@ def test_kept_in_memory_where_no_folder_can_be_written(in_memory):
     assert list(in_memory.rglob("*.nbc"))
     assert os.environ["NUMBA_CACHE_DIR"] == str(in_memory)
     again = jit.kernel("float64(float64)")(double)
+    jit.load(again)
     assert sum(again.stats.cache_hits.values()) == 1
 
 
@@ -188,5 +189,22 @@ def test_full_disk_keeps_no_kernel_from_being_compiled(tmp_path, in_memory, monk
 
 def test_mistake_in_a_kernel_is_said(in_memory):
     """What has nothing to do with the cache is not passed over."""
-    with pytest.raises(numba.TypingError):
-        jit.kernel("float64(unicode_type)")(double)
+    wrong = jit.kernel("float64(unicode_type)")(double)
+    for _ in range(2):
+        with pytest.raises(numba.TypingError):
+            wrong(1.5)
+
+
+def test_nothing_is_compiled_before_it_is_wanted(in_memory):
+    """A process waits for no kernel but its own."""
+    deferred = jit.kernel("float64(float64)")(double)
+    assert not deferred.overloads
+    assert not in_memory.exists()
+    jit.load(deferred)
+    jit.load(deferred)
+    assert [str(types) for types in deferred.overloads] == ["(float64,)"]
+
+
+def test_called_with_a_type_that_casts():
+    """The first call takes what later ones take: an integer for a number."""
+    assert jit.kernel("float64(float64)")(double)(2) == 4.0

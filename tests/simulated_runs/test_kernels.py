@@ -1,0 +1,59 @@
+"""Kernels are compiled, or read from the disk, before the first tick."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+CONFIGS = Path(__file__).parents[2] / "configs"
+STAGED = "compensator.model=" + str(CONFIGS / "models" / "terfenol_staged_preisach.yaml")
+ADAPTED = "adaptation={time_constant_s: 0.2, noise_um: 0.036}"
+HALF = ["waveform.amplitude=20.0", "waveform.offset=0.0"]
+# In one process, one after the other: what is loaded once is not loaded again, so each shows what
+# only it needs.
+RUNS = [
+    ("terfenol_sine_6a.yaml", [], 0.5),
+    ("terfenol_sine_6a.yaml", [STAGED, ADAPTED, *HALF], 0.5),
+    ("piezo_sine.yaml", ["feedback={kind: integral, bandwidth_hz: 2.0, limit_um: 3.0}"], 1.2),
+    ("terfenol_other_rig_uncompensated.yaml", [], 0.5),
+]
+SCRIPT = """
+import json, sys
+from pathlib import Path
+from hilctl.kernels import jit
+from hilctl.run import unpaced
+from hilctl.run.start import checked_experiment
+
+folder, runs = Path(sys.argv[1]), json.loads(sys.argv[2])
+drive, load, late = unpaced._drive, jit._Kernel._compile_declared, []
+
+
+def watch(*args):
+    jit._Kernel._compile_declared = lambda self: (late.append(self.py_func.__name__), load(self))
+    try:
+        return drive(*args)
+    finally:
+        jit._Kernel._compile_declared = load
+
+
+unpaced._drive = watch
+samples = 0
+for number, (path, settings) in enumerate(runs):
+    checked = checked_experiment(Path(path), settings)
+    samples += unpaced.run_unpaced(checked, folder / f"{number}.mcap").samples
+print(json.dumps({"late": late, "samples": samples}))
+"""
+
+
+def test_none_is_loaded_while_a_loop_runs(tmp_path):
+    """The first call of a kernel reads it from the disk: milliseconds that no tick has."""
+    runs = [
+        (str(CONFIGS / name), [*settings, f"waveform.duration_s={seconds}"])
+        for name, settings, seconds in RUNS
+    ]
+    command = [sys.executable, "-P", "-c", SCRIPT, str(tmp_path), json.dumps(runs)]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False, timeout=240.0)
+    assert ended.returncode == 0, ended.stderr
+    found = json.loads(ended.stdout)
+    assert found["samples"] > 50_000
+    assert found["late"] == []
