@@ -2,6 +2,7 @@
 
 import gc
 import hashlib
+import logging
 import os
 import sys
 import tempfile
@@ -15,6 +16,7 @@ from hypothesis import settings
 from hilctl.base.private import memory_folder
 from hilctl.base.yaml import document
 from hilctl.experiment import registry
+from hilctl.kernels.jit import is_kernel, load
 from hilctl_drivers import profile
 
 ROOT = Path(__file__).parents[1]
@@ -52,8 +54,9 @@ def pytest_configure(config):
         return
     for root in (ROOT, ROOT / "drivers"):
         for path in sorted(root.glob("hilctl*/**/*.py")):
-            if "jit import kernel\n" in path.read_text(encoding="utf-8"):
-                import_module(".".join(path.relative_to(root).with_suffix("").parts))
+            if "jit import kernel" in path.read_text(encoding="utf-8"):
+                name = ".".join(path.relative_to(root).with_suffix("").parts)
+                load(*filter(is_kernel, vars(import_module(name)).values()))
 
 
 def pytest_ignore_collect(collection_path, config):
@@ -102,6 +105,33 @@ def memory():
     """A folder in memory of this session's own."""
     with tempfile.TemporaryDirectory(prefix="hilctl-tests-", dir=memory_folder()) as folder:
         yield Path(folder)
+
+
+class LogRecords(logging.Handler):
+    """What was logged, like pytest's own, whose plugin takes as long as a short test."""
+
+    def __init__(self):
+        super().__init__()
+        self.records = []
+        self.emit = self.records.append
+        self.clear = self.records.clear
+
+    @property
+    def messages(self):
+        return [record.getMessage() for record in self.records]
+
+    @property
+    def text(self):
+        return "\n".join(self.messages)
+
+
+@pytest.fixture
+def caplog():
+    """What is logged during a test."""
+    handler = LogRecords()
+    logging.getLogger().addHandler(handler)
+    yield handler
+    logging.getLogger().removeHandler(handler)
 
 
 @pytest.fixture(scope="session", autouse=True)

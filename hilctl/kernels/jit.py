@@ -54,6 +54,11 @@ def load(*kernels: Callable[..., object]) -> None:
         cast("_Kernel", each).load()
 
 
+def is_kernel(value: object) -> bool:
+    """Return whether it is what :func:`kernel` makes."""
+    return isinstance(value, _Kernel)
+
+
 class _Kernel(CPUDispatcher):
     """A compiled function that has its declared signatures, from its first use on."""
 

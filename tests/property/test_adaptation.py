@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -72,6 +73,7 @@ class Broken(FakeFifoDevice):
             displacement_um[wrong] += self.size
 
 
+@pytest.mark.slow
 @given(
     st.sampled_from(["sign", "saturated", "dead", "step"]),
     st.integers(0, 900),

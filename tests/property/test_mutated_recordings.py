@@ -30,6 +30,7 @@ runpy.run_module("tests.benchmark.mutated_recordings", run_name="__main__")
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("part", range(4))
 def test_mutated_recordings_are_refused_in_words(tmp_path: Path, part: int) -> None:
     """No crash, no hang, no warning of numpy; what is recovered is sound."""

@@ -186,6 +186,7 @@ class TestLateness:
         assert plots.lateness(replace(run(), ticks=Ticks(*(np.empty(0, np.int64),) * 4))) is None
 
 
+@pytest.mark.slow
 def test_png_of_every_figure_can_be_drawn(run) -> None:
     """Labels with dollar signs and angle brackets are text, not formulas; nothing warns."""
     recording = run()

@@ -70,6 +70,7 @@ def shown(recording: Recording) -> str:
     return page(recording, summarize(recording))
 
 
+@pytest.mark.slow
 def test_fetches_nothing(shown: str) -> None:
     """All that it refers to stands in the page; there is no script, link or address."""
     seen = Page(shown)
@@ -150,6 +151,7 @@ def test_the_headline_says_what_came_out(recording: Recording) -> None:
     assert "µm" in text
 
 
+@pytest.mark.slow
 def test_before_and_after_stand_in_one_picture(recording: Recording) -> None:
     """The page of a compensated run shows the other one's loop where it is given."""
     phase = 2.0 * np.pi * np.arange(8000) / 1000
@@ -199,6 +201,7 @@ def test_readings_near_the_end_of_all_numbers_are_told_in_words(recording: Recor
     assert "<figure" not in text
 
 
+@pytest.mark.slow
 def test_what_steers_a_browser_or_a_plot_is_written_out(recording: Recording) -> None:
     """Names from a file may hold anything; a formula, a page of text or an escape among it."""
     label = "$\\frac{$ \x1b[31m \u202e" + "x" * 100_000

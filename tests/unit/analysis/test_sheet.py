@@ -22,6 +22,7 @@ def test_a_figure_has_the_width_of_a_column_and_letters_of_one_size(width):
     assert [axes.get_title("left") for axes in figure.axes] == ["(a) x", "(b) x", "(c) x"]
 
 
+@pytest.mark.slow
 def test_panels_stand_abreast_where_there_is_room():
     def columns(sheet, width):
         figure = drawn(sheet, width)

@@ -32,6 +32,7 @@ def test_the_same_figure_has_the_same_bytes(figure):
     assert svg(figure) == svg(figure)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "head"), [("svg", b"<?xml"), ("pdf", b"%PDF"), ("png", b"\x89PNG")]
 )

@@ -22,6 +22,7 @@ WHOLE = replace(
 )
 
 
+@pytest.mark.slow
 def test_the_held_out_error_comes_first():
     page = characterisation_page(replace(WHOLE, identification=identification()))
     assert page.index("Error on references that no fit saw") < page.index("<h2>Measured")

@@ -109,6 +109,7 @@ def test_noise_that_leaves_no_loop(walked, limits):
     assert error.code in {"noise", "not_repeatable"}
 
 
+@pytest.mark.slow
 def test_a_resonance_in_the_band(walked, limits, limits_with):
     from tests.unit.characterise.test_response import resonator
 

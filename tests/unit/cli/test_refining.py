@@ -19,6 +19,7 @@ def given(monkeypatch, tmp_path, truth):
     return tmp_path / "old.yaml", [Path(f"{i}.mcap") for i in range(4)], tmp_path / "better.yaml"
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
 def test_what_is_better_is_written(monkeypatch, tmp_path, capsys):
     model, runs, output = given(monkeypatch, tmp_path, actuator())
@@ -31,6 +32,7 @@ def test_what_is_better_is_written(monkeypatch, tmp_path, capsys):
     assert (tmp_path / "page.html").exists()
 
 
+@pytest.mark.slow
 def test_what_is_no_better_ends_with_one_and_no_file(monkeypatch, tmp_path, capsys):
     model, runs, output = given(monkeypatch, tmp_path, OLD)
     with pytest.raises(typer.Exit) as ended:

@@ -26,6 +26,7 @@ def comparison():
     return compare(request, SteppingClock(1e-3), ignore)
 
 
+@pytest.mark.slow
 def test_the_page_holds_table_and_figure(comparison):
     """Self-contained, with every model by name."""
     page = comparison_page(comparison)

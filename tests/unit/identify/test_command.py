@@ -44,6 +44,7 @@ def settings(*texts: str) -> IdentifySettings:
     return settings_from("ppi", [*TABLE, "weights=free", "offset=true", *texts])
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
 def test_order_and_lag_are_found_and_reported(
     tables: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -95,6 +96,7 @@ def test_settings_are_checked_together() -> None:
         settings_from("presach", [])
 
 
+@pytest.mark.slow
 def test_histories_import_neither_plots_nor_statistics(tables: list[Path]) -> None:
     """They would take longer than the fit of a small table, and 80 MB."""
     code = (

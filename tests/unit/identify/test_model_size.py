@@ -32,6 +32,7 @@ def loops(loops_of: Loops) -> list[SteadyLoop]:
     return loops_of(omega, GRID, POINTS)
 
 
+@pytest.mark.slow
 def test_smallest_order_that_is_as_good_is_chosen(loops: list[SteadyLoop]) -> None:
     """Loops of 6 plays on a noisy sensor are not given 28; every order's error is told."""
     rng = np.random.default_rng(2)
@@ -50,6 +51,7 @@ def test_smallest_order_that_is_as_good_is_chosen(loops: list[SteadyLoop]) -> No
     assert own.deadbands_a_side == chosen.deadbands
 
 
+@pytest.mark.slow
 def test_models_without_deadbands_have_none(loops_of: Loops) -> None:
     """The order of an RDPI is its plays alone."""
     data = loops_of(terfenol_rdpi(), [(2.3, f) for f in (1.0, 50.0, 100.0, 200.0)], POINTS)

@@ -31,6 +31,7 @@ def page_of(data_of):
     return make
 
 
+@pytest.mark.slow
 def test_the_page_fetches_nothing_and_shows_names_as_they_are(page_of):
     page = page_of()
     assert page.count("data:image/png") == 1

@@ -32,6 +32,7 @@ def learned(folder, runs, cycles=2):
     return Session(SINE, SETTINGS, folder, runs).learn(cycles, lambda rows: None)
 
 
+@pytest.mark.slow
 def test_each_run_has_the_next_correction_and_noise_of_its_own(tmp_path):
     """The correction of a run stands beside its recording; the check is one run more."""
     runs, folder = Runs(), tmp_path / "lab #3: ü"  # of a name that has a meaning in YAML

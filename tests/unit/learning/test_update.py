@@ -139,6 +139,7 @@ def test_it_backs_off_to_the_best_where_the_error_grows():
     assert abs(after.next_um[0] - best.correction_um[0]) < 0.1
 
 
+@pytest.mark.slow
 def test_a_plant_that_turns_the_wrong_way_does_not_run_away():
     """Where the answer has the wrong sign above 1 kHz, the error never grows far beyond its start.
 

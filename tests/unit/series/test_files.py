@@ -8,6 +8,7 @@ from hilctl.base.errors import InputError
 from hilctl.series.files import write_sheets
 
 
+@pytest.mark.slow
 def test_each_figure_is_a_file_of_each_format(crossed, tmp_path):
     few = replace(crossed, runs=crossed.runs[:3])
     folder = tmp_path / "figures"

@@ -36,6 +36,7 @@ def model() -> StagedModel:
     return inner
 
 
+@pytest.mark.slow
 def test_a_history_that_was_not_fitted_is_met() -> None:
     settings = FitSettings(kind="field", plays=6, drags=1, cells=8, knots=6)
     found = fit_model([history(1, 0.01)], settings, lambda: 0.0)
@@ -46,6 +47,7 @@ def test_a_history_that_was_not_fitted_is_met() -> None:
     assert 1e-4 < found.parameters["field_s"] < 4e-4
 
 
+@pytest.mark.slow
 def test_a_structure_that_a_slow_record_leaves_open_does_not_bend_the_hysteresis() -> None:
     """The first start ends with one as soft as it may be, and misses the data by 4 % rms."""
     t = np.arange(25_000) / 50e3

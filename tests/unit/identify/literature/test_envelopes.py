@@ -19,16 +19,19 @@ FITS = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("fit", "truth", "peak_percent"), FITS)
 def test_a_model_of_its_own_kind_is_found_again(finds_its_own_kind, fit, truth, peak_percent):
     finds_its_own_kind(fit, truth, peak_percent)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("fit", "truth"), [(fit, truth) for fit, truth, _ in FITS])
 def test_what_is_found_can_be_inverted(finds_an_inverse, fit, truth):
     finds_an_inverse(fit, truth)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("fit", "peak_percent"), [(fit_generalised, 1.0)])
 def test_commands_may_all_lie_on_one_side(takes_one_side, fit, peak_percent):
     takes_one_side(fit, peak_percent)

@@ -37,6 +37,7 @@ def found():
     return refine_runs(OLD, five_runs(), source="old.yaml")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("amplitude", [5.0, 3.0, 1.5])
 def test_error_on_unseen_references_is_far_less_than_half(old, found, amplitude):
     v = command(77, amplitude)
@@ -44,6 +45,7 @@ def test_error_on_unseen_references_is_far_less_than_half(old, found, amplitude)
     assert missed_percent(found.model, actuator(), v) < 0.3 * missed_percent(old, actuator(), v)
 
 
+@pytest.mark.slow
 def test_small_runs_do_not_spoil_the_large_loop(old):
     """Runs that move a tenth say nothing of what the whole stroke does."""
     small = [history(OLD, i, amplitude=0.7, noise_um=0.1) for i in range(4)]
@@ -53,6 +55,7 @@ def test_small_runs_do_not_spoil_the_large_loop(old):
     assert missed_percent(found.model, OLD, large) < 0.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("drift_um", [0.0, 1.0])
 def test_creep_of_single_runs_is_not_learned_as_hysteresis(old, drift_um):
     """Each run creeps by another amount; the model found is as good as without."""
@@ -66,12 +69,14 @@ def test_creep_of_single_runs_is_not_learned_as_hysteresis(old, drift_um):
     assert missed_percent(found.model, actuator(), v) < 0.4 * missed_percent(old, actuator(), v)
 
 
+@pytest.mark.slow
 def test_an_offset_becomes_the_models_own(old):
     runs = [history(actuator(offset_um=4.0), i) for i in range(4)]
     found = refine_runs(old, runs)
     assert found.model.output_offset_um == pytest.approx(4.0, abs=0.3)
 
 
+@pytest.mark.slow
 def test_a_model_that_was_right_stays_as_it_is(old):
     """Noise is nothing to learn, and the reason is given."""
     found = refine_runs(old, [history(OLD, i, noise_um=0.05) for i in range(4)])
@@ -80,6 +85,7 @@ def test_a_model_that_was_right_stays_as_it_is(old):
     assert "noise" in found.reasons[0]
 
 
+@pytest.mark.slow
 def test_refining_what_was_refined_goes_on_from_it(old, runs):
     """The old operator is what the new one is held to where new runs say nothing."""
     first = refine_runs(old, runs[:3]).model
@@ -130,6 +136,7 @@ def test_files_in_a_better_model_file_out(tmp_path):
         assert isinstance(found.model, RefinedModel)
 
 
+@pytest.mark.slow
 def test_nothing_is_written_where_it_is_no_better(tmp_path, monkeypatch, old):
     model, output = tmp_path / "old.yaml", tmp_path / "better.yaml"
     model.write_text(dump_model(old))

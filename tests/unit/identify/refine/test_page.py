@@ -6,6 +6,7 @@ from hilctl.identify.refine.command import refine_runs
 from hilctl.identify.refine.page import HEADINGS, refinement_page, refinement_rows, write_refinement
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
 def test_page_has_verdict_table_figures_and_model(old, runs, tmp_path):
     found = refine_runs(old, runs[:3], source="a<b>.yaml")

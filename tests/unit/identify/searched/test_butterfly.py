@@ -38,6 +38,7 @@ def test_errors_are_small_over_one_wing_or_both(loops_of, centre):
     assert found.model.bias == 0.0
 
 
+@pytest.mark.slow
 def test_magnets_are_found_and_what_is_found_can_be_inverted(loops_of):
     """A bias at no command shows in loops over both wings.
 

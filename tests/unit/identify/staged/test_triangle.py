@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+import pytest
 
 from hilctl.identify.data.records import SteadyLoop
 from hilctl.models.files import dump_model, parse_model
@@ -14,6 +15,7 @@ from tests.staged import GRID, fit
 Loops = Callable[..., list[SteadyLoop]]
 
 
+@pytest.mark.slow
 def test_preisach_triangle_is_nearer_between_known_stages(loops_of: Loops) -> None:
     """A triangle in place of plays and deadbands meets loops whose plays bend one by one."""
     stages: dict[str, Any] = {
