@@ -125,9 +125,9 @@ def test_the_board_keeps_the_pace(board):
 
 def test_a_stall_of_this_machine_costs_fifo_and_no_sample(board):
     """After a stall shorter than the FIFO holds, blocks go out in a burst and none is missing."""
-    driven = board(fifo_blocks=10)  # 400 ms, of which this machine may take some for itself
+    driven = board(fifo_blocks=30)  # 1.2 s, of which a busy machine may take most for itself
     driven.open()
-    driven.hold(1.0, 15)
+    driven.hold(1.0, 35)
     driven.clock.extra_ns += 200 * MS
     assert all(np.isfinite(each).all() for each in driven.hold(1.0, 15))
     assert driven.emulator.device.fifo.underruns == 0
