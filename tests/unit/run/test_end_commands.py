@@ -23,7 +23,7 @@ def result(tmp_path):
     return RunResult(tmp_path / "run.mcap", "stopped", "by hand", True, 15, 90, 2, 1)
 
 
-def ended(result, *commands, timeout_s=20.0):
+def ended(result, *commands, timeout_s=120.0):
     """Run shell lines, or what is no text as it is; return the result."""
     lists = [("sh", "-c", each) if isinstance(each, str) else each for each in commands]
     wanted = tuple(EndCommand(command=each, timeout_s=timeout_s) for each in lists)
