@@ -72,7 +72,6 @@ class SimulatedDevice(DacDevice):
         """Put the plant at rest where the output stands, with the sample count at 0."""
         del block
         self._plant = self._build(sample_rate_hz)
-        self._plant.warm_up()
         self._next_sample = 0
         self._last_command = self._output_at_open or 0.0
         self._last_reading_um = 0.0

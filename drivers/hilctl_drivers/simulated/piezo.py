@@ -121,7 +121,7 @@ class PiezoActuator(Plant):
             parameters.offset_um,
         )
         self._state = np.zeros(2)
-        self.reset()
+        self.warm_up()
 
     def _rest(self) -> None:
         self._state[:] = (0.0, self._constants[-1])

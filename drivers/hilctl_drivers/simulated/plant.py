@@ -18,7 +18,7 @@ class Plant(ABC):
     """
 
     def __init__(self, noise_um: float, seed: int) -> None:
-        """Remember the sensor's noise; the subclass calls :meth:`reset` once it is complete.
+        """Remember the sensor's noise; the subclass calls :meth:`warm_up` once it is complete.
 
         Args:
             noise_um: Noise of each reading, rms.
@@ -56,6 +56,7 @@ class Plant(ABC):
 
     def warm_up(self) -> None:
         """Go on by one sample and back to rest, so that nothing is compiled or loaded later."""
+        self.reset()
         self.hold(1, 0.0)
         self.reset()
 

@@ -186,7 +186,7 @@ class TerfenolActuator(Plant):
         self._part = max(1, CHUNK // self._substeps)
         self._halves = np.empty(2 * self._part * self._substeps + 1)
         self._free = np.empty(self._part * self._substeps)
-        self.reset()
+        self.warm_up()
 
     def _rest(self) -> None:
         self._current[:] = 0.0

@@ -192,13 +192,13 @@ def test_a_silent_host_is_noticed_by_the_device(rig, kind):
 @pytest.mark.parametrize("kind", ["dcon", "cobs"])
 def test_exchanges_feed_the_watchdog_and_close_disarms_it(rig, kind):
     """Through several of its timeouts nothing trips, nor after closing."""
-    bench = rig(kind, watchdog={"timeout_s": 1.0, "safe_command": 0.0})
+    bench = rig(kind, watchdog={"timeout_s": 2.0, "safe_command": 0.0})
     bench.open()
     for _ in range(60):
         bench.exchange(3.0)
         bench.pass_s(0.05)
     bench.device.close()
-    bench.pass_s(3.0)
+    bench.pass_s(6.0)
     bench.open()
     assert {event["event"] for event in bench.events()} == {"write"}
 
