@@ -3,7 +3,7 @@
 The rooms, top to bottom; each sees those below it:
 
 cli          commands, messages and tables; the only room that prints
-api.py       a run from a program of one's own
+api          all of it from a program of one's own; what is kept
 desk         who looks on: the live page of a run, and its server
 campaign     many runs of one experiment, kept and resumed
 series       many runs side by side: what varied, figures and page of all of them

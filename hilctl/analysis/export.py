@@ -99,6 +99,12 @@ def columns(recording: Recording) -> Columns:
     return {"sample": samples.index, "t_s": times_s, **named, "flags": samples.flags}
 
 
+def units(recording: Recording) -> dict[str, str]:
+    """Return the unit of each column of :func:`columns` that has one."""
+    fields = [COLUMNS[name].field(recording.command_unit) for name in recording.samples.columns()]
+    return {"t_s": "s", **{each.name: each.unit for each in fields}}
+
+
 def facts(recording: Recording) -> Facts:
     """Return what is kept beside the columns: JSON of the run's facts, and YAML texts."""
     run = {

@@ -7,8 +7,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hilctl.base.errors import InputError
-from hilctl.base.files import check_writable
 from hilctl.cli.options import AsJson, ExperimentFile, LabelTexts, Overwrite, Settings, with_labels
 from hilctl.cli.output import finish_orphans, print_json
 
@@ -34,18 +32,21 @@ def learn(
     as_json: AsJson = False,
 ) -> None:
     """Learn a correction for a reference that repeats: run, correct, and run again."""
-    from hilctl.experiment.correction import write_correction
-    from hilctl.learning.session import Session
-    from hilctl.run.step import paced, unpaced
+    from hilctl import api
+    from hilctl.api.running import runs_folder
 
-    check_writable(output, overwrite=overwrite)
-    chosen = folder or output.with_name(f"{output.stem}-runs")
-    if not overwrite and any(chosen.glob("run-*.mcap")):
-        raise InputError(f"{chosen}: holds runs already: give another --folder, or --overwrite")
     finish_orphans()
-    session = Session(experiment, with_labels(settings, labels), chosen, unpaced if fast else paced)
-    learned = session.learn(cycles, (lambda rows: None) if as_json else _print_rows)
-    write_correction(output, learned.correction, overwrite=overwrite)
+    chosen = runs_folder(output, folder)
+    learned = api.learn(
+        experiment,
+        output,
+        cycles=cycles,
+        folder=chosen,
+        settings=with_labels(settings, labels),
+        fast=fast,
+        overwrite=overwrite,
+        on_rows=(lambda rows: None) if as_json else _print_rows,
+    )
     if as_json:
         print_json({**learned.to_mapping(), "output": str(output), "folder": str(chosen)})
     else:

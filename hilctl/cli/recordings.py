@@ -124,13 +124,11 @@ def replay(
     as_json: AsJson = False,
 ) -> None:
     """Recompute the commands from the recorded reference and compare them bit for bit."""
-    from hilctl.analysis.replay import replay as recompute
+    from hilctl import api
     from hilctl.cli.console import print_replay
-    from hilctl.models.files import load_model
-    from hilctl.recording.reader import Pieces
 
     finish_orphans()
-    result = recompute(Pieces(recording), load_model(model) if model else None)
+    result = api.replay(recording, model)
     if as_json:
         print_json(result.to_mapping())
     else:
@@ -176,9 +174,9 @@ def identify(
     as_json: AsJson = False,
 ) -> None:
     """Identify a model's parameters from recordings or measured tables."""
+    from hilctl import api
     from hilctl.cli.identify_view import print_identification
     from hilctl.cli.progress import shown_progress
-    from hilctl.identify.command import identify_files, settings_from
 
     del list_settings
     check_page(html, overwrite=overwrite)
@@ -192,11 +190,17 @@ def identify(
         "leave_out": leave_out or None,
     }
     texts = [f"{key}={json.dumps(value)}" for key, value in table.items() if value is not None]
-    chosen = settings_from(model, [*texts, *(settings or [])])
     finish_orphans()
     with shown_progress("identify", quiet=as_json) as progress:
-        found = identify_files(
-            files, chosen, output, validate or [], scheduler, overwrite=overwrite, progress=progress
+        found = api.identify(
+            files,
+            output,
+            model=model,
+            settings=[*texts, *(settings or [])],
+            validate=validate or [],
+            scheduler=scheduler,
+            overwrite=overwrite,
+            on_progress=progress,
         )
     if html is not None:
         from hilctl.identify.page import write_identification
@@ -230,8 +234,7 @@ def export(
     as_json: AsJson = False,
 ) -> None:
     """Write a recording's samples as CSV, NumPy, Parquet or MATLAB file."""
-    from hilctl.analysis.export import export as write
-    from hilctl.recording.reader import Pieces
+    from hilctl import api
 
     finish_orphans()
     if every:
@@ -239,7 +242,7 @@ def export(
             raise InputError("--all: writes whole recordings, and replaces none")
         _export_all(recording, output, as_json=as_json)
         return
-    rows = write(Pieces(recording, _stretch(from_s, to_s)), output, overwrite=overwrite)
+    rows = api.export(recording, output, from_s=from_s, to_s=to_s, overwrite=overwrite)
     if as_json:
         print_json({"output": str(output), "rows": rows})
     else:

@@ -29,14 +29,14 @@ def refine(
     as_json: AsJson = False,
 ) -> None:
     """Improve a model from recordings of runs; it is written only where it has become better."""
+    from hilctl import api
     from hilctl.cli.progress import shown_progress
-    from hilctl.identify.refine.command import refine_files
 
     check_page(html, overwrite=overwrite)
     finish_orphans()
     with shown_progress("refine", quiet=as_json) as progress:
-        found = refine_files(
-            model, runs, output, validate or [], overwrite=overwrite, progress=progress
+        found = api.refine(
+            model, runs, output, validate=validate or [], overwrite=overwrite, on_progress=progress
         )
     if html is not None:
         from hilctl.identify.refine.page import write_refinement

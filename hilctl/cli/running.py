@@ -45,8 +45,8 @@ def run(
     if detach:
         _detach(experiment, output, settings, overwrite=overwrite, as_json=as_json)
         return
+    from hilctl import api
     from hilctl.cli.run_view import LiveView, print_run, report_of, run_mapping
-    from hilctl.run.start import start_run
 
     finish_orphans()
     quiet = as_json or watch
@@ -55,7 +55,9 @@ def run(
         _watched(wanted=watch),
         LiveView(quiet=quiet, addresses=addresses) as view,
     ):
-        result = start_run(experiment, settings, output, overwrite, view.update)
+        result = api.run(
+            experiment, output, settings=settings, overwrite=overwrite, on_progress=view.update
+        )
         if result.stop_signal:  # impatience must not cost the result of a run that has ended
             signal.signal(result.stop_signal, signal.SIG_IGN)
     report, unread = None, ""
@@ -114,10 +116,10 @@ def _detach(
 
 def check(experiment: ExperimentFile, settings: Settings = None, as_json: AsJson = False) -> None:
     """Check an experiment and say what it would do; nothing moves."""
+    from hilctl import api
     from hilctl.cli.run_view import print_forecast
-    from hilctl.run.start import checked_experiment
 
-    checked = checked_experiment(experiment, settings or [])
+    checked = api.check(experiment, settings or [])
     if as_json:
         found = {"warnings": list(checked.warnings), **checked.forecast.to_mapping()}
         print_json({"experiment": str(experiment), **found})

@@ -1,9 +1,11 @@
 """Figures of runs as files, in formats and widths of journals."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from hilctl.analysis.sheet import ColumnWidth, drawn
+from matplotlib.figure import Figure
+
+from hilctl.analysis.sheet import ColumnWidth, Sheet, drawn
 from hilctl.analysis.vector import write_figure
 from hilctl.base.errors import InputError
 from hilctl.series.collect import OnRead, RunSeries
@@ -18,6 +20,7 @@ def write_sheets(
     *,
     overwrite: bool,
     on_done: OnRead = lambda done, text: None,
+    on_drawn: Callable[[str, Figure], None] = lambda name, figure: None,
 ) -> dict[Path, str]:
     """Write all figures that apply to runs.
 
@@ -28,6 +31,7 @@ def write_sheets(
         width: Of one column of a journal, or of two.
         overwrite: Whether files of these names may be replaced.
         on_done: Told of progress.
+        on_drawn: Called with each figure and its name.
 
     Returns:
         The files, each with its caption.
@@ -35,9 +39,7 @@ def write_sheets(
     Raises:
         InputError: No figure applies, or a file exists or can't be written.
     """
-    sheets = sheets_of(series)
-    if not sheets:
-        raise InputError(f"{series.name}: no completed run holds what a figure could be drawn of")
+    sheets = _applying(series)
     names = [folder / f"{sheet.name}.{each}" for sheet in sheets for each in formats]
     taken = [path for path in names if path.exists()]
     if taken and not overwrite:
@@ -50,6 +52,35 @@ def write_sheets(
     for number, sheet in enumerate(sheets):
         on_done(number / len(sheets), f"draw {sheet.name}")
         figure = drawn(sheet, width)
+        on_drawn(sheet.name, figure)
         paths = write_figure(figure, folder, sheet.name, formats, overwrite=overwrite)
         written |= dict.fromkeys(paths, sheet.caption)
     return written
+
+
+def draw_sheets(
+    series: RunSeries, width: ColumnWidth, on_done: OnRead = lambda done, text: None
+) -> dict[str, Figure]:
+    """Draw all figures that apply to runs; return them by their names.
+
+    Args:
+        series: The runs.
+        width: Of one column of a journal, or of two.
+        on_done: Told of progress.
+
+    Raises:
+        InputError: No figure applies.
+    """
+    figures = {}
+    sheets = _applying(series)
+    for number, sheet in enumerate(sheets):
+        on_done(number / len(sheets), f"draw {sheet.name}")
+        figures[sheet.name] = drawn(sheet, width)
+    return figures
+
+
+def _applying(series: RunSeries) -> list[Sheet]:
+    sheets = sheets_of(series)
+    if not sheets:
+        raise InputError(f"{series.name}: no completed run holds what a figure could be drawn of")
+    return sheets

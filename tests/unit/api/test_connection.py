@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import pytest
 
 from hilctl import api
+from hilctl.api import connection
 from hilctl.base.errors import RunError
 from tests.unit.cli.test_steering import HEAVY
 
@@ -16,9 +17,9 @@ from tests.unit.cli.test_steering import HEAVY
 def run(monkeypatch):
     """A run named by the test; what is sent to it comes back."""
     card = SimpleNamespace(name="sine-7", recording="a.mcap")
-    monkeypatch.setattr(api, "find_run", lambda name: SimpleNamespace(card=card, asked=name))
+    monkeypatch.setattr(connection, "find_run", lambda name: SimpleNamespace(card=card, asked=name))
     for name in ("status_of", "mark_run", "set_run"):
-        monkeypatch.setattr(api, name, lambda folder, *given, **named: (*given, named))
+        monkeypatch.setattr(connection, name, lambda folder, *given, **named: (*given, named))
     return api.connect("sine")
 
 
@@ -32,7 +33,7 @@ def test_what_is_wanted_is_passed_on(run):
 
 def test_a_run_that_does_not_stop_is_an_error(run, monkeypatch):
     stopped = {"ended": False, "error": ""}
-    monkeypatch.setattr(api, "stop_runs", lambda chosen, wait_s: [stopped])
+    monkeypatch.setattr(connection, "stop_runs", lambda chosen, wait_s: [stopped])
     with pytest.raises(RunError, match="sine-7 is still going after 2 s: it was requested to stop"):
         run.stop(2.0)
     stopped["ended"] = True

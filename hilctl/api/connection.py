@@ -1,11 +1,4 @@
-"""For programs of one's own: a run that is going on, to look at, to change, to mark, to stop.
-
-    import hilctl.api
-
-    run = hilctl.api.connect()
-    run.set(inverse="out", over_s=0.5)
-    run.mark("tapped the stage")
-    run.stop()
+"""A run that is going on, to look at, to change, to mark, to stop.
 
 It speaks the protocol of ``docs/protocol.md`` and imports nothing heavy until it is needed.
 """

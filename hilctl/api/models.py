@@ -1,0 +1,128 @@
+"""Models: identified, refined, compared."""
+
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from hilctl.api.given import PathLike, Paths, Settings, path_or_none, paths_of, texts_of
+
+if TYPE_CHECKING:
+    from hilctl.comparison.compare import Comparison
+    from hilctl.identify.command import Identification
+    from hilctl.identify.refine.command import Refinement
+
+
+def identify(
+    files: Paths,
+    output: PathLike | None = None,
+    *,
+    model: str = "auto",
+    settings: Settings = (),
+    validate: Paths = (),
+    scheduler: str = "none",
+    overwrite: bool = False,
+    on_progress: Callable[[float, str], None] = lambda done, text: None,
+) -> "Identification":
+    """Identify a model's parameters from recordings or measured tables.
+
+    Args:
+        files: Recordings (MCAP) and text tables.
+        output: Model file to write; what is no model of these data is not written.
+        model: Its kind, or ``auto``: what is best on data that no fit saw.
+        settings: Of the fit, see ``hilctl identify --settings``.
+        validate: Files to judge the model on; parts of the others where there are none.
+        scheduler: Where independent fits run: ``none``, ``processes``, or a Dask address.
+        overwrite: Whether a model file of that name may be replaced.
+        on_progress: Called with how much is done, from 0 to 1, and what is being done.
+
+    Returns:
+        The model, its errors (held out first) and its verdict: good, usable, or not a model.
+
+    Raises:
+        InputError: A file or a setting can't be used; nothing is written.
+    """
+    from hilctl.identify.command import identify_files, settings_from
+
+    return identify_files(
+        paths_of(files),
+        settings_from(model, texts_of(settings)),
+        path_or_none(output),
+        paths_of(validate),
+        scheduler,
+        overwrite=overwrite,
+        progress=on_progress,
+    )
+
+
+def refine(
+    model: PathLike,
+    runs: Paths,
+    output: PathLike | None = None,
+    *,
+    validate: Paths = (),
+    overwrite: bool = False,
+    on_progress: Callable[[float, str], None] = lambda done, text: None,
+) -> "Refinement":
+    """Improve a model from recordings of runs; it is written only where it has become better.
+
+    Args:
+        model: Model file.
+        runs: Recordings of compensated, learned or plain runs.
+        output: Model file to write; None for none.
+        validate: Recordings to judge it on; each run in turn where there are none.
+        overwrite: Whether a model file of that name may be replaced.
+        on_progress: Called with how much is done, from 0 to 1, and what is being done.
+
+    Raises:
+        InputError: A file can't be used; nothing is written.
+    """
+    from hilctl.identify.refine.command import refine_files
+
+    return refine_files(
+        Path(model),
+        paths_of(runs),
+        path_or_none(output),
+        paths_of(validate),
+        overwrite=overwrite,
+        progress=on_progress,
+    )
+
+
+def compare(
+    recordings: Paths,
+    models: Sequence[str] = (),
+    *,
+    experiment: PathLike | None = None,
+    settings: Settings = (),
+    frequencies_hz: Sequence[float] | None = None,
+    points: int | None = None,
+    on_progress: Callable[[float, str], None] = lambda done, text: None,
+) -> "Comparison":
+    """Identify models of the literature on the same loops, and try their inverses.
+
+    Args:
+        recordings: Recordings of steady loops.
+        models: Kinds of model, or model files; those of ``hilctl compare`` where empty.
+        experiment: Experiment that gives device, limits and waveform of the trials; from the first
+            recording where None.
+        settings: Over that experiment.
+        frequencies_hz: Of the trials; 10, 100 and 200 Hz for sines where None.
+        points: Points a loop; 300 where None.
+        on_progress: Called with how much is done, from 0 to 1, and what is being done.
+
+    Raises:
+        InputError: A file or a model can't be used.
+    """
+    from hilctl.comparison.compare import POINTS, ComparisonRequest
+    from hilctl.comparison.compare import compare as compare_models
+
+    request = ComparisonRequest(
+        recordings=paths_of(recordings),
+        models=models,
+        experiment=path_or_none(experiment),
+        settings=texts_of(settings),
+        frequencies_hz=frequencies_hz,
+        points=POINTS if points is None else points,
+    )
+    return compare_models(request, time.perf_counter, on_progress)

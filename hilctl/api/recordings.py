@@ -1,0 +1,211 @@
+"""Recordings, read and judged."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from hilctl.api.given import PathLike, Paths, paths_of
+from hilctl.api.table import SampleTable
+from hilctl.base.errors import InputError
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from hilctl.analysis.figures import RunReport
+    from hilctl.analysis.replay import ReplayResult
+    from hilctl.recording.data import Recording
+    from hilctl.recording.stretch import Stretch
+
+
+@dataclass(frozen=True)
+class RecordedRun:
+    """A recording, read.
+
+    Attributes:
+        recording: All that it holds, see :class:`hilctl.recording.data.Recording`: samples,
+            segments, ticks, events, and the facts of the run.
+    """
+
+    recording: "Recording"
+
+    @property
+    def path(self) -> Path:
+        """File that it was read from."""
+        return self.recording.path
+
+    @property
+    def facts(self) -> dict[str, str]:
+        """What the recording says of the run, from its start and its end."""
+        return {**self.recording.run, **self.recording.end}
+
+    @property
+    def labels(self) -> Mapping[str, Any]:
+        """What the run is found by."""
+        return self.recording.labels
+
+    @cached_property
+    def table(self) -> SampleTable:
+        """The samples as named columns: ``sample``, ``t_s``, those recorded, ``flags``."""
+        from hilctl.analysis.export import columns, units
+
+        return SampleTable(columns(self.recording), units(self.recording))
+
+
+def read(path: PathLike, *, from_s: float | None = None, to_s: float | None = None) -> RecordedRun:
+    """Read a recording into memory.
+
+    Args:
+        path: MCAP file; one that was cut short gives what it holds, with a warning in the log.
+        from_s: Read what comes from then on, in s since the start of the run.
+        to_s: Read what comes before then.
+
+    Raises:
+        InputError: There is no such file.
+        DataError: It is no recording, or holds no sample of that stretch.
+    """
+    from hilctl.recording.reader import read as read_file
+
+    return RecordedRun(read_file(Path(path), _stretch(from_s, to_s)))
+
+
+def _stretch(from_s: float | None, to_s: float | None) -> "Stretch | None":
+    from hilctl.recording.stretch import Stretch
+
+    return None if from_s is None and to_s is None else Stretch(from_s, to_s)
+
+
+def summarize(run: RecordedRun | PathLike) -> "RunReport":
+    """Return the figures of a run: hysteresis, errors, noise, lateness, by segment.
+
+    Args:
+        run: What was read, or a file: that is read in pieces, and may be larger than memory.
+
+    Raises:
+        InputError: There is no such file.
+        DataError: It is no recording.
+    """
+    from hilctl.analysis.report import summarize as judge
+    from hilctl.recording.reader import Pieces
+
+    return judge(run.recording if isinstance(run, RecordedRun) else Pieces(Path(run)))
+
+
+def replay(run: RecordedRun | PathLike, model: PathLike | None = None) -> "ReplayResult":
+    """Recompute the commands of a run from its reference, and hold them against the recorded ones.
+
+    Args:
+        run: What was read, or a file: that is read in pieces.
+        model: Model file of another compensator: what it would have done.
+
+    Raises:
+        InputError: There is no such file.
+        DataError: It is no recording, or can't be replayed.
+    """
+    from hilctl.analysis.replay import replay as recompute
+    from hilctl.models.files import load_model
+    from hilctl.recording.reader import Pieces
+
+    other = None if model is None else load_model(Path(model))
+    recorded = run.recording if isinstance(run, RecordedRun) else Pieces(Path(run))
+    return recompute(recorded, other)
+
+
+def export(
+    run: RecordedRun | PathLike,
+    output: PathLike,
+    *,
+    from_s: float | None = None,
+    to_s: float | None = None,
+    overwrite: bool = False,
+) -> int:
+    """Write samples as ``.csv``, ``.npz``, ``.parquet`` or ``.mat``; return how many.
+
+    Args:
+        run: What was read, or a file: that is read in pieces.
+        output: File to write; its suffix says the format.
+        from_s: Of a file: write what comes from then on, in s since the start of the run.
+        to_s: Of a file: write what comes before then.
+        overwrite: Whether a file of that name may be replaced.
+
+    Raises:
+        InputError: A file can't be read or written, or the format is unknown; nothing is written.
+        DataError: There is no sample.
+    """
+    from hilctl.analysis.export import export as write
+    from hilctl.recording.reader import Pieces
+
+    stretch = _stretch(from_s, to_s)
+    if isinstance(run, RecordedRun):
+        if stretch is not None:
+            raise InputError("from_s and to_s are for a file: give them to read() instead")
+        return write(run.recording, Path(output), overwrite=overwrite)
+    return write(Pieces(Path(run), stretch), Path(output), overwrite=overwrite)
+
+
+def list_runs(
+    folder: PathLike = ".", where: str = "", sort: str = "started", *, reverse: bool = False
+) -> list[dict[str, Any]]:
+    """Return what is known of all recordings below a folder, from their first and last bytes.
+
+    Args:
+        folder: The folder.
+        where: A condition, ``frequency_hz > 100 and label.sample == "A7"``; empty for all.
+        sort: Key to sort by.
+        reverse: The other way round.
+
+    Raises:
+        InputError: The folder can't be listed, the condition can't be read, or a key is none.
+    """
+    from hilctl.analysis.catalogue import read_catalogue
+
+    catalogue = read_catalogue(Path(folder))
+    return [catalogue.entry(row) for row in catalogue.rows(where, sort, reverse=reverse)]
+
+
+def figures(
+    runs: Paths,
+    output: PathLike | None = None,
+    *,
+    formats: str = "svg,pdf,png",
+    width: Literal["single", "double"] = "double",
+    model: PathLike | None = None,
+    overwrite: bool = False,
+    on_progress: Callable[[float, str], None] = lambda done, text: None,
+) -> dict[str, tuple["Axes", ...]]:
+    """Draw the figures that apply to runs, by what varied among them.
+
+    Args:
+        runs: One recording or several, or a folder of them, or of a campaign.
+        output: Folder for a file of each in each format; None for none.
+        formats: ``svg``, ``pdf`` or ``png``, several with commas between.
+        width: Of one column of a journal, 85 mm, or of two, 175 mm.
+        model: Model file to hold against measured loops; the recorded ones where None.
+        overwrite: Whether files may be replaced.
+        on_progress: Called with how much is done, from 0 to 1, and what is being done.
+
+    Returns:
+        The axes of each figure, by its short name; ``axes[0].figure`` is the whole one.
+
+    Raises:
+        InputError: A run can't be read, no figure applies, or a file can't be written.
+        DataError: A recording that was named can't be read.
+    """
+    from hilctl.analysis.vector import formats_of
+    from hilctl.models.files import load_model
+    from hilctl.series.collect import collect
+    from hilctl.series.files import draw_sheets, write_sheets
+
+    chosen = formats_of(formats)
+    known = None if model is None else load_model(Path(model))
+    series = collect(paths_of(runs), known, on_progress)
+    if output is None:
+        drawn = draw_sheets(series, width, on_progress)
+    else:
+        drawn = {}
+        write_sheets(
+            series, Path(output), chosen, width,
+            overwrite=overwrite, on_done=on_progress, on_drawn=drawn.__setitem__,
+        )  # fmt: skip
+    return {name: tuple(figure.axes) for name, figure in drawn.items()}

@@ -1,0 +1,48 @@
+"""The scripts of ``examples/`` run as they are, and what they print and write is what they say."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+# What the text they print must match, figures within what the simulated rig allows, and files.
+EXPECTED = {
+    "first_run": (r"peak hysteresis 3\d\.\d % of 8\d\.\d um", "first-run/loop.svg"),
+    "find_a_model": (r"peak hysteresis \d\.\d\d %", "find-a-model/model.yaml"),
+    "before_and_after": (
+        r"before: 3\d\.\d+ % .*\nafter: [01]\.\d+ %", "before-and-after/before_and_after.svg",
+    ),
+    "learn": (r"run 0: .*[\s\S]*\n0\.\d+ % peak error", "learn/correction.yaml"),
+    "campaign_to_figure": (
+        r"(?s)step 1 .*completed.*table\.csv.*\.mcap\n.*\.mcap", "campaign/figures",
+    ),
+    "matlab_handover": (r"run\.mat: \d+ samples[\s\S]*\nTrue", "handover/run.npz"),
+}  # fmt: skip
+CELL = re.compile(r"^# %%", re.MULTILINE)
+
+
+def test_each_is_expected_and_listed():
+    names = {path.stem for path in EXAMPLES.glob("*.py")}
+    assert names == set(EXPECTED)
+    listed = (EXAMPLES / "README.md").read_text()
+    assert all(f"`{name}.py`" in listed for name in names)
+
+
+@pytest.mark.parametrize("name", EXPECTED)
+def test_example(name, tmp_path):
+    """From an empty folder, without a display."""
+    text, written = EXPECTED[name]
+    script = EXAMPLES / f"{name}.py"
+    assert len(CELL.findall(script.read_text())) >= 3
+    ended = subprocess.run(
+        [sys.executable, "-W", "error", str(script)],
+        cwd=tmp_path, env=os.environ | {"MPLBACKEND": "agg"},
+        capture_output=True, text=True, check=False, timeout=480.0,
+    )  # fmt: skip
+    assert ended.returncode == 0, ended.stderr
+    assert re.search(text, ended.stdout), ended.stdout
+    assert (tmp_path / "examples-out" / written).exists()

@@ -1,0 +1,55 @@
+"""Models from Python: what is passed on, and a fit from a table to a file."""
+
+import numpy as np
+import pytest
+
+from hilctl import api
+from hilctl.models.files import load_model
+from hilctl.models.plays import PpiModel
+
+
+@pytest.fixture
+def table(tmp_path):
+    """Loops of a Prandtl-Ishlinskii model, in a text file."""
+    truth = PpiModel(direct=6.0, weights=(2.0, 1.5), thresholds=(0.5, 1.5))
+    command = 4.0 * np.sin(2.0 * np.pi * np.arange(4000) / 1000.0)
+    displacement_um = np.empty(command.size)
+    truth.forward(1000.0).process(command, displacement_um)
+    file = tmp_path / "loops.csv"
+    rows = np.column_stack([np.arange(command.size) / 1000.0, command, displacement_um])
+    np.savetxt(file, rows, delimiter=",", header="t_s,current_a,displacement_um", comments="")
+    return file
+
+
+def test_a_model_is_identified_and_written(table, tmp_path):
+    output = tmp_path / "model.yaml"
+    texts = []
+    found = api.identify(
+        str(table),
+        output,
+        model="ppi",
+        settings={"plays": 6, "table.time_column": "t_s"},
+        on_progress=lambda *s: texts.append(s),
+    )
+    assert found.verdict.grade != "not a model"
+    assert load_model(output).kind == "ppi"
+    assert texts
+
+
+def test_what_is_given_is_passed_on(monkeypatch, tmp_path):
+    """One path or several, texts or values; nothing is left out."""
+    seen = {}
+    monkeypatch.setattr(
+        "hilctl.identify.refine.command.refine_files", lambda *given, **named: (given, named)
+    )
+    monkeypatch.setattr("hilctl.comparison.compare.compare", lambda *given: seen.update(all=given))
+    given, named = api.refine("m.yaml", ["a.mcap", "b.mcap"], validate="c.mcap", overwrite=True)
+    assert [str(path) for path in (given[0], *given[1], *given[3])] == [
+        "m.yaml", "a.mcap", "b.mcap", "c.mcap",
+    ]  # fmt: skip
+    assert given[2] is None
+    assert named["overwrite"]
+    api.compare("a.mcap", ["ppi"], settings={"block": 5}, frequencies_hz=[1.0])
+    request = seen["all"][0]
+    assert [str(path) for path in request.recordings] == ["a.mcap"]
+    assert (request.models, request.settings, request.points) == (["ppi"], ["block=5"], 300)
