@@ -191,8 +191,7 @@ function showFigures() {
 }
 
 function showGauges() {
-  const list = [...status.gauges,
-    { name: "ring", used: status.ring_used, value: 100 * status.ring_used, limit: 100, unit: "%" }];
+  const list = status.gauges;
   const box = $("gauges");
   const names = list.map((gauge) => gauge.name).join();
   if (box.dataset.names !== names) {
@@ -214,8 +213,7 @@ function showGauges() {
   }
   list.forEach((gauge, at) => {
     const [, bar, part, text] = box.children[at].children;
-    const kind = gauge.used > 0.95 ? "bad" : gauge.used > 0.8 ? "warn" : "";
-    box.children[at].dataset.kind = kind;
+    box.children[at].dataset.kind = gauge.level;
     bar.firstChild.style.width = `${Math.min(100, 100 * gauge.used)}%`;
     part.textContent = `${number(100 * gauge.used, 1, 6)} %`;
     text.textContent = `${Number(gauge.value.toPrecision(3))} of ${Number(gauge.limit.toPrecision(4))} ${gauge.unit}`;
