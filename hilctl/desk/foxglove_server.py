@@ -12,7 +12,13 @@ from typing import TYPE_CHECKING
 from hilctl.base.errors import InputError, RunError
 from hilctl.desk.feed import RunFeed
 from hilctl.desk.feeds import RunFeeds
-from hilctl.desk.foxglove_topics import DIAGNOSTICS, DIAGNOSTICS_SCHEMA, MESSAGES, LiveTopics
+from hilctl.desk.foxglove_topics import (
+    DIAGNOSTICS,
+    DIAGNOSTICS_SCHEMA,
+    MESSAGES,
+    SCOPE_TOPICS,
+    LiveTopics,
+)
 from hilctl.recording import schema
 from hilctl.recording.messages import Encoded
 from hilctl.run.run_folder import RunFolder
@@ -92,7 +98,8 @@ class FoxgloveServer:
             self._shown, self._topics = feed, LiveTopics(feed, start_unix_ns)
         if self._topics is None:
             return
-        for message in self._topics.scope():
+        wanted = [topic for topic in SCOPE_TOPICS if self._channels[topic].has_sinks()]
+        for message in self._topics.scope(wanted):
             self._log(message)
         for message in self._topics.events():
             self._log(message)

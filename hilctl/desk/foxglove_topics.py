@@ -7,7 +7,7 @@ samples they are of, so that no spike is lost.
 """
 
 import json
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from typing import Any, Literal
 
 import numpy as np
@@ -98,16 +98,19 @@ class LiveTopics:
         fields = {name: COLUMNS[name].field(self._layout.command_unit) for name in _COLUMNS}
         self._rows = {fields[name].scope: ROW[signal] for name, signal in _COLUMNS.items()}
 
-    def scope(self) -> Iterator[Encoded]:
+    def scope(self, wanted: Collection[str] = SCOPE_TOPICS) -> Iterator[Encoded]:
         """Yield the messages of the buckets that have become whole, the oldest first.
 
         Those that are gone before they were asked for are left out: the newest count.
+
+        Args:
+            wanted: Topics that somebody listens to.
         """
         first, buckets = self._feed.scope.whole_buckets(_WINDOW_S, self._next_bucket)
         count, width = buckets.first.shape[1], self._feed.scope.bucket_samples(_WINDOW_S)
         self._next_bucket = first + count
-        for topic, part in SCOPE_TOPICS.items():
-            values: F64 = getattr(buckets, part)[list(self._rows.values())]
+        for topic in wanted:
+            values: F64 = getattr(buckets, SCOPE_TOPICS[topic])[list(self._rows.values())]
             for at in np.flatnonzero(~np.isnan(values).all(axis=0)).tolist():
                 sample = (first + at) * width
                 doubles = dict(zip(self._rows, values[:, at].tolist(), strict=True))

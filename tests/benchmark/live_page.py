@@ -196,6 +196,8 @@ def main():
     parser.add_argument("--seconds", type=float, help="120 of frames, 3 of each half of a pair")
     parser.add_argument("--pairs", type=int, default=30)
     parser.add_argument("--client", choices=("browser", "plain"), default="browser")
+    parser.add_argument("--turns", type=int, default=5, help="how often strangers come")
+    parser.add_argument("--only", default="", help="strangers whose name has this")
     parser.add_argument("--kill-server", action="store_true")
     parser.add_argument("--nice", type=int, default=0)
     given = parser.parse_args()

@@ -99,7 +99,7 @@ def test_what_was_not_asked_for_in_time_is_left_out(run):
     feed.poll(1.1)
     exchange(ring, range(500, 900))
     feed.poll(1.2)
-    newest = decoded(topics.scope())["/scope"]
+    newest = decoded(topics.scope(["/scope"]))["/scope"]
     assert len(newest) < 600
     assert newest[-1][1].sample == 42 * (900 * 50 // 42 - 1)
 
