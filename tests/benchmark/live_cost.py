@@ -13,8 +13,9 @@ import signal
 import socket
 import subprocess
 import sys
+import tempfile
 import time
-from contextlib import asynccontextmanager, suppress
+from contextlib import asynccontextmanager, contextmanager, suppress
 
 import numpy as np
 from websockets.exceptions import ConnectionClosed
@@ -24,7 +25,7 @@ from tests.benchmark.live_client import opened
 from tests.benchmark.live_run import LiveRun, Meter, page_server, processor_s
 
 _SETTLE_S = 1.0
-_LONG = ("crowd_of_10000", "slow_reader")
+_LONG = ("message_of_100_mb", "crowd_of_10000", "slow_reader")
 """Strangers that take their time, and come once."""
 _ERROR = (socket.SOL_SOCKET, socket.SO_ERROR)
 
@@ -128,36 +129,61 @@ def _say(text):
 
 
 async def hostile(folder, given):
-    """Strangers at the door of a run; what each of them got, and the run meanwhile and before."""
+    """Strangers at the door of a run; what each of them got, and the run meanwhile.
+
+    They take the processor's time themselves. So windows without them have the same strangers at
+    the door of another program, but for those that no other would keep as long.
+    """
     resource.setrlimit(resource.RLIMIT_NOFILE, (16384, 20000))
     found, pairs, window_s = {}, [], given.seconds or 3.0
-    with LiveRun(folder, 900, "recording.on_failure=go_on") as run:
+    with LiveRun(folder, 900, "recording.on_failure=go_on") as run, _another_program() as elsewhere:
         url = await run.url()
-        port, token = int(re.search(r":(\d+)/", url)[1]), url.partition("#")[2]
-        own = f"http://127.0.0.1:{port}"
-        strangers = {
-            "foreign_origin": lambda: _refused(port, token, "http://evil.example"),
-            "no_token": lambda: _refused(port, "", own),
-            "wrong_token": lambda: _refused(port, "0" * 32, own),
-            "foreign_host": lambda: _status(port, "evil.example"),
-            "crowd_of_10000": lambda: _crowd(port, token, own),
-            "message_of_100_mb": lambda: _flood(port, token, own),
-            "slow_reader": lambda: _slow(port, token, own),
-            "another_user": lambda: asyncio.to_thread(_as_nobody, port),
-        }
+        strangers = _strangers(int(re.search(r":(\d+)/", url)[1]), url.partition("#")[2])
+        others = _strangers(elsewhere, "0" * 32)
         meter = await Meter.of(run)
-        strangers = {name: each for name, each in strangers.items() if given.only in name}
         for turn in range(given.turns):
-            for name, stranger in strangers.items():
+            for name in [each for each in strangers if given.only in each]:
                 if turn and name in _LONG:
                     continue
-                plain, _ = await meter.stretch(window_s)
-                visited, found[name] = await meter.stretch(0.0, _for(window_s, stranger))
+                there = None if name in _LONG else _for(window_s, others[name])
+                plain, _ = await meter.stretch(window_s, there)
+                visited, found[name] = await meter.stretch(0.0, _for(window_s, strangers[name]))
                 pairs.append((plain, visited))
-                _say(f"{turn} {name}: {found[name]}; without / with: {_pair_text(*pairs[-1])}")
+                _say(f"{turn} {name}: {found[name]}; elsewhere / here: {_pair_text(*pairs[-1])}")
                 await asyncio.sleep(_SETTLE_S)
         result = await run.stopped()
     return found | _compared(pairs) | {"code": result["code"], "run_dropped": result["dropped"]}
+
+
+def _strangers(port, token):
+    """Return who comes to a server, by what is wrong with them."""
+    own = f"http://127.0.0.1:{port}"
+    return {
+        "foreign_origin": lambda: _refused(port, token, "http://evil.example"),
+        "no_token": lambda: _refused(port, "", own),
+        "wrong_token": lambda: _refused(port, "0" * 32, own),
+        "foreign_host": lambda: _status(port, "evil.example"),
+        "another_user": lambda: asyncio.to_thread(_as_nobody, port),
+        "message_of_100_mb": lambda: _flood(port, token, own),
+        "crowd_of_10000": lambda: _crowd(port, token, own),
+        "slow_reader": lambda: _slow(port, token, own),
+    }
+
+
+@contextmanager
+def _another_program():
+    """A server that knows nothing of runs; yield its port."""
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    words = [sys.executable, "-m", "http.server", "--bind", "127.0.0.1", str(port)]
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    with tempfile.TemporaryDirectory() as empty:
+        process = subprocess.Popen(words, cwd=empty, **quiet)
+        try:
+            yield port
+        finally:
+            process.terminate()
+            process.wait()
 
 
 async def _for(seconds, stranger):
