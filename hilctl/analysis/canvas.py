@@ -21,6 +21,8 @@ COMMAND = "#D55E00"
 ERROR = "#009E73"
 MARK = "#CC79A7"
 QUIET = "#666666"
+WITHOUT, WITH = COMMAND, DISPLACEMENT
+"""Colours of a motion without a compensator and with one, wherever both are drawn."""
 
 MAX_POINTS = 4000
 """Most points of one line."""

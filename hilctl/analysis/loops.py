@@ -7,7 +7,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 
-from hilctl.analysis.canvas import COMMAND, DISPLACEMENT, MARK, REFERENCE
+from hilctl.analysis.canvas import DISPLACEMENT, MARK, REFERENCE, WITH, WITHOUT
 from hilctl.analysis.sheet import Panel, Sheet
 from hilctl.analysis.steady import SteadyPart, steady_part
 from hilctl.base import metrics
@@ -141,7 +141,7 @@ def before_and_after(before: Recording, after: Recording) -> Sheet | None:
 
     def draw(axes: Axes, off_line: float) -> None:
         for (x, y), colour, label in zip(
-            shown, (COMMAND, DISPLACEMENT), ("without compensator", "with it"), strict=True
+            shown, (WITHOUT, WITH), ("without compensator", "with it"), strict=True
         ):
             axes.plot(x, y - off_line * x, color=colour, linewidth=1.0, label=label)
         straight = [0.0, 100.0 * (1.0 - off_line)]

@@ -16,13 +16,23 @@ def live(
         ),
     ] = None,
     port: Annotated[
-        int, typer.Option(min=0, max=65535, help="Port on this machine; 0 for any that is free.")
-    ] = 0,
+        int | None,
+        typer.Option(
+            min=0,
+            max=65535,
+            help="Port on this machine; any that is free if left out, 8765 with --foxglove.",
+        ),
+    ] = None,
+    foxglove: Annotated[
+        bool,
+        typer.Option(
+            "--foxglove", help="Serve Foxglove, Lichtblick or PlotJuggler instead of a page."
+        ),
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Serve a page that shows runs as they go on, until Ctrl-C or the end of RUN."""
-    from hilctl.desk.live import UntilEnded, serve_runs
-    from hilctl.desk.server import LiveServer
+    from hilctl.desk.live import ShowsRuns, UntilEnded, serve_foxglove, serve_runs
     from hilctl.run.client import find_run
     from hilctl.run.run_folder import RunFolder
 
@@ -35,15 +45,17 @@ def live(
 
     ended = UntilEnded()
 
-    def over(server: LiveServer) -> bool:
+    def over(server: ShowsRuns) -> bool:
         if first is None:
             return False
         # One that has ended before it could be looked at leaves nothing to wait for.
         return ended(server) or (server.feed(None) is None and not first.alive)
 
-    serve_runs(
-        chosen,
-        over,
-        lambda url: print_json({"url": url}) if as_json else print(f"live page: {url}", flush=True),
-        port,
-    )
+    def on_url(url: str) -> None:
+        what = "Foxglove server" if foxglove else "live page"
+        print_json({"url": url}) if as_json else print(f"{what}: {url}", flush=True)
+
+    if foxglove:
+        serve_foxglove(chosen, over, on_url, port)
+    else:
+        serve_runs(chosen, over, on_url, port or 0)

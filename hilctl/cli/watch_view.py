@@ -128,7 +128,7 @@ def _figures(status: dict[str, Any]) -> str:
 def _timing(status: dict[str, Any]) -> str:
     late = status["lateness_us"]
     wakes = f"  p99 {late['p99']:.0f} us  latest {late['max']:.0f} us" if late else ""
-    return f"late ticks {status['late_ticks']}{wakes}  ring {100.0 * status['ring_used']:.0f} %"
+    return f"late ticks {status['late_ticks']}{wakes}"
 
 
 def _limits(status: dict[str, Any]) -> str:

@@ -9,8 +9,10 @@ scope.py      windows over time, rolling or triggered to the waveform's cycle, a
 figures.py    running figures of quality; spectrum.py  of the error
 lateness.py   how late the ticks woke; headroom.py  what is left to each limit
 feed.py       all of it from one run's folder; frames.py  as bytes for a page, subscription.py
-              for programs
+              for programs, foxglove_topics.py  for Foxglove
+feeds.py      the runs that are going on
 server.py     the page and its connections, on loopback; static.py  its files, those of page/
 admission.py  who is let in; viewer.py  one page: what it asks for, and how much it gets
-live.py       the server as a process
+foxglove_server.py  the same without a page, for Foxglove and its like
+live.py       the servers as processes
 """

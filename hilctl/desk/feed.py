@@ -13,7 +13,7 @@ from typing import Any
 from hilctl.base.errors import RunError
 from hilctl.base.events import Event
 from hilctl.desk.figures import FigureValues, RunningFigures
-from hilctl.desk.headroom import Headroom
+from hilctl.desk.headroom import Gauge, Headroom
 from hilctl.desk.lateness import EDGES_US, LatenessCounts
 from hilctl.desk.scope import Scope
 from hilctl.desk.signals import Traces, traces_of
@@ -135,6 +135,11 @@ class RunFeed:
         return self.events[len(self.events) - new :], self._events_seen
 
     @property
+    def start_ns(self) -> int:
+        """When sample 0 was due, monotonic time in ns; 0 before that is known."""
+        return self._page.get(Field.START_NS)
+
+    @property
     def state(self) -> str:
         """Where the run stands, in a word."""
         outcome = self._page.outcome()
@@ -164,6 +169,9 @@ class RunFeed:
         page, rate_hz = self._page, self.description.sample_rate_hz
         outcome = page.outcome()
         late = self._lateness.percentiles_us()
+        ring_used = (page.get(Field.HEAD) - page.get(Field.TAIL)) / self._ring.slots
+        gauges = self._headroom.gauges(late.get("max", 0.0) * 1e-6)
+        gauges.append(Gauge("ring", ring_used, 100.0 * ring_used, 100.0, "%"))
         return {
             "run": self.folder.card.name,
             "recording": self.folder.card.recording,
@@ -183,8 +191,8 @@ class RunFeed:
             "lateness_us": late,
             "lateness_edges_us": EDGES_US.tolist(),
             "lateness_counts": self._lateness.counts.tolist(),
-            "gauges": [asdict(each) for each in self._headroom.gauges(late.get("max", 0.0) * 1e-6)],
-            "ring_used": (page.get(Field.HEAD) - page.get(Field.TAIL)) / self._ring.slots,
+            "gauges": [{**asdict(each), "level": each.level} for each in gauges],
+            "ring_used": ring_used,
             "disk": asdict(self._disk) if self._disk else None,
             "events": [_plain_event(each, rate_hz) for each in self.events],
         }

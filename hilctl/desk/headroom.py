@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -9,6 +10,8 @@ from hilctl.base.arrays import F64, I64
 from hilctl.desk.signals import ROW, Traces
 from hilctl.run.description import LimitBounds, RunDescription
 
+WARNING_USED, ERROR_USED = 0.8, 0.95
+"""Parts of a limit from which on a gauge is a warning and an error."""
 _HOLD_S = 1.0
 
 
@@ -29,6 +32,13 @@ class Gauge:
     value: float
     limit: float
     unit: str
+
+    @property
+    def level(self) -> Literal["info", "warning", "error"]:
+        """How much it should worry people."""
+        if self.used > ERROR_USED:
+            return "error"
+        return "warning" if self.used > WARNING_USED else "info"
 
 
 class Headroom:

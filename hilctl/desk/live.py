@@ -12,14 +12,24 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from typing import Protocol
 
 from hilctl.base.errors import RunError
+from hilctl.desk.feed import RunFeed
 from hilctl.desk.server import LiveServer
 from hilctl.machine.realtime import be_ordinary
 from hilctl.run.run_folder import RunFolder
 
 _NICE = 5
 _LAST_S = 1.5
+
+
+class ShowsRuns(Protocol):
+    """A server, as far as its end goes."""
+
+    def feed(self, name: str | None) -> RunFeed | None:
+        """Return the feed of a run; None for the one that is shown first."""
+        ...
 
 
 class UntilEnded:
@@ -33,7 +43,7 @@ class UntilEnded:
         self._clock = clock
         self._ended_s: float | None = None
 
-    def __call__(self, server: LiveServer) -> bool:
+    def __call__(self, server: ShowsRuns) -> bool:
         """Return whether it is."""
         feed = server.feed(None)
         if feed is None or not feed.ended:
@@ -45,7 +55,7 @@ class UntilEnded:
 
 def serve_runs(
     chosen: Callable[[list[RunFolder]], RunFolder | None],
-    over: Callable[[LiveServer], bool],
+    over: Callable[[ShowsRuns], bool],
     on_url: Callable[[str], None],
     port: int = 0,
 ) -> None:
@@ -60,12 +70,42 @@ def serve_runs(
     Raises:
         RunError: The port can't be had.
     """
-    # Whoever looks on comes after the loop, the recorder and the guardian.
-    be_ordinary()
-    os.nice(_NICE)
+    _come_last()
     server = LiveServer(chosen, port)
     on_url(server.url)
     asyncio.run(server.run(over))
+
+
+def serve_foxglove(
+    chosen: Callable[[list[RunFolder]], RunFolder | None],
+    over: Callable[[ShowsRuns], bool],
+    on_url: Callable[[str], None],
+    port: int | None = None,
+) -> None:
+    """Serve runs to Foxglove and its like until it is over.
+
+    Args:
+        chosen: See :class:`hilctl.desk.feeds.RunFeeds`.
+        over: Whether it is.
+        on_url: Called with the server's address.
+        port: To listen at; 0 for any, None for the one that the applications look for.
+
+    Raises:
+        InputError: The library is not installed.
+        RunError: The port can't be had.
+    """
+    from hilctl.desk.foxglove_server import PORT, FoxgloveServer
+
+    _come_last()  # before the library starts threads, which take over how nice this one is
+    server = FoxgloveServer(chosen, PORT if port is None else port)
+    on_url(server.url)
+    server.run(over)
+
+
+def _come_last() -> None:
+    """Let the loop, the recorder and the guardian come before whoever looks on."""
+    be_ordinary()
+    os.nice(_NICE)
 
 
 @contextmanager
@@ -110,7 +150,7 @@ def main() -> None:
     def its_run(runs: list[RunFolder]) -> RunFolder | None:
         return next((run for run in runs if run.card.supervisor == supervisor), None)
 
-    def over(server: LiveServer) -> bool:
+    def over(server: ShowsRuns) -> bool:
         orphaned = os.getppid() != supervisor and server.feed(None) is None
         return orphaned or ended(server)
 

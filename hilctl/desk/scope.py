@@ -85,6 +85,24 @@ class Scope:
         t_s = np.arange(1 - count, 1) * (envelope.width / self._rate_hz)
         return Window(t_s.astype(np.float64), envelope.window(envelope.newest - count + 1, count))
 
+    def whole_buckets(self, window_s: float, since: int) -> tuple[int, Buckets]:
+        """Return the buckets of a rolling window that no sample will come to any more.
+
+        Args:
+            window_s: One of :data:`WINDOWS_S`; a bucket is one of its :data:`BUCKETS` parts.
+            since: Number of the first bucket that is wanted.
+
+        Returns:
+            Number of the first that is still kept, and the buckets from there on.
+        """
+        envelope = self._rolling[window_s]
+        first = max(since, envelope.newest - envelope.keep + 1, 0)
+        return first, envelope.window(first, max(0, envelope.newest - first))
+
+    def bucket_samples(self, window_s: float) -> int:
+        """Return how many samples a bucket of a rolling window has."""
+        return int(self._rolling[window_s].width)
+
     def triggered(self, cycles: int = 2) -> Window | None:
         """Return the newest whole cycles of the waveform; None where it has none yet.
 

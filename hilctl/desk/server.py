@@ -22,11 +22,11 @@ from websockets.typing import Subprotocol
 from hilctl.base.errors import HilctlError, InputError, RunError
 from hilctl.desk.admission import PROTOCOL, Admission, PendingConnections, bounded
 from hilctl.desk.feed import RunFeed
+from hilctl.desk.feeds import RunFeeds
 from hilctl.desk.frames import frame_of, nearest_window_s
 from hilctl.desk.signals import SIGNALS
 from hilctl.desk.static import file_response, plain_response
 from hilctl.desk.viewer import MAX_MESSAGE_BYTES, PageMessage, Viewer
-from hilctl.run.client import going_on
 from hilctl.run.control_socket import ask
 from hilctl.run.run_folder import RunFolder
 from hilctl.run.stopping import request_stop
@@ -35,7 +35,6 @@ _log = logging.getLogger(__name__)
 
 FRAME_S = 1.0 / 30.0
 _STATUS_FRAMES = 6  # figures that change more often can't be read
-_LOOK_S = 1.0
 _MOST_VIEWERS = 16
 _LIVE = "/live"
 _REQUEST_S = 30.0
@@ -62,17 +61,14 @@ class LiveServer:
         port: int = 0,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._chosen, self._clock = chosen, clock
+        self._clock = clock
         self._sockets = _listeners(port)
         self.port = int(self._sockets[0].getsockname()[1])
         self._token = secrets.token_hex(16)
         self._admission = Admission(self.port, self._token)
         self._pending = PendingConnections()
         self._viewers: set[Viewer] = set()
-        self._runs: list[RunFolder] = []
-        self._feeds: dict[str, RunFeed] = {}
-        self._main = ""
-        self._looked_s = float("-inf")
+        self._feeds = RunFeeds(chosen)
 
     @property
     def url(self) -> str:
@@ -99,24 +95,8 @@ class LiveServer:
             await self._tick(over)
 
     def feed(self, name: str | None) -> RunFeed | None:
-        """Return the feed of a run that is going on, or was when it was first asked for."""
-        if name is None:
-            name = self._main = self._main_run()
-        if name in self._feeds:
-            return self._feeds[name]
-        found = next((run for run in self._runs if run.card.name == name), None)
-        if found is not None:
-            with suppress(RunError):  # being started or removed at this moment
-                self._feeds[name] = RunFeed(found)
-        return self._feeds.get(name)
-
-    def _main_run(self) -> str:
-        """Return the run of pages that name none; one that is over stays until there is another."""
-        feed = self._feeds.get(self._main)
-        if feed is not None and not feed.ended:
-            return self._main
-        chosen = self._chosen(self._runs)
-        return self._main if chosen is None else chosen.card.name
+        """Return the feed of a run, see :meth:`hilctl.desk.feeds.RunFeeds.feed`."""
+        return self._feeds.feed(name)
 
     def _let_in(self, connection: ServerConnection, request: Request) -> Response | None:
         upgrade = request.path == _LIVE
@@ -173,11 +153,9 @@ class LiveServer:
 
     def _show(self, number: int) -> None:
         now_s = self._clock()
-        if now_s - self._looked_s >= _LOOK_S:
-            self._looked_s, self._runs = now_s, going_on()
-            self._forget()
+        self._feeds.look(now_s, [each.view.run for each in self._viewers])
         self.feed(None)  # from its first sample on, though nobody may be looking yet
-        for feed in self._feeds.values():
+        for feed in self._feeds:
             feed.poll(now_s)
         frames: dict[tuple[str, str, float], bytes] = {}
         for viewer in [each for each in self._viewers if each.ready]:
@@ -191,17 +169,10 @@ class LiveServer:
                 frames[key] = frame_of(shown.scope, view.mode, key[2])
             viewer.offer(*status, frames[key])
 
-    def _forget(self) -> None:
-        """Let go of runs that are over and nobody looks at."""
-        shown = {self._main} | {
-            feed.folder.card.name for v in self._viewers if (feed := self.feed(v.view.run))
-        }
-        self._feeds = {
-            name: feed for name, feed in self._feeds.items() if not feed.ended or name in shown
-        }
-
     def _status(self, feed: RunFeed | None) -> str:
-        runs = [{"name": run.card.name, "experiment": run.card.experiment} for run in self._runs]
+        runs = [
+            {"name": run.card.name, "experiment": run.card.experiment} for run in self._feeds.runs
+        ]
         state: dict[str, Any] = {"kind": "status", "runs": runs}
         if feed is not None:
             hz, um = feed.spectrum.points()

@@ -26,7 +26,8 @@ _FIRST = (*_CHOICES, "frequency_hz", "amplitude", "bias_a", "load_kg")
 """Last parts of keys, what runs are told apart by coming first."""
 _UNITS = ("a", "v", "um", "hz", "s", "kg", "ohm", "k", "ms", "us")
 _UNIT_NAMES = {"a": "A", "v": "V", "hz": "Hz", "k": "K", "ohm": "ohm"}
-_WITHOUT = "without compensator"
+WITHOUT_COMPENSATOR = "without compensator"
+"""Name of the runs that have none."""
 _COMPONENT = re.compile(r"\.components\.(\d+)\.")
 
 
@@ -72,7 +73,7 @@ class Dimension:
             number = float(str(value))
             shown = f"{number:g}" if len(f"{number:g}") <= 6 else significant(number)
             return f"{shown} {unit_text(self.unit)}".rstrip()
-        return _WITHOUT if self.is_compensator and value == "none" else str(value)
+        return WITHOUT_COMPENSATOR if self.is_compensator and value == "none" else str(value)
 
 
 def value_at(values: Mapping[str, Any], key: str) -> Hashable:

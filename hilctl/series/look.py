@@ -1,19 +1,20 @@
 """How runs are told apart in figures: colours in order, signs, and which of many are shown."""
 
 from collections.abc import Hashable, Mapping, Sequence
+from itertools import cycle
 from typing import Any, TypeVar
 
 import matplotlib as mpl
 import numpy as np
 
-from hilctl.analysis.canvas import COMMAND, DISPLACEMENT, ERROR, MARK, QUIET, REFERENCE
-from hilctl.series.dimension import Dimension
+from hilctl.analysis.canvas import ERROR, MARK, QUIET, REFERENCE, WITH, WITHOUT
+from hilctl.series.dimension import WITHOUT_COMPENSATOR, Dimension
 
 Item = TypeVar("Item")
 
 _SIGNS = ("o", "s", "^", "D", "v", "P", "X", "<", ">")
 _LINES = ("-", "--", "-.", ":")
-_NAMED = (DISPLACEMENT, COMMAND, ERROR, MARK, "#E69F00", "#56B4E9", REFERENCE, QUIET)
+_NAMED = (WITH, WITHOUT, ERROR, MARK, "#E69F00", "#56B4E9", REFERENCE, QUIET)
 _MOST_CURVES = 7
 """More loops than that can't be told apart."""
 
@@ -39,11 +40,20 @@ def looks(dimension: Dimension | None, values: Sequence[Hashable]) -> Mapping[Ha
         shades = mpl.colormaps["viridis"](np.linspace(0.0, 0.78, len(values)))
         colours = [mpl.colors.to_hex(shade) for shade in shades]
     else:
-        colours = [_NAMED[k % len(_NAMED)] for k in range(len(values))]
+        names = [value if dimension is None else dimension.text(value) for value in values]
+        colours = _of_names(names)
     return {
         value: {"color": colour, "marker": _SIGNS[k % len(_SIGNS)]}
         for k, (value, colour) in enumerate(zip(values, colours, strict=True))
     }
+
+
+def _of_names(names: Sequence[Hashable]) -> list[str]:
+    """Return a colour a name; runs without a compensator have theirs, and no other has it then."""
+    if WITHOUT_COMPENSATOR not in names:
+        return [_NAMED[k % len(_NAMED)] for k in range(len(names))]
+    others = cycle(colour for colour in _NAMED if colour != WITHOUT)
+    return [WITHOUT if name == WITHOUT_COMPENSATOR else next(others) for name in names]
 
 
 def line_of(look: Mapping[str, Any], number: int = 0) -> dict[str, Any]:

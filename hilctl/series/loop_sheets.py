@@ -12,7 +12,7 @@ from hilctl.base.arrays import F64
 from hilctl.base.quantity import quantity
 from hilctl.series.collect import RunSeries, SeriesRun
 from hilctl.series.digest import RunDigest
-from hilctl.series.dimension import Dimension
+from hilctl.series.dimension import WITHOUT_COMPENSATOR, Dimension
 from hilctl.series.look import line_of, looks, spread
 from hilctl.series.minor_loops import minor_parts
 
@@ -183,7 +183,7 @@ def _compensator(run: SeriesRun) -> str:
 
 
 def _draw_pair(axes: Axes, before: SeriesRun, after: Sequence[tuple[str, SeriesRun]]) -> None:
-    lines = [("without compensator", before), *after]
+    lines = [(WITHOUT_COMPENSATOR, before), *after]
     look = looks(None, [name for name, _ in lines])
     axes.plot([0, 100], [0, 100], color=REFERENCE, linestyle=":", linewidth=0.8)
     for name, run in lines:

@@ -101,6 +101,10 @@ class Tab:
                 with suppress(OSError):
                     os.setpriority(os.PRIO_PROCESS, int(thread.name), nice)
 
+    def processes(self):
+        """Return the numbers of the browser's processes."""
+        return [int(each.name) for each in self._processes()]
+
     def _processes(self):
         """Return the folders in /proc of the browser's processes: its session."""
         found = []

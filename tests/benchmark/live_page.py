@@ -4,7 +4,7 @@
     python -m tests.benchmark.live_page spikes
     python -m tests.benchmark.live_page stop --kill-server
     python -m tests.benchmark.live_page hostile
-    python -m tests.benchmark.live_page cost --pairs 5 --seconds 20
+    python -m tests.benchmark.live_page cost --pairs 30 --client browser
     python -m tests.benchmark.live_page pictures OUT
 
 Each prints one JSON object. ``--nice`` is that of all processes started, for a busy machine.
@@ -14,19 +14,13 @@ import argparse
 import asyncio
 import json
 import os
-import re
-import resource
 import signal
-import socket
-import subprocess
-import sys
 import tempfile
 import time
-from contextlib import asynccontextmanager, suppress
+from contextlib import asynccontextmanager
 from pathlib import Path
 
 import numpy as np
-from websockets.asyncio.client import connect
 
 from hilctl.base.samples import Head
 from hilctl.run.description import RunDescription
@@ -35,75 +29,22 @@ from hilctl.run.run_folder import run_folder
 from hilctl.run.shared_page import Field, Phase
 from hilctl.run.start import checked_experiment
 from tests.benchmark.devtools import browser
+from tests.benchmark.live_cost import cost, hostile
+from tests.benchmark.live_run import EXPERIMENT, LiveRun, page_server, rss_mb
 
-CONFIGS = Path(__file__).parents[2] / "configs"
-EXPERIMENT = CONFIGS / "terfenol_sine_6a.yaml"
 _FRAMES = "JSON.stringify([hilctlLive.frames, hilctlLive.errors, performance.now()])"
-
-
-class LiveRun:
-    """``hilctl run --live`` of 50 kHz in a process of its own, with the page's address."""
-
-    def __init__(self, folder, seconds, *more, live=True):
-        self.output = Path(folder) / "run.mcap"
-        self._log = Path(folder) / "log"
-        settings = (f"waveform.duration_s={seconds}", "waveform.frequency_hz=100", *more)
-        words = [word for each in settings for word in ("--set", each)]
-        self.began = time.monotonic()
-        with self._log.open("wb") as log:
-            words = [str(EXPERIMENT), "--json", *words, "--output", str(self.output)]
-            words += ["--overwrite", "--live"] if live else ["--overwrite"]
-            self.process = subprocess.Popen(
-                [sys.executable, "-m", "hilctl.cli", "run", *words],
-                stdout=subprocess.PIPE,
-                stderr=log,
-            )
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *error):
-        if self.process.poll() is None:
-            self.process.send_signal(signal.SIGTERM)
-            self.process.communicate()
-
-    async def url(self):
-        while not (found := re.search(r"http\S+", self._log.read_text())):
-            if self.process.poll() is not None:
-                raise RuntimeError(self._log.read_text())
-            await asyncio.sleep(0.05)
-        return found[0]
-
-    async def result(self):
-        said, _ = await asyncio.to_thread(self.process.communicate)
-        return json.loads(said)
-
-    def server(self, nice=0):
-        """Return the process number of the page's server; give it that niceness."""
-        children = Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children").read_text()
-        for number in map(int, children.split()):
-            if b"hilctl.desk.live" in Path(f"/proc/{number}/cmdline").read_bytes():
-                if nice:
-                    Path(f"/proc/{number}/autogroup").write_text(str(nice))
-                return number
-        raise RuntimeError("it has no page")
-
-
-def rss_mb(process):
-    """Return the resident memory of a process, in MB."""
-    pages = int(Path(f"/proc/{process}/statm").read_text().split()[1])
-    return pages * os.sysconf("SC_PAGESIZE") / 1e6
 
 
 async def frames(folder, given):
     """Frames a second of all signals over a whole run, memory in its first and last part."""
-    with LiveRun(folder, given.seconds + 20, "recording.on_failure=go_on") as run:
+    seconds = given.seconds or 120.0
+    with LiveRun(folder, seconds + 20, "recording.on_failure=go_on") as run:
         async with browser(await run.url()) as tab:
             tab.hurry(given.nice)
             run.server(given.nice)
             await tab.until("hilctlLive.frames > 30")
             rates, memory = [], []
-            until = time.monotonic() + given.seconds
+            until = time.monotonic() + seconds
             before = json.loads(await tab.value(_FRAMES))
             while time.monotonic() < until:
                 await asyncio.sleep(5.0)
@@ -174,27 +115,17 @@ async def spikes(folder, given):
     """Spikes of one sample each, and how many of them the page has drawn."""
     wanted = {}
     async with ringing(folder, wanted) as run:
-        server = subprocess.Popen(
-            [sys.executable, "-m", "hilctl.cli", "live", run.card.name],
-            stdout=subprocess.PIPE,
-        )
         seen = set()
-        try:
-            said = await asyncio.to_thread(server.stdout.readline)
-            url = re.search(r"http\S+", said.decode())[0]
-            async with browser(url) as tab:
-                tab.hurry(given.nice)
-                await tab.until("hilctlLive.frames > 5")
-                await tab.value("document.getElementById('mode').click()")
-                ring = SampleRing(run.ring, look_only=True)
-                begin = ring.page.get(Field.HEAD) + 1000
-                wanted |= {begin + 2400 * each: each for each in range(10)}
-                while ring.page.get(Field.HEAD) < max(wanted) + 1500:
-                    seen.add(round(await tab.value("hilctlLive.highest('plot-error')") - 50.0))
-                    await asyncio.sleep(0.2)
-        finally:
-            server.terminate()
-            server.communicate()
+        async with page_server(run.card.name) as (_, url), browser(url) as tab:
+            tab.hurry(given.nice)
+            await tab.until("hilctlLive.frames > 5")
+            await tab.value("document.getElementById('mode').click()")
+            ring = SampleRing(run.ring, look_only=True)
+            begin = ring.page.get(Field.HEAD) + 1000
+            wanted |= {begin + 2400 * each: each for each in range(10)}
+            while ring.page.get(Field.HEAD) < max(wanted) + 1500:
+                seen.add(round(await tab.value("hilctlLive.highest('plot-error')") - 50.0))
+                await asyncio.sleep(0.2)
     missing = sorted(set(wanted.values()) - seen)
     return {"spikes": len(wanted), "not_drawn": missing}
 
@@ -221,154 +152,6 @@ async def stop(folder, given):
             "output_safe": result["output_safe"],
             "dropped": result["dropped"],
         }
-
-
-async def hostile(folder, given):
-    """Strangers at the door while a run goes on; what each of them got."""
-    resource.setrlimit(resource.RLIMIT_NOFILE, (16384, 20000))
-    with LiveRun(folder, 60, "recording.on_failure=go_on") as run:
-        url = await run.url()
-        port, token = int(re.search(r":(\d+)/", url)[1]), url.partition("#")[2]
-        own = f"http://127.0.0.1:{port}"
-        found = {
-            "foreign_origin": await _refused(port, token, "http://evil.example"),
-            "no_token": await _refused(port, "", own),
-            "wrong_token": await _refused(port, "0" * 32, own),
-            "foreign_host": await _status(port, "evil.example"),
-            "crowd_of_10000": await _crowd(port, token, own),
-            "message_of_100_mb": await _flood(port, token, own),
-            "slow_reader": await _slow(port, token, own),
-            "another_user": _as_nobody(port),
-        }
-        run.process.send_signal(signal.SIGTERM)
-        result = await run.result()
-        return found | {"code": result["code"], "dropped": result["dropped"]}
-
-
-def _opened(port, token, origin, **more):
-    names = ["hilctl.live.1", f"token.{token}"]
-    return connect(
-        f"ws://127.0.0.1:{port}/live", origin=origin, subprotocols=names, proxy=None, **more
-    )
-
-
-async def _refused(port, token, origin):
-    try:
-        async with _opened(port, token, origin):
-            return "LET IN"
-    except Exception as error:  # noqa: BLE001  whatever it is, it is printed
-        return str(error)
-
-
-async def _status(port, host):
-    reader, writer = await asyncio.open_connection("127.0.0.1", port)
-    writer.write(f"GET / HTTP/1.1\r\nHost: {host}\r\n\r\n".encode())
-    line = await reader.readline()
-    writer.close()
-    return line.decode().strip()
-
-
-async def _crowd(port, token, origin):
-    """Connect 10000 times without a word; then a page must still get in."""
-    held, refused = [], 0
-    for _ in range(10_000):
-        try:
-            held.append(await asyncio.wait_for(asyncio.open_connection("127.0.0.1", port), 5.0))
-        except (OSError, TimeoutError):
-            refused += 1
-    began = time.monotonic()
-    async with _opened(port, token, origin, max_size=None) as connection:
-        await connection.recv()
-    took_s = time.monotonic() - began
-    for _, writer in held:
-        with suppress(OSError):
-            writer.close()
-    return {"refused": refused, "page_got_in_after_s": took_s}
-
-
-async def _flood(port, token, origin):
-    with suppress(Exception):
-        async with _opened(port, token, origin, max_size=None) as connection:
-            with suppress(Exception):
-                await connection.send("x" * 100_000_000)
-            await connection.wait_closed()
-            return f"closed by code {connection.close_code}"
-    return "closed"
-
-
-async def _slow(port, token, origin):
-    """Take no frame; return after how many seconds the connection was cut."""
-    async with _opened(port, token, origin, max_size=None) as connection:
-        connection.transport.pause_reading()
-        began = time.monotonic()
-        place = socket.SO_ERROR
-        while time.monotonic() - began < 30.0:
-            await asyncio.sleep(0.5)
-            if connection.transport.get_extra_info("socket").getsockopt(socket.SOL_SOCKET, place):
-                break
-            with suppress(Exception):
-                await asyncio.wait_for(connection.ping(), 0.5)
-        return {"cut_after_s": time.monotonic() - began}
-
-
-def _as_nobody(port):
-    """Ask for the live connection as another user, who has no token to give."""
-    host = f"127.0.0.1:{port}"
-    request = f"GET /live HTTP/1.1\r\nHost: {host}\r\nOrigin: http://{host}\r\n\r\n"
-    script = (
-        f"import socket; s = socket.create_connection(('127.0.0.1', {port})); "
-        f"s.sendall({request.encode()!r}); print(s.recv(60).split(b'\\r')[0].decode())"
-    )
-    said = subprocess.run(
-        ["setpriv", "--reuid=65534", "--clear-groups", "python3", "-c", script],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    return said.stdout.strip() or said.stderr.strip()[-200:]
-
-
-async def cost(folder, given):
-    """Lateness and processor time of paired runs, with a page open and without."""
-    order = [live for pair in range(given.pairs) for live in (pair % 2 == 0, pair % 2 == 1)]
-    rows = [(live, *await _one_cost(folder, given, live=live)) for live in order]
-    plain, shown = (np.array([row[1:] for row in rows if row[0] is live]) for live in (False, True))
-    return {
-        "p99_us": {"plain": plain[:, 0].tolist(), "page": shown[:, 0].tolist()},
-        "p99_ratio_median": float(np.median(shown[:, 0]) / np.median(plain[:, 0])),
-        "supervisor_cpu_ratio": float(np.median(shown[:, 1]) / np.median(plain[:, 1])),
-        "dropped": float(plain[:, 2].sum() + shown[:, 2].sum()),
-    }
-
-
-async def _one_cost(folder, given, *, live):
-    with LiveRun(folder, given.seconds, "recording.on_failure=go_on", live=live) as run:
-        if not live:
-            cpu_s = await _cpu_of(run)
-            result = await run.result()
-            return result["lateness_us"]["p99"], cpu_s, result["dropped"]
-        async with browser(await run.url()) as tab:
-            await tab.until("hilctlLive.frames > 5")
-            cpu_s = await _cpu_of(run)
-            result = await run.result()
-        return result["lateness_us"]["p99"], cpu_s, result["dropped"]
-
-
-async def _cpu_of(run):
-    """Return the processor time that the supervisor took in 10 s of the run."""
-    while not read_ready(run.output):
-        await asyncio.sleep(0.05)
-    stat, spent = Path(f"/proc/{run.process.pid}/stat"), []
-    for _ in range(2):
-        fields = stat.read_text().rpartition(")")[2].split()
-        spent.append((int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK"))
-        await asyncio.sleep(10.0)
-    return spent[1] - spent[0]
-
-
-def read_ready(path):
-    """Return whether samples are being recorded."""
-    return path.exists() and path.stat().st_size > 200_000
 
 
 async def pictures(folder, given):
@@ -410,8 +193,11 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("what", choices=[f.__name__ for f in MEASURED])
     parser.add_argument("out", nargs="?", default="pictures")
-    parser.add_argument("--seconds", type=float, default=120.0)
-    parser.add_argument("--pairs", type=int, default=5)
+    parser.add_argument("--seconds", type=float, help="120 of frames, 3 of each half of a pair")
+    parser.add_argument("--pairs", type=int, default=30)
+    parser.add_argument("--client", choices=("browser", "plain"), default="browser")
+    parser.add_argument("--turns", type=int, default=5, help="how often strangers come")
+    parser.add_argument("--only", default="", help="strangers whose name has this")
     parser.add_argument("--kill-server", action="store_true")
     parser.add_argument("--nice", type=int, default=0)
     given = parser.parse_args()

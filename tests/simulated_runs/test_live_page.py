@@ -8,7 +8,7 @@ import signal
 import pytest
 from websockets.asyncio.client import connect
 
-from tests.benchmark.live_page import LiveRun
+from tests.benchmark.live_run import LiveRun
 
 
 async def messages(url):

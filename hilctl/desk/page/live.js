@@ -15,6 +15,7 @@ const FIGURES = [
 ];
 const FRESH_MS = 2000;
 const SHRINK_MS = 3000;
+const HALF_A_PIXEL = 0.5;
 
 const $ = (id) => document.getElementById(id);
 const token = location.hash.slice(1);
@@ -130,7 +131,7 @@ function showStatus() {
     return;
   }
   const { description } = status;
-  document.title = `${status.state} · ${description.name}`;
+  document.title = `${status.state} · ${status.run}`;
   $("name").textContent = description.name;
   badge(status.state, status.state);
   $("clock").textContent = `${time(status.t_s)} of ${time(status.total_s)}`;
@@ -142,7 +143,7 @@ function showStatus() {
   $("room").textContent = `${disk}ring ${(100 * status.ring_used).toFixed(0)} % full · `
     + `${status.missed_samples} samples not seen`;
   $("stop").disabled = status.ended;
-  if (status.ended) notice(`Run over: ${status.state}. ${status.reason}${safeText()}`, status.state === "fault" || status.safe === false ? "bad" : "calm");
+  if (status.ended) notice(`Run over: ${status.reason || status.state}${safeText()}`, status.state === "fault" || status.safe === false ? "bad" : "calm");
   showFigures();
   showGauges();
   showControls();
@@ -157,15 +158,16 @@ function safeText() {
 }
 
 function showRuns() {
-  const others = status.runs.filter((run) => run.name !== status.run);
-  const key = others.map((run) => run.name).join();
+  const names = status.runs.map((run) => run.name);
+  const key = [status.run, ...names].join();
   if ($("runs").dataset.key === key) return;
   $("runs").dataset.key = key;
-  $("runs").replaceChildren(...others.map((run) => {
+  $("runs").replaceChildren(...names.filter(() => names.length > 1).map((name) => {
     const link = document.createElement("a");
-    link.href = `/?run=${encodeURIComponent(run.name)}#${token}`;
+    link.href = `/?run=${encodeURIComponent(name)}#${token}`;
     link.target = "_blank";
-    link.textContent = run.name;
+    link.textContent = name;
+    if (name === status.run) link.setAttribute("aria-current", "page");
     return link;
   }));
 }
@@ -191,8 +193,7 @@ function showFigures() {
 }
 
 function showGauges() {
-  const list = [...status.gauges,
-    { name: "ring", used: status.ring_used, value: 100 * status.ring_used, limit: 100, unit: "%" }];
+  const list = status.gauges;
   const box = $("gauges");
   const names = list.map((gauge) => gauge.name).join();
   if (box.dataset.names !== names) {
@@ -214,11 +215,10 @@ function showGauges() {
   }
   list.forEach((gauge, at) => {
     const [, bar, part, text] = box.children[at].children;
-    const kind = gauge.used > 0.95 ? "bad" : gauge.used > 0.8 ? "warn" : "";
-    box.children[at].dataset.kind = kind;
+    box.children[at].dataset.kind = gauge.level;
     bar.firstChild.style.width = `${Math.min(100, 100 * gauge.used)}%`;
     part.textContent = `${number(100 * gauge.used, 1, 6)} %`;
-    text.textContent = `${Number(gauge.value.toPrecision(3))} of ${Number(gauge.limit.toPrecision(4))} ${gauge.unit}`;
+    text.textContent = `${Number(gauge.value.toPrecision(3))} of ${Number(gauge.limit.toPrecision(4))} ${gauge.unit.replace("um", "µm")}`;
   });
 }
 
@@ -314,8 +314,9 @@ function steady(name, low, high) {
   return had.range;
 }
 
+// One pixel wide where that can be seen: wider lines of a thousand points take twice the time.
 function series(label, stroke, more = {}) {
-  return { label, stroke, width: Math.max(1.5, 0.1 * letter), points: { show: false }, ...more };
+  return { label, stroke, width: letter < 18 ? 1 : 0.1 * letter, points: { show: false }, ...more };
 }
 
 function axes(yLabel, xLabel, more = {}) {
@@ -344,6 +345,13 @@ function build() {
   add("plot-error", [["error", series("error", colour("error"))]], "error, µm");
   add("plot-command", [["command", series("command", colour("command"))],
     ...(measured ? [["measured", series("measured", colour("measured"), dash)]] : [])], `command, ${command}`, "time, s");
+  $("key").replaceChildren(...Object.values(plots).flatMap(({ plot }) => plot.series.slice(1)).map((each) => {
+    const name = document.createElement("span");
+    const sample = document.createElement("i");
+    sample.style.borderTop = `${each.dash ? "dashed" : "solid"} 2px ${each.stroke()}`;
+    name.append(sample, each.label);
+    return name;
+  }));
   const log = { distr: 3 };
   small("plot-spectrum", [{}, series("error", colour("error"))], { x: { time: false, ...log }, y: { ...log, range: spectrumRange } },
     axes("amplitude, µm", "frequency, Hz"));
@@ -374,7 +382,9 @@ function add(id, signals, yLabel, xLabel = "") {
 
 function small(id, lines, scales, axis) {
   const box = $(id);
-  const options = { ...sizes(box), legend: { show: false }, cursor: { drag: { x: false, y: false } }, scales, axes: axis, series: lines };
+  const options = { ...sizes(box), legend: { show: false }, cursor: { drag: { x: false, y: false } }, scales, axes: axis, series: lines,
+    padding: [null, 2 * letter, null, null] }; // for the last number of the axis
+  for (const each of options.axes) each.values = (_, splits) => splits.map((value) => (value === null ? "" : tidy(value)));
   plots[id] = { plot: new uPlot(options, [[1, 10], [1, 1]], box) };
 }
 
@@ -408,8 +418,9 @@ function unpack(buffer) {
 }
 
 // Each bucket is two points, so that what lies between its lowest and highest value is drawn; in
-// the order of the slope, or a smooth signal would look like a saw.
-function line(low, high) {
+// the order of the slope, or a smooth signal would look like a saw. Where both would be in the same
+// place it is one, and the other is undefined, which is drawn over: points are what drawing costs.
+function line(low, high, still) {
   const found = new Array(2 * low.length);
   let before = NaN;
   for (let at = 0; at < low.length; at += 1) {
@@ -421,7 +432,7 @@ function line(low, high) {
     }
     const falls = a + b < before;
     found[2 * at] = falls ? b : a;
-    found[2 * at + 1] = falls ? a : b;
+    if (b - a > still) found[2 * at + 1] = falls ? a : b;
     before = a + b;
   }
   return found;
@@ -433,9 +444,11 @@ function draw(data) {
   for (let at = 0; at < data.n; at += 1) times[2 * at] = times[2 * at + 1] = data.t[at];
   for (const id of ["plot-um", "plot-error", "plot-command"]) {
     const { plot, signals } = plots[id];
+    const { min, max } = plot.scales.y;
+    const still = (HALF_A_PIXEL * (max - min)) / plot.bbox.height;
     plot.setData([times, ...signals.map((name) => {
       const row = names.indexOf(name);
-      return line(data.low[row], data.high[row]);
+      return line(data.low[row], data.high[row], still);
     })]);
   }
   $("mode").textContent = data.mode === "cycle" ? "triggered to the cycle" : "rolling";
@@ -504,10 +517,11 @@ function curve(canvas, data, value, across, up, xLabel, yLabel, straight) {
   stroke(pen, [[toX(across[0]), toY(straight(across[0]))], [toX(across[1]), toY(straight(across[1]))]]);
   pen.setLineDash([]);
   pen.strokeStyle = colour("displacement");
-  pen.lineWidth = Math.max(1.6, 0.11 * letter) * ratio;
   const cycles = Math.ceil(data.loop / data.cycle);
   for (let cycle = cycles - 1; cycle >= 0; cycle -= 1) {
     pen.globalAlpha = Math.max(0.12, 0.62 ** cycle);
+    // Those that fade are thin: a line of one pixel takes a fraction of the time.
+    pen.lineWidth = (cycle === 0 ? Math.max(1.6, 0.11 * letter) : 1) * ratio;
     const end = data.loop - cycle * data.cycle;
     const points = [];
     for (let at = Math.max(0, end - data.cycle - 1); at < end; at += 1) {
@@ -628,13 +642,13 @@ function refresh(now) {
   counters.frames += 1;
   const gap = now - lastFrameMs;
   lastFrameMs = now;
-  if (gap < FRESH_MS) rate += ((1000 / gap) - rate) * 0.05;
+  if (gap < FRESH_MS) usualMs += (gap - usualMs) * 0.05; // of the times: that of the rates would be too high
   drawn = now;
 }
-let rate = 30;
+let usualMs = 33;
 setInterval(() => {
   const old = performance.now() - lastFrameMs > FRESH_MS;
-  $("rate").textContent = old ? "no new frames" : `${number(rate, 0, 2)} frames/s`;
+  $("rate").textContent = old ? "no new frames" : `${number(1000 / usualMs, 0, 2)} frames/s`;
 }, 1000);
 requestAnimationFrame(refresh);
 connect();

@@ -33,6 +33,20 @@ def test_the_address_is_printed_and_any_run_is_shown(served):
     assert json.loads(CliRunner().invoke(app, ["live", "--json"]).output)["url"].endswith("/#x")
 
 
+def test_foxglove_is_served_at_its_own_port_unless_another_is_given(monkeypatch):
+    ports = []
+
+    def serve_foxglove(chosen, over, on_url, port):
+        ports.append(port)
+        on_url("ws://127.0.0.1:5")
+
+    monkeypatch.setattr("hilctl.desk.live.serve_foxglove", serve_foxglove)
+    said = CliRunner().invoke(app, ["live", "--foxglove"])
+    assert said.output == "Foxglove server: ws://127.0.0.1:5\n"
+    CliRunner().invoke(app, ["live", "--foxglove", "--port", "0"])
+    assert ports == [None, 0]
+
+
 def test_a_run_is_found_by_the_beginning_of_its_name(served, tmp_path):
     with run_folder("demo", tmp_path / "a.mcap", 1.0) as (folder, _):
         assert CliRunner().invoke(app, ["live", "de"]).exit_code == 0

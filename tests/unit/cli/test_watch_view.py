@@ -36,8 +36,7 @@ def feed():
         "figures": {"peak_hysteresis_percent": 29.6, "rms_error_percent": None},
         "lateness_us": {"p50": 3.0, "p99": 21.0, "max": 40.0},
         "late_ticks": 9,
-        "ring_used": 0.25,
-        "gauges": [{"name": "command", "used": 0.84}],
+        "gauges": [{"name": "command", "used": 0.84}, {"name": "ring", "used": 0.25}],
         "events": [{"t_s": 1.0 * k, "code": "mark", "text": f"tap {k}"} for k in range(5)],
     }
     sine = window().buckets.low[:2]
@@ -68,7 +67,7 @@ def test_figures_events_and_limits_are_said(feed):
     for said in (
         "inverse out  gain 0.5  offset -2",
         "hyst. 29.60 %",
-        "late ticks 9  p99 21 us  latest 40 us  ring 25 %",
+        "late ticks 9  p99 21 us  latest 40 us",
         "limits: command 84 %",
         "inverse out, over 0.5 s",
         KEYS,

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilctl.desk.headroom import Headroom
+from hilctl.desk.headroom import Gauge, Headroom
 from hilctl.desk.signals import ROW, SIGNALS, Traces
 from hilctl.run.description import RunDescription
 from hilctl.run.start import checked_experiment
@@ -63,3 +63,8 @@ def test_the_coil_warms_as_the_interlock_has_it(description):
     for start in range(0, 500_000, 50_000):  # one time constant
         headroom.add(traces(start, command=np.full(50_000, 5.0)))
     assert used(headroom)["coil heat"] == pytest.approx(math.sqrt(1 - math.exp(-1)), rel=1e-6)
+
+
+@pytest.mark.parametrize(("part", "level"), [(0.5, "info"), (0.81, "warning"), (0.96, "error")])
+def test_a_gauge_says_how_much_it_should_worry(part, level):
+    assert Gauge("slew", part, part, 1.0, "A/s").level == level

@@ -2,7 +2,8 @@
 
 from matplotlib.colors import to_rgb
 
-from hilctl.series.dimension import Dimension
+from hilctl.analysis.canvas import WITH, WITHOUT
+from hilctl.series.dimension import WITHOUT_COMPENSATOR, Dimension
 from hilctl.series.look import line_of, looks, spread
 
 AMPLITUDE = Dimension("a", "amplitude", "A", (1.0, 2.0, 3.0))
@@ -24,6 +25,17 @@ def test_names_have_colours_and_signs_of_their_own():
     assert len({look["color"] for look in found.values()}) == 3
     assert len({look["marker"] for look in found.values()}) == 3
     assert "marker" not in line_of(found["b"])
+
+
+def test_runs_without_a_compensator_look_as_on_the_page_of_a_single_run():
+    """Whatever stands beside them, and whether they come as a value or by name."""
+    kinds = Dimension("compensator", "compensator", "", ("none", "a", "b"))
+    for found, plain in (
+        (looks(kinds, kinds.values), "none"),
+        (looks(None, [WITHOUT_COMPENSATOR, "a", "b"]), WITHOUT_COMPENSATOR),
+    ):
+        assert (found[plain]["color"], found["a"]["color"]) == (WITHOUT, WITH)
+        assert found["b"]["color"] not in {WITHOUT, WITH}
 
 
 def test_many_are_spread_with_both_ends():

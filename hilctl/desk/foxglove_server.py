@@ -1,0 +1,150 @@
+"""Runs for Foxglove, Lichtblick and PlotJuggler: a server of Foxglove's protocol, on loopback.
+
+It only shows: no client can change anything by it. But the library checks neither who asks nor from
+which page, so that every user and every page in a browser of this machine can look on while it is
+there; therefore it is only where it is asked for.
+"""
+
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from hilctl.base.errors import InputError, RunError
+from hilctl.desk.feed import RunFeed
+from hilctl.desk.feeds import RunFeeds
+from hilctl.desk.foxglove_topics import (
+    DIAGNOSTICS,
+    DIAGNOSTICS_SCHEMA,
+    MESSAGES,
+    SCOPE_TOPICS,
+    LiveTopics,
+)
+from hilctl.recording import schema
+from hilctl.recording.messages import Encoded
+from hilctl.run.run_folder import RunFolder
+
+if TYPE_CHECKING:
+    from foxglove import Channel, Context
+    from foxglove.websocket import WebSocketServer
+
+PORT = 8765
+"""Where the applications look for a server unless they are given another port."""
+_FRAME_S = 1.0 / 30.0
+_STATUS_FRAMES = 15
+_BACKLOG = 4096  # messages for one client, about a second of them; the oldest are dropped
+
+
+class FoxgloveServer:
+    """Serves the run that is going on.
+
+    Args:
+        chosen: See :class:`hilctl.desk.feeds.RunFeeds`.
+        port: To listen at; 0 for any.
+        clock: Monotonic time in s.
+        unix_ns: Unix time in ns.
+        sleep: Lets that many s pass.
+
+    Raises:
+        InputError: The library is not installed.
+        RunError: The port can't be had.
+    """
+
+    def __init__(
+        self,
+        chosen: Callable[[list[RunFolder]], RunFolder | None],
+        port: int = PORT,
+        clock: Callable[[], float] = time.monotonic,
+        unix_ns: Callable[[], int] = time.time_ns,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
+        self._feeds = RunFeeds(chosen)
+        self._shown: RunFeed | None = None
+        self._topics: LiveTopics | None = None
+        self._clock, self._unix_ns, self._sleep = clock, unix_ns, sleep
+        self._context, self._channels, self._server = _started(port)
+
+    @property
+    def url(self) -> str:
+        """Address for the applications."""
+        return f"ws://127.0.0.1:{self._server.port}"
+
+    def run(self, over: Callable[["FoxgloveServer"], bool]) -> None:
+        """Serve until ``over`` says that it is."""
+        number = 0
+        try:
+            while not over(self):
+                began_s = self._clock()
+                self._show(number)
+                number += 1
+                self._sleep(max(_FRAME_S / 4.0, began_s + _FRAME_S - self._clock()))
+        finally:
+            self._server.stop()
+
+    def feed(self, name: str | None) -> RunFeed | None:
+        """Return the feed of a run, see :meth:`hilctl.desk.feeds.RunFeeds.feed`."""
+        return self._feeds.feed(name)
+
+    def _show(self, number: int) -> None:
+        now_s = self._clock()
+        self._feeds.look(now_s)
+        feed = self.feed(None)
+        if feed is None:
+            return
+        feed.poll(now_s)
+        if feed is not self._shown and feed.start_ns:
+            start_unix_ns = self._unix_ns() - round(now_s * 1e9) + feed.start_ns
+            if self._shown is not None:
+                self._server.clear_session()  # what clients have kept is of another run
+            self._shown, self._topics = feed, LiveTopics(feed, start_unix_ns)
+        if self._topics is None:
+            return
+        wanted = [topic for topic in SCOPE_TOPICS if self._channels[topic].has_sinks()]
+        for message in self._topics.scope(wanted):
+            self._log(message)
+        for message in self._topics.events():
+            self._log(message)
+        if number % _STATUS_FRAMES == 0:
+            self._log(self._topics.diagnostics(self._unix_ns()))
+
+    def _log(self, message: Encoded) -> None:
+        self._channels[message.topic].log(message.data, log_time=message.time_ns)
+
+
+def _started(port: int) -> tuple["Context", dict[str, "Channel"], "WebSocketServer"]:
+    """Return the channels by their topics, the server that has them, and what holds them together.
+
+    Without their context, channels would be gone from the server.
+
+    Raises:
+        InputError: The library is not installed.
+        RunError: The port can't be had.
+    """
+    try:
+        import foxglove
+    except ImportError:
+        raise InputError(
+            "--foxglove: its library is not installed: pip install 'hilctl[foxglove]'"
+        ) from None
+    foxglove.set_log_level("ERROR")  # what strangers send, nobody should have to read
+    context = foxglove.Context()
+    descriptors = schema.descriptor_set()
+    channels = {
+        DIAGNOSTICS: foxglove.Channel(DIAGNOSTICS, schema=DIAGNOSTICS_SCHEMA, context=context)
+    }
+    for topic, name in MESSAGES.items():
+        form = foxglove.Schema(name=f"hilctl.{name}", encoding="protobuf", data=descriptors)
+        channels[topic] = foxglove.Channel(
+            topic, schema=form, message_encoding="protobuf", context=context
+        )
+    try:
+        # No capability is given: clients can subscribe, and that is all.
+        server = foxglove.start_server(
+            name="hilctl",
+            host="127.0.0.1",
+            port=port,
+            context=context,
+            message_backlog_size=_BACKLOG,
+        )
+    except RuntimeError as error:
+        raise RunError(f"port {port} of 127.0.0.1: {error}") from None
+    return context, channels, server
