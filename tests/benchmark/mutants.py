@@ -1,6 +1,6 @@
 """Change a module in every small way, and see whether its tests notice.
 
-    python -m tests.benchmark.mutants hilctl/loop/pacer.py [--jobs 2] [--lines 40-60] [--json FILE]
+    python -m tests.benchmark.mutants hilctl/loop/pacer.py [--jobs 2] [--json FILE]
 
 ``mutants.yaml`` says which tests judge which module, and which changes nobody can notice, and why.
 """
@@ -151,7 +151,8 @@ def main() -> None:
     parser.add_argument("tests", nargs="*", help="for pytest, instead of those in mutants.yaml")
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--lines", metavar="FIRST-LAST", help="only mutants of these")
-    parser.add_argument("--json", type=Path, metavar="FILE")
+    parser.add_argument("--again", type=Path, metavar="FILE", help="only what survived there")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="for programs, and --again")
     args = parser.parse_args()
     known = yaml.safe_load(TABLE.read_text(encoding="utf-8")).get(str(args.module), {})
     argued = {(each["line"], each["becomes"]) for each in known.get("argued", [])}
@@ -159,6 +160,11 @@ def main() -> None:
     if args.lines:
         first, last = (int(number) for number in args.lines.split("-"))
         mutants = [mutant for mutant in mutants if first <= mutant.line <= last]
+    if args.again:
+        before = json.loads(args.again.read_text(encoding="utf-8"))
+        left = {(each["before"], each["after"]) for each in before if each["verdict"] != "killed"}
+        mutants = [mutant for mutant in mutants if mutant.change in left]
+    if args.lines or args.again:
         argued &= {mutant.change for mutant in mutants}
     verdicts: dict[Mutation, str] = {}
     began_s = time.monotonic()
