@@ -13,8 +13,11 @@ from hilctl.base.device import DeviceInfo, DeviceOptions
 from hilctl.base.errors import ConfigError
 from hilctl.base.segments import Segment
 from hilctl.base.yaml.document import Document
+from hilctl.experiment import check as module
 from hilctl.experiment.check import Checked, check
 from hilctl.experiment.correction import Correction, LearnedCycle, model_sha256, signature
+from hilctl.experiment.file import CompensatorConfig
+from hilctl.experiment.initial_state import InitialState
 from hilctl.experiment.load import LoadedExperiment, resolve
 from hilctl.models.base import HysteresisModel, IdentifiedRange, Operator, Provenance
 from hilctl.models.plays import RdpiModel
@@ -210,7 +213,7 @@ class TestCommand:
             "x.yaml: limits.peak_current_a: the run must stay within -6.25 to 6.25 A, got -5.5 to "
             "6.5 A (0.25 A too much: lower the waveform's amplitude, or raise the limit)"
         ]
-        checked(CURRENT, "limits.peak_current_a=6.5001")
+        checked(CURRENT, "limits.peak_current_a=6.5")
 
     def test_lowest(self) -> None:
         """The lower end counts as much as the upper."""
@@ -335,6 +338,7 @@ class TestDevice:
         assert found[0].startswith(
             "x.yaml: limits.stroke_um: must lie within what the sensor can report, -100 to 100 um"
         )
+        checked(CURRENT, "limits.stroke_um=[-100.0, 100.0]")
 
     def test_model_of_another_device(self) -> None:
         """A model that gives volts is refused for a device driven with amperes."""
@@ -406,6 +410,12 @@ class TestWatchdog:
                 "must be the safe value, 0 A, got 1.5 (or say in device.watchdog.reason why it is "
                 "not)",
             ),
+            (
+                1e-6,
+                "",
+                "must be the safe value, 0 A, got 1e-06 (or say in device.watchdog.reason why"
+                " it is not)",
+            ),
             (7.5, "holds a load", "must lie within the limits, -7 to 7 A, got 7.5"),
         ],
     )
@@ -449,6 +459,82 @@ def test_a_reference_that_begins_beside_the_rest_position_is_moved_not_hurried()
     assert "slew" not in str(problem)
     there = ("waveform.offset=24.5", "waveform.soft_start_s=0")
     assert check(loaded(DISPLACEMENT, *there, model=moved))
+
+
+class Offset(HysteresisModel):
+    """Commands are 3 A above the reference, and rest comes slowly: a um more with each sample."""
+
+    @property
+    def operators(self) -> int:
+        """Return 1: a number that is added to the commands."""
+        return 1
+
+    def forward(self, sample_rate_hz: float) -> Operator:
+        """Return an operator that counts."""
+
+        def run(x: F64, memory: F64, out: F64) -> None:
+            out[:] = np.arange(x.size)
+
+        return Operator(run, self.operators)
+
+    def inverse(self, sample_rate_hz: float) -> Operator:
+        """Return the operator that adds."""
+
+        def run(x: F64, memory: F64, out: F64) -> None:
+            out[:] = x + 3.0 + memory[0]
+
+        return Operator(run, self.operators)
+
+
+FAST = ("limits.slew_a_per_s=400.0", "waveform.frequency_hz=20.0", "waveform.amplitude=3.5")
+
+
+@pytest.mark.parametrize(("rate_hz", "rests_um"), [(10_000.0, 999), (40.0, 3), (2.0, 0)])
+def test_where_it_rests_is_said_once_all_stages_do(rate_hz: float, rests_um: int) -> None:
+    """After a tenth of a second, and a sample at least."""
+    slow = (f"sample_rate_hz={rate_hz}", "limits.slew_a_per_s=1.0", "waveform.frequency_hz=0.01")
+    (found,) = refusals(DISPLACEMENT, *slow, "waveform.amplitude=1.0", model=Offset())
+    assert found.startswith(
+        "x.yaml: waveform: must begin where the actuator rests at 0 A, by the model "
+        f"{rests_um} um, got 0 um (its first command would step to 3 A at once"
+    )
+
+
+def test_at_the_safe_value_there_is_no_step() -> None:
+    """What is too fast further on is told then, and where it begins is not."""
+    (found,) = refusals(DISPLACEMENT, *FAST, "safe.value=3.0", model=Offset())
+    assert found.startswith("x.yaml: limits.slew_a_per_s: the run must change no faster than 400")
+
+
+def test_the_first_command_is_that_of_the_state_it_begins_with(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A run that goes on from another one makes no step from rest."""
+    there = InitialState(np.array([-3.0, 0.0]), 0.0, "before")
+    monkeypatch.setattr(module, "left_by_last_run", lambda loaded, folder: (there, "as left"))
+    made = loaded(DISPLACEMENT, *FAST, model=Offset())
+    compensator = CompensatorConfig(model="model.yaml", initial_state="last")
+    config = made.config.model_copy(update={"compensator": compensator})
+    with pytest.raises(ConfigError) as caught:
+        check(replace(made, config=config))
+    assert [problem.key for problem in caught.value.problems] == ["limits.slew_a_per_s"]
+
+
+def test_the_input_is_recorded_where_it_may_move() -> None:
+    """By feedback or adaptation alone, too."""
+    plain = checked(DISPLACEMENT, model=terfenol_rdpi())
+    for name in ("feedback", "adaptation"):
+        config = plain.loaded.config.model_copy(update={name: object()})
+        assert replace(plain, loaded=replace(plain.loaded, config=config)).records_input
+
+
+def test_commands_at_its_end_are_looked_at_before_it_starts() -> None:
+    (found,) = refusals(CURRENT, "on_end=[{command: [no-such-program]}]")
+    assert found.startswith("x.yaml: on_end.0.command: must begin with a program that can be run")
+
+
+def test_the_coil_is_cold_unless_something_says_otherwise() -> None:
+    assert checked(CURRENT).heat_a2 == 0.0
 
 
 def test_a_faster_change_further_on_is_what_is_told() -> None:
