@@ -49,6 +49,7 @@ class Judge:
 
     def __init__(self, path: Path, tests: list[str], folder: Path) -> None:
         parts = path.relative_to("drivers") if path.parts[0] == "drivers" else path
+        self._path = path
         self._name = ".".join(parts.with_suffix("").parts)
         self._tests = tests
         self._folder = folder
@@ -76,7 +77,9 @@ class Judge:
         took_s, used_s = time.monotonic() - began_s, _children_s() - used_s
         self._cpu_s, self._wall_s = 3.0 * used_s + 5.0, 4.0 * took_s + 10.0
         graph = grimp.build_graph("hilctl", "hilctl_drivers", cache_dir=None)
-        changed = {self._name, *graph.find_downstream_modules(self._name)}
+        changed = {self._name}
+        if self._name in graph.modules:
+            changed |= graph.find_downstream_modules(self._name)
         loaded = json.loads((self._folder / "unchanged" / "modules").read_text())
         for name in loaded:
             if name == "hypothesis" or (name in graph.modules and name not in changed):
@@ -118,7 +121,7 @@ class Judge:
         if mutant is not None:
             file = folder / "mutant.py"
             file.write_text(mutant.source, encoding="utf-8")
-            os.environ["HILCTL_MUTANT"] = f"{self._name}={file}"
+            os.environ["HILCTL_MUTANT"] = f"{ROOT / self._path}={file}"
             runpy.run_path(str(HOOK / "sitecustomize.py"))
         # Through pytest, so that fixtures still put away what they made in shared memory.
         signal.signal(signal.SIGXCPU, lambda *_: pytest.exit("too long", returncode=TOO_LONG))

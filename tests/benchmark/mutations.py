@@ -8,7 +8,7 @@
 | condition | a condition without any of these turned round |
 | constant | a number one more; 1 to 0 |
 | return | None returned |
-| delete | a call, an assignment, ``del`` or ``raise`` left out, inside functions |
+| delete | a call, an assignment, ``assert``, ``del`` or ``raise`` left out, inside functions |
 | jump | ``break`` and ``continue`` |
 | handler | an exception not handled |
 
@@ -137,7 +137,7 @@ def _statements(node: ast.AST) -> Iterator[tuple[str, ast.AST, ast.AST, str]]:
             yield "delete", node, node, "pass"
         case ast.Expr(ast.Call()) | ast.Assign() | ast.AnnAssign(value=ast.expr()):
             yield "delete", node, node, "pass"
-        case ast.Raise() | ast.Delete() | ast.AugAssign():
+        case ast.Raise() | ast.Assert() | ast.Delete() | ast.AugAssign():
             yield "delete", node, node, "pass"
         case ast.Break():
             yield "jump", node, node, "continue"

@@ -1,32 +1,23 @@
-"""Gives a changed module in the place of one that is imported, in this process and its children.
+"""Gives a changed source in the place of a file that is imported, in this process and its children.
 
 Python runs it at its start where ``PYTHONPATH`` names this folder. ``HILCTL_MUTANT`` says which
-module, and which file to take instead.
+file, and which to take instead.
 """
 
 import os
-import sys
-from importlib.abc import MetaPathFinder
-from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
+from importlib.machinery import SourceFileLoader
 from pathlib import Path
 from types import CodeType
 
-NAME, _, FILE = os.environ.get("HILCTL_MUTANT", "").partition("=")
+FILE, _, MUTANT = os.environ.get("HILCTL_MUTANT", "").partition("=")
+_as_written = SourceFileLoader.get_code
 
 
-class _Loader(SourceFileLoader):
-    def get_code(self, fullname: str) -> CodeType:
-        return compile(Path(FILE).read_bytes(), self.path, "exec", dont_inherit=True)
+def _get_code(loader: SourceFileLoader, fullname: str) -> CodeType | None:
+    if loader.path != FILE:
+        return _as_written(loader, fullname)
+    return compile(Path(MUTANT).read_bytes(), FILE, "exec", dont_inherit=True)
 
 
-class _Finder(MetaPathFinder):
-    def find_spec(self, fullname: str, path: object, target: object = None) -> ModuleSpec | None:
-        if fullname != NAME:
-            return None
-        spec = PathFinder.find_spec(fullname, path)
-        spec.loader = _Loader(fullname, spec.origin)
-        return spec
-
-
-if NAME:
-    sys.meta_path.insert(0, _Finder())
+if FILE:
+    SourceFileLoader.get_code = _get_code  # type: ignore[method-assign]
