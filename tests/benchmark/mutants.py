@@ -156,7 +156,7 @@ def main() -> None:
     parser.add_argument("--lines", metavar="FIRST-LAST", help="only mutants of these")
     parser.add_argument("--again", type=Path, metavar="FILE", help="only what survived there")
     parser.add_argument("--json", type=Path, metavar="FILE", help="for programs, and --again")
-    args = parser.parse_args()
+    args = parser.parse_intermixed_args()
     known = yaml.safe_load(TABLE.read_text(encoding="utf-8")).get(str(args.module), {})
     argued = {(each["line"], each["becomes"]) for each in known.get("argued", [])}
     mutants = mutations((ROOT / args.module).read_text(encoding="utf-8"))

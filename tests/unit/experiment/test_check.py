@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -10,7 +11,7 @@ from pydantic import ConfigDict
 
 from hilctl.base.arrays import F64
 from hilctl.base.device import DeviceInfo, DeviceOptions
-from hilctl.base.errors import ConfigError
+from hilctl.base.errors import ConfigError, DataError
 from hilctl.base.segments import Segment
 from hilctl.base.yaml.document import Document
 from hilctl.experiment import check as module
@@ -533,8 +534,30 @@ def test_commands_at_its_end_are_looked_at_before_it_starts() -> None:
     assert found.startswith("x.yaml: on_end.0.command: must begin with a program that can be run")
 
 
-def test_the_coil_is_cold_unless_something_says_otherwise() -> None:
+def test_the_coil_is_cold_unless_something_says_otherwise(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The last run by what has cooled since, or whoever asks; the hotter counts."""
     assert checked(CURRENT).heat_a2 == 0.0
+    monkeypatch.setattr(module, "heat_before", lambda loaded, folder, now_s: now_s)
+    monkeypatch.setattr(module, "time", SimpleNamespace(time=lambda: 7.0))
+    made = loaded(CURRENT)
+    assert check(made).heat_a2 == 7.0
+    assert check(made, now_s=5.0).heat_a2 == 5.0
+    assert check(made, heat_a2=9.0, now_s=5.0).heat_a2 == 9.0
+
+
+def test_a_run_before_that_says_nothing_is_a_problem(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(path: Path, model: HysteresisModel, rate_hz: float) -> InitialState:
+        raise DataError(f"{path}: nothing there")
+
+    monkeypatch.setattr(module, "initial_state_after", refuse)
+    made = loaded(DISPLACEMENT, model=terfenol_rdpi())
+    compensator = CompensatorConfig(model="model.yaml", initial_state="before.mcap")
+    config = made.config.model_copy(update={"compensator": compensator})
+    with pytest.raises(ConfigError) as caught:
+        check(replace(made, config=config))
+    (problem,) = caught.value.problems
+    assert problem.key == "compensator.initial_state"
+    assert problem.rule == "before.mcap: nothing there"
 
 
 def test_a_faster_change_further_on_is_what_is_told() -> None:
@@ -543,6 +566,9 @@ def test_a_faster_change_further_on_is_what_is_told() -> None:
     holds = ", ".join(f"{{kind: hold, level: {um}, duration_s: 0.2}}" for um in (22.0, 18.0))
     steps = f"waveform={{kind: sequence, unit: A, parts: [{holds}]}}"
     (found,) = refusals(DISPLACEMENT, steps, "limits.slew_a_per_s=1000.0", model=moved)
+    assert found.startswith("x.yaml: limits.slew_a_per_s: the run must change no faster than")
+    a_third_more = steps.replace("22.0", "0.0").replace("18.0", "3.9")
+    (found,) = refusals(DISPLACEMENT, a_third_more, model=Offset())
     assert found.startswith("x.yaml: limits.slew_a_per_s: the run must change no faster than")
 
 

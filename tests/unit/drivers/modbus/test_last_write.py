@@ -1,11 +1,13 @@
 """The last write against an emulated device in this process, in a time that tests make pass."""
 
+import itertools
+
 import pytest
 
 from hilctl.base.errors import DeviceError
 from hilctl_drivers.emulator.options import EmulatorOptions
 from hilctl_drivers.modbus.device import ModbusDac
-from hilctl_drivers.modbus.last_write import ANSWER_S, RETRY_S, TRIES_S
+from hilctl_drivers.modbus.last_write import ANSWER_S, POLL_S, RETRY_S, TRIES_S
 from hilctl_drivers.modbus.setup import ModbusOptions
 from tests.fakes import FaultyLink, emulated
 
@@ -64,7 +66,8 @@ def test_who_never_opened_it_waits_for_others(driven):
     made.link.open()
     made.device.make_safe(-1.0)
     assert made.current_a == pytest.approx(-1.0)
-    assert made.time() - 1.0 >= HOLD_S
+    assert HOLD_S <= made.time() - 1.0 <= HOLD_S + 0.01
+    assert len(made.link.requests) <= HOLD_S / POLL_S + 3  # others use the device meanwhile
 
 
 @pytest.mark.parametrize("silence_s", [0.6, 3.0])
@@ -93,6 +96,21 @@ def test_device_that_stays_silent_is_given_up(driven):
         made.device.make_safe(0.0)
     assert TRIES_S <= made.time() - before_s <= TRIES_S + HOLD_S + 2 * TIMEOUT_S
     assert not made.link.is_open
+
+
+def test_a_device_that_refuses_at_once_is_not_flooded(driven):
+    """It is asked twenty times a second."""
+    made, tried_s = driven(), []
+
+    def refuse(peer):
+        assert len(tried_s) < 1000
+        tried_s.append(made.time())
+        raise DeviceError("connection refused")
+
+    made.device._last_write._connect = refuse
+    with pytest.raises(DeviceError, match=r"refused; what it puts out is not known"):
+        made.device.make_safe(0.0)
+    assert {round(b - a, 6) for a, b in itertools.pairwise(tried_s)} == {RETRY_S}
 
 
 def test_slow_time_out_does_not_keep_a_silent_peer(driven):
