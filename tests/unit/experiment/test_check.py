@@ -15,9 +15,10 @@ from hilctl.base.errors import ConfigError, DataError
 from hilctl.base.segments import Segment
 from hilctl.base.yaml.document import Document
 from hilctl.experiment import check as module
-from hilctl.experiment.check import Checked, check
+from hilctl.experiment.check import Checked, check, command_problems
 from hilctl.experiment.correction import Correction, LearnedCycle, model_sha256, signature
 from hilctl.experiment.file import CompensatorConfig
+from hilctl.experiment.heat import RunHeat
 from hilctl.experiment.initial_state import InitialState
 from hilctl.experiment.load import LoadedExperiment, resolve
 from hilctl.models.base import HysteresisModel, IdentifiedRange, Operator, Provenance
@@ -280,6 +281,48 @@ class TestCommand:
         assert len(found) == 2
         assert "got -1e+308 to 1e+308 A (1e+308 A too much" in found[0]
         assert "(inf times the limit" in found[1]
+
+
+class TestBudget:
+    """What is said of a coil that would get too hot, and what helps."""
+
+    BUDGET: ClassVar = ("limits.rms_current_a=4.0", "limits.thermal_time_constant_s=20.0")
+
+    def hint(self, begins_rms_a: float | None, hottest_a2: float, safe: float = 0.0) -> str:
+        made = loaded(CURRENT, *self.BUDGET, f"safe.value={safe}")
+        forecast = replace(
+            checked(CURRENT).forecast, heating_rms_a=4.5, budget_used_s=1.5, before_s=1.5,
+            begins_rms_a=begins_rms_a, heat=RunHeat(2.0, 1.0, hottest_a2),
+        )  # fmt: skip
+        (problem,) = command_problems(made, forecast)
+        assert problem.key == "limits.rms_current_a"
+        assert problem.rule == "the coil must stay within 4 A rms over 20 s"
+        assert problem.value == "4.5 A"
+        return problem.hint
+
+    @pytest.mark.parametrize(
+        ("begins_rms_a", "hottest_a2", "safe", "wait_s"),
+        [(3.0, 4.0, 0.0, 16), (2.02, 4.0, 0.0, 0), (3.5, 10.0, 3.0, 24)],
+    )
+    def test_heat_of_the_last_run_is_waited_for(
+        self, begins_rms_a: float, hottest_a2: float, safe: float, wait_s: int
+    ) -> None:
+        """20 s times ln(9 / 4), ln(4.08 / 4), and ln(3.25 / 1) above what the safe value makes."""
+        begins = f"it begins at {begins_rms_a:.3g} A rms, left by the last run: wait {wait_s} s"
+        assert self.hint(begins_rms_a, hottest_a2, safe) == begins
+
+    @pytest.mark.parametrize(
+        ("begins_rms_a", "hottest_a2", "safe"),
+        [(1.0, 4.0, 0.0), (3.0, 4.0, 2.0), (3.5, 8.0, 3.0), (None, 0.5, 0.0)],
+    )
+    def test_no_wait_helps_a_run_that_makes_the_heat_itself(
+        self, begins_rms_a: float | None, hottest_a2: float, safe: float
+    ) -> None:
+        """Or one that must begin colder than the safe value lets the coil become."""
+        assert self.hint(begins_rms_a, hottest_a2, safe) == (
+            "0.5 A too much, and the budget is used up after 1.5 s: lower the waveform's "
+            "amplitude, or shorten the run"
+        )
 
 
 class TestDevice:

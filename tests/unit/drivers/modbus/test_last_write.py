@@ -164,9 +164,12 @@ class Rounding(FaultyLink):
         return reply
 
 
-def test_readback_may_be_rounded(driven):
+@pytest.mark.parametrize(
+    ("profile", "link"), [("wago_750", Rounding), ("generic_float32", FaultyLink)]
+)
+def test_readback_may_be_rounded(driven, profile, link):
     """That is no other value, and nothing to write again."""
-    made = driven("wago_750", link=Rounding)
+    made = driven(profile, link=link)
     made.open()
     before = len(made.writes())
     made.device.make_safe(0.3337)
