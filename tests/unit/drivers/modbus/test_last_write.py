@@ -177,6 +177,17 @@ def test_readback_may_be_rounded(driven, profile, link):
     assert made.current_a == pytest.approx(0.3337, abs=1e-3)
 
 
+def test_a_step_of_the_output_is_no_other_value(driven):
+    """Which of two neighbours a device rounds to is its own affair; floats round to a millionth."""
+    for profile in ("wago_750", "generic_float32"):
+        last_write = driven(profile).device._last_write
+        output = last_write._setup.output
+        step = output.step or 1e-6 * (output.max - output.min)
+        assert step > 0.0
+        assert last_write._agrees(step, 0.0)
+        assert not last_write._agrees(1.01 * step, 0.0)
+
+
 def test_no_name_is_looked_up_for_it():
     """The address is that which was reached at opening."""
     with emulated(EmulatorOptions("generic_float32")) as served:
