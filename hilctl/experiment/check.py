@@ -60,8 +60,8 @@ class Checked:
     reference: Reference
     forecast: Forecast
     begun: Begun
-    warnings: tuple[str, ...] = ()
-    heat_a2: float = 0.0
+    warnings: tuple[str, ...]
+    heat_a2: float
 
     @property
     def state_size(self) -> int:

@@ -36,7 +36,6 @@ class Chain(Operator):
         )
         self.preview = preview
         self._rest = rest
-        self._memory[:] = rest
         self._stages = tuple(stages)
         self.keep_in(self._memory)
 
@@ -86,7 +85,7 @@ def smoothing_weights(
         float64[2m + 1], weights of the samples from the oldest to the newest, which add up to 1;
         and m, the samples by which the newest is ahead. Boxes are at most 64 samples long.
     """
-    box = min(_WIDEST, max(1, round(math.sqrt(1.0 + 3.0 * width**2))))
+    box = min(_WIDEST, round(math.sqrt(1.0 + 3.0 * width**2)))
     ones = np.full(box, 1.0 / box)
     pair = np.convolve(ones, ones)
     spline = np.convolve(pair, pair)

@@ -128,6 +128,35 @@ class SafeUntilItIsClosed(SafeOnceItWasOpen):
             self.current_a = command
 
 
+class SafeOnceItIsClosed(Ideal):
+    """Takes the safe value, and puts it out when nobody uses it any more."""
+
+    def make_safe(self, command):
+        if self.is_open:
+            self.due_a = command
+        else:
+            self.current_a = command
+
+    def close(self):
+        self.current_a = vars(self).pop("due_a", self.current_a)
+        super().close()
+
+
+class SafeOnlyOnce(Ideal):
+    """Until it is opened again."""
+
+    was_safe = False
+
+    def open(self, sample_rate_hz, block):
+        super().open(sample_rate_hz, block)
+        self.was_safe = False
+
+    def make_safe(self, command):
+        if self.is_open or not self.was_safe:
+            self.current_a = command
+        self.was_safe = True
+
+
 class SafeElsewhere(Ideal):
     """Puts out zero, whatever the safe value is."""
 
@@ -333,6 +362,11 @@ class TakesAnyRate(Ideal):
         self.is_open = True
 
 
+class TakesHalfAsFastAgain(Ideal):
+    def open(self, sample_rate_hz, block):
+        super().open(sample_rate_hz / 1.5, block)
+
+
 class IsSomebodyElse(Ideal):
     info = replace(Ideal.info, name="another_dac")
 
@@ -379,6 +413,8 @@ MUST_FAIL = {
     SafeOnlyWhileOpen: {"make_safe_works_open_or_closed"},
     SafeOnceItWasOpen: {"make_safe_works_open_or_closed"},
     SafeUntilItIsClosed: {"make_safe_works_open_or_closed"},
+    SafeOnceItIsClosed: {"make_safe_works_open_or_closed"},
+    SafeOnlyOnce: {"make_safe_works_open_or_closed"},
     SafeElsewhere: {"make_safe_works_open_or_closed"},
     LiesAboutItsOutput: {"says_what_it_puts_out"},
     DoesNotSayWhatItKnows: {"says_what_it_puts_out"},
@@ -409,6 +445,7 @@ MUST_FAIL = {
     NeedsNoOpening: {"use_before_open_and_after_close_is_refused"},
     ClosesOnce: {"use_before_open_and_after_close_is_refused"},
     TakesAnyRate: {"rate_beyond_its_limit_is_refused"},
+    TakesHalfAsFastAgain: {"rate_beyond_its_limit_is_refused"},
     IsSomebodyElse: {"says_what_it_is_before_it_is_opened"},
     SaysNothingOfItself: {"says_what_it_is_before_it_is_opened"},
     TakesOhms: {"says_what_it_is_before_it_is_opened"},

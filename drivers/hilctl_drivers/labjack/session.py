@@ -50,19 +50,10 @@ class StreamSession:
         self._turnaround_s = turnaround_s
         self._sleep = sleep
         self._clock = clock
-        self._rate_hz = 0.0
         self._capacity = 0
-        self._queued = 0
-        self._fetched = 0
-        self._backlog = 0
         self._parts: list[npt.NDArray[np.uint16]] = []
-        self._waiting = 0
-        self.margin = 0
-        """Scans that may pass within one message: with fewer values left, nobody can say whether
-        the output had one for each."""
-        self.level_min = 0
-        """Fewest values that a message found in the output's buffer."""
         self.running = False
+        self._begin(0.0)
 
     def calibration(self, channel: int) -> stream.InputCalibration:
         """Return how readings of an input become volts; kept in the device's flash.
@@ -127,7 +118,10 @@ class StreamSession:
         self._queued = self._fetched = self._backlog = self._waiting = 0
         self._parts.clear()
         self.margin = math.ceil(rate_hz * self._turnaround_s) + _MARGIN_SCANS
+        """Scans that may pass within one message: with fewer values left, nobody can say whether
+        the output had one for each."""
         self.level_min = self._capacity
+        """Fewest values that a message found in the output's buffer."""
 
     @property
     def capacity(self) -> int:

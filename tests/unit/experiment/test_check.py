@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -10,11 +11,15 @@ from pydantic import ConfigDict
 
 from hilctl.base.arrays import F64
 from hilctl.base.device import DeviceInfo, DeviceOptions
-from hilctl.base.errors import ConfigError
+from hilctl.base.errors import ConfigError, DataError
 from hilctl.base.segments import Segment
 from hilctl.base.yaml.document import Document
-from hilctl.experiment.check import Checked, check
+from hilctl.experiment import check as module
+from hilctl.experiment.check import Checked, check, command_problems
 from hilctl.experiment.correction import Correction, LearnedCycle, model_sha256, signature
+from hilctl.experiment.file import CompensatorConfig
+from hilctl.experiment.heat import RunHeat
+from hilctl.experiment.initial_state import InitialState
 from hilctl.experiment.load import LoadedExperiment, resolve
 from hilctl.models.base import HysteresisModel, IdentifiedRange, Operator, Provenance
 from hilctl.models.plays import RdpiModel
@@ -210,7 +215,7 @@ class TestCommand:
             "x.yaml: limits.peak_current_a: the run must stay within -6.25 to 6.25 A, got -5.5 to "
             "6.5 A (0.25 A too much: lower the waveform's amplitude, or raise the limit)"
         ]
-        checked(CURRENT, "limits.peak_current_a=6.5001")
+        checked(CURRENT, "limits.peak_current_a=6.5")
 
     def test_lowest(self) -> None:
         """The lower end counts as much as the upper."""
@@ -278,6 +283,48 @@ class TestCommand:
         assert "(inf times the limit" in found[1]
 
 
+class TestBudget:
+    """What is said of a coil that would get too hot, and what helps."""
+
+    BUDGET: ClassVar = ("limits.rms_current_a=4.0", "limits.thermal_time_constant_s=20.0")
+
+    def hint(self, begins_rms_a: float | None, hottest_a2: float, safe: float = 0.0) -> str:
+        made = loaded(CURRENT, *self.BUDGET, f"safe.value={safe}")
+        forecast = replace(
+            checked(CURRENT).forecast, heating_rms_a=4.5, budget_used_s=1.5, before_s=1.5,
+            begins_rms_a=begins_rms_a, heat=RunHeat(2.0, 1.0, hottest_a2),
+        )  # fmt: skip
+        (problem,) = command_problems(made, forecast)
+        assert problem.key == "limits.rms_current_a"
+        assert problem.rule == "the coil must stay within 4 A rms over 20 s"
+        assert problem.value == "4.5 A"
+        return problem.hint
+
+    @pytest.mark.parametrize(
+        ("begins_rms_a", "hottest_a2", "safe", "wait_s"),
+        [(3.0, 4.0, 0.0, 16), (2.02, 4.0, 0.0, 0), (3.5, 10.0, 3.0, 24)],
+    )
+    def test_heat_of_the_last_run_is_waited_for(
+        self, begins_rms_a: float, hottest_a2: float, safe: float, wait_s: int
+    ) -> None:
+        """20 s times ln(9 / 4), ln(4.08 / 4), and ln(3.25 / 1) above what the safe value makes."""
+        begins = f"it begins at {begins_rms_a:.3g} A rms, left by the last run: wait {wait_s} s"
+        assert self.hint(begins_rms_a, hottest_a2, safe) == begins
+
+    @pytest.mark.parametrize(
+        ("begins_rms_a", "hottest_a2", "safe"),
+        [(1.0, 4.0, 0.0), (3.0, 4.0, 2.0), (3.5, 8.0, 3.0), (None, 0.5, 0.0)],
+    )
+    def test_no_wait_helps_a_run_that_makes_the_heat_itself(
+        self, begins_rms_a: float | None, hottest_a2: float, safe: float
+    ) -> None:
+        """Or one that must begin colder than the safe value lets the coil become."""
+        assert self.hint(begins_rms_a, hottest_a2, safe) == (
+            "0.5 A too much, and the budget is used up after 1.5 s: lower the waveform's "
+            "amplitude, or shorten the run"
+        )
+
+
 class TestDevice:
     """What the device can't do."""
 
@@ -335,6 +382,7 @@ class TestDevice:
         assert found[0].startswith(
             "x.yaml: limits.stroke_um: must lie within what the sensor can report, -100 to 100 um"
         )
+        checked(CURRENT, "limits.stroke_um=[-100.0, 100.0]")
 
     def test_model_of_another_device(self) -> None:
         """A model that gives volts is refused for a device driven with amperes."""
@@ -406,6 +454,12 @@ class TestWatchdog:
                 "must be the safe value, 0 A, got 1.5 (or say in device.watchdog.reason why it is "
                 "not)",
             ),
+            (
+                1e-6,
+                "",
+                "must be the safe value, 0 A, got 1e-06 (or say in device.watchdog.reason why"
+                " it is not)",
+            ),
             (7.5, "holds a load", "must lie within the limits, -7 to 7 A, got 7.5"),
         ],
     )
@@ -451,12 +505,113 @@ def test_a_reference_that_begins_beside_the_rest_position_is_moved_not_hurried()
     assert check(loaded(DISPLACEMENT, *there, model=moved))
 
 
+class Offset(HysteresisModel):
+    """Commands are 3 A above the reference, and rest comes slowly: a um more with each sample."""
+
+    @property
+    def operators(self) -> int:
+        """Return 1: a number that is added to the commands."""
+        return 1
+
+    def forward(self, sample_rate_hz: float) -> Operator:
+        """Return an operator that counts."""
+
+        def run(x: F64, memory: F64, out: F64) -> None:
+            out[:] = np.arange(x.size)
+
+        return Operator(run, self.operators)
+
+    def inverse(self, sample_rate_hz: float) -> Operator:
+        """Return the operator that adds."""
+
+        def run(x: F64, memory: F64, out: F64) -> None:
+            out[:] = x + 3.0 + memory[0]
+
+        return Operator(run, self.operators)
+
+
+FAST = ("limits.slew_a_per_s=400.0", "waveform.frequency_hz=20.0", "waveform.amplitude=3.5")
+
+
+@pytest.mark.parametrize(("rate_hz", "rests_um"), [(10_000.0, 999), (40.0, 3), (2.0, 0)])
+def test_where_it_rests_is_said_once_all_stages_do(rate_hz: float, rests_um: int) -> None:
+    """After a tenth of a second, and a sample at least."""
+    slow = (f"sample_rate_hz={rate_hz}", "limits.slew_a_per_s=1.0", "waveform.frequency_hz=0.01")
+    (found,) = refusals(DISPLACEMENT, *slow, "waveform.amplitude=1.0", model=Offset())
+    assert found.startswith(
+        "x.yaml: waveform: must begin where the actuator rests at 0 A, by the model "
+        f"{rests_um} um, got 0 um (its first command would step to 3 A at once"
+    )
+
+
+def test_at_the_safe_value_there_is_no_step() -> None:
+    """What is too fast further on is told then, and where it begins is not."""
+    (found,) = refusals(DISPLACEMENT, *FAST, "safe.value=3.0", model=Offset())
+    assert found.startswith("x.yaml: limits.slew_a_per_s: the run must change no faster than 400")
+
+
+def test_the_first_command_is_that_of_the_state_it_begins_with(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A run that goes on from another one makes no step from rest."""
+    there = InitialState(np.array([-3.0, 0.0]), 0.0, "before")
+    monkeypatch.setattr(module, "left_by_last_run", lambda loaded, folder: (there, "as left"))
+    made = loaded(DISPLACEMENT, *FAST, model=Offset())
+    compensator = CompensatorConfig(model="model.yaml", initial_state="last")
+    config = made.config.model_copy(update={"compensator": compensator})
+    with pytest.raises(ConfigError) as caught:
+        check(replace(made, config=config))
+    assert [problem.key for problem in caught.value.problems] == ["limits.slew_a_per_s"]
+
+
+def test_the_input_is_recorded_where_it_may_move() -> None:
+    """By feedback or adaptation alone, too."""
+    plain = checked(DISPLACEMENT, model=terfenol_rdpi())
+    for name in ("feedback", "adaptation"):
+        config = plain.loaded.config.model_copy(update={name: object()})
+        assert replace(plain, loaded=replace(plain.loaded, config=config)).records_input
+
+
+def test_commands_at_its_end_are_looked_at_before_it_starts() -> None:
+    (found,) = refusals(CURRENT, "on_end=[{command: [no-such-program]}]")
+    assert found.startswith("x.yaml: on_end.0.command: must begin with a program that can be run")
+
+
+def test_the_coil_is_cold_unless_something_says_otherwise(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The last run by what has cooled since, or whoever asks; the hotter counts."""
+    assert checked(CURRENT).heat_a2 == 0.0
+    monkeypatch.setattr(module, "heat_before", lambda loaded, folder, now_s: now_s)
+    monkeypatch.setattr(module, "time", SimpleNamespace(time=lambda: 7.0))
+    made = loaded(CURRENT)
+    assert check(made).heat_a2 == 7.0
+    assert check(made, now_s=5.0).heat_a2 == 5.0
+    assert check(made, heat_a2=9.0, now_s=5.0).heat_a2 == 9.0
+
+
+def test_a_run_before_that_says_nothing_is_a_problem(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(path: Path, model: HysteresisModel, rate_hz: float) -> InitialState:
+        raise DataError(f"{path}: nothing there")
+
+    monkeypatch.setattr(module, "initial_state_after", refuse)
+    made = loaded(DISPLACEMENT, model=terfenol_rdpi())
+    compensator = CompensatorConfig(model="model.yaml", initial_state="before.mcap")
+    config = made.config.model_copy(update={"compensator": compensator})
+    with pytest.raises(ConfigError) as caught:
+        check(replace(made, config=config))
+    (problem,) = caught.value.problems
+    assert problem.key == "compensator.initial_state"
+    assert problem.rule == "before.mcap: nothing there"
+
+
 def test_a_faster_change_further_on_is_what_is_told() -> None:
     """Where to begin is no remedy then."""
     moved = terfenol_rdpi().model_copy(update={"output_offset_um": 24.5})
     holds = ", ".join(f"{{kind: hold, level: {um}, duration_s: 0.2}}" for um in (22.0, 18.0))
     steps = f"waveform={{kind: sequence, unit: A, parts: [{holds}]}}"
     (found,) = refusals(DISPLACEMENT, steps, "limits.slew_a_per_s=1000.0", model=moved)
+    assert found.startswith("x.yaml: limits.slew_a_per_s: the run must change no faster than")
+    a_third_more = steps.replace("22.0", "0.0").replace("18.0", "3.9")
+    (found,) = refusals(DISPLACEMENT, a_third_more, model=Offset())
     assert found.startswith("x.yaml: limits.slew_a_per_s: the run must change no faster than")
 
 

@@ -16,6 +16,13 @@ def pacer(clock: FakeClock, policy: str = "skip") -> Pacer:
     return made
 
 
+def test_a_pacer_that_has_not_begun_is_at_time_0_and_not_late():
+    paced = Pacer(FakeClock(0), PERIOD_NS, "skip", LateRules())
+    assert (paced.tick, paced.deadline_ns, paced.late_ns, paced.late_run) == (-1, 0, 0, 0)
+    paced.wait()
+    assert (paced.tick, paced.deadline_ns, paced.late_ns) == (0, 0, 0)
+
+
 def test_deadlines_do_not_drift():
     """Each deadline is a whole number of periods after the start, whatever wake-ups cost."""
     clock = FakeClock(5_000, dict.fromkeys(range(1000), 40_000))
@@ -113,10 +120,27 @@ class TestMisses:
         seldom = {100 * number: PERIOD_NS for number in range(200)}
         assert self.stalled(seldom, ticks=20_000)[0] == ""
 
+    def test_what_is_forgotten_makes_room_for_no_more_than_it_was(self):
+        """Ten in a thousand for ever, and then eleven."""
+        seldom = {100 * number: PERIOD_NS for number in range(30)}
+        assert self.stalled(seldom | {2950: PERIOD_NS}, ticks=4000)[0]
+
+    @pytest.mark.parametrize(("last", "ends"), [(989, True), (990, False)])
+    def test_the_window_is_as_long_as_it_says(self, last, ends):
+        """One is skipped for tick 1, nine up to tick 13, the eleventh for tick 1000 or 1001."""
+        stalls = {0: PERIOD_NS} | dict.fromkeys((1, 2, 3), 3 * PERIOD_NS) | {last: PERIOD_NS}
+        assert bool(self.stalled(stalls, ticks=1100)[0]) == ends
+
     def test_the_grace_at_the_start_counts_for_nothing(self):
         often = {20 * number: PERIOD_NS for number in range(14)}
         assert self.stalled(often)[0]
         assert self.stalled(often, grace_ticks=100)[0] == ""
+
+    @pytest.mark.parametrize(("grace_ticks", "ends"), [(1, True), (2, False)])
+    def test_the_grace_ends_before_its_tick(self, grace_ticks, ends):
+        """The first of five stalls comes at tick 1."""
+        stalls = {0: PERIOD_NS} | dict.fromkeys((1, 2, 3, 4), 3 * PERIOD_NS)
+        assert bool(self.stalled(stalls, ticks=10, grace_ticks=grace_ticks)[0]) == ends
 
 
 @pytest.mark.parametrize(
@@ -220,6 +244,13 @@ class TestTooLate:
         assert paced.too_late() == ("3 ticks in a row woke late, up to tick 5" if ends else "")
         assert paced.counters.longest_run == ticks - 3
 
+    def test_one_may_be_enough(self):
+        paced = self.paced({1: PERIOD_NS}, 2, max_consecutive_late=1)
+        assert paced.too_late() == "1 ticks in a row woke late, up to tick 1"
+
+    def test_without_grace_the_first_tick_counts(self):
+        assert self.paced({0: PERIOD_NS}, 1, max_late_ns=1.0).too_late()
+
     def test_the_grace_ends_with_its_tick(self):
         rules = {"max_late_ns": 1.0, "grace_ticks": 4}
         stalls_ns = {0: 100 * PERIOD_NS}
@@ -262,6 +293,28 @@ class TestFollow:
         assert max(late_ns) == min(late_ns) == 0
         assert paced.deadline_ns == 10_000 + (100 - 1 - burst) * PERIOD_NS
         assert paced.counters.late_ticks == 0
+
+    def test_each_tick_of_a_burst_is_due_when_it_comes(self):
+        """And the next ones a period after the last of them: a stall then is late in full."""
+        clock = FakeClock(5_000)
+        paced = pacer(clock, "follow")
+        for _ in range(8):
+            paced.wait()
+            assert (paced.deadline_ns, paced.late_ns) == (clock.now, 0)
+        clock.now += 3 * PERIOD_NS
+        paced.wait()
+        assert paced.late_ns == 2 * PERIOD_NS
+
+    def test_deadlines_follow_by_a_64th_of_the_lateness(self):
+        clock = FakeClock(5_000)
+        paced = pacer(clock, "follow")
+        paced.wait()
+        clock.now += PERIOD_NS + 6_400
+        paced.wait()
+        assert (paced.deadline_ns, paced.late_ns) == (10_000 + PERIOD_NS, 6_400)
+        clock.now += PERIOD_NS
+        paced.wait()
+        assert (paced.deadline_ns, paced.late_ns) == (10_100 + 2 * PERIOD_NS, 6_300)
 
     def test_a_stall_is_late_and_soon_forgotten(self):
         """A stall counts in full; the burst after it is late ever less, what follows is not."""

@@ -53,6 +53,21 @@ def test_a_chain_s_memory_is_that_of_its_operators():
     np.testing.assert_array_equal(chain.state(), rest)
 
 
+def test_a_chain_may_be_part_of_another():
+    """Its memory is then a part of that one's, as those of its operators are."""
+    inner = Chain([delayed(2), PLAYS.forward(1.0)])
+    outer = Chain([between(0.5), inner])
+    outer.process(SIGNAL)
+    memory = outer.state()
+    assert inner.state().tolist() == memory[memory.size - inner.state().size :].tolist()
+    then = outer.process(SIGNAL)
+    outer.restore(memory)
+    inner.reset()
+    assert outer.state().tolist() != memory.tolist()
+    outer.restore(memory)
+    assert outer.process(SIGNAL).tolist() == then.tolist()
+
+
 def test_a_chain_begins_where_its_operators_stood():
     """Operators that have seen a signal are taken as they are, and reset to that."""
     moved = PLAYS.forward(1.0)
@@ -65,7 +80,7 @@ def test_a_chain_begins_where_its_operators_stood():
     assert chain.state().tolist() == left.tolist()
 
 
-@pytest.mark.parametrize(("width", "ahead"), [(0.0, 1), (0.9, 3), (4.0, 13), (1e6, 127)])
+@pytest.mark.parametrize(("width", "ahead"), [(0.0, 1), (0.6, 1), (0.9, 3), (4.0, 13), (1e6, 127)])
 def test_smoothing_reaches_as_far_as_four_boxes(width, ahead):
     """Of round(sqrt(1 + 3 s^2)) samples each, at most 64."""
     weights, m = smoothing_weights(width)

@@ -1,24 +1,30 @@
 """The guardian: what it takes for a dead or hanging loop, and what it does then."""
 
 import os
+import select
 import signal
 import subprocess
 import sys
 import threading
 import time
 from contextlib import suppress
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
 from hilctl.base.errors import DeviceError
 from hilctl.loop.plan import Outcome
-from hilctl.run.guardian import Guardian, GuardianJob, main
+from hilctl.run import guardian
+from hilctl.run.guardian import LAST_CALL_MS, Guardian, GuardianJob, main
 from hilctl.run.hang_watch import SilenceLimits
 from hilctl.run.ring import SampleRing
-from hilctl.run.shared_page import Field, GuardianPhase, PageText, Phase
+from hilctl.run.safe_action import SafeAction
+from hilctl.run.shared_page import Field, GuardianPhase, PageText, Phase, SharedPage
 
 SLEEP = [sys.executable, "-c", "import time; time.sleep(600)"]
+DESCRIPTORS = Path("/proc/self/fd")
+IGNORED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class Device:
@@ -43,7 +49,7 @@ def guarded(tmp_path):
     page.put(Field.GO, 1)
     page.put(Field.PHASE, Phase.RUNNING)
     pidfd = os.pidfd_open(loop.pid)
-    made = SimpleNamespace(loop=loop, page=page, device=Device(loop))
+    made = SimpleNamespace(loop=loop, page=page, device=Device(loop), pidfd=pidfd)
 
     def guard(hang_s=60.0):
         job = GuardianJob("", {}, "", "", 0.25, SilenceLimits(hang_s, 60.0, hang_s), loop.pid, 1)
@@ -76,6 +82,50 @@ def test_a_loop_that_hangs_is_killed_before_the_device_is_touched(guarded, how):
     assert guarded.device.asked == [(0.25, False)]
     assert guarded.loop.wait() == -signal.SIGKILL
     assert guarded.page.made_safe().hung
+
+
+def test_a_loop_that_goes_on_is_left_alone(guarded, monkeypatch):
+    """Until it dies. The supervisor sees by the heartbeat that it is watched, from the first on."""
+    page, put = [], SharedPage.put
+
+    def noted(self, field, value):
+        page.append((field, value))
+        put(self, field, value)
+        if len(page) == 6:
+            guarded.loop.kill()
+
+    monkeypatch.setattr(SharedPage, "put", noted)
+    guarded.guard()
+    assert page[1] == (Field.GUARDIAN_PHASE, GuardianPhase.WATCHING)
+    heartbeats_ns = [value for field, value in page if field == Field.GUARDIAN_HEARTBEAT_NS]
+    assert [field for field, _ in page[:6]].count(Field.GUARDIAN_HEARTBEAT_NS) == 5
+    assert heartbeats_ns == sorted(set(heartbeats_ns))
+    assert guarded.page.made_safe().confirmed
+    assert not guarded.page.made_safe().hung
+
+
+def test_a_loop_that_hangs_may_end_a_call_before_the_device_is_touched(guarded, monkeypatch):
+    """The kernel ends it, where it is not held up: a device may take one connection only."""
+    done = []
+
+    class Death:
+        def register(self, loop, events):
+            assert events == select.POLLIN
+
+        def poll(self, wait_ms):
+            done.append(wait_ms)
+
+    def send(loop, number):
+        done.append(number)
+        signal.pidfd_send_signal(loop, number)
+
+    monkeypatch.setattr(guardian, "select", SimpleNamespace(poll=Death, POLLIN=select.POLLIN))
+    monkeypatch.setattr(
+        guardian, "signal", SimpleNamespace(SIGKILL=signal.SIGKILL, pidfd_send_signal=send)
+    )
+    guarded.page.put(Field.LOOP_HEARTBEAT_NS, 1)
+    guarded.guard(hang_s=0.0)
+    assert done[-2:] == [signal.SIGKILL, LAST_CALL_MS]
 
 
 def test_a_loop_that_ended_by_itself_is_left_to_what_it_said(guarded):
@@ -111,9 +161,16 @@ def test_what_is_not_confirmed_is_not_called_safe(guarded, error):
     assert not guarded.page.made_safe().confirmed
 
 
-def test_it_gives_signs_of_life_while_the_device_keeps_it(guarded):
+def test_it_gives_signs_of_life_while_the_device_keeps_it(guarded, monkeypatch):
     """The supervisor would take it for dead otherwise, and reach for the device as well."""
     go_on, seen = threading.Event(), set()
+
+    class Prompt(SafeAction):
+        def result(self, wait_s):
+            assert 0.0 < wait_s <= 0.01
+            return super().result(wait_s)
+
+    monkeypatch.setattr(guardian, "SafeAction", Prompt)
 
     def make_safe(value):
         while len(seen) < 3:
@@ -129,20 +186,78 @@ def test_it_gives_signs_of_life_while_the_device_keeps_it(guarded):
     assert guarded.page.made_safe().confirmed
 
 
-def test_a_device_that_can_not_be_made_is_said_before_the_start(tmp_path):
-    page = SampleRing.create(tmp_path / "ring", slots=4, block=1, state_size=1).page
-    ring, limits = str(tmp_path / "ring"), SilenceLimits(1.0, 1.0, 1.0)
-    job = GuardianJob("device: {kind: gone}", {}, "", ring, 0.0, limits, 1, 1)
-    assert GuardianJob.from_json(job.to_json()) == job
-    (tmp_path / "job").write_text(job.to_json(), encoding="utf-8")
-    before = {number: signal.getsignal(number) for number in (2, 15, 1)}
-    try:
-        assert main([str(tmp_path / "job"), "0"]) == 1
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-    assert page.get(Field.GUARDIAN_PHASE) == GuardianPhase.FAILED
-    assert "unknown device 'gone'" in page.read_text(PageText.GUARDIAN)
+@pytest.fixture
+def written(tmp_path):
+    """A function that writes a job and calls the program; and the page."""
+    ring = tmp_path / "ring of a job"
+    page = SampleRing.create(ring, slots=4, block=1, state_size=1).page
+    before = {number: signal.getsignal(number) for number in IGNORED}
+
+    def call(experiment, loop=0):
+        limits = SilenceLimits(1.0, 1.0, 1.0)
+        job = GuardianJob(experiment, {}, "", str(ring), 0.25, limits, 1, 7)
+        assert GuardianJob.from_json(job.to_json()) == job
+        (tmp_path / "job").write_text(job.to_json(), encoding="utf-8")
+        return main([str(tmp_path / "job"), str(loop)])
+
+    yield SimpleNamespace(call=call, page=page)
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+@pytest.mark.parametrize(
+    ("experiment", "said"),
+    [
+        ("device: {kind: gone}", "unknown device 'gone'"),
+        ("name: x", "the experiment has no device"),
+    ],
+)
+def test_a_device_that_can_not_be_made_is_said_before_the_start(written, experiment, said):
+    assert written.call(experiment) == 1
+    assert written.page.get(Field.GUARDIAN_PHASE) == GuardianPhase.FAILED
+    assert said in written.page.read_text(PageText.GUARDIAN)
+
+
+def test_the_device_is_made_of_the_experiment_alone():
+    limits = SilenceLimits(1.0, 1.0, 1.0)
+    job = GuardianJob("device: {kind: simulated_terfenol}", {}, "", "", 0.0, limits, 1, 1)
+    assert job.device().info.simulated
+
+
+@pytest.mark.parametrize("limit", [None, 65536])
+def test_it_prepares_for_a_machine_that_does_nothing_else(written, guarded, monkeypatch, limit):
+    """No signal ends it, it stays in memory where it may, and both threads are quick."""
+    done, descriptors = [], list(DESCRIPTORS.iterdir())
+    process = SimpleNamespace(
+        freeze_gc=lambda: done.append("frozen"),
+        lockable_bytes=lambda: limit,
+        lock_memory=lambda: done.append("locked"),
+        set_fifo=lambda priority: done.append((priority, threading.current_thread().name)),
+    )
+    monkeypatch.setattr(guardian, "LinuxProcess", lambda: process)
+    monkeypatch.setattr(GuardianJob, "device", lambda job: guarded.device)
+    written.page.put(Field.GO, 1)
+    written.page.put(Field.PHASE, Phase.RUNNING)
+    guarded.loop.kill()
+    assert written.call("", guarded.pidfd) == 0
+    assert guarded.device.asked == [(0.25, False)]
+    locked = ["locked"] if limit is None else []
+    assert done == ["frozen", *locked, (7, "MainThread"), (7, "make safe")]
+    assert [signal.getsignal(number) for number in IGNORED] == [signal.SIG_IGN] * 3
+    assert list(DESCRIPTORS.iterdir()) == descriptors
+
+
+def test_refused_real_time_is_no_reason_to_leave_the_coil(written, guarded, monkeypatch):
+    def refuse(*_):
+        raise OSError(1, "Operation not permitted")
+
+    process = SimpleNamespace(
+        freeze_gc=lambda: None, lockable_bytes=lambda: None, lock_memory=refuse, set_fifo=refuse
+    )
+    monkeypatch.setattr(guardian, "LinuxProcess", lambda: process)
+    guarded.loop.kill()
+    assert written.call("device: {kind: simulated_terfenol}", guarded.pidfd) == 0
+    assert written.page.get(Field.GUARDIAN_PHASE) == GuardianPhase.WATCHING
 
 
 def test_it_brings_no_numba_along():

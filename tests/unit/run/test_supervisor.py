@@ -9,6 +9,7 @@ import signal
 from contextlib import contextmanager
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from hilctl.base.errors import InputError, RunError
@@ -84,10 +85,11 @@ class Neighbours:
             "Safety": self.safety,
             "StartedRun": self.started_run,
             "ProgressThread": lambda *a: SimpleNamespace(
-                start=lambda: None, end=lambda: self.note("progress ended")
+                start=lambda: self.said.append("shown"), end=lambda: self.note("progress ended")
             ),
             "Notifier": lambda: SimpleNamespace(
-                say=lambda *lines: self.said.extend(lines), alive=lambda: None
+                say=lambda *lines: self.said.extend(lines),
+                alive=lambda: self.said.append("alive"),
             ),
         }.items():
             patch.setattr(module, name, double)
@@ -114,7 +116,11 @@ class Neighbours:
     def server(self, socket, answer):
         assert socket == self.folder.socket
         with self.around("server", "server closed", None):
-            yield SimpleNamespace(serve=lambda wait_s: self.note("serve"))
+            yield SimpleNamespace(serve=self.serve)
+
+    def serve(self, wait_s):
+        assert 0.0 < wait_s <= 0.02  # meanwhile nobody sees to the ring
+        self.note("serve")
 
     def child(self, checked, folder, ring, inherits, silence_s):
         self.ring, self.silence_s = ring, silence_s
@@ -203,7 +209,8 @@ def test_a_run_is_begun_in_one_order_and_undone_in_the_other(stage):
         stage.output, "completed", "waveform completed",
     )  # fmt: skip
     assert (result.samples, result.missing, result.safe, result.stop_signal) == (95, 5, True, 0)
-    assert stage.said == ["READY=1", f"STATUS=recording to {stage.output}", "STOPPING=1"]
+    ready = ["shown", "READY=1", f"STATUS=recording to {stage.output}"]
+    assert stage.said == [*ready, *["alive"] * 3, "STOPPING=1"]
 
 
 def test_a_simulated_device_has_no_guardian(stage):
@@ -271,8 +278,11 @@ def test_a_disk_that_takes_too_long_three_times_ends_it(stage):
 def test_what_breaks_afterwards_costs_neither_coil_nor_recording(stage):
     """The run is seen to without all that may have broken, until its recording is closed."""
     stage.fails["serve"] = ZeroDivisionError("a bug")
+    at_ns = []
+    stage.on_attend = dict.fromkeys(range(1, 5), lambda: at_ns.append(stage.time.now_ns))
     stage.run()
     assert stage.attended == [0] * 4
+    assert list(np.diff(at_ns)) == [0, 10 * MS, 10 * MS]  # not as fast as it can
     assert stage.log[len(READY) :][:4] == [
         "requests", "serve", "broken off: a bug", "progress ended",
     ]  # fmt: skip

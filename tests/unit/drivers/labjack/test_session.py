@@ -1,5 +1,6 @@
 """A stream's session: counts of what is queued, played and fetched, and what they must agree on."""
 
+import struct
 from dataclasses import dataclass
 
 import numpy as np
@@ -196,6 +197,10 @@ def test_a_late_device_is_waited_for_and_a_standing_one_is_not(scene):
     late = scene(*[(0, 0, 100)] * 10, (10, 0, 90))
     late.session.start()
     assert late.session.take(10).size == 10
+    at_last = scene(*[(0, 0, 100)] * 11, (10, 0, 90))
+    at_last.session.start()
+    assert at_last.session.take(10).size == 10
+    assert sum(at_last.slept_s) > 0.11
     standing = scene(*[(0, 0, 100)] * 20)
     standing.session.start()
     with pytest.raises(DeviceError, match=r"stands: 0 of 10 readings within 0\.1 s"):
@@ -321,4 +326,29 @@ def test_a_stream_is_started_and_stopped_by_one_register(scene):
 def test_a_new_session_has_nothing():
     session = StreamSession(Scripted(), load_profile("labjack_t7").streaming, 0.1, 0.001)
     assert not session.running
-    assert (session.capacity, session.margin, session.level_min) == (0, 0, 0)
+    assert (session.capacity, session.level_min) == (0, 0)
+
+
+@pytest.mark.parametrize(
+    ("name", "form", "address", "constants"),
+    [
+        ("labjack_t7", "two_slopes", 0x3C4000, struct.pack(">4f", 3e-4, -3e-4, 33523.0, 0.0)),
+        ("labjack_t4", "line", 0x3C4010, struct.pack(">2f", 4e-5, -0.1)),
+    ],
+)
+def test_calibration_is_read_from_flash(name, form, address, constants):
+    """The pointer is set first; of input 2, whose constants may be its own."""
+    asked = []
+
+    class Flash:
+        def call(self, frames):
+            asked.extend((each.address, each.data) for each in frames)
+
+        def read(self, address, words):
+            asked.append((address, words))
+            return constants
+
+    session = StreamSession(Flash(), load_profile(name).streaming, 0.1, 0.001)
+    assert session.calibration(2) == stream.InputCalibration.decode(form, constants)
+    pointer = (stream.FLASH_READ_POINTER, stream.u32(address))
+    assert asked == [pointer, (stream.FLASH_READ, len(constants) // 2)]

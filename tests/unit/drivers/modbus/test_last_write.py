@@ -1,11 +1,13 @@
 """The last write against an emulated device in this process, in a time that tests make pass."""
 
+import itertools
+
 import pytest
 
 from hilctl.base.errors import DeviceError
 from hilctl_drivers.emulator.options import EmulatorOptions
 from hilctl_drivers.modbus.device import ModbusDac
-from hilctl_drivers.modbus.last_write import ANSWER_S, RETRY_S, TRIES_S
+from hilctl_drivers.modbus.last_write import ANSWER_S, POLL_S, RETRY_S, TRIES_S
 from hilctl_drivers.modbus.setup import ModbusOptions
 from tests.fakes import FaultyLink, emulated
 
@@ -64,7 +66,8 @@ def test_who_never_opened_it_waits_for_others(driven):
     made.link.open()
     made.device.make_safe(-1.0)
     assert made.current_a == pytest.approx(-1.0)
-    assert made.time() - 1.0 >= HOLD_S
+    assert HOLD_S <= made.time() - 1.0 <= HOLD_S + 0.01
+    assert len(made.link.requests) <= HOLD_S / POLL_S + 3  # others use the device meanwhile
 
 
 @pytest.mark.parametrize("silence_s", [0.6, 3.0])
@@ -93,6 +96,21 @@ def test_device_that_stays_silent_is_given_up(driven):
         made.device.make_safe(0.0)
     assert TRIES_S <= made.time() - before_s <= TRIES_S + HOLD_S + 2 * TIMEOUT_S
     assert not made.link.is_open
+
+
+def test_a_device_that_refuses_at_once_is_not_flooded(driven):
+    """It is asked twenty times a second."""
+    made, tried_s = driven(), []
+
+    def refuse(peer):
+        assert len(tried_s) < 1000
+        tried_s.append(made.time())
+        raise DeviceError("connection refused")
+
+    made.device._last_write._connect = refuse
+    with pytest.raises(DeviceError, match=r"refused; what it puts out is not known"):
+        made.device.make_safe(0.0)
+    assert {round(b - a, 6) for a, b in itertools.pairwise(tried_s)} == {RETRY_S}
 
 
 def test_slow_time_out_does_not_keep_a_silent_peer(driven):
@@ -146,14 +164,28 @@ class Rounding(FaultyLink):
         return reply
 
 
-def test_readback_may_be_rounded(driven):
+@pytest.mark.parametrize(
+    ("profile", "link"), [("wago_750", Rounding), ("generic_float32", FaultyLink)]
+)
+def test_readback_may_be_rounded(driven, profile, link):
     """That is no other value, and nothing to write again."""
-    made = driven("wago_750", link=Rounding)
+    made = driven(profile, link=link)
     made.open()
     before = len(made.writes())
     made.device.make_safe(0.3337)
     assert len(made.writes()) == before + 1
     assert made.current_a == pytest.approx(0.3337, abs=1e-3)
+
+
+def test_a_step_of_the_output_is_no_other_value(driven):
+    """Which of two neighbours a device rounds to is its own affair; floats round to a millionth."""
+    for profile in ("wago_750", "generic_float32"):
+        last_write = driven(profile).device._last_write
+        output = last_write._setup.output
+        step = output.step or 1e-6 * (output.max - output.min)
+        assert step > 0.0
+        assert last_write._agrees(step, 0.0)
+        assert not last_write._agrees(1.01 * step, 0.0)
 
 
 def test_no_name_is_looked_up_for_it():

@@ -1,17 +1,89 @@
 """A session with a reader on another module: self-test, steps, faults, and letting go."""
 
+import struct
+
 import numpy as np
 import pytest
 
 from hilctl.base.errors import DeviceError
 from hilctl_drivers.emulator.faults import parse_fault
+from hilctl_drivers.modbus.channels import EnsureStep, ExpectStep, WriteStep
 from hilctl_drivers.modbus.device import ModbusDac
+from hilctl_drivers.modbus.session import ModbusSession
+from hilctl_drivers.profile import load_profile
+from hilctl_drivers.profile_parts import WaitStep
 
 
 def exchange(device: ModbusDac, value: float) -> float:
     displacement_um = np.full(1, np.nan)
     device.exchange(0, np.array([value]), displacement_um, np.full(1, np.nan))
     return float(displacement_um[0])
+
+
+class Line:
+    """A device over Modbus TCP with coils and registers at any address."""
+
+    name = "line"
+
+    def __init__(self):
+        self.asked, self.coils, self.registers = [], {}, {}
+
+    def transact(self, request, missing, usual):
+        head, pdu = request[:4], request[7:]
+        function, address, value = struct.unpack_from(">BHH", pdu)
+        self.asked.append(function)
+        reply = pdu[:5]
+        if function == 1:
+            reply = bytes([1, 1, self.coils[address]])
+        elif function == 3:
+            words = [self.registers[address + i] for i in range(value)]
+            reply = struct.pack(f">BB{value}H", 3, 2 * value, *words)
+        elif function == 5:
+            self.coils[address] = value >> 8 & 1
+        elif function == 6:
+            self.registers[address] = value
+        else:
+            for i, (word,) in enumerate(struct.iter_unpack(">H", pdu[6:])):
+                self.registers[address + i] = word
+        return head + struct.pack(">HB", 1 + len(reply), request[6]) + reply
+
+
+class TestSteps:
+    """Steps of a profile over a link whose framing is another than the profile's."""
+
+    @pytest.fixture
+    def session(self, reader):
+        self.line, self.slept_s = Line(), []
+        profile = load_profile(reader)
+        return ModbusSession(profile, self.line, 9, self.slept_s.append, framing="tcp")
+
+    def test_each_kind_of_register_has_its_function(self, session):
+        """Devices that know one function only are common: a single word goes by the simple one."""
+        one = {"kind": "write", "address": 7, "type": "uint16", "value": 3.0}
+        two = {"kind": "write", "address": 8, "type": "float32", "value": 1.5}
+        session.run([WriteStep(**one), WriteStep(**two)])
+        assert self.line.asked == [6, 16]
+        assert self.line.registers == {7: 3, 8: 0x3FC0, 9: 0}
+
+    @pytest.mark.parametrize("value", [0.0, 1.0])
+    def test_bits_are_coils(self, session, value):
+        bit = {"area": "coil", "address": 3, "type": "bit", "value": value}
+        self.line.coils[3] = int(not value)
+        ensure = EnsureStep(kind="ensure", **bit)
+        assert session.would_change([ensure])
+        session.run([ensure, WriteStep(kind="write", verify=True, **bit)])
+        assert self.line.asked == [1, 1, 5, 1, 5, 1]
+        assert self.line.coils == {3: value}
+        assert not session.would_change([ensure])
+        self.line.coils[3] = int(not value)
+        said = f"must hold {value}, got {1 - value:g}, at step expect coil 3"
+        with pytest.raises(DeviceError, match=said):
+            session.run([ExpectStep(kind="expect", **bit)])
+
+    def test_a_wait_is_waited(self, session):
+        session.run([WaitStep(kind="wait", seconds=0.25)])
+        assert self.slept_s == [0.25]
+        assert self.line.asked == []
 
 
 class TestReader:
@@ -58,12 +130,13 @@ class TestReader:
         assert served.events() == []
 
     @pytest.mark.parametrize(
-        ("fault", "said"), [("silence@1s", "no answer"), ("exception@1s", "exception 4")]
+        ("fault", "said", "timeout_s"),
+        [("silence@1s", "no answer", 0.2), ("exception@1s", "exception 4", 2.0)],
     )
-    def test_errors_name_the_reader(self, serve, fault, said):
+    def test_errors_name_the_reader(self, serve, fault, said, timeout_s):
         """The message says which device, where, and what was being done; nothing was written."""
         served = serve("icp_m7024", "icp_m7017", faults=(parse_fault(fault),))
-        device = served.device(timeout_s=0.2)
+        device = served.device(timeout_s=timeout_s)
         device.open(5.0, 1)
         served.clock.pass_s(2.0)
         named = rf"modbus_dac icp_m7024 at .*: reader icp_m7017, unit 2 at .*: .*{said}.* \(to wri"
