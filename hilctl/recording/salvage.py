@@ -28,17 +28,9 @@ from mcap.writer import MCAP0_MAGIC as MAGIC
 
 from hilctl.recording.allowance import Allowance
 from hilctl.recording.checks import SoundMessages
-from hilctl.recording.records import (
-    FRAME,
-    LARGEST_BYTES,
-    Contents,
-    contents,
-    next_likely,
-    own_channels,
-    parse,
-    tail_kind,
-    take_chunk,
-)
+from hilctl.recording.chunks import Contents, contents
+from hilctl.recording.records import FRAME, LARGEST_BYTES, parse
+from hilctl.recording.torn import next_likely, own_channels, tail_kind, take_chunk
 
 _INDEX_KINDS = {Opcode.MESSAGE_INDEX, Opcode.DATA_END, Opcode.FOOTER}
 _KNOWN = {opcode.value for opcode in Opcode}
