@@ -1,6 +1,7 @@
 """What a chunk holds: decompressed, checked, and walked record by record.
 
-A chunk counts as whole where its checksum is right.
+A chunk counts as whole where its checksum is right. Where nothing but messages is in it, as in all
+but the first of a run, they can be had as a table, without an object each.
 """
 
 import struct
@@ -9,6 +10,7 @@ from collections.abc import Collection
 from dataclasses import dataclass
 from functools import cache
 from io import BytesIO
+from types import ModuleType
 from typing import Any
 
 import lz4.frame
@@ -17,6 +19,7 @@ import zstandard
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, McapRecord, Message
 
+from hilctl.base.arrays import I64, U8
 from hilctl.recording.allowance import LARGEST_CHUNK_BYTES, MOST_IN_CHUNK, Allowance
 from hilctl.recording.records import FRAME, LENGTH, parse
 
@@ -24,6 +27,7 @@ _MESSAGE_FRAME = struct.Struct("<BQHIQQ")  # opcode and length as well
 _MESSAGE_BYTES = _MESSAGE_FRAME.size - FRAME.size
 _LOG_TIME_AT = 6
 _IS_MESSAGE = int(Opcode.MESSAGE)  # an enumeration takes longer to compare than all else here
+_SHORTEST = _MESSAGE_FRAME.size
 _PIECE_BYTES = 65536
 
 
@@ -166,3 +170,54 @@ def _index(channel_id: int, data: bytes, places: list[int]) -> bytes:
     times = np.frombuffer(data, np.uint8)[bytes_of].view("<u8")
     head = struct.pack("<HI", channel_id, 2 * LENGTH.size * at.size)
     return head + np.column_stack((times, at.astype("<u8"))).tobytes()
+
+
+@dataclass(frozen=True, slots=True)
+class Messages:
+    """The messages of whole chunks.
+
+    Attributes:
+        data: uint8[n], what the chunks hold, one behind the other.
+        table: int64[m, PLACES], see :func:`hilctl.kernels.packed.walk_messages`.
+        channels: Ids of their channels.
+    """
+
+    data: U8
+    table: I64
+    channels: frozenset[int]
+
+    @classmethod
+    def of(cls, data: U8) -> "Messages | None":
+        """Return the messages of chunks; None where they hold anything else, or are not whole."""
+        packed = kernels()
+        table = np.empty((min(data.size // _SHORTEST, MOST_IN_CHUNK), packed.PLACES), np.int64)
+        count = packed.walk_messages(data, table)
+        if count < 0:
+            return None
+        table = table[:count]
+        return cls(data, table, frozenset(table[:, packed.CHANNEL].tolist()))
+
+    def under(self, *channels: int) -> I64:
+        """Return the rows of some channels: int64[k, PLACES]."""
+        column = self.table[:, kernels().CHANNEL]
+        return self.table[
+            column == channels[0] if len(channels) == 1 else np.isin(column, channels)
+        ]
+
+    def records(self, rows: I64) -> list[Message]:
+        """Return the messages of some rows."""
+        return [self._record(start, end) for _, start, _, end, _ in rows.tolist()]
+
+    def _record(self, start: int, end: int) -> Message:
+        head = self.data[start : start + _MESSAGE_FRAME.size].tobytes()
+        _, _, channel, sequence, log_time, publish_time = _MESSAGE_FRAME.unpack(head)
+        body = self.data[start + _MESSAGE_FRAME.size : end].tobytes()
+        return Message(channel, log_time, body, publish_time, sequence)
+
+
+@cache
+def kernels() -> ModuleType:
+    """Return :mod:`hilctl.kernels.packed`; what it takes to load it, short files do not pay."""
+    from hilctl.kernels import packed
+
+    return packed

@@ -47,7 +47,6 @@ _KINDS: dict[int, Any] = {
     Opcode.FOOTER: Footer,
     Opcode.SCHEMA: Schema,
     Opcode.CHANNEL: Channel,
-    Opcode.CHUNK_INDEX: ChunkIndex,
     Opcode.ATTACHMENT: Attachment,
     Opcode.ATTACHMENT_INDEX: AttachmentIndex,
     Opcode.STATISTICS: Statistics,
@@ -56,6 +55,9 @@ _KINDS: dict[int, Any] = {
     Opcode.DATA_END: DataEnd,
 }
 _COUNT = struct.Struct("<I")
+_CHUNK_INDEX = struct.Struct("<QQQQI")
+_OFFSET = struct.Struct("<HQ")
+_SIZES = struct.Struct("<QQ")
 
 
 def parse(opcode: int, body: bytes) -> McapRecord | None:
@@ -66,6 +68,8 @@ def parse(opcode: int, body: bytes) -> McapRecord | None:
         return _metadata(body)
     if opcode == Opcode.CHUNK:
         return _chunk(body)
+    if opcode == Opcode.CHUNK_INDEX:
+        return _chunk_index(body)
     if opcode not in _KINDS:
         return None
     builder = RecordBuilder()
@@ -108,6 +112,32 @@ def _chunk(body: bytes) -> Chunk | None:
         message_start_time=first,
         uncompressed_crc=crc,
         uncompressed_size=size,
+    )
+
+
+def _chunk_index(body: bytes) -> ChunkIndex | None:
+    # Nor these: eight hours have 300 000 of them.
+    try:
+        first, last, start, length, size = _CHUNK_INDEX.unpack_from(body)
+        offsets_end = _CHUNK_INDEX.size + size
+        offsets = list(_OFFSET.iter_unpack(body[_CHUNK_INDEX.size : offsets_end]))
+        (index_length,) = LENGTH.unpack_from(body, offsets_end)
+        name, at = _text(body, offsets_end + LENGTH.size)
+        compressed, uncompressed = _SIZES.unpack_from(body, at)
+    except (struct.error, ValueError):
+        return None
+    if at + _SIZES.size != len(body) or len(dict(offsets)) != len(offsets):
+        return None
+    return ChunkIndex(
+        chunk_length=length,
+        chunk_start_offset=start,
+        compression=name,
+        compressed_size=compressed,
+        message_end_time=last,
+        message_index_length=index_length,
+        message_index_offsets=dict(offsets),
+        message_start_time=first,
+        uncompressed_size=uncompressed,
     )
 
 
