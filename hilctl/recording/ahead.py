@@ -1,12 +1,12 @@
 """Chunks of a long recording, read and decompressed in a thread before they are asked for."""
 
-import os
 import zlib
 from collections import deque
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import BinaryIO, NamedTuple
+from io import FileIO
+from typing import NamedTuple
 
 import numpy as np
 import zstandard
@@ -105,11 +105,11 @@ class ReadAhead:
     not held up where they seldom let go of it.
 
     Args:
-        stream: Open file; whoever reads it beside this moves no place of this one's.
+        stream: The file, opened for this alone, without a buffer.
     """
 
-    def __init__(self, stream: BinaryIO) -> None:
-        self._file = stream.fileno()
+    def __init__(self, stream: FileIO) -> None:
+        self._file = stream
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="read-ahead")
         self._coming: deque[Future[_Batch]] = deque()
         self._batch = _Batch(0, _NOTHING)
@@ -163,12 +163,12 @@ class _Walk:
     """Goes over the records of a file, a batch at a time.
 
     Args:
-        file: Its descriptor.
+        file: The file; its place is moved.
         at: Where a record begins.
         first: Whether the next chunk is the first that is read of it.
     """
 
-    def __init__(self, file: int, at: int, *, first: bool) -> None:
+    def __init__(self, file: FileIO, at: int, *, first: bool) -> None:
         self._file, self._at, self._first = file, at, first
 
     def next_batch(self) -> _Batch:
@@ -186,7 +186,8 @@ class _Walk:
 
     def _read(self, size: int) -> U8:
         raw = np.empty(size, dtype=np.uint8)
-        return raw[: os.preadv(self._file, [raw.data], self._at)]
+        self._file.seek(self._at)
+        return raw[: self._file.readinto(raw.data) or 0]
 
 
 def _records(raw: memoryview, most: int) -> tuple[list[_Chunk], list[tuple[int, int, int]], int]:

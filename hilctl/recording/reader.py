@@ -76,10 +76,12 @@ def _read(path: Path, stretch: Stretch | None, piece_samples: int | None) -> Ite
     try:
         with path.open("rb") as stream, ExitStack() as closed:
             places = places_of(stream, stretch) if stretch else None
-            size = os.fstat(stream.fileno()).st_size
+            status = os.fstat(stream.fileno())
             ahead = None
-            if size >= LONG_BYTES and (places is None or len(places) >= LONG_CHUNKS):
-                ahead = closed.enter_context(closing(ReadAhead(stream)))
+            if status.st_size >= LONG_BYTES and (places is None or len(places) >= LONG_CHUNKS):
+                beside = closed.enter_context(path.open("rb", buffering=0))
+                if os.path.samestat(status, os.fstat(beside.fileno())):  # nobody has replaced it
+                    ahead = closed.enter_context(closing(ReadAhead(beside)))
             salvage = Salvage(stream, ahead=ahead)
             gathered = Gathering(salvage, stretch)
             records = salvage.taken() if places is None else salvage.taken_at(places)

@@ -112,8 +112,8 @@ def test_chunks_come_many_at_once(whole, tmp_path):
     """All but the first, which has the channels, and no message of theirs by itself."""
     path = tmp_path / "run.mcap"
     path.write_bytes(whole)
-    with path.open("rb") as stream, closing(ReadAhead(stream)) as first:
-        salvage = Salvage(stream, ahead=first)
+    with path.open("rb", buffering=0) as stream, closing(ReadAhead(stream)) as first:
+        salvage = Salvage(io.BytesIO(whole), ahead=first)
         salvage._channels.update(own_channels())
         runs = [each for each in salvage.taken() if not hasattr(each, "write")]
     with path.open("rb") as stream:
@@ -127,8 +127,8 @@ def test_chunks_come_many_at_once(whole, tmp_path):
 def test_records_are_given_out_one_by_one_all_the_same(whole, tmp_path):
     path = tmp_path / "run.mcap"
     path.write_bytes(whole)
-    with path.open("rb") as stream, closing(ReadAhead(stream)) as first:
-        by_run = list(Salvage(stream, ahead=first).records())
+    with path.open("rb", buffering=0) as stream, closing(ReadAhead(stream)) as first:
+        by_run = list(Salvage(io.BytesIO(whole), ahead=first).records())
     assert by_run == list(Salvage(io.BytesIO(whole)).records())
 
 
@@ -141,8 +141,8 @@ def test_chunks_that_hold_much_are_not_opened_together(make, tmp_path, monkeypat
     path = tmp_path / "run.mcap"
     path.write_bytes((b"\x06" + struct.pack("<Q", len(body)) + body) * 50)
     monkeypatch.setattr(ahead, "_MOST_BYTES", 5 * 2**20)
-    with path.open("rb") as stream:
-        walk = ahead._Walk(stream.fileno(), 0, first=False)
+    with path.open("rb", buffering=0) as stream:
+        walk = ahead._Walk(stream, 0, first=False)
         sizes = [walk.next_batch().data.size for _ in range(3)]
     assert sizes == [5 * 2**20] * 3
 
@@ -150,7 +150,7 @@ def test_chunks_that_hold_much_are_not_opened_together(make, tmp_path, monkeypat
 def test_a_file_that_is_damaged_all_over_is_not_begun_again_and_again(tmp_path):
     path = tmp_path / "run.mcap"
     path.write_bytes(b"\xff" * 2**22)
-    with path.open("rb") as stream, closing(ReadAhead(stream)) as first:
+    with path.open("rb", buffering=0) as stream, closing(ReadAhead(stream)) as first:
         for at in range(0, 2**20, 2**12):
             assert first.chunks(at) is None
         assert first._starts == ahead._MOST_STARTS
