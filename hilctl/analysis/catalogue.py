@@ -8,7 +8,7 @@ the others, the next look may find more.
 import json
 import os
 import stat
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -94,6 +94,19 @@ class Catalogue:
         """Return all that is known of a recording, labels and options as mappings."""
         plain = {name: self.column(name)[row] for name in _PLAIN}
         return plain | {name: self._mappings(name)[row] for name in (LABELS_FACT, "options")}
+
+    def json_lines(self, rows: Iterable[int]) -> Iterator[str]:
+        """Yield what :meth:`entry` returns as JSON."""
+        encode = json.JSONEncoder(allow_nan=False).encode
+        columns = [self.column(name) for name in _PLAIN]
+        texts = {name: self.column(name) for name in (LABELS_FACT, "options")}
+        for row in rows:
+            line = encode(dict(zip(_PLAIN, [values[row] for values in columns], strict=True)))[:-1]
+            for name, values in texts.items():
+                text = values[row] or "{}"
+                # It is JSON already; what is not ASCII may not be for every terminal.
+                line += f', "{name}": {text if text.isascii() else encode(json.loads(text))}'
+            yield line + "}"
 
 
 class Found(NamedTuple):

@@ -5,7 +5,9 @@ place for the facts of the run.
 """
 
 import json
+from collections import deque
 from collections.abc import Callable, Iterable
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import BinaryIO
@@ -15,6 +17,8 @@ from hilctl.base.errors import DataError, InputError
 from hilctl.base.files import check_writable, write_file
 from hilctl.base.samples import COLUMNS
 from hilctl.recording.data import Recording
+
+_MOST_WAITING = 4  # pieces: as many as fill a row group
 
 
 def export(
@@ -77,14 +81,25 @@ def write_pieces(
         DataError: There is no sample.
     """
     rows = 0
-    for piece in pieces:
-        if piece.samples.index.size:
-            file.add((table_of or columns)(piece))
-            rows += piece.samples.index.size
+    waiting: deque[Future[None]] = deque()
+    # The next pieces are read while these are compressed, as both leave the interpreter to others.
+    with ThreadPoolExecutor(1, thread_name_prefix="export") as worker:
+        for piece in pieces:
+            if piece.samples.index.size:
+                if len(waiting) == _MOST_WAITING:
+                    waiting.popleft().result()
+                waiting.append(worker.submit(_add, file, piece, table_of or columns))
+                rows += piece.samples.index.size
+        for each in waiting:
+            each.result()
     if not rows:
         raise DataError(f"{piece.path}: holds no sample")
     file.finish(facts(piece))
     return rows
+
+
+def _add(file: ColumnFile, piece: Recording, table_of: Callable[[Recording], Columns]) -> None:
+    file.add(table_of(piece))
 
 
 def columns(recording: Recording) -> Columns:

@@ -19,7 +19,7 @@ Columns: TypeAlias = Mapping[str, Any]
 Facts: TypeAlias = Mapping[str, str]
 
 _CSV_ROWS = 20_000
-_GROUP_ROWS = 2**20  # pyarrow's own row groups
+_GROUP_ROWS = 2**20  # as pyarrow has it
 _LARGEST_MAT_BYTES = 2**31 - 1  # of a variable, as MATLAB reads files of this version
 _MAT_HEADER_BYTES = 128
 _MATRIX, _DIMENSIONS, _NAME, _FLAGS = 14, 5, 1, 6
@@ -76,7 +76,7 @@ class CsvFile:
 
 
 class ParquetFile:
-    """Row groups of a million; facts are the schema's metadata.
+    """Row groups of a million or two; facts are the schema's metadata.
 
     Columns may be of NumPy or of Arrow.
 
@@ -93,39 +93,56 @@ class ParquetFile:
         self._pa = arrow()
         self._stream = stream
         self._writer: Any = None
-        self._waiting: Any = None
+        self._waiting: list[Any] = []
 
     def add(self, columns: Columns) -> None:
-        """Write what fills row groups, and keep the rest."""
-        rows = self._pa.table(dict(columns))
-        if self._waiting is not None:
-            rows = self._pa.concat_tables([self._waiting, rows])
-        while rows.num_rows > _GROUP_ROWS:
-            self._write(rows.slice(0, _GROUP_ROWS))
-            rows = rows.slice(_GROUP_ROWS)
-        self._waiting = rows
+        """Write a row group where there is enough for one, else keep the rows."""
+        self._waiting.append(self._pa.table(dict(columns)))
+        if sum(each.num_rows for each in self._waiting) >= _GROUP_ROWS:
+            self._write()
 
     def finish(self, facts: Facts) -> None:
         """Write the last row group and the facts."""
         metadata = {f"hilctl.{name}": text for name, text in facts.items()}
         if self._writer is None:
-            self._waiting = self._waiting.replace_schema_metadata(metadata)
-            self._write(self._waiting, store_schema=True)
+            self._waiting = [each.replace_schema_metadata(metadata) for each in self._waiting]
+            self._write(store_schema=True)
         else:
-            self._write(self._waiting)
-            schema = self._waiting.schema.with_metadata(metadata)
+            self._write()
+            schema = self._writer.schema.with_metadata(metadata)
             kept = {"ARROW:schema": b64encode(schema.serialize()).decode(), **metadata}
             self._writer.add_key_value_metadata(kept)
         self._writer.close()
 
-    def _write(self, rows: Any, *, store_schema: bool = False) -> None:
-        from pyarrow import parquet
-
+    def _write(self, *, store_schema: bool = False) -> None:
+        if not self._waiting:
+            return
+        rows, self._waiting = self._pa.concat_tables(self._waiting), []
         if self._writer is None:
             # Where the facts are not known yet, the schema that holds them is stored at the end.
-            kept = {"store_schema": store_schema}
-            self._writer = parquet.ParquetWriter(self._stream, rows.schema, **kept)
-        self._writer.write_table(rows.combine_chunks())
+            self._writer = self._begun(rows.schema, store_schema=store_schema)
+        self._writer.write_table(rows, row_group_size=2 * _GROUP_ROWS)
+
+    def _begun(self, schema: Any, *, store_schema: bool) -> Any:
+        """Return a writer that looks for repeated values only in columns that are of few.
+
+        Measured numbers hardly repeat, but lie near one another: with like bytes side by side they
+        take half the space, in a third of the time.
+        """
+        from pyarrow import parquet
+
+        floats = [each.name for each in schema if self._pa.types.is_floating(each.type)]
+        counts = [each.name for each in schema if self._pa.types.is_int64(each.type)]
+        encoded = dict.fromkeys(floats, "BYTE_STREAM_SPLIT")
+        encoded |= dict.fromkeys(counts, "DELTA_BINARY_PACKED")
+        repeated = [name for name in schema.names if name not in encoded]
+        return parquet.ParquetWriter(
+            self._stream,
+            schema,
+            store_schema=store_schema,
+            use_dictionary=repeated,
+            column_encoding=encoded,
+        )
 
 
 class _Aside:

@@ -5,19 +5,20 @@ stretch the samples with the lowest and the highest displacement, reference, com
 kept, and all of the last samples that are judged of each segment.
 """
 
-from collections.abc import Iterable, Iterator
+from collections import deque
+from collections.abc import Iterable, Sequence
 from dataclasses import fields, replace
-from itertools import chain, islice
 
 import numpy as np
 
-from hilctl.analysis.report import Windows
+from hilctl.analysis.figures import RunReport
+from hilctl.analysis.report import RunGathering, Windows
 from hilctl.analysis.steady import Overview, SteadyPart, trusted
 from hilctl.base.arrays import F64, I64
+from hilctl.base.errors import DataError
 from hilctl.base.events import Event
-from hilctl.base.metrics import Folding
+from hilctl.base.metrics import Fold
 from hilctl.base.samples import Samples
-from hilctl.base.segments import Segment
 from hilctl.recording.data import Recording, Ticks
 
 MOST_SAMPLES = 2**22
@@ -28,23 +29,68 @@ _LAST_SAMPLES = 2**18  # all segments together
 _MOST_TICKS = 2**20
 
 
-def overview(pieces: Iterable[Recording], windows: Windows) -> Recording:
-    """Return a recording whose plots are those of the whole.
+def overview(pieces: Iterable[Recording]) -> tuple[RunReport, Recording]:
+    """Return the figures of a recording, and one whose plots are those of the whole.
 
     Of its ticks, where they are many, every so manieth is there, and the latest.
 
     Args:
-        pieces: At least one, in order.
-        windows: What is judged of it, see :func:`hilctl.analysis.report.summarize_windows`.
+        pieces: The run in order, which can be gone through again: one that ended early or was tuned
+            is read twice.
+
+    Raises:
+        DataError: As :func:`hilctl.analysis.report.summarize` does.
     """
-    coming = iter(pieces)
-    held: list[Recording] = []
-    while sum(piece.samples.index.size for piece in held) <= MOST_SAMPLES:
-        more = list(islice(coming, 1))
-        if not more:
-            return _joined(held)
-        held += more
-    return _thinned(chain(held, coming), windows)
+    planned: Windows | None = None
+    for _ in range(2):
+        gathering, shown = _gathered(pieces, planned)
+        planned = gathering.right_windows()
+        if planned == gathering.windows:
+            break
+    return gathering.report(), shown.recording(gathering.cycles())
+
+
+def _gathered(
+    pieces: Iterable[Recording], windows: Windows | None
+) -> tuple[RunGathering, "_Shown"]:
+    gathering: RunGathering | None = None
+    for piece in pieces:
+        if gathering is None:
+            gathering = RunGathering(piece, windows)
+            shown = _Shown(gathering.windows)
+        gathering.add(piece)
+        shown.add(piece)
+    if gathering is None:
+        raise DataError("there is no recording to show")
+    return gathering, shown
+
+
+class _Shown:
+    """Gathers what plots need of a recording.
+
+    Args:
+        windows: What is judged of it.
+    """
+
+    def __init__(self, windows: Windows) -> None:
+        self._windows = windows
+        self._held: list[Recording] = []
+        self._thinned: _Thinned | None = None
+
+    def add(self, piece: Recording) -> None:
+        """Take the next piece."""
+        if self._thinned:
+            self._thinned.add(piece)
+            return
+        self._held.append(piece)
+        if sum(each.samples.index.size for each in self._held) > MOST_SAMPLES:
+            self._thinned = _Thinned(self._windows)
+            while self._held:
+                self._thinned.add(self._held.pop(0))
+
+    def recording(self, cycles: Sequence[Fold | None]) -> Recording:
+        """Return it, at the end, when the average cycle of each segment is known."""
+        return self._thinned.recording(cycles) if self._thinned else _joined(self._held)
 
 
 def _joined(pieces: list[Recording]) -> Recording:
@@ -71,34 +117,49 @@ def _ticks_of(parts: list[Ticks]) -> Ticks:
     return Ticks(**{name: np.concatenate([getattr(p, name) for p in parts]) for name in names})
 
 
-def _thinned(pieces: Iterator[Recording], windows: Windows) -> Overview:
-    last: Recording | None = None
-    shown: list[Samples] = []
-    ticks = _SomeTicks()
-    most = _LAST_SAMPLES // max(1, len(windows))
-    gathered = [_Part(*window, most) for window in windows]
-    per_stretch = 0
-    events: list[Event] = []
-    for piece in pieces:
-        last = piece
-        events += piece.events
-        if not per_stretch:
+class _Thinned:
+    """Thins out what plots do not show."""
+
+    def __init__(self, windows: Windows) -> None:
+        self._windows = windows
+        self._last: Recording | None = None
+        self._shown: list[Samples] = []
+        self._size = 0
+        self._ticks = _SomeTicks()
+        most = _LAST_SAMPLES // max(1, len(windows))
+        self._parts = [_Part(window, most) for _, window in windows]
+        self._per_stretch = 0
+        self._events: list[Event] = []
+
+    def add(self, piece: Recording) -> None:
+        self._last = piece
+        self._events += piece.events
+        if not self._per_stretch:
             longest = max((segment.stop for segment in piece.segments), default=0)
-            per_stretch = max(16, longest // _STRETCHES)
-        ticks.add(piece.ticks)
-        for part in gathered:
+            self._per_stretch = max(16, longest // _STRETCHES)
+        self._ticks.add(piece.ticks)
+        for part in self._parts:
             part.add(piece)
-        shown.append(_rows_of(piece.samples, _extreme_rows(piece.samples, per_stretch)))
-        if sum(each.index.size for each in shown) > MOST_SAMPLES:  # longer than was planned
-            per_stretch *= 4
-            together = _samples_of(shown)
-            shown = [_rows_of(together, _extreme_rows(together, 32))]
-    assert last is not None
-    parts = {part.segment: part.steady_part() for part in gathered}
-    samples = _with(_samples_of(shown), [part.last_samples() for part in gathered])
-    named = {each.name: getattr(last, each.name) for each in fields(Recording)}
-    named |= {"samples": samples, "ticks": ticks.ticks(), "events": tuple(events), "starts": ()}
-    return Overview(**named, windows=dict(windows), parts=parts)
+        rows = _extreme_rows(piece.samples, self._per_stretch)
+        self._shown.append(_rows_of(piece.samples, rows))
+        self._size += rows.size
+        if self._size > MOST_SAMPLES:  # longer than was planned
+            self._per_stretch *= 4
+            together = _samples_of(self._shown)
+            rows = _extreme_rows(together, 32)
+            self._shown, self._size = [_rows_of(together, rows)], rows.size
+
+    def recording(self, cycles: Sequence[Fold | None]) -> Overview:
+        assert self._last is not None
+        parts = {
+            segment: part.steady_part(cycle)
+            for (segment, _), part, cycle in zip(self._windows, self._parts, cycles, strict=True)
+        }
+        samples = _with(_samples_of(self._shown), [part.last_samples() for part in self._parts])
+        named = {each.name: getattr(self._last, each.name) for each in fields(Recording)}
+        named |= {"samples": samples, "ticks": self._ticks.ticks()}
+        named |= {"events": tuple(self._events), "starts": ()}
+        return Overview(**named, windows=dict(self._windows), parts=parts)
 
 
 def _extreme_rows(samples: Samples, per_stretch: int) -> I64:
@@ -128,48 +189,45 @@ def _rows_of(samples: Samples, rows: I64) -> Samples:
 
 
 class _Part:
-    """Gathers the steady part of a segment, with its last samples.
+    """Gathers the last steady samples of a segment.
 
     Args:
-        segment: The segment.
         window: Its judged samples: first, after the last, whole cycles.
         most: Most samples to keep.
     """
 
-    def __init__(self, segment: Segment, window: tuple[int, int, int], most: int) -> None:
-        self.segment = segment
+    def __init__(self, window: tuple[int, int, int], most: int) -> None:
         self._start, self._stop, self._cycles = window
         self._most = most
-        self._folding = Folding(segment.period, 2) if self._cycles else None
-        self._kept: Samples | None = None
+        self._kept: deque[Samples] = deque()
+        self._size = 0
         self._compensated = False
 
     def add(self, piece: Recording) -> None:
         index = piece.samples.index
         elsewhere = index.size == 0 or index[-1] < self._start or index[0] >= self._stop
-        if elsewhere and self._kept is not None:
+        if elsewhere and self._kept:
             return
         part = trusted(piece.samples.part(self._start, self._stop))
         self._compensated = piece.compensated
-        if self._folding and part.index.size:
-            self._folding.add(part.index - self.segment.start, self._loop(part))
-        kept = part if self._kept is None else self._kept.followed_by(part)
-        self._kept = kept.rows(slice(-self._most, None))
+        self._kept.append(part)
+        self._size += part.index.size
+        while self._size - self._kept[0].index.size >= self._most > 0:
+            self._size -= self._kept.popleft().index.size
 
     def _loop(self, samples: Samples) -> F64:
         loop_input = samples.reference_um if self._compensated else samples.command
         return np.array((loop_input, samples.displacement_um))
 
     def last_samples(self) -> Samples:
-        assert self._kept is not None
-        return self._kept
+        return _samples_of(list(self._kept)).rows(slice(-self._most, None))
 
-    def steady_part(self) -> SteadyPart:
+    def steady_part(self, cycle: Fold | None) -> SteadyPart:
+        """Return it with the average cycle of all of its samples; None where it has no cycle."""
         samples = self.last_samples()
-        if self._folding is None:
+        if cycle is None:
             loop = self._loop(samples)
             return SteadyPart(samples, 0, None, loop[:, np.isfinite(loop).all(axis=0)])
-        cycle = self._folding.fold()
         if not cycle.whole:
             return SteadyPart(samples, self._cycles, None, np.empty((2, 0)))
         return SteadyPart(samples, self._cycles, cycle, cycle.signals)

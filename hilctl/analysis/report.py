@@ -13,6 +13,7 @@ from hilctl.analysis.steady import judged, waveform_end
 from hilctl.base.arrays import F64
 from hilctl.base.errors import DataError
 from hilctl.base.events import ADAPTED, CHANGES, MARK, Event
+from hilctl.base.metrics import Fold
 from hilctl.base.samples import LAST_SAMPLE, NO_WAVEFORM, Flag, Samples
 from hilctl.base.segments import Segment
 from hilctl.recording.data import Recording
@@ -47,29 +48,24 @@ def summarize(recording: Recording | Iterable[Recording]) -> RunReport:
     """
     if isinstance(recording, Recording):
         windows = _windows(recording, recording.events, waveform_end(recording.samples))
-        return _gathered([recording], windows)[1]
-    return summarize_windows(recording)[0]
+        return _gathered([recording], windows).report()
+    planned: Windows | None = None
+    for _ in range(2):
+        gathering = _gathered(recording, planned)
+        planned = gathering.right_windows()
+        if planned == gathering.windows:
+            break
+    return gathering.report()
 
 
-def summarize_windows(pieces: Iterable[Recording]) -> tuple[RunReport, Windows]:
-    """Return the figures of a recording in pieces, and what was judged, see :func:`summarize`."""
-    gathering, report = _gathered(pieces, None)
-    windows = gathering.right_windows()
-    # How far the run got and how it was tuned is known only now.
-    right = windows == gathering.windows
-    return (report if right else _gathered(pieces, windows)[1]), windows
-
-
-def _gathered(
-    pieces: Iterable[Recording], windows: Windows | None
-) -> tuple["_RunGathering", RunReport]:
-    gathering: _RunGathering | None = None
+def _gathered(pieces: Iterable[Recording], windows: Windows | None) -> "RunGathering":
+    gathering: RunGathering | None = None
     for piece in pieces:
-        gathering = gathering or _RunGathering(piece, windows or _windows(piece, (), LAST_SAMPLE))
+        gathering = gathering or RunGathering(piece, windows)
         gathering.add(piece)
     if gathering is None:
         raise DataError("there is no recording to judge")
-    return gathering, gathering.report()
+    return gathering
 
 
 def _windows(recording: Recording, events: Iterable[Event], end: int) -> Windows:
@@ -91,13 +87,18 @@ _KEPT = {*CHANGES, ADAPTED, MARK}
 """Codes of events that figures go by, or that are shown among them."""
 
 
-class _RunGathering:
-    """Gathers the figures of a run, piece by piece."""
+class RunGathering:
+    """Gathers the figures of a run, piece by piece.
 
-    def __init__(self, first: Recording, windows: Windows) -> None:
-        self.windows = windows
+    Args:
+        first: The first piece.
+        windows: What is judged of it; as it was planned where None.
+    """
+
+    def __init__(self, first: Recording, windows: Windows | None) -> None:
+        self.windows = windows if windows is not None else _windows(first, (), LAST_SAMPLE)
         self._last = first
-        self._segments = [SegmentGathering(first, *window) for window in windows]
+        self._segments = [SegmentGathering(first, *window) for window in self.windows]
         longest = max((segment.stop for segment in first.segments), default=0)
         self._ticks = timing.TickGathering(longest / first.sample_rate_hz / 60.0)
         self._events: list[Event] = []
@@ -131,8 +132,12 @@ class _RunGathering:
         self._displacement_um.add(samples.displacement_um)
 
     def right_windows(self) -> Windows:
-        """Return what is to be judged by what is known at the end."""
+        """Return what is to be judged by how far the run got and how it was tuned: at the end."""
         return _windows(self._last, self._events, self._waveform[1] if self._waveform else 0)
+
+    def cycles(self) -> list[Fold | None]:
+        """Return the average cycle of each segment, at the end; None where it has no period."""
+        return [segment.cycle() for segment in self._segments]
 
     def report(self) -> RunReport:
         """Return the figures, at the end."""

@@ -61,6 +61,10 @@ class SegmentGathering:
         if self._has_noise:
             self._noise.add(part.index, output)
 
+    def cycle(self) -> metrics.Fold | None:
+        """Return the average cycle of the loop's input and output; None where it has no period."""
+        return self._folding.fold() if self._folding else None
+
     @property
     def _has_noise(self) -> bool:
         period = self._segment.period
@@ -79,7 +83,7 @@ class SegmentGathering:
     @np.errstate(over="ignore", invalid="ignore")  # of readings near the end of all numbers
     def report(self) -> SegmentReport:
         """Return the figures; None where they have no meaning or the segment was not reached."""
-        cycle = self._folding.fold() if self._folding else None
+        cycle = self.cycle()
         stroke_um = noise_um = hysteresis = area = floor = None
         peak_rms: tuple[float | None, float | None] = (None, None)
         raw = peak_rms

@@ -13,3 +13,6 @@ U32: TypeAlias = npt.NDArray[np.uint32]
 
 I64: TypeAlias = npt.NDArray[np.int64]
 """An int64 array, used for indices and nanoseconds."""
+
+U8: TypeAlias = npt.NDArray[np.uint8]
+"""A uint8 array, used for bytes."""

@@ -91,7 +91,9 @@ class Folding:
         if not finite.all():
             index, signals = index[finite], signals[:, finite]
         bins = self._counts.size
-        phase = np.mod(index.astype(np.float64), self._period)
+        # Whole numbers are divided in a tenth of the time, with the same result.
+        whole = self._period.is_integer()
+        phase = (index % int(self._period) if whole else np.mod(index, self._period)).astype(float)
         # Multiply first: phase * bins is exact for whole periods, so that samples of one phase
         # can't be torn apart by rounding.
         bin_of = np.minimum((phase * bins / self._period).astype(np.int64), bins - 1)

@@ -70,7 +70,7 @@ def _parser() -> argparse.ArgumentParser:
 
 def _print_json(catalogue: Catalogue, rows: Sequence[int], folder: Path) -> None:
     """Print one object, a line a recording: indented as others are it would take seconds."""
-    lines = ",\n".join(json.dumps(catalogue.entry(row), allow_nan=False) for row in rows)
+    lines = ",\n".join(catalogue.json_lines(rows))
     head = f'"folder": {json.dumps(str(folder))}, "of": {len(catalogue)}'
     print(f'{{{head}, "recordings": [\n{lines}\n]}}')
 

@@ -70,7 +70,7 @@ def _report_one(
     overwrite: bool,
     as_json: bool,
 ) -> None:
-    from hilctl.analysis.report import summarize_windows
+    from hilctl.analysis.report import summarize
     from hilctl.cli.console import print_rich
     from hilctl.cli.report_view import render
     from hilctl.recording.reader import Pieces
@@ -79,17 +79,16 @@ def _report_one(
     if before is not None and html is None:
         raise InputError("--before is drawn on the page: name one with --html")
     pieces = Pieces(recording, stretch)
-    summary, windows = summarize_windows(pieces)
-    if html is not None:
+    if html is None:
+        summary = summarize(pieces)
+    else:
         from hilctl.analysis.overview import overview
         from hilctl.analysis.run_page import write_html
 
         check_page(html, overwrite=overwrite)
-        earlier = None
-        if before is not None:
-            whole = Pieces(before)
-            earlier = overview(whole, summarize_windows(whole)[1])
-        write_html(overview(pieces, windows), summary, html, earlier)
+        earlier = overview(Pieces(before))[1] if before is not None else None
+        summary, shown = overview(pieces)
+        write_html(shown, summary, html, earlier)
     if as_json:
         print_json(summary.to_mapping())
     else:

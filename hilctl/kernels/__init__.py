@@ -1,4 +1,4 @@
-"""Compiled hysteresis operators: pure functions of float64 arrays and plain numbers.
+"""Compiled hysteresis operators, and what else is worked out sample by sample: pure functions.
 
 Rules of this folder: explicit signatures, no globals, no objects, state passed in and updated in
 place, and every kernel stands in one file with all that it calls, because numba's on-disk cache
@@ -13,4 +13,5 @@ does not notice a callee that changed in another file. Units live one level abov
     dynamics.py  field lag, structure and delay, and their inverses
     limit.py     peak and slew limits of a command
     interlock.py what ends a run, looked at in every sample
+    packed.py    messages of a recording's chunk, and their packed lists
 """

@@ -76,7 +76,7 @@ def block_problem(block: BlockArrays, next_sample: int) -> str:
     lengths = {name: values.size for name, values in block.columns.items()}
     lengths["flags"] = block.flags.size
     # Of a million samples there are thousands of blocks, and all have the same columns.
-    complete = set(lengths.values()) == {block.n} and _has_all(tuple(lengths))
+    complete = set(lengths.values()) == {block.n} and has_all(tuple(lengths))
     if not complete and (wrong := _wrong_lengths(lengths, "", block.n)):
         return f"{block.n} samples with {wrong}"
     before = block.previous_command
@@ -86,8 +86,8 @@ def block_problem(block: BlockArrays, next_sample: int) -> str:
 
 
 @cache
-def _has_all(names: tuple[str, ...]) -> bool:
-    """Return whether columns of right lengths are all that there must be."""
+def has_all(names: tuple[str, ...]) -> bool:
+    """Return whether columns of right lengths are all that there must be, by their fields."""
     return not _wrong_lengths(dict.fromkeys(names, 1), "", 1)
 
 

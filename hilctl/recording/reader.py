@@ -1,10 +1,13 @@
 """From an MCAP file to a recording in memory, or to one piece of it after the other."""
 
 import logging
+import os
 from collections.abc import Iterator
+from contextlib import ExitStack, closing
 from pathlib import Path
 
 from hilctl.base.errors import DataError
+from hilctl.recording.ahead import ReadAhead
 from hilctl.recording.data import Recording
 from hilctl.recording.gathering import Gathering
 from hilctl.recording.index import places_of
@@ -14,6 +17,10 @@ from hilctl.recording.stretch import Stretch
 
 _log = logging.getLogger(__name__)
 
+LONG_BYTES = 8 * 2**20
+"""A file as large is read ahead: loading what that takes is worth it then."""
+LONG_CHUNKS = 64
+"""So is a stretch of one in as many places."""
 PIECE_SAMPLES = 2**18
 """Fewest samples of a piece: what is worked on then stays in a processor's cache."""
 
@@ -67,11 +74,17 @@ class Pieces:
 def _read(path: Path, stretch: Stretch | None, piece_samples: int | None) -> Iterator[Recording]:
     """Yield pieces of that many samples, uncut; all in one where None."""
     try:
-        with path.open("rb") as stream:
-            salvage = Salvage(stream)
-            gathered = Gathering(salvage, stretch)
+        with path.open("rb") as stream, ExitStack() as closed:
             places = places_of(stream, stretch) if stretch else None
-            records = salvage.records() if places is None else salvage.records_at(places)
+            status = os.fstat(stream.fileno())
+            ahead = None
+            if status.st_size >= LONG_BYTES and (places is None or len(places) >= LONG_CHUNKS):
+                beside = closed.enter_context(path.open("rb", buffering=0))
+                if os.path.samestat(status, os.fstat(beside.fileno())):  # nobody has replaced it
+                    ahead = closed.enter_context(closing(ReadAhead(beside)))
+            salvage = Salvage(stream, ahead=ahead)
+            gathered = Gathering(salvage, stretch)
+            records = salvage.taken() if places is None else salvage.taken_at(places)
             for record in records:
                 gathered.take(record)
                 if piece_samples and gathered.waiting >= piece_samples:

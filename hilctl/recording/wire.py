@@ -6,7 +6,7 @@ as long.
 """
 
 import struct
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
@@ -22,13 +22,27 @@ U64: TypeAlias = npt.NDArray[np.uint64]
 _VARINT, _BYTES = 0, 2
 _MORE = 0x80
 _LONGEST_VARINT = 10
-_TICK0, _N, _DROPPED, _T_REL, _FLAGS, _STATE, _PREVIOUS = 1, 2, 3, 4, 9, 14, 15
+TICK0, N, _DROPPED, T_REL, FLAGS, STATE, PREVIOUS = 1, 2, 3, 4, 9, 14, 15
 _COLUMNS = {field.block: field.name for field in RECORDED_FIELDS}
-_NUMBERS = {_TICK0, _N, _DROPPED}
-_NUMBER_OF = {name: number for number, name in _COLUMNS.items()}
-_DOUBLES = {_T_REL, _STATE, _PREVIOUS, *_COLUMNS}
+_NUMBERS = {TICK0, N, _DROPPED}
+NUMBER_OF = {name: number for number, name in _COLUMNS.items()}
+"""The number of each column's field in a ``SampleBlock``, by the field's name."""
+_DOUBLES = {T_REL, STATE, PREVIOUS, *_COLUMNS}
 _TICKS = dict(enumerate(TICK_COLUMNS, start=1))
-_LARGEST_N = 2**32
+
+
+def _kinds(numbers: Collection[int], lists: Collection[int]) -> I64:
+    """Return what each field of a message is, by its number; nothing where it is none of it."""
+    fields = range(max(*numbers, *lists) + 1)
+    return np.array([_VARINT if f in numbers else _BYTES if f in lists else -1 for f in fields])
+
+
+BLOCK_KINDS = _kinds(_NUMBERS, _DOUBLES | {FLAGS})
+"""int64[f]: wire type of each field of a ``SampleBlock``; -1 where it is none."""
+TICK_KINDS = _kinds((), _TICKS)
+"""int64[f]: that of each field of a ``TickBlock``."""
+LARGEST_N = 2**32
+"""No block has as many samples."""
 _LARGEST = 2**63 - 1
 _NONE = np.empty(0)
 _EIGHT_BYTES = 1
@@ -80,11 +94,11 @@ def sample_block(data: bytes) -> BlockArrays | None:
     if found is None:
         return None
     numbers, spans = found
-    flags = varints(data, spans.pop(_FLAGS, (0, 0)))
+    flags = varints(data, spans.pop(FLAGS, (0, 0)))
     plain = numbers.keys() <= _NUMBERS and spans.keys() <= _DOUBLES
-    if flags is None or not plain or numbers.get(_N, 0) >= _LARGEST_N:
+    if flags is None or not plain or numbers.get(N, 0) >= LARGEST_N:
         return None
-    spans.pop(_T_REL, None)  # it is the index over the rate
+    spans.pop(T_REL, None)  # it is the index over the rate
     if any(size % 8 for _, size in spans.values()):
         return None
     doubles = {
@@ -92,12 +106,12 @@ def sample_block(data: bytes) -> BlockArrays | None:
         for number, (start, size) in spans.items()
     }
     return BlockArrays(
-        tick0=numbers.get(_TICK0, 0),
-        n=numbers.get(_N, 0),
+        tick0=numbers.get(TICK0, 0),
+        n=numbers.get(N, 0),
         dropped=numbers.get(_DROPPED, 0),
         flags=flags.astype(np.uint32),
-        state=doubles.pop(_STATE, _NONE),
-        previous_command=doubles.pop(_PREVIOUS, _NONE),
+        state=doubles.pop(STATE, _NONE),
+        previous_command=doubles.pop(PREVIOUS, _NONE),
         columns={_COLUMNS[number]: values for number, values in doubles.items() if values.size},
     )
 
@@ -109,11 +123,11 @@ def block_bytes(block: BlockArrays, t_rel: F64) -> bytes:
         block: What it holds.
         t_rel: float64[n], time of its samples in s.
     """
-    lists = {_T_REL: t_rel, _STATE: block.state, _PREVIOUS: block.previous_command}
-    lists |= {_NUMBER_OF[name]: values for name, values in block.columns.items()}
+    lists = {T_REL: t_rel, STATE: block.state, PREVIOUS: block.previous_command}
+    lists |= {NUMBER_OF[name]: values for name, values in block.columns.items()}
     packed = {number: values.tobytes() for number, values in lists.items()}
-    packed[_FLAGS] = _packed(block.flags)
-    numbers = {_TICK0: block.tick0, _N: block.n, _DROPPED: block.dropped}
+    packed[FLAGS] = _packed(block.flags)
+    numbers = {TICK0: block.tick0, N: block.n, _DROPPED: block.dropped}
     heads = [_number(field << 3) + _number(value) for field, value in numbers.items() if value]
     return b"".join(heads) + b"".join(
         _number(field << 3 | _BYTES) + _number(len(packed[field])) + packed[field]
@@ -170,7 +184,7 @@ def tick_block(data: bytes) -> Ticks | None:
         values = varints(data, span)
         if values is None:
             return None
-        columns[_TICKS[number]] = _index(values) if number == 1 else _signed(values)
+        columns[_TICKS[number]] = _index(values) if number == 1 else signed(values)
     return Ticks(**columns)
 
 
@@ -210,10 +224,10 @@ def _index(values: U64) -> I64:
     return np.minimum(values, np.uint64(_LARGEST)).astype(np.int64)
 
 
-def _signed(values: U64) -> I64:
-    """Undo the zigzag of numbers with a sign."""
-    signed: I64 = (values >> np.uint64(1)).view(np.int64) ^ -(values & np.uint64(1)).view(np.int64)
-    return signed
+def signed(values: U64) -> I64:
+    """Undo the zigzag of numbers with a sign: their lowest bit says it."""
+    found: I64 = (values >> np.uint64(1)).view(np.int64) ^ -(values & np.uint64(1)).view(np.int64)
+    return found
 
 
 def _fields(data: bytes) -> tuple[dict[int, int], dict[int, tuple[int, int]]] | None:

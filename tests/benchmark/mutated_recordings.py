@@ -33,7 +33,7 @@ from mcap.writer import CompressionType, Writer
 from hilctl.analysis.export import export
 from hilctl.analysis.overview import overview
 from hilctl.analysis.replay import replay
-from hilctl.analysis.report import summarize, summarize_windows
+from hilctl.analysis.report import summarize
 from hilctl.analysis.run_entry import entry_of
 from hilctl.analysis.run_page import page
 from hilctl.base.errors import ConfigError, HilctlError
@@ -334,18 +334,18 @@ def _export(recording: Recording, path: Path) -> None:
 
 def _pieces(_recording: Recording, path: Path) -> None:
     """Read it in pieces, as the commands do: refused where the whole is not, never otherwise."""
-    reader.PIECE_SAMPLES, usual = 300, reader.PIECE_SAMPLES
+    usual = reader.PIECE_SAMPLES, reader.LONG_BYTES, reader.LONG_CHUNKS
+    reader.PIECE_SAMPLES, reader.LONG_BYTES, reader.LONG_CHUNKS = 300, 0, 0
     try:
         for stretch in (None, Stretch(0.01, 0.05)):
             pieces = reader.Pieces(path, stretch)
-            summary, windows = summarize_windows(pieces)
+            summary, _ = overview(pieces)
             json.dumps(summary.to_mapping())
-            overview(pieces, windows)
             with suppress(HilctlError):
                 json.dumps(replay(pieces).to_mapping())
             export(pieces, path.with_suffix(".npz"), overwrite=True)
     finally:
-        reader.PIECE_SAMPLES = usual
+        reader.PIECE_SAMPLES, reader.LONG_BYTES, reader.LONG_CHUNKS = usual
 
 
 def _identify(recording: Recording, _path: Path) -> None:

@@ -25,7 +25,7 @@ except IndexError:
     pass
 else:
     sys.exit("the kernels were compiled without bounds checks")
-sys.argv[1:] = ["60", "--seed", "7", "--commands", "replay,initial_state"]
+sys.argv[1:] = ["60", "--seed", "7", "--commands", "replay,initial_state,pieces"]
 runpy.run_module("tests.benchmark.mutated_recordings", run_name="__main__")
 """
 

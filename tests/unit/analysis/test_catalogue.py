@@ -1,6 +1,7 @@
 """All recordings below a folder: none hidden, each read once, and found by what it says."""
 
 import fcntl
+import json
 import os
 import shutil
 from pathlib import Path
@@ -157,3 +158,13 @@ def test_a_folder_that_is_none_is_an_input_error(tmp_path):
         with pytest.raises(InputError, match=f"{name}: can't be listed: {problem}"):
             read_catalogue(tmp_path / name)
     assert len(read_catalogue(tmp_path)) == 0
+
+
+def test_lines_of_json_are_the_entries(folder):
+    """Whatever letters a label has, in ASCII."""
+    known = read_catalogue(folder)
+    known.column("labels")[0] = '{"operator": "Zo\u00eb"}'
+    lines = list(known.json_lines([2, 0]))
+    assert [json.loads(line) for line in lines] == [known.entry(2), known.entry(0)]
+    assert json.loads(lines[1])["labels"] == {"operator": "Zo\u00eb"}
+    assert all(line.isascii() for line in lines)

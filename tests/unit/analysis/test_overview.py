@@ -9,7 +9,7 @@ from hilctl.analysis import overview as module
 from hilctl.analysis import plots
 from hilctl.analysis.loops import hysteresis_loop
 from hilctl.analysis.overview import overview
-from hilctl.analysis.report import summarize, summarize_windows
+from hilctl.analysis.report import summarize
 from hilctl.analysis.run_page import page
 from hilctl.analysis.steady import Overview, steady_part, steady_samples
 from hilctl.base.segments import Segment
@@ -41,8 +41,10 @@ class Parts:
 
     def __init__(self, whole: Recording, rows: int = 7_000) -> None:
         self._whole, self._rows = whole, rows
+        self.walks = 0
 
     def __iter__(self):
+        self.walks += 1
         whole = self._whole
         for at in range(0, N, self._rows):
             ticks = whole.ticks
@@ -65,7 +67,7 @@ def small(monkeypatch):
 
 def test_a_short_one_is_the_whole(recording):
     pieces = Parts(recording)
-    found = overview(pieces, summarize_windows(pieces)[1])
+    found = overview(pieces)[1]
     assert not isinstance(found, Overview)
     assert np.array_equal(found.samples.index, recording.samples.index)
     assert found.samples.command.tobytes() == recording.samples.command.tobytes()
@@ -74,7 +76,7 @@ def test_a_short_one_is_the_whole(recording):
 
 def test_a_long_one_keeps_its_spikes_and_what_is_judged(small, recording):
     pieces = Parts(recording)
-    found = overview(pieces, summarize_windows(pieces)[1])
+    found = overview(pieces)[1]
     assert isinstance(found, Overview)
     assert found.samples.index.size < 30_000
     assert np.all(np.diff(found.samples.index) > 0)
@@ -99,7 +101,7 @@ def test_a_long_one_keeps_its_spikes_and_what_is_judged(small, recording):
 def test_its_plots_can_be_drawn(small, recording):
     """All of them, with the last cycles sample by sample."""
     pieces = Parts(recording)
-    found = overview(pieces, summarize_windows(pieces)[1])
+    found = overview(pieces)[1]
     assert hysteresis_loop(found) is not None
     assert all(draw(found) is not None for draw in (plots.time_history, plots.error))
     last = plots._zoom(found, 0)
@@ -109,18 +111,19 @@ def test_its_plots_can_be_drawn(small, recording):
 
 def test_its_page_has_the_figures_of_the_whole(small, recording, undrawn):
     pieces = Parts(recording)
-    summary, windows = summarize_windows(pieces)
+    summary, shown = overview(pieces)
+    assert pieces.walks == 1
     assert summary.peak_hysteresis_percent == pytest.approx(
         summarize(recording).peak_hysteresis_percent, rel=1e-9
     )
-    assert "Figures" in page(overview(pieces, windows), summary)
+    assert "Figures" in page(shown, summary)
 
 
 def test_many_ticks_are_told_by_some_of_them(small, monkeypatch, recording):
     """Evenly, so that their distribution stays, and the latest."""
     monkeypatch.setattr(module, "_MOST_TICKS", 200)
     pieces = Parts(recording)
-    ticks = overview(pieces, summarize_windows(pieces)[1]).ticks
+    ticks = overview(pieces)[1].ticks
     assert 90 < ticks.late_ns.size <= 202
     assert ticks.late_ns.max() == 9_000_000
     assert np.all(np.diff(ticks.first_sample) > 0)
@@ -131,6 +134,6 @@ def test_a_run_longer_than_planned_is_thinned_further(small, monkeypatch, record
     monkeypatch.setattr(module, "_STRETCHES", 10**6)
     monkeypatch.setattr(module, "_LAST_SAMPLES", 100)
     pieces = Parts(recording)
-    found = overview(pieces, summarize_windows(pieces)[1])
+    found = overview(pieces)[1]
     assert found.samples.index.size < 30_000
     assert 31_234 in found.samples.index

@@ -78,16 +78,3 @@ def test_a_column_in_some_blocks_only_is_refused(tmp_path, monkeypatch, make):
         list(Pieces(path))
     with pytest.raises(DataError, match="200 values of measured_a for 400 samples"):
         read(path)
-
-
-def test_many_small_blocks_take_no_array_each(make):
-    """Views of messages are joined as they come."""
-    from hilctl.recording.gathering import _Table
-
-    table = _Table()
-    for number in range(2000):
-        table.add({"a": np.array([number])} | ({"b": np.array([number])} if number % 7 else {}))
-        assert len(table._loose.get("a", [])) < 512
-    assert table.column("a", np.int64).tolist() == list(range(2000))
-    assert table.column("b", np.int64).tolist() == [n for n in range(2000) if n % 7]
-    assert table.column("a", np.int64).size == 0
