@@ -9,6 +9,7 @@ import numpy as np
 from hilctl.base.arrays import F64, I64
 from hilctl.identify.data.records import History
 from hilctl.identify.field.columns import bare_displacement, corners
+from hilctl.identify.field.rows import Motion
 from hilctl.models.chain import smoothing_weights
 
 POINTS = 90  # samples that are left of the fastest cycle
@@ -29,7 +30,7 @@ class Run:
         command: float64[n], at the end of each step.
         mean: float64[n], the command's mean over each step.
         derivatives: float64[3, N], displacement of all samples in um and its derivatives by time.
-        judged: First sample of ``kept`` that counts.
+        motion: How it moves, at the samples that are left.
     """
 
     rate_hz: float
@@ -38,7 +39,7 @@ class Run:
     command: F64
     mean: F64
     derivatives: F64
-    judged: int
+    motion: Motion
 
     @property
     def time_s(self) -> F64:
@@ -113,15 +114,10 @@ class Prepared:
         held = np.cumsum(np.concatenate(([command[0]], command)))
         mean = np.full(kept.size, command[0])
         mean[1:] = np.diff(held[kept]) / np.diff(kept)
-        return Run(
-            rate_hz,
-            kept,
-            steps / rate_hz,
-            at_end,
-            mean,
-            np.ascontiguousarray(derivatives),
-            int(np.searchsorted(kept, record.ignore)),
-        )
+        step_s, both = steps / rate_hz, (at_end, derivatives[0, kept])
+        judged = int(np.searchsorted(kept, record.ignore))
+        motion = Motion.of(both, step_s, judged, self.reach, self.stroke_um)
+        return Run(rate_hz, kept, step_s, at_end, mean, np.ascontiguousarray(derivatives), motion)
 
 
 def _speed(record: History) -> float:
