@@ -33,8 +33,7 @@ _REVERSALS = 9
 _BIASES = (0.7, 0.35, 0.0, -0.35, -0.7)
 _TRIES = 5
 _OF_BIAS = 0.15
-_PLACES = (0.6, -0.6, 0.0)
-_OF_SMALL = 0.35
+_SMALL = ((0.6, 0.35), (-0.6, 0.35), (0.0, 0.35), (0.87, 0.11), (-0.87, 0.11), (0.0, 0.11))
 _RANDOM_BAND = (5.0, 0.5)  # of the lowest and of the highest frequency of loops
 
 
@@ -231,11 +230,13 @@ def _random_part(
 
 
 def small_motions(limits: CampaignLimits, amplitude: float) -> Keys:
-    """Return small aperiodic motions at places all over the range, after a conditioning cycle."""
-    small = _OF_SMALL * amplitude
+    """Return small aperiodic motions of two sizes all over the range, after a conditioning cycle.
+
+    Loops of a tenth of the stroke depend on what larger ones say nothing of, most at the ends.
+    """
     parts = [
-        _random_part(limits, small, seed, 0.5 * RANDOM_S, limits.centre + part * amplitude)
-        for seed, part in enumerate(_PLACES, TRAINING_SEED + 1)
+        _random_part(limits, size * amplitude, seed, 0.5 * RANDOM_S, limits.centre + at * amplitude)
+        for seed, (at, size) in enumerate(_SMALL, TRAINING_SEED + 1)
     ]
     return _sequence(limits, [conditioning(limits, amplitude), *parts])
 

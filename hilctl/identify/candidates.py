@@ -8,17 +8,18 @@ from hilctl.base.device import CommandUnit
 from hilctl.base.errors import DataError
 from hilctl.identify.data.records import History, Record
 from hilctl.identify.held_out import HeldOut, held_out_error
-from hilctl.identify.job import OnProgress
+from hilctl.identify.job import OnProgress, ignore_progress
 from hilctl.identify.settings import IdentifySettings
-from hilctl.identify.workers import Map
+from hilctl.identify.workers import Map, one_by_one
 
 WHOLE: tuple[Mapping[str, Any], ...] = (
-    {"kind": "field"},
     {"kind": "field", "drags": 0},
     {"kind": "generalised_duhem"},
     {"kind": "integrated", "offset": True},
 )
 """What is tried on histories."""
+THEN: Mapping[str, tuple[Mapping[str, Any], ...]] = {"field": ({"kind": "field"},)}
+"""What is tried as well where a kind is the best of these: its small loops may creep."""
 LOOPS: tuple[Mapping[str, Any], ...] = (
     {"kind": "staged"},
     {"kind": "integrated", "offset": True},
@@ -65,19 +66,33 @@ def choose_kind(
     """
     candidates = WHOLE if any(isinstance(record, History) for record in records) else LOOPS
     shared = {"whole": settings.whole, "table": settings.table, "points": settings.points}
-    best: tuple[float, IdentifySettings, HeldOut] | None = None
+    tried: list[tuple[IdentifySettings, HeldOut]] = []
     errors: list[CandidateError] = []
-    for i, candidate in enumerate(candidates):
-        tried = IdentifySettings(**{**candidate, **shared})
-        name = ", ".join(f"{key} {value}" for key, value in candidate.items())
-        progress(i / len(candidates), name)
-        held_out = held_out_error(records, tried, unit, run, progress)
-        if held_out is None:
-            continue
-        judged = held_out.judgement
-        errors.append(CandidateError(name, judged.rms_percent, judged.peak_percent))
-        if best is None or judged.rms_percent < best[0]:
-            best = judged.rms_percent, tried, held_out
-    if best is None:
-        raise DataError("too few data to leave some out and choose by them: name a --model")
-    return best[1], best[2], tuple(errors)
+    while candidates:
+        names = [", ".join(f"{key} {value}" for key, value in each.items()) for each in candidates]
+        progress(len(errors) / (len(errors) + len(names)), "; ".join(names))
+        trials = [
+            _Trial(tuple(records), IdentifySettings(**{**each, **shared}), unit)
+            for each in candidates
+        ]
+        for trial, name, held_out in zip(trials, names, run(_held_out, trials), strict=True):
+            if held_out is not None:
+                judged = held_out.judgement
+                errors.append(CandidateError(name, judged.rms_percent, judged.peak_percent))
+                tried.append((trial.settings, held_out))
+        if not tried:
+            raise DataError("too few data to leave some out and choose by them: name a --model")
+        best = min(tried, key=lambda each: each[1].judgement.rms_percent)
+        candidates = THEN.get(best[0].kind, ()) if candidates is WHOLE else ()
+    return *best, tuple(errors)
+
+
+@dataclass(frozen=True, slots=True)
+class _Trial:
+    records: tuple[Record, ...]
+    settings: IdentifySettings
+    unit: CommandUnit
+
+
+def _held_out(trial: _Trial) -> HeldOut | None:
+    return held_out_error(trial.records, trial.settings, trial.unit, one_by_one, ignore_progress)

@@ -104,6 +104,30 @@ def turning_points(u: F64, distance: float, out: I64) -> int:
     return count
 
 
+@kernel("void(float64[::1], float64, float64[::1])")
+def swings(y: F64, turn: float, out: F64) -> None:
+    """Work out how far a path goes between the turns before and after each sample.
+
+    Args:
+        y: float64[n].
+        turn: What it has to go back by for that to be a turn.
+        out: float64[n], filled with the way between the turns.
+    """
+    first = last = 0  # the last turn, and the furthest sample since
+    way = 0.0
+    for k in range(y.size):
+        forth = (y[k] - y[last]) * way
+        if way == 0.0 and abs(y[k] - y[0]) > turn:
+            way = math.copysign(1.0, y[k] - y[0])
+            last = k
+        elif forth > 0.0:
+            last = k
+        elif forth < -turn:
+            out[first:last] = abs(y[last] - y[first])
+            first, last, way = last, k, -way
+    out[first:] = abs(y[last] - y[first])
+
+
 @kernel("int64(float64[::1], int64[::1], int64[::1], int64[::1])")
 def needed_points(u: F64, rows: I64, points: I64, places: I64) -> int:
     """Find the rows of a path and all samples at which it turns: operators need no others.

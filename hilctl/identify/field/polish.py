@@ -21,7 +21,7 @@ STAGES = len(NAMES)
 
 
 @dataclass(frozen=True, slots=True)
-class Rows:
+class Bare:
     """What stages make of the records.
 
     Attributes:
@@ -46,7 +46,7 @@ class Polish:
     """
 
     def __init__(
-        self, rows_of: Callable[[F64], Rows], paths: Sequence[I64], grid: Grid, least: float
+        self, rows_of: Callable[[F64], Bare], paths: Sequence[I64], grid: Grid, least: float
     ) -> None:
         self._rows_of, self._paths, self._grid, self._least = rows_of, paths, grid, least
 
@@ -71,7 +71,7 @@ class Polish:
     def _laid(self, x: F64) -> Grid:
         return replace(self._grid, thresholds=np.append(0.0, x[STAGES:]))
 
-    def _equations(self, x: F64) -> tuple[Equations, F64, Rows]:
+    def _equations(self, x: F64) -> tuple[Equations, F64, Bare]:
         rows, grid = self._rows_of(x[:STAGES]), self._laid(x)
         columns = table(rows.fields, self._paths, grid)
         return Equations(columns, rows.y, grid, self._least, rows.scale), columns, rows

@@ -9,10 +9,11 @@ import numpy as np
 from hilctl.base.arrays import F64, I64
 from hilctl.identify.data.records import History
 from hilctl.identify.field.columns import bare_displacement, corners
-from hilctl.models.chain import smoothing_weights
+from hilctl.identify.field.rows import Motion
+from hilctl.identify.field.smoothing import smoothed
 
 POINTS = 90  # samples that are left of the fastest cycle
-SMOOTHED = 0.09  # of a radian of the fastest cycle: how far the displacement is smoothed
+SMOOTHED = 0.09  # of a radian of the fastest cycle: how far the displacement is smoothed at least
 OFF = 5e-4  # of the displacement's peak-to-peak: how far straight lines may be from it
 COMMAND_OFF = 1e-4  # the same for commands, on which the operators turn
 LONGEST = 0.3  # cycles of the fastest: longest step
@@ -29,7 +30,7 @@ class Run:
         command: float64[n], at the end of each step.
         mean: float64[n], the command's mean over each step.
         derivatives: float64[3, N], displacement of all samples in um and its derivatives by time.
-        judged: First sample of ``kept`` that counts.
+        motion: How it moves, at the samples that are left.
     """
 
     rate_hz: float
@@ -38,7 +39,7 @@ class Run:
     command: F64
     mean: F64
     derivatives: F64
-    judged: int
+    motion: Motion
 
     @property
     def time_s(self) -> F64:
@@ -95,13 +96,7 @@ class Prepared:
     def _run(self, record: History) -> Run:
         rate_hz, command = record.sample_rate_hz, record.command
         width = min(SMOOTHED / (2.0 * math.pi * self.top_hz), 1.0) * rate_hz
-        plain, ahead = smoothing_weights(width)
-        by_slope = smoothing_weights(width, slope_gain=rate_hz)[0] - plain
-        by_bend = smoothing_weights(width, bend_gain=rate_hz**2)[0] - plain
-        padded = np.pad(record.displacement_um, ahead, mode="edge")
-        derivatives = np.stack(
-            [np.convolve(padded, weights[::-1], "valid") for weights in (plain, by_slope, by_bend)]
-        )
+        derivatives = smoothed(record.displacement_um, width, rate_hz)
         thin = max(1, math.floor(rate_hz / (self._points * self.top_hz)))
         furthest = max(thin, math.floor(LONGEST * rate_hz / self.top_hz))
         kept = np.empty(command.size, dtype=np.int64)
@@ -113,15 +108,10 @@ class Prepared:
         held = np.cumsum(np.concatenate(([command[0]], command)))
         mean = np.full(kept.size, command[0])
         mean[1:] = np.diff(held[kept]) / np.diff(kept)
-        return Run(
-            rate_hz,
-            kept,
-            steps / rate_hz,
-            at_end,
-            mean,
-            np.ascontiguousarray(derivatives),
-            int(np.searchsorted(kept, record.ignore)),
-        )
+        step_s, both = steps / rate_hz, (at_end, derivatives[0, kept])
+        judged = int(np.searchsorted(kept, record.ignore))
+        motion = Motion.of(both, step_s, judged, self.reach, self.stroke_um)
+        return Run(rate_hz, kept, step_s, at_end, mean, derivatives, motion)
 
 
 def _speed(record: History) -> float:

@@ -1,16 +1,14 @@
 """From a few starts to the stages; the weights follow from them, round by round."""
 
-import math
 from dataclasses import dataclass, replace
-from typing import TypeAlias
 
 import numpy as np
 
-from hilctl.base.arrays import F64, I64
-from hilctl.identify.field.columns import turning_points
+from hilctl.base.arrays import F64
 from hilctl.identify.field.descent import Place, settle
-from hilctl.identify.field.polish import TRIED, Polish, Rows
+from hilctl.identify.field.polish import TRIED, Bare, Polish
 from hilctl.identify.field.prepared import Prepared
+from hilctl.identify.field.rows import Rows, chosen
 from hilctl.identify.field.stages import (
     HIGH,
     LOW,
@@ -26,7 +24,6 @@ from hilctl.identify.field.stages import (
 from hilctl.identify.field.weights import Curve, Grid, Weights, solve, table
 from hilctl.identify.job import OnProgress
 
-SEARCH_WAY, FINAL_WAY = 0.06, 0.02  # of the span: furthest way between two samples of a path
 MARGIN = 0.1  # of the span: room of the tables beyond what the data reach
 LENGTHS = (0.05, 0.4)  # of half the span: shortest and longest drag
 SEARCH_ROWS, POLISH_ROWS, FINAL_ROWS = 2500, 4000, 12_000
@@ -51,10 +48,6 @@ class Size:
     def coarse(self) -> "Size":
         """Fewer of them, for the search."""
         return Size(min(self.plays, 8), self.drags, min(self.cells, 12), min(self.knots, 16))
-
-
-Paths: TypeAlias = tuple[I64, ...]
-"""For each record int64[N_i], the samples that are rows."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,12 +111,12 @@ class FieldSearch:
             part = (turn + 0.2) / (ROUNDS + 1)
             progress(done + (1.0 - done) * part, f"round {turn + 1} of {ROUNDS}")
             self._lay(stages_in(x), coarse)
-            self._learn(x, self._paths())
+            self._learn(x, self._chosen())
             self._lay(stages_in(x), coarse)
-            self._learn(x, self._paths())
-            x = self._followed(x, self._paths())
-            self._learn(x, self._paths())
-        error = float(np.sqrt(np.mean(self._errors(x, self._paths()) ** 2)))
+            self._learn(x, self._chosen())
+            x = self._followed(x, self._chosen())
+            self._learn(x, self._chosen())
+        error = float(np.sqrt(np.mean(self._errors(x, self._chosen()) ** 2)))
         return _Descent(error, stages_in(x), self._curve, self._grid, self._widest)
 
     def _forget(self) -> None:
@@ -135,71 +128,73 @@ class FieldSearch:
         self._forget()
         for _ in range(2):
             self._lay(stages, size)
-            self._learn(row(stages), self._paths())
+            self._learn(row(stages), self._chosen())
         self._lay(stages, size)
-        errors = self._errors(row(stages), self._paths())
+        errors = self._errors(row(stages), self._chosen())
         return float(np.sqrt(np.mean(errors**2))), stages
 
-    def _followed(self, x: F64, paths: Paths) -> F64:
+    def _followed(self, x: F64, rows: Rows) -> F64:
         size = self._data.stroke_um
 
         def sum_of(point: F64) -> float:
-            return float(np.mean((self._errors(point, paths) / size) ** 2))
+            return float(np.mean((self._errors(point, rows) / size) ** 2))
 
         def place_of(point: F64) -> Place:
-            here = self._errors(point, paths) / size
-            slopes = self._slopes(point, here, paths)
+            here = self._errors(point, rows) / size
+            slopes = self._slopes(point, here, rows)
             normal, slope = slopes.T @ slopes, slopes.T @ here
             return Place(float(np.mean(here**2)), slope / here.size, normal / here.size)
 
         return settle(sum_of, place_of, x, (row(LOW), row(HIGH)), row(STEP))
 
-    def _polished(self, x: F64, paths: Paths) -> F64:
+    def _polished(self, x: F64, rows: Rows) -> F64:
         """Return better stages; better thresholds stand in the grid."""
 
-        def rows_of(stages: F64) -> Rows:
-            fields, y, known = self._rows(stages, paths)
-            return Rows(fields, y, self._swelling(fields, known) * self._scale(y))
+        def bare(stages: F64) -> Bare:
+            fields, y, known = self._bare(stages, rows)
+            return Bare(fields, y, self._swelling(fields, known) * self._scale(y, rows))
 
-        x, self._grid = Polish(rows_of, paths, self._laid(), self._least).follow(x)
+        x, self._grid = Polish(bare, rows.samples, self._laid(), self._least).follow(x)
         return x
 
-    def _slopes(self, x: F64, here: F64, paths: Paths) -> F64:
+    def _slopes(self, x: F64, here: F64, rows: Rows) -> F64:
         out = np.empty((here.size, len(NAMES)))
         for i, step in enumerate(TRIED * row(STEP)):
             there = x.copy()
             there[i] += step if x[i] + step <= row(HIGH)[i] else -step
-            errors = self._errors(there, paths) / self._data.stroke_um
+            errors = self._errors(there, rows) / self._data.stroke_um
             out[:, i] = (errors - here) / (there[i] - x[i])
         return out
 
-    def _errors(self, x: F64, paths: Paths) -> F64:
-        """Return errors of the displacement that commands would give: float64[N], in um.
+    def _errors(self, x: F64, rows: Rows) -> F64:
+        """Return weighted errors of the displacement that commands would give: float64[N], in um.
 
         The effective field has the measured output in it. An error of the operators' is one of the
         model by as much more as it comes back through the coupling; without that, a coupling that
         explains the output by itself would look best.
         """
-        fields, y, known = self._rows(x, paths)
-        return self._weights(fields, y, paths).errors_um * self._swelling(fields, known)
+        fields, y, known = self._bare(x, rows)
+        found = self._weights(fields, y, rows)
+        return found.errors_um * self._swelling(fields, known) * rows.scale
 
     def _swelling(self, fields: list[F64], known: Physical) -> float:
         reach = max(float(np.ptp(u)) for u in fields)
         alone = max(reach - known.coupling * self._data.stroke_um, 0.1 * reach)
         return reach / alone
 
-    def _solved(self, x: F64, paths: Paths) -> Weights:
-        fields, y, _ = self._rows(x, paths)
-        return self._weights(fields, y, paths)
+    def _solved(self, x: F64, rows: Rows) -> Weights:
+        fields, y, _ = self._bare(x, rows)
+        return self._weights(fields, y, rows)
 
-    def _weights(self, fields: list[F64], y: F64, paths: Paths) -> Weights:
+    def _weights(self, fields: list[F64], y: F64, rows: Rows) -> Weights:
         grid = self._laid()
-        return solve(table(fields, paths, grid), y, grid, self._least, self._scale(y))
+        return solve(table(fields, rows.samples, grid), y, grid, self._least, self._scale(y, rows))
 
-    def _rows(self, x: F64, paths: Paths) -> tuple[list[F64], F64, Physical]:
+    def _bare(self, x: F64, rows: Rows) -> tuple[list[F64], F64, Physical]:
         """Return effective fields, displacements of the rows, and what they are worked out by."""
         fields, bare, known = self._signals(x)
-        return fields, np.concatenate([b[rows] for b, rows in zip(bare, paths, strict=True)]), known
+        y = [b[samples] for b, samples in zip(bare, rows.samples, strict=True)]
+        return fields, np.concatenate(y), known
 
     def _signals(self, x: F64) -> tuple[list[F64], list[F64], Physical]:
         known = physical(stages_in(x), self._data)
@@ -207,21 +202,21 @@ class FieldSearch:
         both = [signals(run, known, self._curve, span) for run in self._data.runs]
         return [u for u, _ in both], [y for _, y in both], known
 
-    def _scale(self, y: F64) -> F64:
-        """Return what makes errors of the operators' those of the displacement: float64[N]."""
+    def _scale(self, y: F64, rows: Rows) -> F64:
+        """Return what makes errors of the operators' weighted ones of the displacement."""
         if self._curve is None:
-            return np.ones(y.size)
+            return rows.scale
         step = 0.01 * self._data.stroke_um
         rise = self._curve.operators_of(y + step) - self._curve.operators_of(y - step)
-        return np.asarray(2.0 * step / np.maximum(rise, 0.5 * step))
+        return np.asarray(rows.scale * 2.0 * step / np.maximum(rise, 0.5 * step))
 
     def _laid(self) -> Grid:
         assert self._grid is not None
         return self._grid
 
-    def _learn(self, x: F64, paths: Paths) -> Weights:
+    def _learn(self, x: F64, rows: Rows) -> Weights:
         """Work out weights; what drags and curve do follows from them the next time."""
-        found = self._solved(x, paths)
+        found = self._solved(x, rows)
         grid = self._laid()
         plays = grid.thresholds.size
         self._curve = self._between(found)
@@ -253,25 +248,18 @@ class FieldSearch:
             0.5 * span * self._widest * spread, lengths, lowest, width, size.cells, size.knots
         )
 
-    def _paths(self, way: float = SEARCH_WAY, most: int = SEARCH_ROWS) -> Paths:
-        """Return the rows: where commands turn, and as far apart as they go."""
-        rows = []
-        for run in self._data.runs:
-            out = np.empty(run.command.size, dtype=np.int64)
-            count = turning_points(run.command, way * 2.0 * self._data.reach, out)
-            rows.append(out[:count][out[:count] >= run.judged])
-        step = max(1, math.ceil(sum(each.size for each in rows) / most))
-        return tuple(np.ascontiguousarray(each[::step]) for each in rows)
+    def _chosen(self, most: int = SEARCH_ROWS) -> Rows:
+        return chosen([run.motion for run in self._data.runs], most)
 
     def _end(self, x: F64) -> FieldEnd:
-        paths = self._paths(FINAL_WAY, POLISH_ROWS)
+        rows = self._chosen(POLISH_ROWS)
         for _ in range(2):
             self._lay(stages_in(x), self._size)
-            self._learn(x, paths)
-        x = self._polished(x, paths)
-        paths = self._paths(FINAL_WAY, FINAL_ROWS)
-        self._learn(x, paths)
-        found = self._solved(x, paths)
+            self._learn(x, rows)
+        x = self._polished(x, rows)
+        rows = self._chosen(FINAL_ROWS)
+        self._learn(x, rows)
+        found = self._solved(x, rows)
         return FieldEnd(physical(stages_in(x), self._data), self._laid(), found)
 
 

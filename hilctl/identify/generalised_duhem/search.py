@@ -10,8 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
-from hilctl.base.arrays import F64, I64
+from hilctl.base.arrays import F64
 from hilctl.identify.field.prepared import Prepared
+from hilctl.identify.field.rows import chosen
 from hilctl.identify.field.stages import Physical
 from hilctl.identify.field.weights import Curve
 from hilctl.identify.generalised_duhem.signals import (
@@ -78,7 +79,6 @@ class DuhemSearch:
         self._size = cells, across
         mean = np.log(data.stroke_um / (2.0 * data.reach))
         self._log_range = float(np.log(least)), float(mean + STEEPEST)
-        self._rows: tuple[I64, ...] = ()
 
     def find(self, progress: OnProgress) -> DuhemEnd:
         """Search with a coarse table, then with one of the size that is wanted."""
@@ -102,10 +102,7 @@ class DuhemSearch:
     def _chosen(self, x: F64, way: float, rows: int) -> list[Path]:
         self._signals.choose(x, way)
         paths = self._signals.paths(x)
-        every = max(1, sum(path.field.size for path in paths) // rows)
-        self._rows = tuple(
-            np.arange(path.judged, path.field.size, every, dtype=np.int64) for path in paths
-        )
+        self._rows = chosen([path.motion for path in paths], rows)
         return paths
 
     def _lay(self, layout: Layout) -> None:
@@ -175,7 +172,7 @@ class DuhemSearch:
         return normal, down
 
     def _errors(self, x: F64, logs: F64, slopes: F64 | None = None) -> F64:
-        """Return errors in percent of the stroke, over the square root of their number.
+        """Return weighted errors in percent of the stroke, over the square root of their number.
 
         Args:
             x: The stages.
@@ -186,14 +183,15 @@ class DuhemSearch:
         start_um = self._signals.offset_um(x, self._first_um)
         flux = np.arange(layout.centre.size, dtype=np.float64)  # of which nothing here depends
         band = layout.band(logs, flux)
-        to_percent = 100.0 / self._stroke_um / np.sqrt(sum(rows.size for rows in self._rows))
+        to_percent = 100.0 / self._stroke_um / np.sqrt(self._rows.scale.size)
         middles = layout.nodes_um[:-1] + 0.5 * layout.cell_um
         parts = []
-        for path, rows in zip(self._signals.paths(x), self._rows, strict=True):
+        for path, rows in zip(self._signals.paths(x), self._rows.samples, strict=True):
             columns = np.empty((rows.size, 0 if slopes is None else logs.size))
             w = np.empty_like(path.field)
             duhem_columns(path.displacement_um, start_um, 0.0, band, rows, w, columns)
-            scale = to_percent * np.interp(path.displacement_um[rows], middles, layout.slopes)
+            slope = np.interp(path.displacement_um[rows], middles, layout.slopes)
+            scale = to_percent * slope * self._rows.scale[first : first + rows.size]
             parts.append(scale * (w[rows] - path.field[rows]))
             if slopes is not None:
                 slopes[first : first + rows.size] = columns * scale[:, None]

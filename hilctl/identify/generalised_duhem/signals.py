@@ -7,6 +7,7 @@ import numpy as np
 from hilctl.base.arrays import F64, I64
 from hilctl.identify.field.columns import turning_points
 from hilctl.identify.field.prepared import Prepared
+from hilctl.identify.field.rows import Motion
 from hilctl.identify.field.stages import HIGH, LOW, STEP, Physical, Stages, physical, signals
 from hilctl.identify.field.weights import Curve
 
@@ -35,12 +36,12 @@ class Path:
     Attributes:
         field: float64[n], w.
         displacement_um: float64[n], y before structure and delay.
-        judged: First point that counts.
+        motion: How the record moves, at these points.
     """
 
     field: F64
     displacement_um: F64
-    judged: int
+    motion: Motion
 
 
 class Signals:
@@ -89,7 +90,7 @@ class Signals:
             Path(
                 np.ascontiguousarray(field[kept]),
                 np.ascontiguousarray(y[kept]),
-                int(np.searchsorted(kept, run.judged)),
+                run.motion.at(kept),
             )
             for (field, y), kept, run in zip(
                 self._whole(x), self._kept, self._data.runs, strict=True

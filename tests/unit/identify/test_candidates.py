@@ -42,8 +42,17 @@ def test_the_least_error_wins_and_all_are_told(monkeypatch: pytest.MonkeyPatch) 
     settings, held_out, errors = chosen([HISTORY])
     assert (settings.kind, settings.drags, settings.whole) == ("field", 0, True)
     assert held_out.judgement.rms_percent == 0.3
-    assert [error.rms_percent for error in errors] == [0.5, 0.3, 0.4, 0.9]
-    assert len(errors) == len(WHOLE)
+    assert [error.rms_percent for error in errors] == [0.3, 0.4, 0.9, 0.5]
+    assert len(errors) == len(WHOLE) + 1
+
+
+def test_drags_are_not_tried_where_plays_alone_are_not_the_best(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    fake(monkeypatch, {"field 0": 0.3, "generalised_duhem": 0.2, "integrated": 0.9})
+    settings, _, errors = chosen([HISTORY])
+    assert settings.kind == "generalised_duhem"
+    assert [error.rms_percent for error in errors] == [0.3, 0.2, 0.9]
 
 
 def test_loops_have_candidates_of_their_own(monkeypatch: pytest.MonkeyPatch) -> None:

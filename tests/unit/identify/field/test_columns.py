@@ -3,7 +3,13 @@
 import numpy as np
 import pytest
 
-from hilctl.identify.field.columns import bare_displacement, corners, needed_points, turning_points
+from hilctl.identify.field.columns import (
+    bare_displacement,
+    corners,
+    needed_points,
+    swings,
+    turning_points,
+)
 from hilctl.identify.field.fits import FINER, tabled
 from hilctl.identify.field.weights import Grid, table
 from hilctl.models.field import FieldModel, OutputCurve
@@ -51,6 +57,14 @@ def test_turning_points_and_rows_are_enough_of_a_path() -> None:
     whole = table([u], [kept], GRID)
     few = table([np.ascontiguousarray(u[kept])], [np.arange(kept.size)], GRID)
     assert few == pytest.approx(whole, abs=0.02)
+
+
+def test_swings_go_from_turn_to_turn_and_small_ones_are_none() -> None:
+    y = np.array([0.0, -0.1, 0.2, 1.0, 0.9, 2.0, 1.9, 0.5, 0.6, -1.0, -0.9, 3.0])
+    out = np.empty(y.size)
+    swings(y, 0.3, out)
+    # From 0 up to 2 at sample 5, down to -1 at sample 9, and up to 3.
+    assert out.tolist() == [2.0] * 5 + [3.0] * 4 + [4.0] * 3
 
 
 def test_points_are_the_rows_and_all_turns() -> None:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hilctl.base.arrays import F64
-from hilctl.identify.field.polish import ROOM, STAGES, Polish, Rows
+from hilctl.identify.field.polish import ROOM, STAGES, Bare, Polish
 from hilctl.identify.field.stages import HIGH, LOW, STEP, Stages, row
 from hilctl.identify.field.weights import Equations, Grid, by_threshold, solve, table
 
@@ -30,7 +30,7 @@ def displacement_um() -> F64:
 
 def test_a_threshold_goes_to_where_the_rods_yield() -> None:
     y = displacement_um()
-    polish = Polish(lambda _: Rows([path()], y, np.ones(y.size)), KEPT, GRID, LEAST)
+    polish = Polish(lambda _: Bare([path()], y, np.ones(y.size)), KEPT, GRID, LEAST)
     x, grid = polish.follow(row(Stages()))
     assert grid.thresholds[1] == pytest.approx(TRUE_R, abs=0.02)
     assert x == pytest.approx(row(Stages()))  # nothing follows from them here, so they stay
@@ -44,7 +44,7 @@ def test_a_threshold_goes_to_where_the_rods_yield() -> None:
 def test_thresholds_stay_in_order() -> None:
     """Whatever would be best: none goes halfway to its neighbour."""
     y = np.asarray(table([path()], KEPT, GRID)[:, 5:10].sum(axis=1) + 4.0 * np.sign(path()))
-    polish = Polish(lambda _: Rows([path()], y, np.ones(y.size)), KEPT, GRID, LEAST)
+    polish = Polish(lambda _: Bare([path()], y, np.ones(y.size)), KEPT, GRID, LEAST)
     _, grid = polish.follow(row(Stages()))
     assert grid.thresholds[0] == 0.0
     assert (np.abs(grid.thresholds - GRID.thresholds) <= ROOM * 0.7 + 1e-9).all()
@@ -54,9 +54,9 @@ def test_a_stage_is_found_with_the_weights_free() -> None:
     """The field's path is larger by what one stage is away from where it should be."""
     y, first = displacement_um(), row(Stages())
 
-    def rows_of(stages: F64) -> Rows:
+    def rows_of(stages: F64) -> Bare:
         bent = path() + 0.4 * (stages[0] - 0.16) / row(STEP)[0] * np.sin(np.arange(900) / 40.0)
-        return Rows([np.ascontiguousarray(bent)], y, np.ones(y.size))
+        return Bare([np.ascontiguousarray(bent)], y, np.ones(y.size))
 
     x, _ = Polish(rows_of, KEPT, GRID, LEAST).follow(first)
     assert x[0] == pytest.approx(0.16, abs=0.002)

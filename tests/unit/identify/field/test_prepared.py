@@ -108,8 +108,8 @@ def test_noise_is_smoothed() -> None:
 @pytest.mark.parametrize("ignore", [0, 1, 20, 21, 1003])
 def test_no_sample_is_judged_that_is_to_be_ignored(ignore: int) -> None:
     run = Prepared([history(ignore=ignore)]).runs[0]
-    assert run.kept[run.judged] >= ignore
-    assert run.judged == 0 or run.kept[run.judged - 1] < ignore
+    assert run.kept[run.motion.judged] >= ignore
+    assert run.motion.judged == 0 or run.kept[run.motion.judged - 1] < ignore
 
 
 @pytest.mark.parametrize("delay_s", [0.0, 2.5e-4])
