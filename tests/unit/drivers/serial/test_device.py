@@ -151,7 +151,9 @@ def exchange_until_it_fails(bench, command=2.0):
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_bad_answer_is_an_error_and_the_output_can_still_be_made_safe(rig, kind, fault):
     """No wrong reading is taken; the next request is not confused by what is left on the line."""
-    bench = rig(kind, faults=[f"{fault}:{1.5 * TIMEOUT_S}@30" if fault == "delay" else f"{fault}@30"])
+    bench = rig(
+        kind, faults=[f"{fault}:{1.5 * TIMEOUT_S}@30" if fault == "delay" else f"{fault}@30"]
+    )
     bench.open()
     with pytest.raises(DeviceError, match=FAULTS[fault]) as caught:
         exchange_until_it_fails(bench)
