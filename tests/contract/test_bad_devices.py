@@ -154,7 +154,7 @@ class SafeOnlyOnce(Ideal):
     def make_safe(self, command):
         if self.is_open or not self.was_safe:
             self.current_a = command
-        self.was_safe = True
+        self.was_safe = not self.is_open
 
 
 class SafeElsewhere(Ideal):

@@ -144,6 +144,26 @@ def test_delay_holds_back_whole_samples_and_parts():
     np.testing.assert_allclose(between[1:], ramp[1:] - 0.7)
 
 
+@pytest.mark.parametrize("samples", [1, 2])
+def test_delay_holds_back_few_samples(samples):
+    ramp, out = np.arange(9.0), np.empty(9)
+    dynamics.delay_block(ramp, rest_memory(samples), out)
+    assert out.tolist() == [0.0] * samples + ramp[:-samples].tolist()
+
+
+def test_the_first_weight_is_of_the_oldest_value():
+    weights, out = np.array([0.5, 2.0, -1.0]), np.empty(9)
+    dynamics.weigh_block(SIGNAL[:9], weights, rest_memory(2), out)
+    before = np.concatenate([SIGNAL[:1], SIGNAL[:1], SIGNAL[:9]])
+    np.testing.assert_allclose(out, np.convolve(before, weights[::-1], "valid"), rtol=1e-13)
+
+
+def test_a_structure_begins_at_rest_whatever_its_memory_held():
+    out = np.empty(50)
+    dynamics.structure_block(np.full(50, 2.0), MOTION, np.array([9.0, 9.0, np.nan]), out)
+    np.testing.assert_allclose(out, 2.0, rtol=1e-12)
+
+
 def test_lag_refuses_other_types():
     """A float32 signal is refused at once."""
     with pytest.raises(TypeError):

@@ -3,6 +3,7 @@
 import json
 import struct
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -526,3 +527,17 @@ def test_watchdog_that_is_shorter_than_the_start_is_refused(driven):
     with pytest.raises(DeviceError, match=r"must be longer, got 2: 2\.1 s passed"):
         made.hold(1.0, 1)
     assert made.clock.level == 0
+
+
+@pytest.mark.parametrize(
+    ("running", "held_v", "holds"), [(0, 1.0, True), (1, 1.0, False), (0, 2.0, False)]
+)
+def test_safe_is_a_stream_that_stands_and_an_output_that_holds(
+    driven, monkeypatch, running, held_v, holds
+):
+    """Each alone is not: a stream that goes on writes over it with its next scan."""
+    last_write = driven().device._last_write
+    encoded = last_write._setup.output.format.encode(held_v)
+    answer = SimpleNamespace(call=lambda frames: [stream.u32(running), encoded])
+    monkeypatch.setattr("hilctl_drivers.labjack.last_write.ModbusFeedback", lambda *_: answer)
+    assert last_write._holds(SimpleNamespace(link=None), 1.0) == holds
