@@ -76,7 +76,7 @@ class Folding:
 
     def __init__(self, period: float, signals: int, max_bins: int = MAX_BINS) -> None:
         bins = max(1, min(max_bins, int(period + 1e-9)))
-        self._period = period
+        self._period = float(period)
         self._counts = np.zeros(bins, dtype=np.int64)
         self._sums = np.zeros((signals + 1, bins))
 
