@@ -6,7 +6,6 @@ it turns the path back and forth where the actuator went one way, and a model is
 
 import numpy as np
 from scipy.ndimage import uniform_filter1d
-from scipy.signal import oaconvolve
 
 from hilctl.base.arrays import F64
 from hilctl.models.chain import smoothing_weights
@@ -52,4 +51,4 @@ def _derivatives(y: F64, width: float, rate_hz: float) -> F64:
 def _convolved(y: F64, weights: F64) -> F64:
     """Return y under odd weights of which the middle one is its own, its ends going on as are."""
     padded = np.pad(y, weights.size // 2, mode="edge")
-    return np.asarray(oaconvolve(padded, weights[::-1], mode="valid"))
+    return np.convolve(padded, weights[::-1], "valid")
