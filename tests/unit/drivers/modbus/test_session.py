@@ -81,9 +81,10 @@ class TestSteps:
             session.run([ExpectStep(kind="expect", **bit)])
 
     def test_a_wait_is_waited(self, session):
-        session.run([WaitStep(kind="wait", seconds=0.25)])
+        write = WriteStep(kind="write", address=7, type="uint16", value=3.0)
+        session.run([WaitStep(kind="wait", seconds=0.25), write])
         assert self.slept_s == [0.25]
-        assert self.line.asked == []
+        assert self.line.asked == [6]
 
 
 class TestReader:
