@@ -31,6 +31,8 @@ after = api.run(
     out / "after.mcap",
     settings={
         "compensator.model": str((out / "model.yaml").resolve()),
+        "waveform.amplitude": 11.0,  # within the range that the model was found on
+        "waveform.offset": -1.0,
         "waveform.frequency_hz": 70.0,
         "waveform.duration_s": 1.0,
     },

@@ -18,7 +18,7 @@ EXPECTED = {
     ),
     "learn": (r"run 0: .*[\s\S]*\n0\.\d+ % peak error", "learn/correction.yaml"),
     "campaign_to_figure": (
-        r"(?s)step 1 .*completed.*table\.csv.*\.mcap\n.*\.mcap", "campaign/figures",
+        r"(?s)step 1 .*completed.*amplitudes\.csv.*\.mcap\n.*\.mcap", "campaign/figures",
     ),
     "matlab_handover": (r"run\.mat: \d+ samples[\s\S]*\nTrue", "handover/run.npz"),
 }  # fmt: skip
