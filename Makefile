@@ -11,11 +11,11 @@ run: $(VENV)/.ready
 	$(BIN)/hilctl run configs/demo.yaml
 
 test: $(VENV)/.ready
-	@echo "Takes 5 to 6 minutes of processor time, shared by up to 4 cores; whole runs: make test-slow."
+	@echo "Takes 4 to 5 minutes of processor time, shared by up to 4 cores; whole runs: make test-slow."
 	$(BIN)/pytest -n auto --maxprocesses 4 --dist loadfile -m "not slow"
 
 test-slow: $(VENV)/.ready
-	@echo "Takes about 13 minutes on two cores: whole runs, in processes of their own."
+	@echo "Takes about 12 minutes on two cores: whole runs, in processes of their own."
 	$(BIN)/pytest -n 2 --dist loadfile -m "slow and not long"
 
 test-long: $(VENV)/.ready
