@@ -200,7 +200,7 @@ def test_exchanges_feed_the_watchdog_and_close_disarms_it(rig, kind):
         bench.exchange(3.0)
         bench.pass_s(0.05)
     bench.device.close()
-    bench.pass_s(6.0)
+    bench.pass_s(3.0)
     bench.open()
     assert {event["event"] for event in bench.events()} == {"write"}
 
@@ -210,7 +210,7 @@ def test_a_trip_of_an_earlier_run_ends_at_the_safe_value(rig, profiles, readback
     """Before anything else is put out, whatever the module would say of its last command."""
     path = Path(profiles["dcon"])
     path.write_text(DCON.replace("of: output", f"of: {readback}"))
-    bench = rig("dcon", watchdog={"timeout_s": 2.0, "safe_command": 0.0})
+    bench = rig("dcon", watchdog={"timeout_s": 1.0, "safe_command": 0.0})
     # As where a trip keeps commands back, but does not forget the last one.
     switch, device = bench.emulator.device._switch, bench.emulator.device
 
@@ -225,7 +225,7 @@ def test_a_trip_of_an_earlier_run_ends_at_the_safe_value(rig, profiles, readback
     bench.device.wire.release()
     with pytest.raises(DeviceError, match="not open"):
         bench.device.close()
-    bench.pass_s(6.0)
+    bench.pass_s(1.2)
     bench.device.open(60.0, 1)
     events = [(event["event"], event["current_a"]) for event in bench.events()]
     assert events[-3:] == [("watchdog", 0.0), ("stale", 3.0), ("write", 0.0)]
@@ -394,13 +394,13 @@ def test_an_output_that_nobody_can_read_back_is_not_known(rig, profiles):
 @pytest.mark.parametrize("kind", KINDS)
 def test_looking_changes_nothing(rig, kind):
     """Displacement and output as they are; no write, no step, and a trip stays."""
-    watched = {"watchdog": {"timeout_s": 2.0}} if kind != "scpi" else {}
+    watched = {"watchdog": {"timeout_s": 1.0}} if kind != "scpi" else {}
     bench = rig(kind, **watched)
     bench.open()
     bench.exchange(3.0)
     bench.device.wire.release()
     bench.device._block = 0
-    bench.pass_s(5.0)
+    bench.pass_s(1.2)  # each second takes the emulated rig time, too
     before = bench.events()
     displacement_um, output = bench.device.look()
     held = 3.0 if kind == "scpi" else 0.0  # tripped
