@@ -74,11 +74,13 @@ def run(
         RunError: The device could not be opened; nothing has moved, and no file is left.
     """
     from hilctl.run.start import checked_experiment, output_of, start_run
-    from hilctl.run.unpaced import run_unpaced
 
     path, texts, chosen = Path(experiment), texts_of(settings), path_or_none(output)
     if not fast:
         return start_run(path, texts, chosen, overwrite, on_progress)
+    # Not before: a supervisor has no use for a loop of its own.
+    from hilctl.run.unpaced import run_unpaced
+
     checked = checked_experiment(path, texts, chosen)
     return run_unpaced(checked, output_of(checked, chosen), overwrite=overwrite)
 
