@@ -5,6 +5,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from mcap.data_stream import RecordBuilder
+from mcap.records import Chunk, Message
 
 from hilctl.base.events import Event
 from hilctl.base.samples import COLUMNS, Batch, Head, Samples
@@ -81,3 +83,17 @@ def make():
         batch=batch, samples=samples, write=write, rate_hz=RATE_HZ, start_ns=START_NS, block=BLOCK,
         segment=SEGMENT, ended=ENDED,
     )  # fmt: skip
+
+
+def raw(record):
+    builder = RecordBuilder()
+    record.write(builder)
+    return builder.end()
+
+
+def message(number, data=b""):
+    return Message(channel_id=4, log_time=number, data=data, publish_time=0, sequence=number)
+
+
+def chunk(data, *, size=None, crc=0):
+    return Chunk("", data, 0, 0, crc, len(data) if size is None else size)

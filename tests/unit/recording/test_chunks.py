@@ -2,25 +2,9 @@
 
 import struct
 
-from mcap.data_stream import RecordBuilder
-from mcap.records import Chunk, Message
-
 from hilctl.recording.allowance import Allowance
 from hilctl.recording.chunks import contents, inflate
-
-
-def raw(record):
-    builder = RecordBuilder()
-    record.write(builder)
-    return builder.end()
-
-
-def message(number, data=b""):
-    return Message(channel_id=4, log_time=number, data=data, publish_time=0, sequence=number)
-
-
-def chunk(data, *, size=None, crc=0):
-    return Chunk("", data, 0, 0, crc, len(data) if size is None else size)
+from tests.unit.recording.conftest import chunk, message, raw
 
 
 def test_a_chunk_must_be_records_to_its_last_byte():

@@ -3,25 +3,11 @@
 import io
 import struct
 
-from mcap.data_stream import RecordBuilder
-from mcap.records import Chunk, Message, Metadata
+from mcap.records import Metadata
 
 from hilctl.recording.allowance import Allowance
 from hilctl.recording.torn import next_likely, own_channels, take_chunk
-
-
-def raw(record):
-    builder = RecordBuilder()
-    record.write(builder)
-    return builder.end()
-
-
-def message(number, data=b""):
-    return Message(channel_id=4, log_time=number, data=data, publish_time=0, sequence=number)
-
-
-def chunk(data, *, size=None, crc=0):
-    return Chunk("", data, 0, 0, crc, len(data) if size is None else size)
+from tests.unit.recording.conftest import chunk, message, raw
 
 
 def torn(data):
