@@ -5,6 +5,7 @@
 
 device.py         the base of every device: range, sizes, rate, safe value, wording
 wiring.py         an experiment's options: place, amplifier, sensor, reader, watchdog
+starter.py        a device section to begin with
 profile.py        profiles of commercial devices, by name or path; profiles/ has them
 profile_parts.py  what all profiles have in common
 wire/             bytes there and back, and how long they take; knows no protocol

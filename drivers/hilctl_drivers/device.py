@@ -110,7 +110,7 @@ class DacDevice(ABC):
         if block == 1:  # most devices: a comparison of arrays takes ten times as long
             if not self._low <= command.item() <= self._high:
                 raise self._out_of_range(command)
-        elif not ((command >= self._low) & (command <= self._high)).all():
+        elif not (self._low <= command.min() and command.max() <= self._high):  # both NaN for a NaN
             raise self._out_of_range(command)
         try:
             self._exchange(first_sample, command, displacement_um, measured)

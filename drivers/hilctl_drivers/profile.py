@@ -19,7 +19,7 @@ from pydantic_core import PydanticKnownError
 from hilctl.base.errors import ConfigError, InputError, Problem
 from hilctl.base.files import TextFiles
 from hilctl.base.yaml.document import Document
-from hilctl.base.yaml.messages import broken_rules, loc_of
+from hilctl.base.yaml.messages import broken_rules, did_you_mean, loc_of
 from hilctl_drivers.profile_parts import BaseProfile
 
 FOLDER = Path(__file__).parent / "profiles"
@@ -128,9 +128,10 @@ def load_profile(
     elif "/" in name_or_path or Path(name_or_path).suffix in {".yaml", ".yml"}:
         path = (folder or Path()) / name_or_path
     else:
+        hint = did_you_mean(name_or_path, shipped)
         raise InputError(
-            f"no profile '{name_or_path}' is shipped: take one of {', '.join(shipped)},"
-            " or give the path of a .yaml file"
+            f"no profile '{name_or_path}' is shipped ({hint}): take another one, or give the path "
+            "of a .yaml file"
         )
     return parse_profile((files or TextFiles()).read(path), str(path))
 

@@ -10,6 +10,7 @@ from types import TracebackType
 from typing import BinaryIO, Self
 
 from hilctl.base.errors import InputError
+from hilctl.base.remedy import no_such_file, reason
 
 
 class TextFiles:
@@ -68,12 +69,12 @@ def read_text(path: Path, max_bytes: int = MAX_TEXT_BYTES) -> str:
             )
         return path.read_text(encoding="utf-8")
     except FileNotFoundError:
-        raise InputError(f"{path}: no such file") from None
+        raise InputError(no_such_file(path)) from None
     except UnicodeDecodeError:
         raise InputError(f"{path}: is not UTF-8 text") from None
     except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise InputError(f"{path}: can't be read: {reason}") from None
+        why = reason(error) if isinstance(error, OSError) else error
+        raise InputError(f"{path}: can't be read: {why}") from None
 
 
 class AtomicFile:
@@ -164,10 +165,19 @@ def _written(path: Path, *, overwrite: bool) -> Iterator[AtomicFile]:
         with AtomicFile(path, overwrite=overwrite) as file:
             yield file
     except FileExistsError:
-        hint = "give another name, or --overwrite"
-        raise InputError(f"{path}: exists already: {hint}") from None
+        raise already_there(path, "give another name, or --overwrite") from None
+    except FileNotFoundError as error:
+        lost = "" if path.parent.is_dir() else f" (there is no folder {path.parent})"
+        raise InputError(f"{path}: can't be written: {error.strerror}{lost}") from None
     except OSError as error:
-        raise InputError(f"{path}: can't be written: {error.strerror or error}") from None
+        raise InputError(f"{path}: can't be written: {reason(error)}") from None
+
+
+def already_there(path: Path, remedy: str) -> InputError:
+    """Return the refusal of a file that would be replaced; no remedy helps against a folder."""
+    if path.is_dir():
+        return InputError(f"{path}: is a folder: name a file in it")
+    return InputError(f"{path}: exists already: {remedy}")
 
 
 def write_file(path: Path, write: Callable[[BinaryIO], object], *, overwrite: bool) -> None:

@@ -5,8 +5,10 @@ which page, so that every user and every page in a browser of this machine can l
 there; therefore it is only where it is asked for.
 """
 
+import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from hilctl.base.errors import InputError, RunError
@@ -110,6 +112,16 @@ class FoxgloveServer:
         self._channels[message.topic].log(message.data, log_time=message.time_ns)
 
 
+@contextmanager
+def _logging_as_before() -> Iterator[None]:
+    """Keep the level and handlers of all logs: the library sets its own for everybody's."""
+    root = logging.getLogger()
+    level, handlers = root.level, root.handlers[:]
+    yield
+    root.setLevel(level)
+    root.handlers[:] = handlers
+
+
 def _started(port: int) -> tuple["Context", dict[str, "Channel"], "WebSocketServer"]:
     """Return the channels by their topics, the server that has them, and what holds them together.
 
@@ -125,7 +137,8 @@ def _started(port: int) -> tuple["Context", dict[str, "Channel"], "WebSocketServ
         raise InputError(
             "--foxglove: its library is not installed: pip install 'hilctl[foxglove]'"
         ) from None
-    foxglove.set_log_level("ERROR")  # what strangers send, nobody should have to read
+    with _logging_as_before():
+        foxglove.set_log_level("ERROR")  # what strangers send, nobody should have to read
     context = foxglove.Context()
     descriptors = schema.descriptor_set()
     channels = {

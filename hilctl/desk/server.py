@@ -20,6 +20,7 @@ from websockets.http11 import Request, Response
 from websockets.typing import Subprotocol
 
 from hilctl.base.errors import HilctlError, InputError, RunError
+from hilctl.base.remedy import ADDRESS_REMEDIES, reason
 from hilctl.desk.admission import PROTOCOL, Admission, PendingConnections, bounded
 from hilctl.desk.feed import RunFeed
 from hilctl.desk.feeds import RunFeeds
@@ -214,6 +215,6 @@ def _listeners(port: int) -> list[socket.socket]:
                     address = ("::1", first.getsockname()[1])
                     found.append(socket.create_server(address, family=socket.AF_INET6))
         except OSError as error:
-            raise RunError(f"port {port} of 127.0.0.1: {error.strerror}") from None
+            raise RunError(f"port {port} of 127.0.0.1: {reason(error, ADDRESS_REMEDIES)}") from None
         stack.pop_all()
         return found

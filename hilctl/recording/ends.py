@@ -12,6 +12,7 @@ from mcap.records import Footer, McapRecord, Metadata, MetadataIndex, SummaryOff
 from mcap.writer import MCAP0_MAGIC as MAGIC
 
 from hilctl.base.errors import DataError
+from hilctl.base.remedy import reason
 from hilctl.recording.locks import is_being_recorded
 from hilctl.recording.records import FRAME, LARGEST_BYTES, parse
 
@@ -48,7 +49,7 @@ def read_ends(path: Path) -> RecordingEnds:
         with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb", buffering=0) as stream:
             return _ends(stream)
     except OSError as error:
-        raise DataError(f"{path}: can't be read: {error.strerror}") from None
+        raise DataError(f"{path}: can't be read: {reason(error)}") from None
     except DataError as error:
         raise DataError(f"{path}: {error}") from None
 

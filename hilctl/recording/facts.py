@@ -16,6 +16,9 @@ END_FIGURES = (
     "rms_error_percent",
 )
 """Facts of the end of a run: the worst figure of its segments, where any has it; as in a report."""
+USAGE_FACT = "processes"
+"""Fact of the end of a run: what ``loop`` and ``supervisor`` took of the machine while it went on,
+a JSON object of each."""
 OVERRIDES_FACT = "overrides"
 """Fact of a run: JSON list of the key=value texts that were set over its file."""
 RECORDINGS = "recordings"

@@ -7,6 +7,7 @@ from contextlib import ExitStack, closing
 from pathlib import Path
 
 from hilctl.base.errors import DataError
+from hilctl.base.remedy import no_such_file, reason
 from hilctl.recording.ahead import ReadAhead
 from hilctl.recording.data import Recording
 from hilctl.recording.gathering import Gathering
@@ -91,9 +92,9 @@ def _read(path: Path, stretch: Stretch | None, piece_samples: int | None) -> Ite
                     yield gathered.piece(path)
             live = not salvage.sound and is_being_recorded(stream)
     except FileNotFoundError:
-        raise DataError(f"{path}: no such file") from None
+        raise DataError(no_such_file(path)) from None
     except OSError as error:
-        raise DataError(f"{path}: can't be read: {error.strerror}") from None
+        raise DataError(f"{path}: can't be read: {reason(error)}") from None
     except DataError as error:
         text = str(error).removeprefix(f"{path}: ")  # of a piece, it is there already
         raise DataError(f"{path}: {text}") from None

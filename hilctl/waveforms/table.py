@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from hilctl.base.arrays import F64
 from hilctl.base.errors import InputError
+from hilctl.base.remedy import no_such_file, reason
 from hilctl.base.segments import SHORTEST_PERIOD
 from hilctl.base.text_table import MAX_COLUMNS, TextTable, check_rows, column_index
 from hilctl.waveforms.shapes import check_length
@@ -38,9 +39,9 @@ def read_samples(w: FileWaveform, sample_rate_hz: float, folder: Path) -> tuple[
     try:
         found = path.is_file()
     except OSError as error:  # a name that is too long
-        raise InputError(f"{path}: can't be read: {error.strerror}") from None
+        raise InputError(f"{path}: can't be read: {reason(error)}") from None
     if not found:
-        raise InputError(f"{path}: no such file")
+        raise InputError(no_such_file(path))
     raw, own_rate_hz = _read(w, path)
     rate_hz = _file_rate(w, path, own_rate_hz)
     values = w.offset + w.scale * _resampled(w, path, raw, rate_hz, sample_rate_hz)

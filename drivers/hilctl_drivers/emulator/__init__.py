@@ -6,6 +6,7 @@ all of a run is real.
 command.py         ``hilctl emulate``
 options.py         what to emulate; faults.py  what goes wrong
 setup.py           devices, rig and ports put together
+wired.py           what to emulate for an experiment
 server.py          one thread that answers, over connections.py
 wire.py            requests out of bytes, replies into bytes: modbus_wire.py, serial_wire.py
 modbus_device.py   a device of registers.py, with its watchdog.py

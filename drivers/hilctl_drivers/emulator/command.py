@@ -3,27 +3,39 @@
 import gc
 import signal
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import FrameType
 from typing import Annotated, cast
 
 import typer
 
+from hilctl.base.errors import InputError
 from hilctl_drivers.emulator.faults import parse_fault
 from hilctl_drivers.emulator.modbus_device import EmulatedModbus
 from hilctl_drivers.emulator.modbus_wire import LinkKind
 from hilctl_drivers.emulator.options import EmulatorOptions, ReaderLine
 from hilctl_drivers.emulator.setup import Emulator, build
+from hilctl_drivers.emulator.wired import WiredExperiment, is_experiment, wired_experiment
 
 
 def emulate(
-    profile: Annotated[str, typer.Argument(help="Shipped profile, or path of one.")],
+    profile: Annotated[
+        str,
+        typer.Argument(
+            help="Shipped profile, path of one, or an experiment, whose wiring it takes.",
+            metavar="PROFILE|EXPERIMENT",
+        ),
+    ],
     link: Annotated[str | None, typer.Option(help="tcp or rtu; else the profile's own.")] = None,
     host: Annotated[str, typer.Option(help="Address to listen on.")] = EmulatorOptions.host,
-    port: Annotated[int, typer.Option(help="TCP port; 0 takes a free one.")] = EmulatorOptions.port,
+    port: Annotated[
+        int, typer.Option(min=0, max=65535, help="TCP port; 0 takes a free one.")
+    ] = EmulatorOptions.port,
     log: Annotated[Path | None, typer.Option(help="File for a log of every write.")] = None,
     fault: Annotated[
-        list[str] | None, typer.Option(help="KIND@COUNT or KIND@SECONDSs; may be repeated.")
+        list[str] | None,
+        typer.Option(metavar="KIND@WHEN", help="KIND@COUNT or KIND@SECONDSs; may be repeated."),
     ] = None,
     output: Annotated[str | None, typer.Option(help="Output that drives the rig.")] = None,
     sensor: Annotated[
@@ -37,13 +49,25 @@ def emulate(
     ] = None,
     reader_unit_id: Annotated[int | None, typer.Option(help="The reader's unit id.")] = None,
     reader_port: Annotated[
-        int, typer.Option(help="The reader's own TCP port; 0 takes a free one.")
+        int, typer.Option(min=0, max=65535, help="The reader's own TCP port; 0 takes a free one.")
     ] = EmulatorOptions.reader_port,
     current_a: Annotated[
         float | None, typer.Option(help="Current at the start, A; else as the device powers up.")
     ] = None,
 ) -> None:
     """Serve the simulated rig as a real device would, until Ctrl-C."""
+    faults = tuple(parse_fault(text) for text in fault or ())
+    if is_experiment(profile):
+        own = {"--link": link, "--output": output, "--sensor": sensor, "--reader": reader,
+               "--reader-line": reader_line, "--reader-unit-id": reader_unit_id}  # fmt: skip
+        if given := [name for name, value in own.items() if value is not None]:
+            raise InputError(f"{', '.join(given)}: {profile} says that itself")
+        wired = wired_experiment(Path(profile), port, host)
+        options = replace(wired.options, log=log, faults=faults, current_a=current_a)
+        if reader_port:
+            options = replace(options, reader_port=reader_port)
+        serve(options, _say, wired)
+        return
     if reader is None and sensor is not None and ":" in sensor:
         reader, _, sensor = sensor.rpartition(":")
     options = EmulatorOptions(
@@ -52,7 +76,7 @@ def emulate(
         host=host,
         port=port,
         log=log,
-        faults=tuple(parse_fault(text) for text in fault or ()),
+        faults=faults,
         output=output,
         sensor=sensor,
         reader=reader,
@@ -61,15 +85,24 @@ def emulate(
         reader_port=reader_port,
         current_a=current_a,
     )
-    serve(options, lambda name, address: typer.echo(f"{name} answers at {address}"))
+    serve(options, _say)
 
 
-def serve(options: EmulatorOptions, on_ready: Callable[[str, str], None]) -> None:
+def _say(name: str, address: str) -> None:
+    typer.echo(f"{name} answers at {address}")
+
+
+def serve(
+    options: EmulatorOptions,
+    on_ready: Callable[[str, str], None],
+    wired: WiredExperiment | None = None,
+) -> None:
     """Serve an emulator until SIGINT or SIGTERM.
 
     Args:
         options: What to emulate.
         on_ready: Called with a profile and its ``host:port`` or device file once it answers.
+        wired: The experiment that the options are of: its wiring is printed, and how to run it.
 
     Raises:
         InputError: See :func:`~hilctl_drivers.emulator.setup.build`.
@@ -86,6 +119,8 @@ def serve(options: EmulatorOptions, on_ready: Callable[[str, str], None]) -> Non
     try:
         for name, address in _places(options, emulator):
             on_ready(name, address)
+        if wired is not None:
+            typer.echo("\n".join([*wired.wiring(), wired.command(emulator)]))
         emulator.server.run()
     finally:
         for number, handler in before.items():

@@ -8,6 +8,7 @@ from typing import IO, Any
 import numpy as np
 
 from hilctl.base.errors import InputError
+from hilctl.base.remedy import reason
 from hilctl_drivers.profile_parts import Range
 from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
 
@@ -119,7 +120,7 @@ class WriteLog:
             try:
                 self._file = path.open("wb", buffering=0)
             except OSError as error:
-                raise InputError(f"{path}: can't be written: {error.strerror}") from None
+                raise InputError(f"{path}: can't be written: {reason(error)}") from None
 
     def event(self, now_ns: int, event: str, **more: Any) -> None:
         """Write one line.

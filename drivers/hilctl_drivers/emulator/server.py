@@ -10,12 +10,13 @@ import time
 from collections.abc import Callable, Sequence
 
 from hilctl.base.errors import InputError
+from hilctl.base.remedy import ADDRESS_REMEDIES, reason
 from hilctl_drivers.emulator.connections import Connection, PtyConnection, TcpConnection
 from hilctl_drivers.emulator.faults import FaultPlan, WireFault, spoil
 from hilctl_drivers.emulator.wire import EmulatedReply, EmulatedWire
 
 _TICK_S = 0.005
-_STALE_NS = 50_000_000
+_STALE_NS = 1_000_000_000  # a busy machine may pass on in parts what was written at once
 
 
 class EmulatorServer:
@@ -51,7 +52,8 @@ class EmulatorServer:
         try:
             listener = socket.create_server((host, port))
         except OSError as error:
-            raise InputError(f"can't listen on {host}:{port}: {error.strerror}") from None
+            why = reason(error, ADDRESS_REMEDIES)
+            raise InputError(f"can't listen on {host}:{port}: {why}") from None
         self._listeners[listener] = wire
         self._wires.append(wire)
         self._selector.register(listener, selectors.EVENT_READ)

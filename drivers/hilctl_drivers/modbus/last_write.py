@@ -98,7 +98,7 @@ class ModbusLastWrite:
             if held and now_s >= end_s:
                 return
             if now_s >= give_up_s:
-                raise DeviceError("the safe value was written, but did not stay")
+                raise DeviceError("the safe value was written, but was not seen to stay")
             if held:
                 self._sleep(min(POLL_S, end_s - now_s))
             else:

@@ -28,6 +28,7 @@ class Plant(ABC):
         self._seed = seed
         self._command = np.empty(CHUNK)
         self._noise = np.empty(CHUNK)
+        self._parts = self._command, self._noise
         self._generator = np.random.Generator(np.random.PCG64(seed))
 
     def reset(self) -> None:
@@ -44,15 +45,21 @@ class Plant(ABC):
             displacement_um: float64[n], filled with readings of the displacement from rest.
             measured: float64[n], filled with the command as it had come about at each reading.
         """
+        if command.size <= CHUNK:
+            self._step(command, displacement_um, measured)
+            return
         for start in range(0, command.size, CHUNK):
             part = slice(start, start + CHUNK)
-            size = command[part].size
-            held = self._command[:size]  # a copy: compiled code refuses read-only arrays
-            held[:] = command[part]
-            noise = self._noise[:size]
-            self._generator.standard_normal(out=noise)
-            noise *= self._noise_um
-            self._advance(held, noise, displacement_um[part], measured[part])
+            self._step(command[part], displacement_um[part], measured[part])
+
+    def _step(self, command: F64, displacement_um: F64, measured: F64) -> None:
+        held, noise = self._parts
+        if held.size != command.size:  # views are kept: one block is as long as the next
+            self._parts = held, noise = self._command[: command.size], self._noise[: command.size]
+        held[:] = command  # a copy: compiled code refuses read-only arrays
+        self._generator.standard_normal(out=noise)
+        noise *= self._noise_um
+        self._advance(held, noise, displacement_um, measured)
 
     def warm_up(self) -> None:
         """Go on by one sample and back to rest, so that nothing is compiled or loaded later."""

@@ -11,7 +11,6 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.linalg import expm
 
 from hilctl.base.arrays import F64
 from hilctl_drivers.simulated.extras import Creep, SecondMode, Thermal, VoltageLimit
@@ -80,6 +79,8 @@ def _motion(parameters: TerfenolParameters, load_kg: float, step_s: float) -> F6
     Velocities are kept in um per radian of their natural frequency, so that the matrix is well
     scaled.
     """
+    from scipy.linalg import expm  # no other device should have to wait for it
+
     omega = math.sqrt(parameters.stiffness_n_per_m / (parameters.moving_mass_kg + load_kg))
     modes = [(omega, parameters.damping_ratio, 1.0)]
     second = parameters.second_mode
@@ -202,6 +203,9 @@ class TerfenolActuator(Plant):
             past = np.arange(self._samples, self._samples + command.size)
             noise_um -= whole * np.expm1(-past * per_sample)  # the sensor takes no notice of it
         self._samples += command.size
+        if command.size <= self._part:
+            self._move(command, noise_um, displacement_um, measured)
+            return
         for start in range(0, command.size, self._part):
             part = slice(start, start + self._part)
             self._move(command[part], noise_um[part], displacement_um[part], measured[part])

@@ -8,11 +8,13 @@ This is what all links have in common; :mod:`hilctl_drivers.wire.tcp` and
 :mod:`hilctl_drivers.wire.serial_port` are the links.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from types import MappingProxyType
 from typing import Protocol, TypeAlias
 
 from hilctl.base.errors import DeviceError
+from hilctl.base.remedy import reason
 
 Missing: TypeAlias = Callable[[bytearray], int]
 """How many more bytes to wait for, at least, after those that have come; 0 where the reply is
@@ -77,9 +79,14 @@ def naming(who: str) -> Iterator[None]:
         raise
 
 
-def why(error: OSError) -> str:
-    """Return the system's own words for an error, to stand in a sentence."""
-    text = error.strerror or str(error)
+def why(error: OSError, remedies: Mapping[int, str] = MappingProxyType({})) -> str:
+    """Return the system's own words for an error, to stand in a sentence, and what to do about it.
+
+    Args:
+        error: What was raised.
+        remedies: What to do, by ``errno``.
+    """
+    text = reason(error, remedies)
     return text[:1].lower() + text[1:]
 
 

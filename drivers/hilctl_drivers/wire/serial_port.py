@@ -16,6 +16,7 @@ from typing import Literal
 import serial
 
 from hilctl.base.errors import DeviceError
+from hilctl.base.remedy import PORT_REMEDIES, reason
 from hilctl_drivers.wire.links import LostError, Missing, NoAnswerError, cut, why
 
 _FIRST = 256
@@ -188,7 +189,9 @@ class SerialLink:
         self.close()
         try:
             port = _open_port(self._path, self._settings, self._timeout_s)
-        except (OSError, ValueError) as error:
+        except OSError as error:
+            raise LostError(f"can't be opened: {reason(error, PORT_REMEDIES)}") from None
+        except ValueError as error:
             raise LostError(f"can't be opened: {error}") from None
         try:
             port.set_low_latency_mode(True)

@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable
 
 from hilctl.base.errors import DeviceError
+from hilctl.base.remedy import CONNECT_REMEDIES
 from hilctl_drivers.wire.links import LostError, Missing, NoAnswerError, cut, why
 
 _FIRST = 256
@@ -49,7 +50,7 @@ class TcpLink:
         except TimeoutError:
             raise LostError(f"no connection within {self._timeout_s:g} s") from None
         except OSError as error:
-            raise LostError(f"can't connect: {why(error)}") from None
+            raise LostError(f"can't connect: {why(error, CONNECT_REMEDIES)}") from None
         try:
             self._set_up(made)
         except OSError as error:  # reset since

@@ -4,6 +4,7 @@ A document remembers where each value stands, so that a broken rule is reported 
 ``file:line: key: rule, got value (what to do)``.
 """
 
+import logging
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
@@ -13,10 +14,12 @@ from pydantic import BaseModel, ValidationError
 
 from hilctl.base.errors import ConfigError, Problem
 from hilctl.base.files import TextFiles
+from hilctl.base.yaml.lenient import PlainReading, readings
 from hilctl.base.yaml.messages import Loc, broken_rules, dotted
 from hilctl.base.yaml.plain import MAX_DEPTH, compose, scalar
 
 Model = TypeVar("Model", bound=BaseModel)
+_log = logging.getLogger(__name__)
 _UNREADABLE = "is not readable YAML"
 
 
@@ -130,6 +133,9 @@ class Document:
     ) -> Model:
         """Build a pydantic model from the document, or from a part of it.
 
+        What can be read in one way only is read so, and stands so in :attr:`data` from then on: see
+        :mod:`hilctl.base.yaml.lenient`.
+
         Args:
             model: What to build.
             at: Where the part stands; all of the document where empty.
@@ -139,15 +145,49 @@ class Document:
         Raises:
             ConfigError: One or more rules are broken; all are listed.
         """
+        while True:
+            data = self._at(at)
+            if without:
+                data = {key: value for key, value in data.items() if key not in without}
+            try:
+                return model.model_validate(data, context=context)
+            except ValidationError as error:
+                plain = readings(error, model)
+                if not plain:
+                    raise ConfigError(broken_rules(error, model, self.where, at)) from None
+            for each in plain:
+                self._read_as(each, at)
+
+    def _read_as(self, reading: PlainReading, at: Loc) -> None:
+        loc = (*at, *reading.loc)
+        if reading.said:
+            _log.warning("%s: %s: %s", self.where(loc), dotted(loc), reading.said)
+        if not reading.is_key:
+            parts = [str(part) for part in loc]
+            self.data = _replaced(self.data, parts, lambda _: reading.value, self.where(loc))
+            return
+        old, new = loc[-1], reading.value
+        mapping = self._at(loc[:-1])
+        if new in mapping:
+            first = self.where((*loc[:-1], new))
+            raise ConfigError([Problem(self.where(loc), dotted(loc), f"stands already at {first}")])
+        renamed = {(new if key == old else key): value for key, value in mapping.items()}
+        moved = {
+            ((*loc[:-1], new, *place[len(loc) :]) if place[: len(loc)] == loc else place): where
+            for place, where in self._places.items()
+        }
+        self._places = moved
+        if len(loc) == 1:
+            self.data = renamed
+        else:
+            parts = [str(part) for part in loc[:-1]]
+            self.data = _replaced(self.data, parts, lambda _: renamed, self.where(loc[:-1]))
+
+    def _at(self, loc: Loc) -> Any:
         data: Any = self.data
-        for part in at:
+        for part in loc:
             data = data[part]
-        if without:
-            data = {key: value for key, value in data.items() if key not in without}
-        try:
-            return model.model_validate(data, context=context)
-        except ValidationError as error:
-            raise ConfigError(broken_rules(error, model, self.where, at)) from None
+        return data
 
 
 def load_document(path: Path, files: TextFiles | None = None) -> Document:

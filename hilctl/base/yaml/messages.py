@@ -65,7 +65,7 @@ def broken_rules(
     # What a validator has read from another file says for itself where it stands.
     elsewhere = [p for cause in causes if isinstance(cause, ConfigError) for p in cause.problems]
     broken = [
-        _located(model, detail)
+        located(model, detail)
         for detail, cause in zip(details, causes, strict=True)
         if not isinstance(cause, ConfigError)
     ]
@@ -73,7 +73,7 @@ def broken_rules(
     meant = {
         each.loc[:n] for each in broken if not each.of_choice for n in range(len(each.loc) + 1)
     }
-    groups: dict[Loc, list[_Broken]] = {}
+    groups: dict[Loc, list[BrokenRule]] = {}
     for index, each in enumerate(broken):
         if not (each.of_choice and each.loc in meant):
             groups.setdefault(each.loc if each.of_choice else (index, *each.loc), []).append(each)
@@ -81,7 +81,7 @@ def broken_rules(
 
 
 @dataclass(frozen=True, slots=True)
-class _Broken:
+class BrokenRule:
     """One thing that pydantic says, with the keys that stand in the file.
 
     Attributes:
@@ -97,7 +97,7 @@ class _Broken:
     of_choice: bool
 
 
-def _problem(group: list[_Broken], where: Callable[[Loc], str], at: Loc) -> Problem:
+def _problem(group: list[BrokenRule], where: Callable[[Loc], str], at: Loc) -> Problem:
     first = group[0]
     loc = (*at, *first.loc)
     rule = ", or ".join([_rule(first.detail), *(_choice(each.detail) for each in group[1:])])
@@ -164,6 +164,8 @@ def _hint(detail: ErrorDetails, known: Iterable[str]) -> str:
     value, kind = detail["input"], detail["type"]
     if kind == "extra_forbidden":
         return did_you_mean(str(detail["loc"][-1]), known)
+    if kind in {"literal_error", "union_tag_invalid"}:
+        return _word_hint(detail)
     if kind in _NUMBERS and isinstance(value, str):
         return _number_hint(value)
     if kind in _NUMBERS and isinstance(value, float) and value.is_integer():
@@ -175,17 +177,26 @@ def _hint(detail: ErrorDetails, known: Iterable[str]) -> str:
     return ""
 
 
+def _word_hint(detail: ErrorDetails) -> str:
+    """Return the word that is near, where one of a few was wanted: all of them are listed."""
+    context = detail.get("ctx", {})
+    given = context.get("tag", detail["input"])
+    words = re.findall(r"'([^']+)'", str(context.get("expected") or context.get("expected_tags")))
+    close = difflib.get_close_matches(str(given), words, n=1, cutoff=0.75)
+    return f"did you mean '{close[0]}'?" if close and len(words) > 1 else ""
+
+
 def _number_hint(text: str) -> str:
     if is_number(text):
         return "remove the quotes"
-    if is_number(text.replace(",", ".")):
-        return "write a decimal point"
+    if is_number(point := text.replace(",", ".", 1)):
+        return f"{point} or {text.replace(',', '')}? write a decimal point, or none"
     if text[:1] in set("+-.0123456789"):
         return "write a plain number, such as 1000, 0.5 or 1e-3"
     return ""
 
 
-def _located(model: type[BaseModel], detail: ErrorDetails) -> _Broken:
+def located(model: type[BaseModel], detail: ErrorDetails) -> BrokenRule:
     """Follow pydantic's location through the types, and leave out its names of choices."""
     choices: list[Any] = [model]
     parent: type[BaseModel] | None = None
@@ -203,7 +214,7 @@ def _located(model: type[BaseModel], detail: ErrorDetails) -> _Broken:
     if kind == "union_tag_invalid":
         plain.append("kind")
     of_choice = chose and (kind == "literal_error" or kind.endswith("_type"))
-    return _Broken(detail, tuple(plain), parent, of_choice)
+    return BrokenRule(detail, tuple(plain), parent, of_choice)
 
 
 def _is_model(annotation: Any) -> bool:

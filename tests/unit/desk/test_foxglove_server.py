@@ -3,6 +3,7 @@
 import asyncio
 import base64
 import json
+import logging
 import struct
 import sys
 import threading
@@ -25,6 +26,14 @@ from hilctl.run.shared_page import Field, Phase
 from hilctl.run.start import checked_experiment
 
 DEMO = Path(__file__).parents[3] / "configs" / "demo.yaml"
+
+
+def test_logs_of_hilctl_are_what_they_were():
+    """The library sets a level and a handler for all logs, and their warnings would be lost."""
+    root = logging.getLogger()
+    before = root.level, root.handlers[:]
+    FoxgloveServer(first, port=0).run(lambda server: True)
+    assert (root.level, root.handlers) == before
 
 
 def first(runs):

@@ -320,11 +320,11 @@ class TestLoading:
         assert load_profile(str(path)).title == "Acme DAQ-1"
 
     def test_unknown_name(self) -> None:
-        """An unknown name lists the shipped ones."""
-        with pytest.raises(
-            InputError, match=r"no profile 'labjack' is shipped.*labjack_t7"
-        ) as error:
+        """An unknown name is answered with the nearest, or with all that are shipped."""
+        with pytest.raises(InputError, match=r"'labjack' is shipped.*did you mean 'labjack_t"):
             load_profile("labjack")
+        with pytest.raises(InputError, match="'zzz' is shipped") as error:
+            load_profile("zzz")
         assert all(name in str(error.value) for name in shipped_profiles())
 
     def test_no_file(self, tmp_path: Path) -> None:

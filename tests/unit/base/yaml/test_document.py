@@ -98,8 +98,8 @@ def test_every_value_has_its_line(loc, place):
      "bench.yaml:3: limits.peak_a: must be a number, got '6.0' (remove the quotes)"),
     ("6.0", "'1e3'",
      "bench.yaml:3: limits.peak_a: must be a number, got '1e3' (remove the quotes)"),
-    ("6.0", "1,5",
-     "bench.yaml:3: limits.peak_a: must be a number, got '1,5' (write a decimal point)"),
+    ("6.0", "1,500", "bench.yaml:3: limits.peak_a: must be a number, got '1,500' "
+     "(1.500 or 1500? write a decimal point, or none)"),
     ("6.0", "1_000", "bench.yaml:3: limits.peak_a: must be a number, got '1_000' "
      "(write a plain number, such as 1000, 0.5 or 1e-3)"),
     ("6.0", "1:30", "bench.yaml:3: limits.peak_a: must be a number, got '1:30' "
@@ -119,8 +119,8 @@ def test_every_value_has_its_line(loc, place):
     ("[1, 2, 3]", "[1, 2, 3, 4]",
      "bench.yaml:4: limits.steps: must have at most 3 values, got [1, 2, 3, 4]"),
     ("[1, 2, 3]", "7", "bench.yaml:4: limits.steps: must be a list, got 7"),
-    ("[1, 2, 3]", "[1e3]",
-     "bench.yaml:4: limits.steps.0: must be a whole number, got 1000.0 (write 1000)"),
+    ("[1, 2, 3]", "[1000.5]",
+     "bench.yaml:4: limits.steps.0: must be a whole number, got 1000.5"),
     ("bench", "true", "bench.yaml:1: name: must be text, got true (put it in quotes)"),
     ("bench", "5", "bench.yaml:1: name: must be text, got 5 (put it in quotes)"),
     ("  peak_a", "  slow: on\n  peak_a",
@@ -137,7 +137,8 @@ def test_every_value_has_its_line(loc, place):
     ("radius_um: 2.5", "round: 2.5",
      "bench.yaml:7: parts.0.round: unknown key (known: kind, radius_um)"),
     ("kind: square", "kind: sqare",
-     "bench.yaml:8: parts.1.kind: must be one of 'round', 'square', got 'sqare'"),
+     "bench.yaml:8: parts.1.kind: must be one of 'round', 'square', got 'sqare' "
+     "(did you mean 'square'?)"),
     ("kind: square\n    ", "", "bench.yaml:8: parts.1: needs a 'kind'"),
     ("parts:", "colours: {red: x}\nparts:",
      "bench.yaml:5: colours.red: must be a number, got 'x'"),

@@ -44,6 +44,8 @@ class Several(Strict):
      ["x:1: guard: kick must be write where timeout_s is above 1"]),
     ("guard: {timeout_s: 2, kick: x}",
      ["x:1: guard.kick: must be one of 'any' or 'write', got 'x'"]),
+    ("guard: {timeout_s: 2, kick: wirte}",
+     ["x:1: guard.kick: must be one of 'any' or 'write', got 'wirte' (did you mean 'write'?)"]),
     ("base: 2", ["x:1: base: must be one of 0, 1 or 'modicon', got 2"]),
     ("level: high", ["x:1: level: must be a number, or 'safe', got 'high'"]),
     ("level: '1e3'", ["x:1: level: must be a number, or 'safe', got '1e3' (remove the quotes)"]),

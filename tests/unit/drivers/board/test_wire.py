@@ -24,6 +24,8 @@ from hilctl_drivers.serial.setup import SerialOptions
 from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
 from tests.fakes import FakeHost, ShiftedClock, SteppingClock, emulated
 
+pytestmark = pytest.mark.slow  # the board's FIFO runs empty in real time
+
 RATE_HZ = 2_500.0
 BLOCK = 100
 FIFO_BLOCKS = 5  # 200 ms, which a busy machine may take for itself
@@ -273,6 +275,7 @@ def test_a_whole_run_loses_nothing(board):
     driven.device.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fault", ["silence", "corrupt", "cut", "unplug"])
 def test_a_run_that_loses_the_board_leaves_by_the_one_way_out(board, fault):
     """The reason is kept, blocks under way are recorded as unanswered, the coil is at 0 A."""

@@ -204,6 +204,7 @@ def test_a_block_costs_no_more_messages_than_values_and_readings_need(driven):
     assert len(made.link.requests) - before <= 10 * (10 + 5)
 
 
+@pytest.mark.slow
 def test_the_highest_rate_needs_all_of_the_messages(driven):
     """At 1 ms a message and nearly the rate that check allows, nothing runs dry."""
     made = driven(message_s=0.001, fifo_blocks=6)

@@ -11,6 +11,7 @@ import pytest
 
 from hilctl_drivers.emulator.options import EmulatorOptions
 from hilctl_drivers.emulator.setup import Emulator, build
+from hilctl_drivers.modbus import last_write
 from hilctl_drivers.modbus.device import ModbusDac
 from hilctl_drivers.modbus.setup import ModbusOptions
 from hilctl_drivers.profile import shipped_profiles
@@ -18,6 +19,8 @@ from tests.fakes import FaultyLink, InProcess, ManualClock, VirtualTime
 
 MESSAGE_S = 0.001
 TIMEOUT_S = 0.1
+PATIENT_S = 20.0
+"""A busy machine answers within it."""
 RATE_HZ = 100.0
 
 READER = """\
@@ -52,7 +55,7 @@ class ServedPair:
     log: Path
 
     def device(self, **changes) -> ModbusDac:
-        options = {**self.emulator.options, "timeout_s": 2.0, **changes}
+        options = {**self.emulator.options, "timeout_s": PATIENT_S, **changes}
         time = VirtualTime()
         return ModbusDac(ModbusOptions.model_validate(options), sleep=time.sleep, clock=time)
 
@@ -61,8 +64,9 @@ class ServedPair:
 
 
 @pytest.fixture
-def serve(tmp_path) -> Iterator[Callable[..., ServedPair]]:
+def serve(tmp_path, monkeypatch) -> Iterator[Callable[..., ServedPair]]:
     """Return a function that serves two devices on a clock that stands still."""
+    monkeypatch.setattr(last_write, "ANSWER_S", PATIENT_S)
     started: list[tuple[ServedPair, threading.Thread]] = []
 
     def start(profile: str, reader: str, **options) -> ServedPair:

@@ -14,6 +14,7 @@ from hilctl.base.errors import DeviceError, InputError
 from hilctl_drivers.emulator.faults import parse_fault
 from hilctl_drivers.emulator.options import EmulatorOptions
 from hilctl_drivers.emulator.setup import Emulator, build
+from hilctl_drivers.modbus import last_write
 from hilctl_drivers.modbus.device import ModbusDac
 from hilctl_drivers.modbus.setup import ModbusOptions
 from hilctl_drivers.profile import load_profile, shipped_profiles
@@ -88,8 +89,9 @@ class Served:
 
 
 @pytest.fixture
-def serve(tmp_path) -> Iterator[Callable[..., Served]]:
+def serve(tmp_path, monkeypatch) -> Iterator[Callable[..., Served]]:
     """Return a function that serves an emulated device on a clock that stands still."""
+    monkeypatch.setattr(last_write, "ANSWER_S", 20.0)  # a busy machine answers within it
     started: list[tuple[Served, threading.Thread]] = []
 
     def start(profile: str, **options) -> Served:
@@ -237,7 +239,7 @@ class TestOptions:
 
 def timeout_s(said: str) -> float:
     """Return a short timeout where it is what ends the exchange, else longer than any stall."""
-    return 1.0 if "within" in said else 5.0
+    return 1.0 if "within" in said else 20.0
 
 
 class TestExchange:

@@ -127,12 +127,12 @@ class TestReader:
         """It is read once at opening, before the first write."""
         served = serve("icp_m7024", "icp_m7017", **fault)
         with pytest.raises(DeviceError, match=rf": reader icp_m7017, .*{said}.* \(to open\)"):
-            served.device(timeout_s=0.2).open(5.0, 1)
+            served.device(timeout_s=2.0).open(5.0, 1)
         assert served.events() == []
 
     @pytest.mark.parametrize(
         ("fault", "said", "timeout_s"),
-        [("silence@1s", "no answer", 0.2), ("exception@1s", "exception 4", 2.0)],
+        [("silence@1s", "no answer", 2.0), ("exception@1s", "exception 4", 20.0)],
     )
     def test_errors_name_the_reader(self, serve, fault, said, timeout_s):
         """The message says which device, where, and what was being done; nothing was written."""
@@ -162,7 +162,7 @@ class TestReader:
         """After an error in the one, neither port is kept."""
         faults = (parse_fault("silence@1s"),)
         served = serve("icp_m7024", "icp_m7017", reader_line="own", faults=faults)
-        device, other = served.device(timeout_s=0.2), served.device(timeout_s=0.2)
+        device, other = served.device(timeout_s=2.0), served.device(timeout_s=2.0)
         device.open(5.0, 1)
         with pytest.raises(DeviceError, match="can't be opened"):
             other.open(5.0, 1)

@@ -136,6 +136,7 @@ def test_loops_take_energy(frequency_hz: float, amplitude: float) -> None:
     assert VACUUM_PERMEABILITY * float(np.diff(flux) @ halves[-2 * n :: 2]) > 0.0
 
 
+@pytest.mark.slow
 def test_is_its_differential_equation() -> None:
     """Another solver of the same shells, written down anew, agrees within 0.2 %, loops and all."""
     rods = replace(RATED, shells=4, cells=4)
