@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
 from typing import Any
 
 from hilctl.base.device import CommandUnit
@@ -13,13 +14,22 @@ from hilctl.identify.settings import IdentifySettings
 from hilctl.identify.workers import Map, one_by_one
 
 WHOLE: tuple[Mapping[str, Any], ...] = (
-    {"kind": "field", "drags": 0},
-    {"kind": "generalised_duhem"},
-    {"kind": "integrated", "offset": True},
+    {"kind": "field", "drags": 0, "plays": 8, "cells": 12, "knots": 16},
+    {"kind": "generalised_duhem", "cells": 12, "across": 8},
 )
-"""What is tried on histories."""
-THEN: Mapping[str, tuple[Mapping[str, Any], ...]] = {"field": ({"kind": "field"},)}
-"""What is tried as well where a kind is the best of these: its small loops may creep."""
+"""What is tried on histories: of each kind a model small enough to be found soon."""
+PLAIN: Mapping[str, Any] = {"kind": "integrated", "offset": True}
+"""What is tried on them as well where none of these does well."""
+WELL_PERCENT = 1.0  # rms of the stroke: small models of the right kind come to a third of it
+IN_FULL: Mapping[str, tuple[Mapping[str, Any], ...]] = {
+    "field": ({"kind": "field", "drags": 0}, {"kind": "field"}),
+    "generalised_duhem": ({"kind": "generalised_duhem"},),
+}
+"""What is tried of a kind whose small model did well, one after the other: the small loops of a
+field may creep."""
+LONGEST = max(map(len, IN_FULL.values()))
+NEAR = 2.0  # times the least error: that of a small model whose kind may still be the best
+WORTH = 0.95  # of an error: what more operators must bring it to; each run takes longer by them
 LOOPS: tuple[Mapping[str, Any], ...] = (
     {"kind": "staged"},
     {"kind": "integrated", "offset": True},
@@ -51,6 +61,9 @@ def choose_kind(
 ) -> tuple[IdentifySettings, HeldOut, tuple[CandidateError, ...]]:
     """Fit each candidate to a part of the data, and take the one that does best on the rest.
 
+    Of histories, small models say which kinds are worth a large one: the errors of the wrong kind
+    are several times those of the right one at any size.
+
     Args:
         records: The data.
         settings: How files were read; of the fit, nothing.
@@ -64,27 +77,69 @@ def choose_kind(
     Raises:
         DataError: There are too few data to leave some out.
     """
-    candidates = WHOLE if any(isinstance(record, History) for record in records) else LOOPS
-    shared = {"whole": settings.whole, "table": settings.table, "points": settings.points}
-    tried: list[tuple[IdentifySettings, HeldOut]] = []
-    errors: list[CandidateError] = []
-    while candidates:
-        names = [", ".join(f"{key} {value}" for key, value in each.items()) for each in candidates]
-        progress(len(errors) / (len(errors) + len(names)), "; ".join(names))
+    whole = any(isinstance(record, History) for record in records)
+    trials = _Trials(tuple(records), settings, unit, run, progress)
+    errors = trials.of(WHOLE if whole else LOOPS)
+    if whole and not any(each.rms_percent < WELL_PERCENT for each in errors):
+        errors += trials.of((PLAIN,))
+    if not errors:
+        raise DataError("too few data to leave some out and choose by them: name a --model")
+    best = min(errors, key=_rms_percent)
+    near = [each for each in errors if each.rms_percent <= NEAR * best.rms_percent]
+    for turn in range(LONGEST if whole else 0):
+        chains = [(IN_FULL.get(each.settings.kind, ())[turn:], each) for each in near]
+        larger = [(chain[0], each) for chain, each in chains if chain]
+        found = trials.of([more for more, _ in larger], [each.held_out.end for _, each in larger])
+        errors += found
+        best = min((best, *(x for x in found if x.rms_percent < WORTH * best.rms_percent)),
+                   key=_rms_percent)  # fmt: skip
+        near = [best] if best in found else []
+    return best.settings, best.held_out, tuple(each.error for each in errors)
+
+
+@dataclass(frozen=True, slots=True)
+class _Tried:
+    name: str
+    settings: IdentifySettings
+    held_out: HeldOut
+
+    @property
+    def rms_percent(self) -> float:
+        return self.held_out.judgement.rms_percent
+
+    @property
+    def error(self) -> CandidateError:
+        return CandidateError(self.name, self.rms_percent, self.held_out.judgement.peak_percent)
+
+
+def _rms_percent(tried: _Tried) -> float:
+    return tried.rms_percent
+
+
+@dataclass(frozen=True, slots=True)
+class _Trials:
+    """Fits of candidates to a part of the records."""
+
+    records: tuple[Record, ...]
+    settings: IdentifySettings
+    unit: CommandUnit
+    run: Map
+    progress: OnProgress
+
+    def of(
+        self, candidates: Sequence[Mapping[str, Any]], starts: Sequence[object | None] = ()
+    ) -> list[_Tried]:
+        """Return how candidates do that can be fitted; searches begin where others ended."""
+        given = self.settings
+        shared = {"whole": given.whole, "table": given.table, "points": given.points}
         trials = [
-            _Trial(tuple(records), IdentifySettings(**{**each, **shared}), unit)
-            for each in candidates
+            _Trial(self.records, IdentifySettings(**{**each, **shared}), self.unit, start)
+            for each, start in zip_longest(candidates, starts)
         ]
-        for trial, name, held_out in zip(trials, names, run(_held_out, trials), strict=True):
-            if held_out is not None:
-                judged = held_out.judgement
-                errors.append(CandidateError(name, judged.rms_percent, judged.peak_percent))
-                tried.append((trial.settings, held_out))
-        if not tried:
-            raise DataError("too few data to leave some out and choose by them: name a --model")
-        best = min(tried, key=lambda each: each[1].judgement.rms_percent)
-        candidates = THEN.get(best[0].kind, ()) if candidates is WHOLE else ()
-    return *best, tuple(errors)
+        names = [", ".join(f"{key} {value}" for key, value in each.items()) for each in candidates]
+        self.progress(0.0, "; ".join(names))
+        found = zip(names, trials, self.run(_held_out, trials), strict=True)
+        return [_Tried(name, trial.settings, out) for name, trial, out in found if out is not None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,7 +147,10 @@ class _Trial:
     records: tuple[Record, ...]
     settings: IdentifySettings
     unit: CommandUnit
+    start: object | None
 
 
 def _held_out(trial: _Trial) -> HeldOut | None:
-    return held_out_error(trial.records, trial.settings, trial.unit, one_by_one, ignore_progress)
+    return held_out_error(
+        trial.records, trial.settings, trial.unit, one_by_one, ignore_progress, trial.start
+    )

@@ -158,7 +158,7 @@ def identify_records(
     created = datetime.now(UTC).isoformat(timespec="seconds")
     fit = fit_model(
         records, chosen, time.perf_counter, unit=unit, source=source, created=created,
-        progress=progress, run=run,
+        progress=progress, run=run, start=None if held_out is None else held_out.end,
     )  # fmt: skip
     if validate:
         judged = judge(fit.model, validate, creep=settings.creep)

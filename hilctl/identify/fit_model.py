@@ -68,6 +68,7 @@ def fit_model(
     created: str = "",
     progress: OnProgress = ignore_progress,
     run: Map = one_by_one,
+    start: object | None = None,
 ) -> FittedModel:
     """Fit a model's parameters to steady loops and time histories.
 
@@ -86,13 +87,14 @@ def fit_model(
         created: Date and time in ISO 8601, UTC, for the provenance.
         progress: Called with what is being done.
         run: Follows starts that do not depend on each other.
+        start: Where the search begins, see :class:`~hilctl.identify.job.FitJob`.
 
     Raises:
         DataError: The data can't be used as asked, or there are none.
     """
     begin = clock()
     data, few = FitData(records, unit), search_data(records, settings.kind, unit)
-    found = CATALOGUE[settings.kind].fit(FitJob(few, settings, run, progress))
+    found = CATALOGUE[settings.kind].fit(FitJob(few, settings, run, progress, start))
     judged = judge(found.model, data, creep=settings.creep)
     provenance = Provenance(
         source=tuple(source),

@@ -45,11 +45,13 @@ class HeldOut:
         judgement: The errors.
         records: The data.
         how: Where they come from, for people.
+        end: Where the last of the fits ended, for one to all the data to go on from.
     """
 
     judgement: Judgement
     records: tuple[Record, ...]
     how: str
+    end: object | None = None
 
     def to_mapping(self) -> dict[str, Any]:
         """Return the errors as plain mappings, lists and numbers, for JSON."""
@@ -61,6 +63,7 @@ class _Trial:
     fold: Fold
     settings: FitSettings
     unit: CommandUnit
+    start: object | None
 
 
 def folds_of(records: Sequence[Record]) -> list[Fold]:
@@ -94,6 +97,7 @@ def held_out_error(
     unit: CommandUnit,
     run: Map,
     progress: OnProgress,
+    start: object | None = None,
 ) -> HeldOut | None:
     """Fit with parts of the data left out, and judge on these; None where too few are left.
 
@@ -103,32 +107,35 @@ def held_out_error(
         unit: Unit of the command.
         run: Runs fits that do not depend on each other.
         progress: Called with what is being done.
+        start: Where fits begin, see :class:`~hilctl.identify.job.FitJob`.
     """
     lean = settings.model_copy(update={"starts": 1})
-    trials = [_Trial(fold, lean, unit) for fold in folds_of(records)]
+    trials = [_Trial(fold, lean, unit, start) for fold in folds_of(records)]
     progress(0.0, f"{len(trials)} fits with data left out")
     done = [
-        (trial.fold.held_out, modelled)
-        for trial, modelled in zip(trials, run(_modelled_um, trials), strict=True)
-        if modelled is not None
+        (trial.fold.held_out, *found)
+        for trial, found in zip(trials, run(_tried, trials), strict=True)
+        if found is not None
     ]
     if not done:
         return None
-    held_out = tuple(record for out, _ in done for record in out)
-    responses_um = np.concatenate([modelled for _, modelled in done])
+    held_out = tuple(record for out, _, _ in done for record in out)
+    responses_um = np.concatenate([modelled for _, modelled, _ in done])
     parts = "the last parts of histories" if isinstance(held_out[-1], History) else "loops"
     how = f"{len(held_out)} of {len(records)} {parts}, left out of the fit in turn"
-    return HeldOut(judgement_of(FitData(held_out, unit), responses_um), held_out, how)
+    judgement = judgement_of(FitData(held_out, unit), responses_um)
+    return HeldOut(judgement, held_out, how, done[-1][2])
 
 
-def _modelled_um(trial: _Trial) -> F64 | None:
+def _tried(trial: _Trial) -> tuple[F64, object | None] | None:
+    """Return what a model gives of the data that it did not see, and where its search ended."""
     data = search_data(trial.fold.fitted, trial.settings.kind, trial.unit)
     try:
-        found = CATALOGUE[trial.settings.kind].fit(FitJob(data, trial.settings))
+        found = CATALOGUE[trial.settings.kind].fit(FitJob(data, trial.settings, start=trial.start))
     except DataError:  # what is left is too little for this kind of fit; all of it need not be
         return None
     judged = judge(found.model, trial.fold.held_out, creep=trial.settings.creep)
-    return np.concatenate(judged.modelled_um)
+    return np.concatenate(judged.modelled_um), found.end
 
 
 def _halved(record: Record) -> tuple[Record, Record | None]:

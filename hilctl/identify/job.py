@@ -26,12 +26,15 @@ class FitJob:
         settings: The choices; only those of the kind count.
         run: Runs what does not depend on each other.
         progress: Called with what is being done.
+        start: ``end`` of a fit of this kind to other data, or of another size, to go on from;
+            kinds that have no use for it, and ends of others, are found from the beginning.
     """
 
     data: FitData
     settings: FitSettings
     run: Map = one_by_one
     progress: OnProgress = ignore_progress
+    start: object | None = None
 
     @property
     def least(self) -> float:
@@ -70,6 +73,7 @@ class FoundModel:
         starts: What became of each start of the search; empty where there was none.
         standard_errors: Of the parameters, by the same names; empty where a fit has none.
         at_bound: Parameters that stand on a bound: not found, but as far as they may go.
+        end: Where the search ended, for one that goes on from there; None of kinds without.
     """
 
     model: HysteresisModel
@@ -78,3 +82,4 @@ class FoundModel:
     starts: tuple[StartOutcome, ...] = ()
     standard_errors: dict[str, float] = field(default_factory=dict)
     at_bound: tuple[str, ...] = ()
+    end: object | None = None

@@ -24,6 +24,8 @@ _PLAIN = ("ppi", "spi", "rdpi")
 _SEARCHED = (*_PLAIN, "integrated")
 _PLAYS = (*_SEARCHED, "staged")
 
+_HISTORIES = {"field", "generalised_duhem", "ppi", "spi"}
+
 _PPI: Choices = {"plays": 10}
 PUBLISHED: Mapping[str, Choices] = {
     "ppi": _PPI,
@@ -246,8 +248,11 @@ class IdentifySettings(FitSettings):
     @model_validator(mode="before")
     @classmethod
     def _histories(cls, given: Any) -> Any:
-        """Whole histories for a kind whose small loops remember the large ones before them."""
-        if isinstance(given, dict) and given.get("kind") in {"field", "generalised_duhem"}:
+        """Whole histories for a kind whose small loops remember the large ones before them.
+
+        And for those that know no rate: their range must reach to where a run begins, at rest.
+        """
+        if isinstance(given, dict) and given.get("kind") in _HISTORIES:
             return {"whole": True, **given}
         return given
 

@@ -1,19 +1,24 @@
 """From recordings and tables to the data of an identification."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
 
+from hilctl.base.arrays import F64, I64
 from hilctl.base.device import CommandUnit
 from hilctl.base.errors import DataError, InputError
 from hilctl.base.samples import Flag
-from hilctl.identify.data.cycles import find_cycles, loops_from_recording
+from hilctl.identify.data.cycles import find_cycles, loops_from_pieces
 from hilctl.identify.data.records import History, Record
 from hilctl.identify.data.tables import read_table
 from hilctl.identify.settings import IdentifySettings
 from hilctl.recording.data import Recording
-from hilctl.recording.reader import read
+from hilctl.recording.reader import Pieces
+
+MOST_WHOLE = 20_000_000
+"""Samples of a run that is fitted as a whole; a fit takes some 100 bytes and 10 us of each."""
 
 
 def load_records(
@@ -39,22 +44,24 @@ def load_records(
     units: set[CommandUnit] = set()
     left_out = settings.leave_out
     for path in paths:
-        recording = read(path) if path.suffix.lower() == ".mcap" else None
-        loops = recording is not None and not settings.whole and recording.segments
+        pieces = iter(Pieces(path)) if path.suffix.lower() == ".mcap" else iter(())
+        first = next(pieces, None)
+        loops = first is not None and not settings.whole and first.segments
         labels = [segment.label for segment in loops] if loops else [path.name]
         known += labels
         kept = [label for label in labels if not label.startswith(left_out)]
-        if recording is not None:
-            units.add(recording.command_unit)
+        if first is not None:
+            units.add(first.command_unit)
         if not kept:
             continue
-        if recording is None:
+        if first is None:
             records.append(_from_table(path, settings, lag_samples))
         elif settings.whole:
-            records.append(history_from_recording(recording))
+            records.append(history_from_pieces(chain([first], pieces)))
         else:
             # Before their cycles are looked for: one that has none can be left out too.
-            records += loops_from_recording(recording, settings.points, kept if left_out else ())
+            chosen = kept if left_out else ()
+            records += loops_from_pieces(chain([first], pieces), settings.points, chosen)
     if len(units) > 1:
         raise InputError("recordings of devices driven in A and in V can't be fitted together")
     _check_left_out(settings.leave_out, known, records)
@@ -75,33 +82,57 @@ def _check_left_out(labels: Sequence[str], known: Sequence[str], kept: Sequence[
 
 
 def history_from_recording(recording: Recording) -> History:
+    """Return a run's waveform as a whole, see :func:`history_from_pieces`."""
+    return history_from_pieces([recording])
+
+
+def history_from_pieces(pieces: Iterable[Recording]) -> History:
     """Return a run's waveform as a whole, from rest, without the ramp at its end.
 
+    Args:
+        pieces: The run, see :class:`hilctl.recording.reader.Pieces`.
+
     Raises:
-        DataError: Samples are missing or have no displacement, or the run ramped to its waveform
-            from another output, so the hysteresis can't be followed from rest.
+        DataError: Samples are missing or have no displacement, the run is too long to be fitted
+            as a whole, or it ramped to its waveform from another output, so the hysteresis can't
+            be followed from rest.
     """
-    samples = recording.samples
-    conditioned = (samples.flags & Flag.CONDITION.value) != 0
-    if conditioned.any():  # what was before its conditioning is forgotten
-        samples = samples.rows(slice(int(np.argmax(conditioned)), None))
-    rows = (samples.flags & Flag.RAMP.value) == 0
-    if samples.index.size and samples.index[0] == 0 and not rows[0]:
+    kept: list[tuple[I64, F64, F64]] = []
+    conditioned = size = begins_at = 0
+    ramped = False
+    for piece in pieces:
+        samples = piece.samples
+        condition = (samples.flags & Flag.CONDITION.value) != 0
+        if condition.any() and not conditioned:  # what was before its conditioning is forgotten
+            samples = samples.rows(slice(int(np.argmax(condition)), None))
+            kept, size, begins_at, ramped = [], 0, int(samples.index[0]), False
+        conditioned += int(np.count_nonzero(condition))  # it makes the state, and is not judged
+        rows = (samples.flags & Flag.RAMP.value) == 0
+        ramped |= bool(rows.size) and samples.index[0] == 0 and not rows[0]
+        kept.append((samples.index[rows], samples.command[rows], samples.displacement_um[rows]))
+        size += int(np.count_nonzero(rows))
+        _check_length(piece, size)
+    if ramped:
         raise DataError(
-            f"{recording.path}: begins with a ramp from where the output was, so the actuator was "
+            f"{piece.path}: begins with a ramp from where the output was, so the actuator was "
             "not at rest: leave out --whole to use its steady cycles"
         )
-    index, displacement_um = samples.index[rows], samples.displacement_um[rows]
-    begins_at = int(samples.index[0]) if conditioned.any() else 0
+    index, command, displacement_um = (np.concatenate(each) for each in zip(*kept, strict=True))
     whole = index.size > 0 and index[0] == begins_at == index[-1] + 1 - index.size
     if not whole or not np.isfinite(displacement_um).all():
         raise DataError(
-            f"{recording.path}: samples are missing, so it can't be judged as a whole: "
+            f"{piece.path}: samples are missing, so it can't be judged as a whole: "
             "leave out --whole to use its steady cycles"
         )
-    command = np.ascontiguousarray(samples.command[rows])
-    ignore = int(np.count_nonzero(conditioned))  # it makes the state, and is not judged
-    return History(recording.path.name, command, displacement_um, recording.sample_rate_hz, ignore)
+    return History(piece.path.name, command, displacement_um, piece.sample_rate_hz, conditioned)
+
+
+def _check_length(recording: Recording, size: int) -> None:
+    if size > MOST_WHOLE:
+        raise DataError(
+            f"{recording.path}: has more than {MOST_WHOLE:,} samples, too many to be fitted as a "
+            "whole: leave out --whole to use its steady cycles, or record a shorter run"
+        )
 
 
 def _from_table(path: Path, settings: IdentifySettings, lag_samples: int) -> Record:

@@ -36,7 +36,8 @@ def read_table(
             is not even, or not just one of ``time_column`` and ``rate_hz`` is given.
     """
     if (time_column is None) == (rate_hz is None):
-        raise DataError(f"{path}: give either a time column or a rate in Hz, and not both")
+        given = "neither" if rate_hz is None else "both"
+        raise DataError(f"{path}: give its time column or its rate in Hz: got {given}")
     wanted = [command_column, displacement_column]
     wanted += [] if time_column is None else [time_column]
     table = TextTable(path)

@@ -6,7 +6,8 @@ prepared.py  records as the fit needs them: thinned in time, displacement withou
 columns.py   kernels: which samples matter, how far loops go, and what plays of each cell give
 rows.py      which samples are rows of a fit, and how much each of them counts
 weights.py   densities and output curve by one non-negative least-squares problem
-stages.py    losses, coupling, structure and delay: in a row for the search, out of it for a model
+stages.py    losses, structure and delay: in a row for the search, out of it for a model
 descent.py   a sum of squares followed down
+polish.py    stages and thresholds together, the weights following
 search.py    from a few starts to the stages, the weights following
 """

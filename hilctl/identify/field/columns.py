@@ -174,6 +174,28 @@ def _add_splines(u: float, lowest: float, width: float, sign: float, out: F64) -
     out[j + 2] += width * sign * (cube / 6.0 + 0.5 * above)
 
 
+@kernel("UniTuple(float64, 2)(float64, float64, float64, float64[::1], float64[::1])")
+def _risen(u: float, lowest: float, width: float, s: F64, edges: F64) -> tuple[float, float]:
+    """Return the integral of weighted quadratic splines up to u, and their sum there.
+
+    Args:
+        u: Where.
+        lowest: Lower end of the first piece.
+        width: Of a piece.
+        s: float64[c], weights of the splines.
+        edges: float64[c - 1], the integral at the edges of the pieces.
+    """
+    pieces = s.size - 2
+    place = (u - lowest) / width
+    j = int(min(max(math.floor(place), 0.0), pieces - 1.0))
+    t = min(max(place - j, 0.0), 1.0)
+    slope = 0.5 * s[j] * (1.0 - t) ** 2 + s[j + 1] * (0.5 + t - t * t) + 0.5 * s[j + 2] * t * t
+    third = t * t * t / 3.0
+    value = 0.5 * s[j] * (t - t * t + third) + s[j + 1] * (0.5 * (t + t * t) - third)
+    beyond = place - j - t
+    return edges[j] + width * (value + 0.5 * s[j + 2] * third + slope * beyond), slope
+
+
 @kernel("void(float64[::1], int64[::1], float64[::1], float64, float64, int64, float64[:, ::1])")
 def play_columns(
     u: F64, rows: I64, thresholds: F64, lowest: float, width: float, splines: int, out: F64
@@ -203,3 +225,52 @@ def play_columns(
             columns = out[row, first : first + splines]
             columns[:] = rest
             _add_splines(held, lowest, width, 1.0, columns)
+
+
+@kernel(
+    "void(float64[::1], int64[::1], float64[::1], float64, float64, float64[:, ::1],"
+    " float64[::1], float64[:, ::1])"
+)
+def plays_given(
+    u: F64,
+    rows: I64,
+    thresholds: F64,
+    lowest: float,
+    width: float,
+    weights: F64,
+    total: F64,
+    by: F64,
+) -> None:
+    """Work out what plays of known weights give together, and what it changes by with thresholds.
+
+    A search needs the columns of :func:`play_columns` where it looks for weights alone.
+
+    Args:
+        u: See :func:`play_columns`.
+        rows: See :func:`play_columns`.
+        thresholds: See :func:`play_columns`.
+        lowest: See :func:`play_columns`.
+        width: See :func:`play_columns`.
+        weights: float64[p, c], of the splines.
+        total: float64[N], filled.
+        by: float64[N, p], filled with the derivatives of the total by each threshold.
+    """
+    pieces = weights.shape[1] - 2
+    edges = np.empty(pieces + 1)
+    total[:] = 0.0
+    for i in range(thresholds.size):
+        s = weights[i]
+        edges[0] = 0.0
+        for j in range(pieces):
+            edges[j + 1] = edges[j] + width / 6.0 * (s[j] + 4.0 * s[j + 1] + s[j + 2])
+        held, side, k = 0.0, 0.0, 0
+        rest = _risen(0.0, lowest, width, s, edges)[0]
+        for row in range(rows.size):
+            while k <= rows[row]:
+                low, high = u[k] - thresholds[i], u[k] + thresholds[i]
+                side = -1.0 if held < low else (1.0 if held > high else side)
+                held = max(min(held, high), low)
+                k += 1
+            value, slope = _risen(held, lowest, width, s, edges)
+            total[row] += value - rest
+            by[row, i] = slope * side

@@ -10,6 +10,7 @@ from hilctl.identify.staged.descend import bounded_solution
 
 STEPS, TRIALS = 5, 8  # most that are taken, and that are tried
 SETTLED = 0.02  # of a unit: a step that ends the search
+ENOUGH = 3e-3  # of the sum of squares: a step that gains less ends it as well
 HELD = 1e-6  # of the first sum of squares: what a unit away from the start costs
 
 
@@ -67,10 +68,12 @@ def settle(
             return tried
         before = place.squares + held * float(away @ away)
         away = (tried - first) / unit
-        if sum_of(tried) + held * float(away @ away) < before:
-            x, place, damping, taken = tried, place_of(tried), 0.1 * damping, taken + 1
-            if taken == STEPS:
+        after = sum_of(tried) + held * float(away @ away)
+        if after < before:
+            x, damping, taken = tried, 0.1 * damping, taken + 1
+            if taken == STEPS or before - after < ENOUGH * before:
                 break
+            place = place_of(x)
         else:
             damping = max(8.0 * damping, 1e-3)
     return x

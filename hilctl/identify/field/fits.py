@@ -18,11 +18,11 @@ FINER = 8  # cells of the model's tables to each piece of a spline
 
 
 def fit_field(job: FitJob) -> FoundModel:
-    """Fit plays and drags of an effective field, losses, coupling, structure and delay.
+    """Fit plays and drags of a field, losses, structure and delay.
 
     Raises:
-        DataError: There are steady loops among the data: they leave coupling, curve and losses
-            undetermined, and what is found then depends on rounding.
+        DataError: There are steady loops among the data: they leave curve and losses undetermined,
+            and what is found then depends on rounding.
     """
     loops = [record.label for record in job.data.records if isinstance(record, SteadyLoop)]
     if loops:
@@ -33,10 +33,14 @@ def fit_field(job: FitJob) -> FoundModel:
     settings = job.settings
     data = Prepared([r for r in job.data.records if isinstance(r, History)])
     size = Size(settings.plays, settings.drags, settings.cells, settings.knots)
-    found = FieldSearch(data, size, job.least).find(Stages(), job.progress)
+    search = FieldSearch(data, size, job.least)
+    if isinstance(job.start, FieldEnd):
+        found = search.go_on(job.start)
+    else:
+        found = search.find(Stages(), job.progress)
     known = _parameters(found)
     numbers = len(known) + int((found.weights.slopes > 0.0).sum()) + settings.knots
-    return FoundModel(_model(job, found), numbers, known)
+    return FoundModel(_model(job, found), numbers, known, end=found)
 
 
 def _model(job: FitJob, found: FieldEnd) -> StagedModel:
@@ -49,7 +53,6 @@ def _model(job: FitJob, found: FieldEnd) -> StagedModel:
         lowest=grid.lowest,
         cell=grid.piece / FINER,
         slopes=tuple(tuple(line) for line in lines),
-        coupling=known.coupling,
         curve=OutputCurve(
             operators_um=tuple(weights.curve.operators.tolist()),
             displacement_um=tuple(weights.curve.displacement_um.tolist()),
@@ -80,7 +83,6 @@ def _parameters(found: FieldEnd) -> dict[str, float]:
     known = found.known
     return {
         **known.losses.model_dump(),
-        "coupling": known.coupling,
         "natural_hz": 0.5 / (math.pi * known.radian_s),
         "damping_ratio": known.damping_ratio,
         "delay_s": known.delay_s,

@@ -12,7 +12,7 @@ import numpy as np
 from hilctl.base.arrays import F64, I64
 from hilctl.identify.field.descent import Place, settle
 from hilctl.identify.field.stages import HIGH, LOW, NAMES, STEP, row
-from hilctl.identify.field.weights import Equations, Grid, by_threshold, table
+from hilctl.identify.field.weights import Equations, Grid, outputs, table
 
 TRIED = 0.2  # of a unit: change that slopes are taken by; kinks of single rows are smoothed
 MOVES = 0.1  # of the way to the next: change of a threshold that makes about as much difference
@@ -39,7 +39,7 @@ class Polish:
     """A sum of squares over stages and thresholds.
 
     Args:
-        rows_of: From stages, float64[10], to the rows.
+        rows_of: From stages, float64[9], to the rows.
         paths: For each record int64[N_i], the samples that are rows.
         grid: The operators; their thresholds are where to start.
         least: Smallest slope of the first line, um per command unit.
@@ -49,6 +49,7 @@ class Polish:
         self, rows_of: Callable[[F64], Bare], paths: Sequence[I64], grid: Grid, least: float
     ) -> None:
         self._rows_of, self._paths, self._grid, self._least = rows_of, paths, grid, least
+        self._tried: tuple[F64, Equations, Bare] | None = None
 
     def follow(self, stages: F64) -> tuple[F64, Grid]:
         """Return the stages and the operators where the sum is least."""
@@ -57,8 +58,8 @@ class Polish:
         above = np.append(below[1:], below[-1:])
         unit = np.concatenate((row(STEP), MOVES * below))
         # Each goes less than halfway to its neighbours, so that they stay in order.
-        low = np.concatenate((row(replace(LOW, coupling=0.0)), first - ROOM * below))
-        high = np.concatenate((row(replace(HIGH, coupling=0.0)), first + ROOM * above))
+        low = np.concatenate((row(LOW), first - ROOM * below))
+        high = np.concatenate((row(HIGH), first + ROOM * above))
         x = settle(
             lambda point: self._equations(point)[0].solve().squares,
             lambda point: self._place(point, unit, high),
@@ -71,21 +72,26 @@ class Polish:
     def _laid(self, x: F64) -> Grid:
         return replace(self._grid, thresholds=np.append(0.0, x[STAGES:]))
 
-    def _equations(self, x: F64) -> tuple[Equations, F64, Bare]:
-        rows, grid = self._rows_of(x[:STAGES]), self._laid(x)
-        columns = table(rows.fields, self._paths, grid)
-        return Equations(columns, rows.y, grid, self._least, rows.scale), columns, rows
+    def _equations(self, x: F64) -> tuple[Equations, Bare]:
+        """Return the equations of a point: a step is tried first, and taken from there."""
+        if self._tried is None or not np.array_equal(self._tried[0], x):
+            rows, grid = self._rows_of(x[:STAGES]), self._laid(x)
+            columns = table(rows.fields, self._paths, grid)
+            equations = Equations(columns, rows.y, grid, self._least, rows.scale)
+            self._tried = x.copy(), equations, rows
+        return self._tried[1:]
 
     def _place(self, x: F64, unit: F64, high: F64) -> Place:
-        equations, columns, rows = self._equations(x)
+        equations, rows = self._equations(x)
         grid, found = self._laid(x), equations.solve()
-        here = found.errors_of(columns, rows.y)
-        changes = np.empty((here.size, x.size))
+        changes = np.empty((rows.y.size, x.size))
+        given, changes[:, STAGES:] = outputs(rows.fields, self._paths, grid, found.slopes)
+        here = found.errors_of(given, rows.y)
         for i in range(STAGES):
             there = x.copy()
             there[i] += TRIED * unit[i] if x[i] + TRIED * unit[i] <= high[i] else -TRIED * unit[i]
             moved = self._rows_of(there[:STAGES])
-            errors = found.errors_of(table(moved.fields, self._paths, grid), moved.y)
+            given, _ = outputs(moved.fields, self._paths, grid, found.slopes)
+            errors = found.errors_of(given, moved.y)
             changes[:, i] = (errors * moved.scale / rows.scale - here) / (there[i] - x[i])
-        changes[:, STAGES:] = by_threshold(rows.fields, self._paths, grid, found.slopes)
         return equations.place(here, changes)

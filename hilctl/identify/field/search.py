@@ -5,21 +5,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hilctl.base.arrays import F64
-from hilctl.identify.field.descent import Place, settle
-from hilctl.identify.field.polish import TRIED, Bare, Polish
+from hilctl.identify.field.polish import Bare, Polish
 from hilctl.identify.field.prepared import Prepared
 from hilctl.identify.field.rows import Rows, chosen
 from hilctl.identify.field.stages import (
     HIGH,
-    LOW,
-    NAMES,
-    STEP,
     Physical,
     Stages,
     physical,
     row,
     signals,
     stages_in,
+    stages_of,
 )
 from hilctl.identify.field.weights import Curve, Grid, Weights, solve, table
 from hilctl.identify.job import OnProgress
@@ -52,11 +49,21 @@ class Size:
 
 @dataclass(frozen=True, slots=True)
 class FieldEnd:
-    """What was found."""
+    """What was found, and what another search goes on from.
+
+    Attributes:
+        known: The stages.
+        grid: The operators.
+        weights: Of the operators, and the curve.
+        met: The curve by which errors were judged, by displacement with its offset.
+        widest: Largest threshold that is worth its place, of half the span.
+    """
 
     known: Physical
     grid: Grid
     weights: Weights
+    met: Curve | None
+    widest: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,13 +99,18 @@ class FieldSearch:
         found = self._descended(first, progress, 0.0)
         if _at_bound(found.stages):
             # A slow record says little of the structure: a soft one can bend what the hysteresis
-            # should, and takes the coupling along.
+            # should.
             for k, radian in enumerate(STIFFER, start=1):
                 start = replace(first, radian=radian, delay=0.3 * radian)
                 other = self._descended(start, progress, 1.0 - 0.5**k)
                 found = min(found, other, key=lambda each: each.error)
         self._curve, self._grid, self._widest = found.curve, found.grid, found.widest
-        return self._end(row(found.stages))
+        return self._end(row(found.stages), None)
+
+    def go_on(self, end: FieldEnd) -> FieldEnd:
+        """Return where a search leads that begins where one of other operators or data ended."""
+        self._curve, self._grid, self._widest = end.met, end.grid, end.widest
+        return self._end(row(stages_of(end.known, self._data)), end.grid)
 
     def _descended(self, first: Stages, progress: OnProgress, done: float) -> "_Descent":
         """Return where the best of some starts leads."""
@@ -114,7 +126,7 @@ class FieldSearch:
             self._learn(x, self._chosen())
             self._lay(stages_in(x), coarse)
             self._learn(x, self._chosen())
-            x = self._followed(x, self._chosen())
+            x, _ = self._polish(x, self._chosen())
             self._learn(x, self._chosen())
         error = float(np.sqrt(np.mean(self._errors(x, self._chosen()) ** 2)))
         return _Descent(error, stages_in(x), self._curve, self._grid, self._widest)
@@ -133,74 +145,35 @@ class FieldSearch:
         errors = self._errors(row(stages), self._chosen())
         return float(np.sqrt(np.mean(errors**2))), stages
 
-    def _followed(self, x: F64, rows: Rows) -> F64:
-        size = self._data.stroke_um
-
-        def sum_of(point: F64) -> float:
-            return float(np.mean((self._errors(point, rows) / size) ** 2))
-
-        def place_of(point: F64) -> Place:
-            here = self._errors(point, rows) / size
-            slopes = self._slopes(point, here, rows)
-            normal, slope = slopes.T @ slopes, slopes.T @ here
-            return Place(float(np.mean(here**2)), slope / here.size, normal / here.size)
-
-        return settle(sum_of, place_of, x, (row(LOW), row(HIGH)), row(STEP))
-
-    def _polished(self, x: F64, rows: Rows) -> F64:
-        """Return better stages; better thresholds stand in the grid."""
+    def _polish(self, x: F64, rows: Rows) -> tuple[F64, Grid]:
+        """Return better stages and thresholds."""
 
         def bare(stages: F64) -> Bare:
-            fields, y, known = self._bare(stages, rows)
-            return Bare(fields, y, self._swelling(fields, known) * self._scale(y, rows))
+            fields, y = self._bare(stages, rows)
+            return Bare(fields, y, self._scale(y, rows))
 
-        x, self._grid = Polish(bare, rows.samples, self._laid(), self._least).follow(x)
-        return x
-
-    def _slopes(self, x: F64, here: F64, rows: Rows) -> F64:
-        out = np.empty((here.size, len(NAMES)))
-        for i, step in enumerate(TRIED * row(STEP)):
-            there = x.copy()
-            there[i] += step if x[i] + step <= row(HIGH)[i] else -step
-            errors = self._errors(there, rows) / self._data.stroke_um
-            out[:, i] = (errors - here) / (there[i] - x[i])
-        return out
+        return Polish(bare, rows.samples, self._laid(), self._least).follow(x)
 
     def _errors(self, x: F64, rows: Rows) -> F64:
-        """Return weighted errors of the displacement that commands would give: float64[N], in um.
-
-        The effective field has the measured output in it. An error of the operators' is one of the
-        model by as much more as it comes back through the coupling; without that, a coupling that
-        explains the output by itself would look best.
-        """
-        fields, y, known = self._bare(x, rows)
-        found = self._weights(fields, y, rows)
-        return found.errors_um * self._swelling(fields, known) * rows.scale
-
-    def _swelling(self, fields: list[F64], known: Physical) -> float:
-        reach = max(float(np.ptp(u)) for u in fields)
-        alone = max(reach - known.coupling * self._data.stroke_um, 0.1 * reach)
-        return reach / alone
+        """Return weighted errors of the displacement at rows: float64[N], in um."""
+        return self._solved(x, rows).errors_um * rows.scale
 
     def _solved(self, x: F64, rows: Rows) -> Weights:
-        fields, y, _ = self._bare(x, rows)
-        return self._weights(fields, y, rows)
-
-    def _weights(self, fields: list[F64], y: F64, rows: Rows) -> Weights:
+        fields, y = self._bare(x, rows)
         grid = self._laid()
         return solve(table(fields, rows.samples, grid), y, grid, self._least, self._scale(y, rows))
 
-    def _bare(self, x: F64, rows: Rows) -> tuple[list[F64], F64, Physical]:
-        """Return effective fields, displacements of the rows, and what they are worked out by."""
-        fields, bare, known = self._signals(x)
+    def _bare(self, x: F64, rows: Rows) -> tuple[list[F64], F64]:
+        """Return fields, and displacements of the rows."""
+        fields, bare = self._signals(x)
         y = [b[samples] for b, samples in zip(bare, rows.samples, strict=True)]
-        return fields, np.concatenate(y), known
+        return fields, np.concatenate(y)
 
-    def _signals(self, x: F64) -> tuple[list[F64], list[F64], Physical]:
+    def _signals(self, x: F64) -> tuple[list[F64], list[F64]]:
         known = physical(stages_in(x), self._data)
         span = self._grid.width * self._grid.cells if self._grid else 2.0 * self._data.reach
         both = [signals(run, known, self._curve, span) for run in self._data.runs]
-        return [u for u, _ in both], [y for _, y in both], known
+        return [u for u, _ in both], [y for _, y in both]
 
     def _scale(self, y: F64, rows: Rows) -> F64:
         """Return what makes errors of the operators' weighted ones of the displacement."""
@@ -236,8 +209,8 @@ class FieldSearch:
         return Curve(0.5 * (found.curve.operators + self._curve.operators_of(y)), y)
 
     def _lay(self, stages: Stages, size: Size) -> None:
-        """Lay the cells over the effective field that the stages give."""
-        fields, _, _ = self._signals(row(stages))
+        """Lay the cells over the field that the stages give."""
+        fields, _ = self._signals(row(stages))
         low = min(float(u.min()) for u in fields)
         high = max(float(u.max()) for u in fields)
         span = high - low
@@ -251,16 +224,19 @@ class FieldSearch:
     def _chosen(self, most: int = SEARCH_ROWS) -> Rows:
         return chosen([run.motion for run in self._data.runs], most)
 
-    def _end(self, x: F64) -> FieldEnd:
+    def _end(self, x: F64, before: Grid | None) -> FieldEnd:
         rows = self._chosen(POLISH_ROWS)
-        for _ in range(2):
+        kept = before is not None and before.thresholds.size == self._size.plays
+        for _ in range(1 if kept else 2):
             self._lay(stages_in(x), self._size)
+            if kept and before is not None:
+                self._grid = replace(self._laid(), thresholds=before.thresholds)
             self._learn(x, rows)
-        x = self._polished(x, rows)
-        rows = self._chosen(FINAL_ROWS)
+        x, self._grid = self._polish(x, rows)
         self._learn(x, rows)
-        found = self._solved(x, rows)
-        return FieldEnd(physical(stages_in(x), self._data), self._laid(), found)
+        found = self._solved(x, self._chosen(FINAL_ROWS))
+        known = physical(stages_in(x), self._data)
+        return FieldEnd(known, self._laid(), found, self._curve, self._widest)
 
 
 def _at_bound(stages: Stages) -> bool:

@@ -1,4 +1,4 @@
-"""Losses, coupling, structure and delay: in a row for the search, out of it for a model."""
+"""Losses, structure and delay: in a row for the search, out of it for a model."""
 
 import math
 from dataclasses import dataclass, fields
@@ -23,7 +23,6 @@ class Stages:
         growth: Of the losses with themselves.
         bend: The same, squared.
         excess: Of the losses' square root.
-        coupling: Effective field of half the stroke.
         radian: 1 / w of the structure.
         damping: Its damping ratio.
         delay: Transport delay.
@@ -35,7 +34,6 @@ class Stages:
     growth: float = 0.1
     bend: float = 0.1
     excess: float = 0.01
-    coupling: float = 0.0
     radian: float = 0.1
     damping: float = 0.2
     delay: float = 0.03
@@ -44,14 +42,14 @@ class Stages:
 SHORTEST_S = 1e-9  # of lags
 
 NAMES = tuple(field.name for field in fields(Stages))
-LOW = Stages(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -0.95, 0.01, 0.02, 0.0)
-HIGH = Stages(2.0, 2.0, 0.3, 10.0, 20.0, 0.5, 0.6, 0.3, 2.0, 0.3)
-STEP = Stages(0.02, 0.02, 0.01, 0.05, 0.05, 0.01, 0.05, 0.02, 0.05, 0.01)
+LOW = Stages(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.01, 0.02, 0.0)
+HIGH = Stages(2.0, 2.0, 0.3, 10.0, 20.0, 0.5, 0.3, 2.0, 0.3)
+STEP = Stages(0.02, 0.02, 0.01, 0.05, 0.05, 0.01, 0.02, 0.05, 0.01)
 """Bounds, and changes that make about as much difference as each other."""
 
 
 def row(stages: Stages) -> F64:
-    """Return stages as float64[10]."""
+    """Return stages as float64[9]."""
     return np.array([getattr(stages, name) for name in NAMES])
 
 
@@ -65,7 +63,6 @@ class Physical:
     """The same in s, um and the unit of the command; and the lag of small, slow changes in all."""
 
     losses: FieldLosses
-    coupling: float
     radian_s: float
     damping_ratio: float
     delay_s: float
@@ -86,7 +83,6 @@ def physical(stages: Stages, data: Prepared) -> Physical:
     )
     return Physical(
         losses,
-        stages.coupling * gain,
         stages.radian * unit_s,
         stages.damping,
         stages.delay * unit_s,
@@ -94,15 +90,34 @@ def physical(stages: Stages, data: Prepared) -> Physical:
     )
 
 
+def stages_of(known: Physical, data: Prepared) -> Stages:
+    """Undo :func:`physical`, for records that may be others; within the bounds of a search."""
+    unit_s = 1.0 / (2.0 * math.pi * data.top_hz)
+    gain = 2.0 * data.reach / data.stroke_um
+    losses = known.losses
+    found = Stages(
+        field=losses.field_s / unit_s,
+        output=losses.output_s / (unit_s * gain),
+        decay=losses.decay_s / unit_s,
+        growth=losses.growth * data.reach,
+        bend=losses.bend * data.reach**2,
+        excess=losses.excess / math.sqrt(data.reach),
+        radian=known.radian_s / unit_s,
+        damping=known.damping_ratio,
+        delay=known.delay_s / unit_s,
+    )
+    return stages_in(np.clip(row(found), row(LOW), row(HIGH)))
+
+
 def signals(run: Run, known: Physical, curve: Curve | None, span: float) -> tuple[F64, F64]:
-    """Return effective field and bare displacement of a record: float64[n] each.
+    """Return field that is left and bare displacement of a record: float64[n] each.
 
     Args:
         run: The record.
         known: The stages.
         curve: From displacement to what the operators give; None where it is not known yet, and
             the displacement itself stands for it.
-        span: Of the effective field, which says below what size the excess loss is even.
+        span: Of the field, which says below what size the excess loss is even.
     """
     y = run.bare_um(known.delay_s, 2.0 * known.damping_ratio * known.radian_s, known.radian_s**2)
     m = y if curve is None else curve.operators_of(y)
@@ -120,4 +135,4 @@ def signals(run: Run, known: Physical, curve: Curve | None, span: float) -> tupl
     w = np.empty_like(y)
     late, command = run.late_command(max(known.lag_s, SHORTEST_S))
     field_left(command, late, run.step_s, m, losses, w)
-    return w + known.coupling * m, y
+    return w, y

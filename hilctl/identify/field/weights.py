@@ -14,7 +14,7 @@ from scipy.linalg import cholesky, solve_triangular
 from scipy.optimize import nnls
 
 from hilctl.base.arrays import F64, I64
-from hilctl.identify.field.columns import needed_points, play_columns
+from hilctl.identify.field.columns import needed_points, play_columns, plays_given
 from hilctl.identify.field.descent import Place
 from hilctl.identify.linear import RIDGE
 from hilctl.kernels.field import drag_columns
@@ -24,7 +24,6 @@ SMOOTH = 0.01  # weight of a difference of neighbours, relative to the longest c
 SMOOTH_PLAYS = 10  # lines beyond which it falls with their number, as their densities do
 CURVE_SMOOTH = 0.02  # the same for the curve's slopes
 EDGE = 0.1  # of half a turn: how much closer they lie
-CHANGED = 0.05  # of the way to the next threshold: change of one that its slope is taken by
 MOVED = 1e-3  # of the furthest: a column that moves less is left out
 
 
@@ -93,10 +92,10 @@ class Weights:
     errors_um: F64
     squares: float = 0.0
 
-    def errors_of(self, columns: F64, y: F64) -> F64:
-        """Return errors of the operators' output at rows that may be others: float64[N]."""
+    def errors_of(self, given: F64, y: F64) -> F64:
+        """Return errors of what operators give at rows that may be others: float64[N]."""
         curve = Curve(self.curve.operators, self.curve.displacement_um + self.offset_um)
-        return np.asarray(columns @ self.slopes.ravel() - curve.operators_of(y))
+        return np.asarray(given - curve.operators_of(y))
 
 
 def table(paths: Sequence[F64], kept: Sequence[I64], grid: Grid) -> F64:
@@ -121,8 +120,8 @@ def table(paths: Sequence[F64], kept: Sequence[I64], grid: Grid) -> F64:
     return np.concatenate(parts)
 
 
-def by_threshold(paths: Sequence[F64], kept: Sequence[I64], grid: Grid, slopes: F64) -> F64:
-    """Return by how much the operators' output changes with each threshold but the first.
+def outputs(paths: Sequence[F64], kept: Sequence[I64], grid: Grid, slopes: F64) -> tuple[F64, F64]:
+    """Return what operators of known weights give, and its derivatives by the thresholds.
 
     Args:
         paths: See :func:`table`.
@@ -131,17 +130,23 @@ def by_threshold(paths: Sequence[F64], kept: Sequence[I64], grid: Grid, slopes: 
         slopes: float64[lines, cells].
 
     Returns:
-        float64[N, p - 1].
+        float64[N], and float64[N, p - 1] for all thresholds but the first.
     """
-    step = CHANGED * float(np.diff(grid.thresholds).min())
-    out = []
-    for i in range(1, grid.thresholds.size):
-        both = []
-        for r in (grid.thresholds[i] - step, grid.thresholds[i] + step):
-            one = replace(grid, thresholds=np.array([r]), lengths=np.empty(0))
-            both.append(table(paths, kept, one) @ slopes[i])
-        out.append((both[1] - both[0]) / (2.0 * step))
-    return np.stack(out, axis=1)
+    plays = grid.thresholds.size
+    drags = replace(grid, thresholds=np.empty(0))
+    given: list[F64] = []
+    changes: list[F64] = []
+    for path, samples in zip(paths, kept, strict=True):
+        points, rows = np.empty(path.size, dtype=np.int64), np.empty_like(samples)
+        u = path[points[: needed_points(path, samples, points, rows)]]
+        total, by = np.empty(rows.size), np.empty((rows.size, plays))
+        weights = np.ascontiguousarray(slopes[:plays])
+        plays_given(u, rows, grid.thresholds, grid.lowest, grid.piece, weights, total, by)
+        if grid.lengths.size:
+            total += table([u], [rows], drags) @ slopes[plays:].ravel()
+        given.append(total)
+        changes.append(by[:, 1:])
+    return np.concatenate(given), np.concatenate(changes)
 
 
 class Equations:
@@ -180,7 +185,7 @@ class Equations:
         self._prior, self._wanted = _prior(self._used, grid, longest, curve)
 
     def solve(self) -> Weights:
-        """Find all weights."""
+        """Find all weights; once, however often it is asked for."""
         found, constant = self._found
         grid, others = self._grid, self._others
         curve_slopes = np.empty(grid.knots)

@@ -32,10 +32,14 @@ def fit_generalised_duhem(job: FitJob) -> FoundModel:
         )
     data = Prepared([r for r in job.data.records if isinstance(r, History)], POINTS, OFF)
     settings = job.settings
-    found = DuhemSearch(data, settings.cells, settings.across, job.least).find(job.progress)
+    search = DuhemSearch(data, settings.cells, settings.across, job.least)
+    if isinstance(job.start, DuhemEnd):
+        found = search.go_on(job.start)
+    else:
+        found = search.find(job.progress)
     parameters = _parameters(found)
     numbers = found.logs.size + len(NAMES)
-    return FoundModel(_model(job, found), numbers, parameters)
+    return FoundModel(_model(job, found), numbers, parameters, end=found)
 
 
 def _model(job: FitJob, found: DuhemEnd) -> StagedModel:

@@ -31,6 +31,7 @@ from hilctl.kernels.generalised_duhem import duhem_columns
 COARSE_WAY, FINE_WAY = 0.03, 0.02  # of the span: furthest way between two points of a path
 COARSE_ROWS, FINE_ROWS = 4000, 7000
 COARSE = (12, 8)  # cells of the first table
+FIRM, FIRMER = 100.0, 3000.0  # times the prior: for the first table, and for the first steps
 TABLE_ALONE = 3  # first steps, with the stages as they are
 STEPS_COARSE, STEPS_FINE = 18, 8
 COARSE_GAIN, FINE_GAIN = 3e-2, 3e-3  # of the error's square in a step: less ends the search
@@ -87,13 +88,29 @@ class DuhemSearch:
         self._lay(laid_over(paths, *COARSE))
         self._first_um = self._rest_um(paths[0])
         logs = self._layout.first_logs()
+        # Long steps with little to hold them take what few loops reach to where no other step
+        # leads it back from: slopes of a tenth of their neighbours', with a field along the edge.
+        self._hold(FIRMER)
         x, logs = self._descend(x, logs, TABLE_ALONE, 0.0, stages=False)
         progress(0.1, "a coarse table")
+        self._hold(FIRM)
         x, logs = self._descend(x, logs, STEPS_COARSE, COARSE_GAIN)
         progress(0.5, "the table")
-        coarse = self._layout
+        return self._end(x, logs, self._layout)
+
+    def go_on(self, end: DuhemEnd) -> DuhemEnd:
+        """Return where a search leads that begins where one of another table or data ended."""
+        x = self._signals.row_of(end.known, end.x)
+        path = self._chosen(x, COARSE_WAY, COARSE_ROWS)[0]
+        self._layout = end.layout
+        self._first_um = self._rest_um(path)
+        x[-1] = self._signals.offset_in(end.offset_um, self._first_um)
+        return self._end(x, end.logs, end.layout)
+
+    def _end(self, x: F64, logs: F64, before: Layout) -> DuhemEnd:
+        """Follow a table of the size that is wanted down, from one of another."""
         self._lay(laid_over(self._chosen(x, FINE_WAY, FINE_ROWS), *self._size))
-        x, logs = self._descend(x, self._layout.moved(logs, coarse), STEPS_FINE, FINE_GAIN)
+        x, logs = self._descend(x, self._layout.moved(logs, before), STEPS_FINE, FINE_GAIN)
         offset_um = self._signals.offset_um(x, self._first_um)
         return DuhemEnd(
             self._signals.known(x), self._layout, logs, self._signals.flux(x), offset_um, x
@@ -108,7 +125,11 @@ class DuhemSearch:
     def _lay(self, layout: Layout) -> None:
         self._layout = layout
         rows = prior(layout)
-        self._prior = rows.T @ rows
+        self._smooth = self._prior = rows.T @ rows
+
+    def _hold(self, times: float) -> None:
+        """Hold neighbouring slopes alike by so many times what the table itself is held by."""
+        self._prior = times * self._smooth
 
     def _rest_um(self, path: Path) -> float:
         """Return the displacement at no field, by the first point and the centre line."""

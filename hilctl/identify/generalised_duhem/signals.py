@@ -8,7 +8,16 @@ from hilctl.base.arrays import F64, I64
 from hilctl.identify.field.columns import turning_points
 from hilctl.identify.field.prepared import Prepared
 from hilctl.identify.field.rows import Motion
-from hilctl.identify.field.stages import HIGH, LOW, STEP, Physical, Stages, physical, signals
+from hilctl.identify.field.stages import (
+    HIGH,
+    LOW,
+    STEP,
+    Physical,
+    Stages,
+    physical,
+    signals,
+    stages_of,
+)
 from hilctl.identify.field.weights import Curve
 
 STAGES = ("field", "output", "decay", "growth", "bend", "excess", "radian", "damping", "delay")
@@ -26,7 +35,9 @@ def _row(stages: Stages, flux: float, offset: float) -> F64:
 LOWEST = _row(LOW, -_FLUX, -_OFFSET)
 HIGHEST = _row(HIGH, _FLUX, _OFFSET)
 STEPS = _row(STEP, 0.05, 0.005)
-FIRST = _row(Stages(), 0.0, 0.0)
+# Rods conduct. From a start with nearly no eddy currents, the lag of the field took their place for
+# good: where they are 0 nothing says how the flux goes, and so nothing brings them back.
+FIRST = _row(Stages(field=0.05, output=0.08, decay=0.005), 0.0, 0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +72,7 @@ class Signals:
     def known(self, x: F64) -> Physical:
         """Return the stages of a row in s, um and the unit of the command."""
         given = dict(zip(STAGES, x.tolist(), strict=False))
-        return physical(replace(Stages(), coupling=0.0, **given), self._data)
+        return physical(replace(Stages(), **given), self._data)
 
     def flux(self, x: F64) -> Curve:
         """Return the flux of a row, in um, by the displacement."""
@@ -74,6 +85,15 @@ class Signals:
     def offset_um(self, x: F64, first_um: float) -> float:
         """Return the displacement at rest, from a first guess and what a row adds to it."""
         return first_um + float(x[-1]) * self._half_um
+
+    def offset_in(self, offset_um: float, first_um: float) -> float:
+        """Undo :meth:`offset_um`: return what a row holds; within its bounds."""
+        return float(np.clip((offset_um - first_um) / self._half_um, -_OFFSET, _OFFSET))
+
+    def row_of(self, known: Physical, other: F64) -> F64:
+        """Return a row of stages, its flux and its offset as in one of other records."""
+        stages = stages_of(known, self._data)
+        return np.array([*(getattr(stages, name) for name in STAGES), *other[len(STAGES) :]])
 
     def choose(self, x: F64, way: float) -> None:
         """Choose the points of all paths, at most ``way`` of the command's span apart."""

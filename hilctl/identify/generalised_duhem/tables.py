@@ -16,7 +16,7 @@ WIDER = 1.1  # band, of what the data take up
 BINS = 60
 FLATTEST = 0.02  # slope of the centre, of its mean
 TILT = 0.6  # a first guess: logarithm of the slope, from the centre to the edge of the band
-BENT, TILTED = 0.016, 0.003  # weights of second and first differences, percent of the stroke
+BENT, TILTED = 0.009, 0.0016  # weights of second and first differences, percent of the stroke
 SHORTEST = 0.125  # of a cell: steps of a search
 STEEPEST = 5.0  # logarithm of the largest slope, of the mean
 

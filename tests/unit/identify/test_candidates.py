@@ -7,7 +7,7 @@ import pytest
 
 from hilctl.base.errors import DataError
 from hilctl.identify import candidates
-from hilctl.identify.candidates import LOOPS, WHOLE, choose_kind
+from hilctl.identify.candidates import LOOPS, choose_kind
 from hilctl.identify.command import settings_from
 from hilctl.identify.data.records import History, Record, SteadyLoop
 from hilctl.identify.held_out import HeldOut
@@ -20,49 +20,82 @@ HISTORY = History("history", WAVE, 9.0 * WAVE, 100.0)
 LOOP = SteadyLoop("loop", WAVE, 9.0 * WAVE, 1.0)
 
 
-def fake(monkeypatch: pytest.MonkeyPatch, errors: dict[str, float | None]) -> None:
-    def held_out_error(records: Any, settings: Any, *_: Any) -> HeldOut | None:
-        rms = errors[settings.kind if settings.kind != "field" else f"field {settings.drags}"]
+SMALL = {"field 0 8": 0.6, "generalised_duhem 12": 0.9, "field 0 32": 0.3, "field 3 32": 0.2}
+
+
+def fake(monkeypatch: pytest.MonkeyPatch, errors: dict[str, float | None]) -> list[tuple[str, Any]]:
+    """Let fits have errors by kind, drags and size; return the list of them and their starts."""
+    seen: list[tuple[str, Any]] = []
+
+    def held_out_error(records: Any, settings: Any, *rest: Any) -> HeldOut | None:
+        name = {
+            "field": f"field {settings.drags} {settings.plays}",
+            "generalised_duhem": f"generalised_duhem {settings.cells}",
+        }.get(settings.kind, settings.kind)
+        seen.append((name, rest[-1]))
+        rms = errors[name]
         if rms is None:
             return None
-        return HeldOut(
-            Judgement(errors=(), modelled_um=(), peak_percent=3.0 * rms, rms_percent=rms,
-                      own_peak_percent=0.0), tuple(records), "test",
-        )  # fmt: skip
+        judgement = Judgement(
+            errors=(), modelled_um=(), peak_percent=3.0 * rms, rms_percent=rms, own_peak_percent=0.0
+        )
+        return HeldOut(judgement, tuple(records), "test", f"end of {name}")
 
     monkeypatch.setattr(candidates, "held_out_error", held_out_error)
+    return seen
 
 
 def chosen(records: list[Record]) -> Any:
     return choose_kind(records, settings_from("auto", []), "A", one_by_one, ignore_progress)
 
 
-def test_the_least_error_wins_and_all_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    fake(monkeypatch, {"field 3": 0.5, "field 0": 0.3, "generalised_duhem": 0.4, "integrated": 0.9})
-    settings, held_out, errors = chosen([HISTORY])
-    assert (settings.kind, settings.drags, settings.whole) == ("field", 0, True)
-    assert held_out.judgement.rms_percent == 0.3
-    assert [error.rms_percent for error in errors] == [0.3, 0.4, 0.9, 0.5]
-    assert len(errors) == len(WHOLE) + 1
-
-
-def test_drags_are_not_tried_where_plays_alone_are_not_the_best(
+def test_the_kind_whose_small_model_does_well_is_tried_in_full(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    fake(monkeypatch, {"field 0": 0.3, "generalised_duhem": 0.2, "integrated": 0.9})
+    seen = fake(monkeypatch, {**SMALL, "generalised_duhem 12": 1.3})
+    settings, held_out, errors = chosen([HISTORY])
+    assert (settings.kind, settings.drags, settings.whole) == ("field", 3, True)
+    assert held_out.judgement.rms_percent == 0.2
+    assert [error.rms_percent for error in errors] == [0.6, 1.3, 0.3, 0.2]
+    # Each goes on from where the one before it ended, and the fit to all data from the last.
+    starts = [start for _, start in seen]
+    assert starts == [None, None, "end of field 0 8", "end of field 0 32"]
+    assert held_out.end == "end of field 3 32"
+
+
+def test_more_operators_are_taken_only_where_they_are_worth_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    fake(monkeypatch, {**SMALL, "generalised_duhem 12": 1.3, "field 3 32": 0.99 * 0.3})
+    settings, _, _ = chosen([HISTORY])
+    assert (settings.kind, settings.drags) == ("field", 0)
+
+
+def test_a_kind_that_is_near_is_tried_in_full_as_well(monkeypatch: pytest.MonkeyPatch) -> None:
+    fake(monkeypatch, {**SMALL, "generalised_duhem 24": 0.25})
     settings, _, errors = chosen([HISTORY])
     assert settings.kind == "generalised_duhem"
-    assert [error.rms_percent for error in errors] == [0.3, 0.2, 0.9]
+    assert [error.rms_percent for error in errors] == [0.6, 0.9, 0.3, 0.25]
+
+
+@pytest.mark.parametrize("plain", [0.8, 5.0])
+def test_a_plain_kind_is_tried_where_no_other_does_well(
+    plain: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    poor = {"field 0 8": 2.0, "generalised_duhem 12": 1.9, "field 0 32": 1.8, "field 3 32": 1.8}
+    fake(monkeypatch, {**poor, "generalised_duhem 24": 1.7, "integrated": plain})
+    settings, _, _ = chosen([HISTORY])
+    assert settings.kind == ("integrated" if plain < 1.0 else "generalised_duhem")
 
 
 def test_loops_have_candidates_of_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
-    fake(monkeypatch, {"field 3": 0.5, "staged": 0.1, "integrated": None})
+    fake(monkeypatch, {"staged": 0.1, "integrated": None})
     settings, _, errors = chosen([LOOP])
     assert settings.kind == "staged"
     assert len(errors) == len(LOOPS) - 1
 
 
 def test_without_anything_held_out_there_is_no_choice(monkeypatch: pytest.MonkeyPatch) -> None:
-    fake(monkeypatch, dict.fromkeys(("field 3", "field 0", "generalised_duhem", "integrated")))
+    fake(monkeypatch, dict.fromkeys(("field 0 8", "generalised_duhem 12", "integrated")))
     with pytest.raises(DataError, match="name a --model"):
         chosen([HISTORY])

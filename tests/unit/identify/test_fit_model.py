@@ -120,6 +120,7 @@ def test_ppi_with_free_weights_from_a_decaying_history() -> None:
     assert found.errors[0].area_error_percent is None
 
 
+@pytest.mark.slow
 def test_published_parametrisation_of_omega_is_found_again(loops_of: Loops) -> None:
     """Eleven parameters of the integrated model come back from the published grid (6.24)."""
     truth = omega()

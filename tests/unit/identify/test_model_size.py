@@ -63,6 +63,7 @@ def test_models_without_deadbands_have_none(loops_of: Loops) -> None:
         choose_order(data[:3], settings, one_by_one, ignore_progress)
 
 
+@pytest.mark.slow
 def test_lag_of_a_table_is_found() -> None:
     """A displacement recorded three samples late is seen to lag by three."""
     stage = PpiModel(

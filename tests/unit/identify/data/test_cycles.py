@@ -1,13 +1,19 @@
 """Steady cycles: averaged from recordings and found in tables."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from hilctl.base.errors import DataError
 from hilctl.base.segments import Segment
-from hilctl.identify.data.cycles import average_cycle, find_cycles, loops_from_recording
+from hilctl.identify.data.cycles import (
+    average_cycle,
+    find_cycles,
+    loops_from_pieces,
+    loops_from_recording,
+)
 from hilctl.identify.data.records import History
 from hilctl.recording.data import Recording
 
@@ -59,6 +65,23 @@ def test_samples_missing_from_some_cycles_do_no_harm(
     start = segment.steady_cycles()[0] / segment.period
     expected = 6.0 * np.sin(2.0 * np.pi * (np.arange(300) / 300 + start))
     np.testing.assert_allclose(loop.command, expected, atol=1e-3)
+
+
+def test_loops_in_pieces_are_those_of_the_whole(recording_of: Callable[..., Recording]) -> None:
+    """Where a piece ends makes no difference, and some pieces have nothing of a segment."""
+    command, segment = sine_segment(100.0, 6)
+    later = replace(
+        segment, label="again", start=3000, stop=6000, steady_start=3500, steady_stop=5900
+    )
+    command = np.concatenate((command, command))
+    noise = np.random.default_rng(5).normal(0.0, 1.0, command.size)
+    recording = recording_of(command, command + noise, [segment, later])
+    cuts = (slice(0, 10), slice(10, 2222), slice(2222, 2222), slice(2222, 4001), slice(4001, None))
+    pieces = [replace(recording, samples=recording.samples.rows(cut)) for cut in cuts]
+    for loop, whole in zip(loops_from_pieces(pieces), loops_from_recording(recording), strict=True):
+        assert (loop.label, loop.frequency_hz) == (whole.label, whole.frequency_hz)
+        np.testing.assert_allclose(loop.command, whole.command, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(loop.displacement_um, whole.displacement_um, atol=1e-12)
 
 
 def test_a_phase_missing_from_all_cycles_is_refused() -> None:

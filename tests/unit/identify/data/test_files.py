@@ -1,6 +1,7 @@
 """Recordings and tables to records: loops or whole histories, one unit, and no gaps."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,12 @@ import pytest
 from hilctl.base.errors import DataError, InputError
 from hilctl.base.samples import Flag
 from hilctl.identify.command import settings_from
-from hilctl.identify.data.files import history_from_recording, load_records
+from hilctl.identify.data import files
+from hilctl.identify.data.files import (
+    history_from_pieces,
+    history_from_recording,
+    load_records,
+)
 from hilctl.identify.data.records import History, SteadyLoop
 
 GOLDEN = Path(__file__).parents[4] / "recordings" / "golden"
@@ -17,7 +23,7 @@ CURRENT, VOLTAGE = GOLDEN / "terfenol_uncompensated.mcap", GOLDEN / "piezo_compe
 
 
 def test_a_recording_gives_loops_or_its_history():
-    loops, unit = load_records([CURRENT], settings_from("ppi", []), 0)
+    loops, unit = load_records([CURRENT], settings_from("rdpi", []), 0)
     assert unit == "A"
     assert all(isinstance(each, SteadyLoop) for each in loops)
     (history,), _ = load_records([CURRENT], settings_from("ppi", ["whole=true"]), 0)
@@ -71,6 +77,34 @@ def test_a_history_with_missing_samples_is_refused(recording_of, what):
         displacement_um[50] = np.nan
     with pytest.raises(DataError, match="samples are missing, so it can't be judged as a whole"):
         history_from_recording(recording_of(np.zeros(100), displacement_um, [], index=index))
+
+
+def pieces_of(recording, edges):
+    """Return a recording in pieces, cut before some samples."""
+    bounds = zip([0, *edges], [*edges, recording.samples.index.size], strict=True)
+    return [replace(recording, samples=recording.samples.rows(slice(*each))) for each in bounds]
+
+
+def test_a_history_in_pieces_is_that_of_the_whole(recording_of):
+    """The ramp, its conditioning and the waveform each go over an edge."""
+    command = np.linspace(0.0, 1.0, 150)
+    recording = recording_of(command, 2.0 * command, [])
+    recording.samples.flags[:30] |= Flag.RAMP.value
+    recording.samples.flags[30:60] |= Flag.CONDITION.value
+    recording.samples.flags[130:] |= Flag.RAMP.value
+    whole = history_from_recording(recording)
+    for edges in ([20, 40, 100, 140], [30, 60], [0, 29, 31, 150]):
+        history = history_from_pieces(pieces_of(recording, edges))
+        np.testing.assert_array_equal(history.command, whole.command)
+        np.testing.assert_array_equal(history.displacement_um, whole.displacement_um)
+        assert history.ignore == whole.ignore == 30
+
+
+def test_a_run_that_is_too_long_for_memory_is_refused_as_a_whole(recording_of, monkeypatch):
+    monkeypatch.setattr(files, "MOST_WHOLE", 99)
+    recording = recording_of(np.linspace(0.0, 1.0, 150), np.linspace(0.0, 1.0, 150), [])
+    with pytest.raises(DataError, match=r"more than 99 samples, .* leave out --whole"):
+        history_from_pieces(pieces_of(recording, [50]))
 
 
 def test_tables_have_no_unit_of_their_own(tmp_path):

@@ -99,9 +99,9 @@ def test_times_rounded_in_the_text_are_fine(tmp_path: Path) -> None:
 def test_rate_or_time_not_both(tmp_path: Path) -> None:
     """Exactly one of time column and rate is needed."""
     path = write(tmp_path, rows(","))
-    with pytest.raises(DataError, match="not both"):
+    with pytest.raises(DataError, match="its rate in Hz: got neither"):
         read_table(path, 2, 3)
-    with pytest.raises(DataError, match="not both"):
+    with pytest.raises(DataError, match="got both"):
         read_table(path, 2, 3, time_column=1, rate_hz=100.0)
 
 

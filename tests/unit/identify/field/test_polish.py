@@ -1,12 +1,14 @@
 """Stages and thresholds followed down together, on rows whose answer is known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from hilctl.base.arrays import F64
 from hilctl.identify.field.polish import ROOM, STAGES, Bare, Polish
 from hilctl.identify.field.stages import HIGH, LOW, STEP, Stages, row
-from hilctl.identify.field.weights import Equations, Grid, by_threshold, solve, table
+from hilctl.identify.field.weights import Equations, Grid, outputs, solve, table
 
 TRUE_R = 0.85
 GRID = Grid(np.array([0.0, 0.7, 1.4]), np.empty(0), -4.0, 1.6, 5, 4)
@@ -65,15 +67,25 @@ def test_a_stage_is_found_with_the_weights_free() -> None:
     assert x.size == STAGES
 
 
+@pytest.mark.parametrize("lengths", [(), (0.6, 1.5)])
+def test_operators_of_known_weights_give_what_their_columns_do(lengths: tuple[float, ...]) -> None:
+    grid = replace(GRID, lengths=np.array(lengths))
+    slopes = np.random.default_rng(3).uniform(0.5, 2.0, (grid.lines, 5))
+    for gain in (1.0, 2.0):  # within the cells, and beyond them
+        given, _ = outputs([path(gain)] * 2, KEPT * 2, grid, slopes)
+        columns = table([path(gain)] * 2, KEPT * 2, grid)
+        assert given == pytest.approx(columns @ slopes.ravel(), abs=1e-9)
+
+
 def test_slopes_by_thresholds_are_differences() -> None:
     slopes = np.random.default_rng(3).uniform(0.5, 2.0, (3, 5))
-    found = by_threshold([path()], KEPT, GRID, slopes)
+    _, found = outputs([path()], KEPT, GRID, slopes)
     for i in (1, 2):
         moved = []
         for change in (-1e-3, 1e-3):
             thresholds = GRID.thresholds.copy()
             thresholds[i] += change
-            grid = Grid(thresholds, GRID.lengths, GRID.lowest, GRID.width, 5, 4)
+            grid = replace(GRID, thresholds=thresholds)
             moved.append(table([path()], KEPT, grid) @ slopes.ravel())
         rise = (moved[1] - moved[0]) / 2e-3
         assert np.mean(np.abs(found[:, i - 1] - rise)) < 0.05 * np.mean(np.abs(rise))
@@ -84,7 +96,8 @@ def test_what_free_weights_take_up_of_a_change_costs_nothing() -> None:
     y = displacement_um() + np.random.default_rng(1).normal(0.0, 0.05, 900)
     columns = table([path()], KEPT, GRID)
     equations = Equations(columns, y, GRID, LEAST, np.ones(900))
-    here = equations.solve().errors_of(columns, y)
+    weights = equations.solve()
+    here = weights.errors_of(columns @ weights.slopes.ravel(), y)
     changes = np.stack([columns[:, 2], np.sign(path())], axis=1)
     place = equations.place(here, changes)
     total = np.sum((changes - changes.mean(axis=0)) ** 2, axis=0)

@@ -19,12 +19,13 @@ from hilctl.identify.field.stages import (
     row,
     signals,
     stages_in,
+    stages_of,
 )
 from hilctl.identify.field.weights import Curve
 from hilctl.models.field import FieldLosses, FieldModel, OutputCurve
 
 RATE_HZ = 20_000.0
-STAGES = Stages(0.3, 0.2, 0.1, 0.4, 0.5, 0.06, -0.7, 0.08, 0.9, 0.11)
+STAGES = Stages(0.3, 0.2, 0.1, 0.4, 0.5, 0.06, 0.08, 0.9, 0.11)
 TIME_S = np.arange(2000) / RATE_HZ
 COMMAND = 4.0 * np.sin(2.0 * np.pi * 50.0 * TIME_S) + np.sin(2.0 * np.pi * 230.0 * TIME_S)
 
@@ -44,7 +45,7 @@ def plain_run(command: np.ndarray, derivatives: np.ndarray) -> Run:
 
 def test_a_row_is_the_stages_in_the_order_of_their_names() -> None:
     assert stages_in(row(STAGES)) == STAGES
-    assert dict(zip(NAMES, row(STAGES), strict=True))["coupling"] == STAGES.coupling
+    assert dict(zip(NAMES, row(STAGES), strict=True))["radian"] == STAGES.radian
     assert tuple(row(STAGES)) == astuple(STAGES)
 
 
@@ -54,7 +55,7 @@ def test_a_search_can_begin_at_the_defaults_and_step_either_way() -> None:
     assert (row(Stages()) <= high).all()
     assert (step > 0.0).all()
     assert (2.0 * step <= high - low).all()
-    assert np.flatnonzero(low < 0.0).tolist() == [NAMES.index("coupling")]
+    assert (low >= 0.0).all()
     # Without inertia or damping there is no structure: natural_hz is worked out as 1 / radian.
     assert LOW.radian > 0.0
     assert LOW.damping > 0.0
@@ -76,11 +77,17 @@ def test_units_by_hand() -> None:
     assert known.losses.growth == pytest.approx(0.4 / 4.0)
     assert known.losses.bend == pytest.approx(0.5 / 16.0)
     assert known.losses.excess == pytest.approx(0.06 * 2.0)
-    # Half the stroke, 8 um, makes an effective field of -0.7 of the reach.
-    assert known.coupling * 8.0 == pytest.approx(-0.7 * 4.0)
     assert known.radian_s == pytest.approx(0.08 * 0.01)
     assert known.damping_ratio == 0.9
     assert known.delay_s == pytest.approx(0.11 * 0.01)
+    assert row(stages_of(known, data)) == pytest.approx(row(STAGES))
+
+
+def test_stages_of_other_records_lie_within_the_bounds() -> None:
+    """A search that goes on from one of slower records begins where it may be."""
+    known = physical(HIGH, Prepared([history()]))
+    faster = Prepared([history(rate=5.0)])
+    assert stages_of(known, faster).radian == HIGH.radian
 
 
 @pytest.mark.parametrize("units", [(3.0, 1.0, 1.0), (1.0, 0.2, 1.0), (1.0, 1.0, 5.0)])
@@ -99,17 +106,14 @@ def test_the_same_stages_mean_the_same_in_any_units(units: tuple[float, float, f
 
 
 @pytest.mark.parametrize("decay_s", [0.0, 1e-4])
-@pytest.mark.parametrize("coupling", [-0.1, 0.1])
-def test_of_a_model_s_record_the_effective_field_is_the_model_s(
-    coupling: float, decay_s: float
-) -> None:
+def test_of_a_model_s_record_the_field_is_the_model_s(decay_s: float) -> None:
     """The model's operators give 2 u: so what its curve is undone to is twice the field."""
     operators, displacement_um = np.array([-40.0, 5.0, 40.0]), np.array([-20.0, 1.0, 50.0])
     losses = FieldLosses(
         field_s=2e-4, output_s=3e-5, decay_s=decay_s, growth=0.2, bend=0.05, excess=0.3
     )
     model = FieldModel(
-        thresholds=(0.0,), lowest=-10.0, cell=20.0, slopes=((2.0,),), coupling=coupling,
+        thresholds=(0.0,), lowest=-10.0, cell=20.0, slopes=((2.0,),),
         curve=OutputCurve(
             operators_um=tuple(operators.tolist()), displacement_um=tuple(displacement_um.tolist())
         ),
@@ -117,7 +121,7 @@ def test_of_a_model_s_record_the_effective_field_is_the_model_s(
     )  # fmt: skip
     y_um = model.forward(RATE_HZ).process(COMMAND)
     run = plain_run(COMMAND, np.stack([y_um, np.zeros_like(y_um), np.zeros_like(y_um)]))
-    known = Physical(losses, coupling, 1e-4, 0.3, 0.0, 1.0)
+    known = Physical(losses, 1e-4, 0.3, 0.0, 1.0)
     u, bare_um = signals(run, known, Curve(operators, displacement_um), 20.0)
     np.testing.assert_array_equal(bare_um, y_um)
     np.testing.assert_allclose(2.0 * u, np.interp(y_um, displacement_um, operators), atol=1e-4)
@@ -128,9 +132,8 @@ def test_structure_and_delay_are_taken_off_the_displacement() -> None:
     w, r, d, late = 2.0 * np.pi * 200.0, 3e-4, 0.4, 7
     sine, cosine = np.sin(w * TIME_S), np.cos(w * TIME_S)
     run = plain_run(np.zeros_like(sine), np.stack([sine, w * cosine, -(w**2) * sine]))
-    known = Physical(FieldLosses(), 0.25, r, d, late / RATE_HZ, 1.0)
+    known = Physical(FieldLosses(), r, d, late / RATE_HZ, 1.0)
     u, y = signals(run, known, None, 20.0)
     before = (1.0 - (r * w) ** 2) * sine + 2.0 * d * r * w * cosine
     np.testing.assert_allclose(y[:-late], before[late:], atol=1e-9)
-    # No command leaves no field, so the effective one is the coupling's, of the displacement.
-    np.testing.assert_allclose(u, 0.25 * y, atol=1e-9)
+    np.testing.assert_allclose(u, 0.0, atol=1e-9)

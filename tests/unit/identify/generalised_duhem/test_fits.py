@@ -49,6 +49,7 @@ def found() -> FittedModel:
     return fit_model([history(1, 0.01)], SETTINGS, lambda: 0.0)
 
 
+@pytest.mark.slow
 def test_a_history_that_was_not_fitted_is_met() -> None:
     judged = judge(found().model, [history(2)])
     assert judged.rms_percent < 0.1
@@ -73,6 +74,7 @@ def test_the_table_is_of_the_size_that_was_asked_for() -> None:
     assert found().numbers == 2 * (SETTINGS.cells + 1) * (SETTINGS.across + 1) + 12
 
 
+@pytest.mark.slow
 def test_records_begin_at_rest_each() -> None:
     """Two that were cut in the middle of a motion, each with its rest before it."""
     both = fit_model([history(1, 0.01, 9000), history(3, 0.01, 9000)], SETTINGS, lambda: 0.0)

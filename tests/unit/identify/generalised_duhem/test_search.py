@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hilctl.base.arrays import F64
-from hilctl.identify.generalised_duhem.search import DuhemSearch, _bounded_step
+from hilctl.identify.generalised_duhem.search import FIRM, FIRMER, DuhemSearch, _bounded_step
 from hilctl.identify.generalised_duhem.signals import FIRST, HIGHEST, LOWEST, NAMES, STEPS
 from hilctl.identify.generalised_duhem.tables import laid_over
 from tests.unit.identify.generalised_duhem.test_signals import data
@@ -25,7 +25,7 @@ def test_slopes_are_those_of_the_errors() -> None:
     job._errors(FIRST, logs, slopes)
     way = np.random.default_rng(1).standard_normal(logs.shape)
     change = (job._errors(FIRST, logs + 1e-5 * way) - errors) / 1e-5
-    assert slopes @ way.ravel() == pytest.approx(change, abs=0.01 * np.abs(change).max())
+    assert slopes @ way.ravel() == pytest.approx(change, abs=0.02 * np.abs(change).max())
 
 
 def test_some_steps_lessen_the_error() -> None:
@@ -70,3 +70,35 @@ def test_progress_rises_below_1() -> None:
     DuhemSearch(data(), 6, 4, 0.05).find(lambda part, _: seen.append(part))
     assert seen == sorted(set(seen))
     assert 0.0 < seen[0] < seen[-1] < 1.0
+
+
+def test_slopes_are_held_alike_the_more_the_rougher_the_table(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """What is held too little in the first long steps comes to lie where nothing moves it."""
+    held = []
+
+    def descend(job: DuhemSearch, x: F64, logs: F64, *_: object, **__: object) -> tuple[F64, F64]:
+        rough = np.random.default_rng(4).standard_normal(logs.shape)
+        held.append(
+            job._cost(FIRST, rough, np.zeros(1))
+            / float(rough.ravel() @ job._smooth @ rough.ravel())
+        )
+        return x, logs
+
+    monkeypatch.setattr(DuhemSearch, "_descend", descend)
+    DuhemSearch(data(), 6, 4, 0.05).find(lambda *_: None)
+    assert held == pytest.approx([FIRMER, FIRM, 1.0])
+    assert FIRMER > FIRM > 1.0
+
+
+def test_a_search_that_goes_on_from_a_rougher_one_ends_no_worse() -> None:
+    rough = DuhemSearch(data(), 5, 3, 0.05).find(lambda *_: None)
+    whole, after = (DuhemSearch(data(), 6, 4, 0.05) for _ in range(2))
+    fine, end = whole.find(lambda *_: None), after.go_on(rough)
+    spread, other = (
+        np.std(job._errors(at.x, at.logs)) for job, at in ((whole, fine), (after, end))
+    )
+    assert end.logs.shape == fine.logs.shape
+    assert other < 1.1 * spread
+    assert end.offset_um == pytest.approx(fine.offset_um, abs=0.05)

@@ -98,6 +98,7 @@ def test_refining_what_was_refined_goes_on_from_it(old, runs):
     assert missed_percent(again.model, shifted, v) < 0.5 * missed_percent(old, shifted, v)
 
 
+@pytest.mark.slow
 def test_one_run_is_judged_by_its_end(old):
     found = refine_runs(old, [history(actuator(), 1, seconds=2.0)])
     assert found.better
@@ -105,12 +106,14 @@ def test_one_run_is_judged_by_its_end(old):
     assert found.choice.after.records[0].ignore > 10_000
 
 
+@pytest.mark.slow
 def test_validation_runs_are_judged_and_not_fitted(old, runs):
     found = refine_runs(old, runs[:3], runs[3:])
     assert [record.label for record in found.choice.after.records] == ["run 3", "run 4"]
     assert "run 3" not in found.model.provenance.source
 
 
+@pytest.mark.slow
 def test_provenance_says_what_it_was_refined_on(found):
     found = found.model.provenance
     assert found.source == ("old.yaml", "run 0", "run 1", "run 2", "run 3", "run 4")
@@ -125,6 +128,7 @@ def test_swapped_wires_are_refused(old, runs):
         refine_runs(old, turned)
 
 
+@pytest.mark.slow
 def test_files_in_a_better_model_file_out(tmp_path):
     """A shipped model and a recording of it; what is written is what was found."""
     output = tmp_path / "better.yaml"
