@@ -11,6 +11,7 @@ does not notice a callee that changed in another file. Units live one level abov
     field.py     plays and drags of an effective field, its losses, and their inverse
     residual.py  plays, drags and rate of a modelled displacement, and what undoes them
     dynamics.py  field lag, structure and delay, and their inverses
+    tick.py      a tick's kernels one after another, called by their addresses
     limit.py     peak and slew limits of a command
     interlock.py what ends a run, looked at in every sample
     packed.py    messages of a recording's chunk, and their packed lists

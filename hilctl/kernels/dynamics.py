@@ -8,7 +8,7 @@ signal into blocks gives the same bits as one call. ``out`` may be the input arr
 import math
 
 from hilctl.base.arrays import F64
-from hilctl.kernels.jit import kernel
+from hilctl.kernels.jit import STAGE, kernel
 
 # Share of the fastest change the lag allows that its inverse asks for; towards 1 the command that
 # takes grows beyond all bounds.
@@ -140,7 +140,7 @@ def _oldest(memory: F64, now: float) -> float:
     return left
 
 
-@kernel("void(float64[::1], float64[::1], float64[::1], float64[::1])")
+@kernel(STAGE)
 def weigh_block(x: F64, weights: F64, memory: F64, out: F64) -> None:
     """Sum a signal's last values, each with its weight.
 
@@ -186,3 +186,22 @@ def between_block(x: F64, part: float, memory: F64, out: F64) -> None:
             before = now
         memory[0] = now
         out[k] = before + part * (now - before)
+
+
+@kernel(STAGE)
+def lead_stage(x: F64, parameters: F64, memory: F64, out: F64) -> None:
+    """Run :func:`lead_block`; parameters: periods, growth."""
+    lead_block(x, parameters[0], parameters[1], memory, out)
+
+
+@kernel(STAGE)
+def between_stage(x: F64, parameters: F64, memory: F64, out: F64) -> None:
+    """Run :func:`between_block`; parameters: part."""
+    between_block(x, parameters[0], memory, out)
+
+
+@kernel(STAGE)
+def offset_stage(x: F64, parameters: F64, memory: F64, out: F64) -> None:
+    """Add an offset, the one parameter; there is no memory."""
+    for k in range(x.size):
+        out[k] = x[k] + parameters[0]

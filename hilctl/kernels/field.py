@@ -49,7 +49,8 @@ _OUTPUT, _COMMAND, _FIELD = 0, 1, 2
 _SPAN = "UniTuple(float64, 3)"
 _CURVE = "UniTuple(float64[::1], 2)"
 _BANK = "UniTuple(float64[::1], 5)"
-_LOSSES = "UniTuple(float64, 8)"
+_ARRAY, _LOSSES = "float64[::1]", "UniTuple(float64, 8)"
+_RUN = f"void({_ARRAY}, {_SPAN}, {_BANK}, float64, {_LOSSES}, {_CURVE}, {_ARRAY}, {_ARRAY})"
 
 
 @kernel("int64(float64, float64)", inline=True)
@@ -374,10 +375,9 @@ def _advance(
     """Advance by a sample with a given output or command, and return the other of the two."""
     k = memory.size - 6
     fresh = not abs(memory[k + 5]) >= 0.0
-    if fresh and what == _COMMAND:  # it counts as having stood there for ever: nothing is lost
-        u, m = _root(_FIELD, target, span, memory, bank, coupling, losses)
-    else:
-        u, m = _root(what, target, span, memory, bank, coupling, losses)
+    # The first command counts as having stood there for ever: nothing of it is lost.
+    given = _FIELD if fresh and what == _COMMAND else what
+    u, m = _root(given, target, span, memory, bank, coupling, losses)
     w = u - coupling * m
     e = losses[0] * (w - memory[k + 3]) + losses[1] * (m - memory[k + 1])
     if fresh:
@@ -393,10 +393,7 @@ def _advance(
     return m if what == _COMMAND else command
 
 
-@kernel(
-    f"void(float64[::1], {_SPAN}, {_BANK}, float64, {_LOSSES}, {_CURVE}, float64[::1],"
-    " float64[::1])"
-)
+@kernel(_RUN)
 def field_forward(
     v: F64,
     span: Span,
@@ -429,10 +426,7 @@ def field_forward(
             out[k] = np.nan
 
 
-@kernel(
-    f"void(float64[::1], {_SPAN}, {_BANK}, float64, {_LOSSES}, {_CURVE}, float64[::1],"
-    " float64[::1])"
-)
+@kernel(_RUN)
 def field_inverse(
     y: F64,
     span: Span,

@@ -14,15 +14,18 @@ from pydantic import Field
 from hilctl.base.arrays import F64, U32
 from hilctl.base.device import CommandUnit
 from hilctl.base.errors import InputError
-from hilctl.base.samples import Flag
+from hilctl.base.samples import Flag, Head
 from hilctl.base.strict import Strict
 from hilctl.kernels import interlock as kernels
 from hilctl.kernels.interlock import InterlockFlag
 from hilctl.kernels.jit import load
+from hilctl.loop.block import Block
 
 TripCode: TypeAlias = Literal[
     "stroke", "sensor_range", "sensor_frozen", "deviation", "thermal", "tracking_error"
 ]
+
+_FIRST_SAMPLE = int(Head.FIRST_SAMPLE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,19 +153,25 @@ class Interlocks:
     ) -> None:
         self.context = context
         self.settings = settings
-        self._settings = _numbers(context, settings, sample_rate_hz)
-        self._memory = np.zeros(kernels.MEMORY)
-        self._memory[kernels.READING] = math.nan
-        self._memory[kernels.COMMAND] = context.safe
-        self._memory[kernels.HEAT] = max(context.heat_a2, context.safe**2)
-        self._next_sample = 0
+        self.numbers = _numbers(context, settings, sample_rate_hz)
+        self.memory = np.zeros(kernels.MEMORY)
+        self.memory[kernels.READING] = math.nan
+        self.memory[kernels.COMMAND] = context.safe
+        self.memory[kernels.HEAT] = max(context.heat_a2, context.safe**2)
+        self.next_sample = 0
         load(kernels.interlock_block)
 
     def begin_at(self, command: float) -> None:
         """Begin with the output at ``command``; its coil is as hot as that keeps it, at least."""
-        memory = self._memory
+        memory = self.memory
         memory[kernels.COMMAND] = command
         memory[kernels.HEAT] = max(memory[kernels.HEAT], command**2)
+
+    def judge(self, block: Block) -> Trip | None:
+        """Look at the next block; return the first trip in it, or None."""
+        sent = block.command, block.reference
+        came = block.displacement_um, block.measured
+        return self.check(block.head[_FIRST_SAMPLE], *sent, *came, block.flags)
 
     def check(
         self,
@@ -187,15 +196,41 @@ class Interlocks:
         Returns:
             The first trip in this block, or None.
         """
-        if first_sample > self._next_sample:
-            self._hold(first_sample - self._next_sample)
-        before = self._memory.item(kernels.COMMAND)
+        before = self.reach(first_sample, command.size)
         k = kernels.interlock_block(
-            self._settings, self._memory, command, reference, displacement_um, measured, flags
+            self.numbers, self.memory, command, reference, displacement_um, measured, flags
         )
-        self._next_sample = first_sample + command.size
+        sent = before, command, measured
+        return self.trip(first_sample, k, sent, (reference, displacement_um), flags)
+
+    def reach(self, first_sample: int, samples: int) -> float:
+        """Pass over what was left out before the next block; return the command before it."""
+        if first_sample > self.next_sample:
+            self._hold(first_sample - self.next_sample)
+        self.next_sample = first_sample + samples
+        return self.memory.item(kernels.COMMAND)
+
+    def trip(
+        self,
+        first_sample: int,
+        k: int,
+        commands: tuple[float, F64, F64],
+        lengths: tuple[F64, F64],
+        flags: U32,
+    ) -> Trip | None:
+        """Say what tripped in a block; float64[n] each, but for the first.
+
+        Args:
+            first_sample: Its first sample.
+            k: Index of the first sample that trips, or -1.
+            commands: Command before it, commands, commands as measured.
+            lengths: References and displacements.
+            flags: uint32[n].
+        """
         if k < 0:
             return None
+        before, command, measured = commands
+        reference, displacement_um = lengths
         if k:
             before = command.item(k - 1)
         sent = (before, command.item(k), measured.item(k))
@@ -204,9 +239,9 @@ class Interlocks:
 
     def _hold(self, samples: int) -> None:
         """Let samples pass that were never exchanged: the output stays, and so do conditions."""
-        memory = self._memory
+        memory = self.memory
         rest = memory[kernels.COMMAND] ** 2
-        cooling = (1.0 - self._settings[kernels.WARMING]) ** samples
+        cooling = (1.0 - self.numbers[kernels.WARMING]) ** samples
         memory[kernels.HEAT] = rest + (memory[kernels.HEAT] - rest) * cooling
         for run in (kernels.FROZEN_RUN, kernels.DEVIATION_RUN, kernels.TRACKING_RUN):
             if memory[run]:

@@ -6,11 +6,14 @@ Pure: (wanted, previous, limits, time step) to (command, flags). The loop and th
 import math
 from dataclasses import dataclass
 
+import numpy as np
+
 from hilctl.base.arrays import F64, U32
 from hilctl.base.errors import InputError
 from hilctl.base.samples import Flag
 from hilctl.kernels.jit import load
 from hilctl.kernels.limit import limit_block
+from hilctl.kernels.tick import HIGH, LAST, LIMITER_NUMBERS, LOW, STEP
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,9 +50,8 @@ class CommandLimits:
 
 
 _LARGEST_STRIDE = 0.25  # of the way from the far limit to the safe value
-_RANGE_LIMITED = int(Flag.RANGE_LIMITED)
-_SLEW_LIMITED = int(Flag.SLEW_LIMITED)
-_INVALID = int(Flag.INVALID)
+BITS = int(Flag.RANGE_LIMITED), int(Flag.SLEW_LIMITED), int(Flag.INVALID)
+"""Flags that a limit sets: range, slew, a wish that is none."""
 
 
 class Limiter:
@@ -65,12 +67,27 @@ class Limiter:
 
     def __init__(self, limits: CommandLimits, dt_s: float) -> None:
         self.limits = limits
-        self.last = limits.safe
-        self._step = limits.slew_per_s * dt_s
+        self.numbers = np.empty(LIMITER_NUMBERS)
+        """What a limit takes, by the places in :mod:`hilctl.kernels.tick`, updated in place."""
+        self.numbers[[LAST, LOW, HIGH, STEP]] = (
+            limits.safe,
+            limits.low,
+            limits.high,
+            limits.slew_per_s * dt_s,
+        )
         self._ramp_step = limits.ramp_per_s * dt_s
         furthest = max(limits.high - limits.safe, limits.safe - limits.low)
         self._stride = max(self._ramp_step, _LARGEST_STRIDE * furthest)
         load(limit_block)
+
+    @property
+    def last(self) -> float:
+        """The last command."""
+        return self.numbers.item(LAST)
+
+    @last.setter
+    def last(self, command: float) -> None:
+        self.numbers[LAST] = command
 
     def limit(self, wanted: F64, command: F64, flags: U32) -> int:
         """Fill ``command`` (float64[n]) with what may be put out; add to ``flags`` (uint32[n]).
@@ -78,7 +95,7 @@ class Limiter:
         Returns:
             Index of the first wish that was not finite, or -1.
         """
-        return self._apply(wanted, self._step, command, flags)
+        return self._apply(wanted, self.numbers.item(STEP), command, flags)
 
     @property
     def at_rest(self) -> bool:
@@ -123,9 +140,7 @@ class Limiter:
             limits.low,
             limits.high,
             max_step,
-            _RANGE_LIMITED,
-            _SLEW_LIMITED,
-            _INVALID,
+            *BITS,
             command,
             flags,
         )

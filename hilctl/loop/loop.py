@@ -21,14 +21,18 @@ from hilctl.base.device import Device
 from hilctl.base.errors import DeviceError
 from hilctl.base.events import OFFSET, Event
 from hilctl.base.samples import Flag, Head
+from hilctl.kernels.tick import ASKED
 from hilctl.loop.beginning import Beginning
 from hilctl.loop.block import Block
+from hilctl.loop.composed import Composed, compose
+from hilctl.loop.feed import feed, pass_over
 from hilctl.loop.host import Host, Tuning
-from hilctl.loop.interlocks import Interlocks
+from hilctl.loop.interlocks import Interlocks, Trip
 from hilctl.loop.limiter import Limiter
 from hilctl.loop.pacer import Lateness, Pacer
 from hilctl.loop.plan import Code, Outcome, Plan
-from hilctl.loop.tuning import Tuner, tune
+from hilctl.loop.tuning import Tuner
+from hilctl.loop.usual import UsualTicks
 
 # Plain numbers: looking up an enumeration's member takes longer than writing it.
 _FIRST_SAMPLE, _SAMPLES = int(Head.FIRST_SAMPLE), int(Head.SAMPLES)
@@ -63,12 +67,20 @@ class Loop:
         self._device = device
         self._host = host
         self._clock = host.clock
-        self._is_input = plan.input_um is plan.reference
         self._compensator = plan.compensator
         self._limiter = Limiter(plan.limits, 1.0 / plan.sample_rate_hz)
         self._interlocks = Interlocks(plan.interlocks, plan.interlock_settings, plan.sample_rate_hz)
         self._pacer = Pacer(host.clock, period_ns, plan.late_policy, plan.late_rules)
         self._tuner = Tuner()
+        self._composed = compose(plan, self._limiter, self._interlocks)
+        # What works out part of the input, and learns from the answers, block by block.
+        learners = plan.feedback, plan.adaptation, plan.conditioning
+        self._learns = any(each is not None for each in learners)
+        self._usual: UsualTicks | None = None
+        if self._composed and not self._learns and not plan.latency_blocks:
+            direct = host.direct()
+            if direct is not None:
+                self._usual = UsualTicks(self._composed, direct, device, host.clock)
         self._in_flight: deque[Block] = deque()
         self._start_ns = 0
         self._next_sample = 0
@@ -136,15 +148,15 @@ class Loop:
 
     def _tick(self) -> bool:
         """Run one tick; return whether the safe value is reached in it."""
-        block = self._next_block()
+        skipped = self._wait()
+        if not skipped and self._usual_tick():
+            return False
+        block = self._claim(skipped)
         # Supervision comes before the commands are worked out: what it asks for holds at once.
         self._supervise()
         done, first_invalid = self._fill(block)
         self._exchange(block)
-        if first_invalid >= 0:
-            sample = block.head[_FIRST_SAMPLE] + first_invalid
-            reason = f"wanted command is not a finite number at sample {sample}"
-            self._leave("fault", "invalid_command", reason)
+        self._leave_invalid(block.head[_FIRST_SAMPLE], first_invalid)
         feedback = self._plan.feedback
         if feedback is not None and feedback.against:
             self._leave("fault", "feedback_sign", feedback.against)
@@ -155,58 +167,74 @@ class Loop:
             self._take_offset_out()
             if self._plan.adaptation is not None:
                 self._plan.adaptation.take_noise(self._before.noise_um)
-        self._record_adapted()
+        if self._learns:
+            self._record_adapted()
         return done
+
+    def _usual_tick(self) -> bool:
+        """Run a whole tick that nothing special happens in; False, and nothing done, in others."""
+        usual, first_sample = self._usual, self._next_sample
+        follows = self._phase is _Phase.FOLLOWING and self._tuner.idle and not self._missing
+        if usual is None or not follows or self._end - first_sample < self._plan.block:
+            return False
+        start = first_sample - self._before.waveform_at
+        invalid = usual.begin(self._pacer, first_sample, start, self._start_ns)
+        if invalid == ASKED:
+            return False
+        self._on_ramp = False
+        self._next_sample = self._ended_at = first_sample + self._plan.block
+        try:
+            tripped = usual.exchange(first_sample)
+        except DeviceError:  # it may have reached the device: recorded as sent and not answered
+            self._in_flight.append(usual.newest())
+            raise
+        self._interlocks.next_sample = self._next_sample
+        if tripped >= 0:
+            block = usual.newest()
+            self._take(block, usual.trip(block, tripped))
+        self._leave_invalid(first_sample, invalid)
+        return True
+
+    def _leave_invalid(self, first_sample: int, invalid: int) -> None:
+        """Leave where a block has a wish that is none; ``invalid`` is its index, or -1."""
+        if invalid >= 0:
+            reason = f"wanted command is not a finite number at sample {first_sample + invalid}"
+            self._leave("fault", "invalid_command", reason)
 
     def _hold(self) -> None:
         """Hold the safe value for one more block, for the sake of the answer that comes with it."""
-        block = self._next_block(due=False)
+        block = self._claim(self._wait(), due=False)
         self._host.heartbeat(self._next_sample, self._pacer.counters.late_ticks)
         block.command[:] = self._limiter.limits.safe
         self._exchange(block)
 
-    def _next_block(self, *, due: bool = True) -> Block:
-        """Wait for the tick; return its block with the head filled in."""
-        pacer, block_samples = self._pacer, self._plan.block
-        most = None
+    def _wait(self) -> int:
+        """Wait for the tick; return the samples that were skipped before it."""
+        block_samples, most = self._plan.block, None
         if self._phase in _BEFORE:  # their last tick is not skipped: what comes next waits
             before = self._before
             ends = before.condition_at if self._phase is _Phase.STARTING else before.waveform_at
             most = (ends - self._next_sample) // block_samples - 1
-        skipped = pacer.wait(most) * block_samples
+        skipped = self._pacer.wait(most) * block_samples
         # Before the block is claimed: its number and the state kept with it are those after it.
-        if skipped:
-            self._pass_over(skipped)
+        start = self._next_sample
+        self._next_sample += skipped
+        if skipped and self._phase is _Phase.FOLLOWING:
+            at = self._before.waveform_at
+            pass_over(self._plan, self._before, self._tuner, start - at, self._next_sample - at)
+        return skipped
+
+    def _claim(self, skipped: int, *, due: bool = True) -> Block:
+        """Return the tick's block with the head filled in."""
+        pacer = self._pacer
         block = self._host.claim(due=due)
         block.skipped = skipped
         head = block.head
-        head[_FIRST_SAMPLE], head[_SAMPLES] = self._next_sample, block_samples
+        head[_FIRST_SAMPLE], head[_SAMPLES] = self._next_sample, self._plan.block
         head[_DROPPED_BEFORE] = skipped
         head[_DEADLINE_NS] = pacer.deadline_ns - self._start_ns
         head[_LATE_NS], head[_EXCHANGE_NS] = pacer.late_ns, 0
         return block
-
-    def _pass_over(self, skipped: int) -> None:
-        """Let references go by that no tick was in time for.
-
-        The compensator follows them, though nothing is put out: a jump of its input would come out
-        as a command of its own, the more so the more of a lead it gives.
-        """
-        plan, start = self._plan, self._next_sample
-        self._next_sample += skipped
-        if self._phase is not _Phase.FOLLOWING:
-            return
-        at = self._before.waveform_at
-        passed = plan.input_um[start - at : self._next_sample - at].copy()
-        factors = self._tuner.advance(passed.size)
-        if factors is not None:
-            tune(factors, passed, passed)
-        self._before.correct(passed, start - at)
-        if plan.feedback is not None:
-            passed += plan.feedback.correction_um
-        if plan.adaptation is not None:
-            plan.adaptation.follow(passed, passed.size)
-        self._compensator.process(passed, np.empty_like(passed))
 
     def _supervise(self) -> None:
         """Write the heartbeat, and follow what is requested of the run."""
@@ -285,34 +313,42 @@ class Loop:
             number, or -1.
         """
         plan = self._plan
-        # The memory before the block, so that a replay can begin at any gap.
-        self._compensator.state(block.memory)
-        block.state[-1] = self._limiter.last
         if block.skipped:
             block.flags |= _SKIPPED
         following = self._phase is _Phase.FOLLOWING
+        left = self._end - self._next_sample
+        n = min(left, plan.block) if following else 0
+        if n == plan.block and (composed := self._composed) and self._tuner.idle:
+            self._on_ramp = False
+            return False, self._fill_composed(composed, block)
+        # The memory before the block, so that a replay can begin at any gap.
+        self._compensator.state(block.memory)
+        block.state[-1] = self._limiter.last
         conditioning = self._phase is _Phase.CONDITIONING
         block.guarded = following or conditioning
         if conditioning:
             return False, self._condition(block)
-        left = self._end - self._next_sample
-        n = min(left, plan.block) if following else 0
         on_ramp, self._on_ramp = self._on_ramp, n < plan.block
-        if n == plan.block:
-            reference, input_um = block.reference, block.input_um
-            wish = self._follow(
-                block, reference, input_um, block.wanted, block.command, block.flags
-            )
-            return False, wish
         first_invalid = -1
         if n > 0:
             parts = (block.reference[:n], block.input_um[:n], block.wanted[:n])
             first_invalid = self._follow(block, *parts, block.command[:n], block.flags[:n])
+        if n == plan.block:
+            return False, first_invalid
         block.reference[n:] = block.input_um[n:] = np.nan
         block.wanted[n:] = self._limiter.limits.safe
         skipped = block.skipped if on_ramp else 0
         there = self._limiter.ramp(block.command[n:], block.flags[n:], skipped)
         return there and self._phase is _Phase.LEAVING, first_invalid
+
+    def _fill_composed(self, composed: Composed, block: Block) -> int:
+        """Work out a block of the waveform that passes as it is; see :meth:`_follow`."""
+        start = self._next_sample - self._before.waveform_at
+        block.composed = True
+        if not self._learns:
+            return composed.plan_block(block, start)
+        feed(self._plan, self._before, None, block, (block.reference, block.input_um), start)
+        return composed.follow_block(block)
 
     def _condition(self, block: Block) -> int:
         """Fill a block of the conditioning; return the first wish that is not finite, or -1."""
@@ -331,24 +367,10 @@ class Loop:
         flags: U32,
     ) -> int:
         """Fill what comes of the reference; return the first wish that is not finite, or -1."""
-        plan = self._plan
-        start = self._next_sample - self._before.waveform_at
-        stop = start + wanted.size
         tuner = self._tuner
         factors = tuner.advance(wanted.size)
-        if factors is None:
-            reference[:] = plan.reference[start:stop]
-            # The reference itself, as a rule: a copy of what was copied is the quicker one.
-            input_um[:] = reference if self._is_input else plan.input_um[start:stop]
-        else:
-            tune(factors, plan.reference[start:stop], reference)
-            tune(factors, plan.input_um[start:stop], input_um)
-        self._before.correct(input_um, start)
-        if plan.feedback is not None:
-            plan.feedback.follow(block, input_um)
-        # Last: what it makes of the input is the model's own, and what it learns from.
-        if plan.adaptation is not None:
-            plan.adaptation.follow(input_um, plan.block)
+        start = self._next_sample - self._before.waveform_at
+        feed(self._plan, self._before, factors, block, (reference, input_um), start)
         self._compensator.process(input_um, wanted)
         # The compensator's memory first: it goes on as if its command were put out.
         if factors is not None:
@@ -367,31 +389,26 @@ class Loop:
             # Before the exchange: a loop that is killed in it leaves what it has sent.
             self._host.sending(sent)
             self._ended_at = self._next_sample
+        composed = self._composed if sent.composed else None
+        given, filled = (sent, answered) if composed is None else (composed, composed)
+        first_sample = sent.head[_FIRST_SAMPLE]
         before_ns = self._clock.now_ns()
-        self._device.exchange(
-            sent.head[_FIRST_SAMPLE], sent.command, answered.displacement_um, answered.measured
-        )
+        self._device.exchange(first_sample, given.command, filled.displacement_um, filled.measured)
         sent.head[_EXCHANGE_NS] = self._clock.now_ns() - before_ns
         if not early:
             in_flight.popleft()
-            self._take(answered)
+            judge = self._interlocks.judge if composed is None else composed.judge
+            self._take(answered, judge(answered))
 
-    def _take(self, block: Block) -> None:
-        """Judge and record a block whose displacements have come."""
-        trip = self._interlocks.check(
-            block.head[_FIRST_SAMPLE],
-            block.command,
-            block.reference,
-            block.displacement_um,
-            block.measured,
-            block.flags,
-        )
-        self._before.take(block.head[_FIRST_SAMPLE], block.displacement_um)
-        # Before it is recorded: from then on its slot may be another block's.
-        if self._plan.feedback is not None:
-            self._plan.feedback.take(block)
-        if self._plan.adaptation is not None:
-            self._plan.adaptation.take(block)
+    def _take(self, block: Block, trip: Trip | None) -> None:
+        """Learn from a block whose displacements have come and been judged, and record it."""
+        if self._learns:
+            self._before.take(block.head[_FIRST_SAMPLE], block.displacement_um)
+            # Before it is recorded: from then on its slot may be another block's.
+            if self._plan.feedback is not None:
+                self._plan.feedback.take(block)
+            if self._plan.adaptation is not None:
+                self._plan.adaptation.take(block)
         # Recorded before the run leaves for it: the event refers to samples that are there.
         self._record(block)
         if trip is not None and block.guarded:

@@ -55,7 +55,8 @@ class Tuner:
         self._from = _AS_IT_IS
         self._to = Tuning(1.0, 0.0, 0)
         self._done = 0
-        self._idle = True
+        self.idle = True
+        """Whether references and commands pass as they are."""
 
     @property
     def moving(self) -> bool:
@@ -92,11 +93,11 @@ class Tuner:
         if self.moving:
             values = self._way(self._done / wanted.samples)
         self.gain, self.offset, self.inverse_share = values
-        self._idle = not self.moving and values == _AS_IT_IS
+        self.idle = not self.moving and values == _AS_IT_IS
 
     def advance(self, samples: int) -> Factors | None:
         """Return what the next samples are tuned by; None where they pass as they are."""
-        if self._idle:
+        if self.idle:
             return None
         if not self.moving:
             return Factors(self.gain, self.offset, self.inverse_share)

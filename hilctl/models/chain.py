@@ -6,8 +6,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from hilctl.base.arrays import F64
-from hilctl.kernels.dynamics import between_block, delay_block
-from hilctl.models.base import Operator
+from hilctl.kernels.dynamics import between_stage, delay_block
+from hilctl.models.base import Operator, Stage
 
 _WIDEST = 64
 
@@ -48,6 +48,16 @@ class Chain(Operator):
             stage.keep_in(memory[start:stop])
             start = stop
 
+    def _own_stages(self) -> list[Stage] | None:
+        """Return those of all its operators, in order."""
+        stages: list[Stage] = []
+        for each in self._stages:
+            parts = each.stages()
+            if parts is None:
+                return None
+            stages += parts
+        return stages
+
     def _run(self, block: F64, memory: F64, out: F64) -> None:
         for stage in self._stages:
             block = stage.process(block, out)
@@ -60,11 +70,7 @@ def delayed(samples: int) -> Operator:
 
 def between(part: float) -> Operator:
     """Return an operator that takes a signal ``part`` of the way from the sample before to each."""
-
-    def run(x: F64, memory: F64, out: F64) -> None:
-        between_block(x, part, memory, out)
-
-    return Operator(run, 0)
+    return Operator.staged(between_stage, np.array([part]), 0)
 
 
 def smoothing_weights(

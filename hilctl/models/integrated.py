@@ -6,7 +6,7 @@ import numpy as np
 from pydantic import Field
 
 from hilctl.base.arrays import F64
-from hilctl.kernels.hysteresis import integrated_forward, integrated_inverse
+from hilctl.kernels.hysteresis import integrated_forward, integrated_inverse_stage
 from hilctl.models.base import Operator
 from hilctl.models.deadband import DeadbandFunction
 from hilctl.models.plays import PlayModel
@@ -44,9 +44,11 @@ class IntegratedModel(PlayModel):
         """Return Omega^-1, from um to command, at rest (6.17)."""
         direct, weights, thresholds = self.inverse_parameters()
         rate_gain = self.inverse_rate_gain(sample_rate_hz)
-        deadband = self.deadband.inverse().arrays()
-
-        def run(y: F64, memory: F64, out: F64) -> None:
-            integrated_inverse(y, *deadband, rate_gain, direct, thresholds, weights, memory, out)
-
-        return Operator(run, self.operators, input_offset=-self.output_offset_um)
+        slope, *sides = self.deadband.inverse().arrays()
+        sizes = sides[0].size, sides[2].size
+        numbers = (slope, rate_gain, direct, *sizes)
+        parameters = np.concatenate((numbers, *sides, thresholds, weights))
+        offset = -self.output_offset_um
+        return Operator.staged(
+            integrated_inverse_stage, parameters, self.operators, input_offset=offset
+        )

@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import model_validator
 
 from hilctl.base.arrays import F64
-from hilctl.kernels.implicit import implicit_forward, implicit_inverse
+from hilctl.kernels.implicit import implicit_forward, implicit_inverse_stage
 from hilctl.models.base import HysteresisModel, Operator
 
 TOLERANCE_UM = 1e-7
@@ -69,12 +69,13 @@ class ImplicitModel(SpannedModel):
         """Return the operator from um to command, at rest."""
         del sample_rate_hz
         p = self.packed()
-        span = self.command_span
-
-        def run(y: F64, memory: F64, out: F64) -> None:
-            implicit_inverse(p.kind, y, span, TOLERANCE_UM, p.arrays, memory, out)
-
-        return Operator(run, self.operators, input_offset=-self.output_offset_um)
+        sizes = p.arrays[0].size, p.arrays[1].size
+        numbers = (p.kind, *self.command_span, TOLERANCE_UM, *sizes)
+        parameters = np.concatenate((numbers, *p.arrays))
+        offset = -self.output_offset_um
+        return Operator.staged(
+            implicit_inverse_stage, parameters, self.operators, input_offset=offset
+        )
 
 
 NOTHING = np.zeros(1)

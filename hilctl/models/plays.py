@@ -7,7 +7,7 @@ from pydantic import Field, model_validator
 
 from hilctl.base.arrays import F64
 from hilctl.base.errors import ModelError
-from hilctl.kernels.hysteresis import play_sum
+from hilctl.kernels.hysteresis import play_sum, play_sum_stage
 from hilctl.models.base import (
     HysteresisModel,
     Operator,
@@ -106,11 +106,9 @@ class PlayModel(HysteresisModel):
         """Return the operator from um to command, at rest."""
         direct, weights, thresholds = self.inverse_parameters()
         rate_gain = self.inverse_rate_gain(sample_rate_hz)
-
-        def run(x: F64, memory: F64, out: F64) -> None:
-            play_sum(x, rate_gain, direct, thresholds, weights, memory, out)
-
-        return Operator(run, self.operators, input_offset=-self.output_offset_um)
+        parameters = np.concatenate(((rate_gain, direct), thresholds, weights))
+        offset = -self.output_offset_um
+        return Operator.staged(play_sum_stage, parameters, self.operators, input_offset=offset)
 
 
 class PpiModel(PlayModel):

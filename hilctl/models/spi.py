@@ -5,7 +5,7 @@ from typing import Literal
 import numpy as np
 
 from hilctl.base.arrays import F64
-from hilctl.kernels.hysteresis import stop_sum
+from hilctl.kernels.hysteresis import stop_sum_stage
 from hilctl.models.base import Operator
 from hilctl.models.plays import PlayModel
 
@@ -37,8 +37,6 @@ class SpiModel(PlayModel):
         """Return the operator from um to command, at rest; no rate makes a difference."""
         del sample_rate_hz
         direct, weights, thresholds = self.stop_parameters()
-
-        def run(y: F64, memory: F64, out: F64) -> None:
-            stop_sum(y, direct, thresholds, weights, memory, out)
-
-        return Operator(run, weights.size, input_offset=-self.output_offset_um)
+        parameters = np.concatenate(((direct,), thresholds, weights))
+        offset = -self.output_offset_um
+        return Operator.staged(stop_sum_stage, parameters, weights.size, input_offset=offset)

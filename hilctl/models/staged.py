@@ -23,7 +23,7 @@ from hilctl.base.errors import ModelError
 from hilctl.base.strict import Strict
 from hilctl.kernels.dynamics import (
     lag_block,
-    lead_block,
+    lead_stage,
     structure_block,
     weigh_block,
 )
@@ -66,12 +66,8 @@ class FieldLag(Strict):
 
     def inverse(self, sample_rate_hz: float) -> Operator:
         """Return the lead, exact where the lag can follow; with a preview of one sample."""
-        periods, growth = 1.0 / (sample_rate_hz * self.tau_s), self.growth_per_unit
-
-        def run(x: F64, memory: F64, out: F64) -> None:
-            lead_block(x, periods, growth, memory, out)
-
-        lead = Operator(run, 1)
+        periods = 1.0 / (sample_rate_hz * self.tau_s)
+        lead = Operator.staged(lead_stage, np.array([periods, self.growth_per_unit]), 1)
         lead.preview = 1
         return lead
 
@@ -221,11 +217,7 @@ class StagedModel(HysteresisModel):
         radian = radian_s * sample_rate_hz
         width = max(self.smoothing_s * sample_rate_hz, radian)
         weights, ahead = smoothing_weights(width, 2.0 * damping * radian, radian**2)
-
-        def run(y: F64, memory: F64, out: F64) -> None:
-            weigh_block(y, weights, memory, out)
-
-        inverse = Operator(run, weights.size - 1)
+        inverse = Operator.staged(weigh_block, weights, weights.size - 1)
         inverse.preview = ahead
         return inverse
 

@@ -79,7 +79,7 @@ class SampleRing:
             raise ValueError(f"{path}: is damaged")
         self._area = self._views(state_size)
         self._heads = memoryview(self._area.heads.data.cast("B")).cast("q")
-        self._sent, self._spares_used = self.page.get(Field.SENT), 0
+        self._spares_used = 0
         self._tail = self._safe = self._released = self.page.get(Field.TAIL)
 
     @classmethod
@@ -136,17 +136,28 @@ class SampleRing:
 
         The same one again until :meth:`sending` has been called with it.
         """
-        number = self._sent
+        number = self._numbers[_SENT]
         if due and number - self._numbers[_TAIL] < self.slots:
             slot = number % self.slots
         else:
             slot, number = self.slots + self._spares_used % self._spare, -1
             self._spares_used += 1
             self._clean(slice(slot, slot + 1))
-        at, area = slot * _HEAD_NUMBERS, self._area
-        head = self._heads[at : at + _HEAD_NUMBERS]
-        # Views are made anew: those of all slots, kept, would be out of the processor's cache.
-        block = Block(head, area.states[slot], area.columns[slot], area.flags[slot])
+        return self._block(slot, number, due=due)
+
+    @property
+    def area(self) -> Batch:
+        """All slots, and the spare ones after them."""
+        return self._area
+
+    def newest(self) -> Block:
+        """Return the block that was sent last; its slot is its own, and the sender asks."""
+        number = self._numbers[_SENT] - 1
+        return self._block(number % self.slots, number)
+
+    def _block(self, slot: int, number: int, *, due: bool = True) -> Block:
+        at = slot * _HEAD_NUMBERS
+        block = Block(self._heads[at : at + _HEAD_NUMBERS], self._area, slot)
         block.number, block.due = number, due
         return block
 
@@ -155,7 +166,7 @@ class SampleRing:
         numbers = self._numbers
         if block.number >= 0:
             block.head[_SEQUENCE] = -block.number - 1
-            self._sent = numbers[_SENT] = block.number + 1
+            numbers[_SENT] = block.number + 1
         numbers[_ENDED_AT] = block.head[_FIRST_SAMPLE] + self.block
         # Last: from here on the loop may be silent for as long as the device keeps it waiting.
         numbers[_EXCHANGING] = 1

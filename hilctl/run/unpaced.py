@@ -69,11 +69,14 @@ class BatchHost:
         self._claimed = self._first = self._answered = 0
         self._on_batch, self._on_event, self._stop = on_batch, on_event, stop
 
+    def direct(self) -> None:
+        """Return None: blocks are gathered call by call."""
+
     def claim(self, *, due: bool = True) -> Block:
         """Return room for the next block."""
         slot, room = self._claimed % self._room.heads.shape[0], self._room
         head = room.heads[slot].data.cast("B").cast("q")
-        block = Block(head, room.states[slot], room.columns[slot], room.flags[slot])
+        block = Block(head, room, slot)
         block.number, block.due = self._claimed if due else -1, due
         self._claimed += 1
         return block

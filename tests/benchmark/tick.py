@@ -12,6 +12,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from pathlib import Path
 from typing import ClassVar
@@ -29,9 +30,11 @@ from hilctl.run import loop_process
 from hilctl.run.job import Job
 from hilctl.run.ring import SampleRing
 from hilctl.run.run_folder import RunCard, RunFolder
-from hilctl.run.shared_page import Field
+from hilctl.run.shared_page import Field, Phase, SharedPage
 
 EXPERIMENT = Path(__file__).parents[2] / "configs" / "terfenol_sine_6a.yaml"
+MODELS = EXPERIMENT.parent / "models"
+TARGETS_US = {"terfenol_omega": 5.0, "terfenol_staged": 6.0, "terfenol_staged_preisach": 10.0}
 HAL = """\
 loadrt threads name1=servo period1={period_ns}
 loadrt siggen num_chan=1
@@ -65,16 +68,15 @@ class NotingClock(SystemClock):
         self.woke.append(time.monotonic_ns())
 
 
-def experiment(options: argparse.Namespace) -> LoadedExperiment:
-    """Return the shipped experiment at one sample a tick."""
+def experiment(options: argparse.Namespace, model: Path) -> LoadedExperiment:
+    """Return the shipped experiment with a model, one sample a tick."""
     settings = {
         "sample_rate_hz": float(options.rate),
         "block": 1,
         "waveform.frequency_hz": 1.0,
         "waveform.duration_s": options.ticks / options.rate,
+        "compensator.model": model.resolve(),
     }
-    if options.model:
-        settings["compensator.model"] = options.model.resolve()
     return load_experiment(EXPERIMENT, [f"{key}={value}" for key, value in settings.items()])
 
 
@@ -83,9 +85,19 @@ def job(folder: RunFolder, checked: Checked) -> Job:
     return Job.of(checked, folder, supervisor=os.getppid(), silence_s=1e9)
 
 
-def ticks_us(options: argparse.Namespace) -> tuple[np.ndarray, np.ndarray]:
+def start(page: SharedPage) -> None:
+    """Give the start signal once all is compiled, as the supervisor does."""
+    while page.get(Field.PHASE) != Phase.READY:
+        time.sleep(0.01)
+    page.put(Field.START_NS, time.monotonic_ns() + 50_000_000)
+    page.put(Field.GO, 1)
+
+
+def ticks_us(options: argparse.Namespace, model: Path) -> tuple[np.ndarray, np.ndarray]:
     """Run the loop; return the cost of each tick beside the exchange, and the exchange, in us."""
-    checked = check(experiment(options))
+    checked = check(experiment(options, model))
+    NotingClock.slept.clear()
+    NotingClock.woke.clear()
     config = checked.loaded.config
     slots = options.ticks + 10 * round(config.safe.ramp_s * options.rate)
     loop_process.SystemClock = NotingClock  # type: ignore[misc]
@@ -93,10 +105,7 @@ def ticks_us(options: argparse.Namespace) -> tuple[np.ndarray, np.ndarray]:
         folder = RunFolder(Path(name), RunCard("tick", "tick", "", os.getpid(), 0.0))
         ring = SampleRing.create(folder.ring, slots=slots, block=1, state_size=checked.state_size)
         work = job(folder, checked)
-        for step in prepare(Realtime(priority=options.priority)):
-            print(f"{step.name:>13}  {step.outcome}: {step.detail}")
-        ring.page.put(Field.START_NS, time.monotonic_ns() + 50_000_000)
-        ring.page.put(Field.GO, 1)
+        threading.Thread(target=start, args=(ring.page,), daemon=True).start()
         outcome = loop_process.run_job(work, ring, work.load())
         batch = ring.pop()
     if outcome.code != "completed" or batch is None:
@@ -145,19 +154,28 @@ def figures(values_us: np.ndarray) -> str:
 
 
 def main() -> int:
-    """Run the benchmark; the exit code is 1 where the median is above ``--max-us``."""
+    """Run the benchmark; the exit code is 1 where a median is above its target."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
     parser.add_argument("--ticks", type=int, default=10_000)
     parser.add_argument("--rate", type=float, default=1000.0, help="ticks a second")
     parser.add_argument("--priority", type=int, default=80)
-    parser.add_argument("--model", type=Path, help="another model than the experiment's")
-    parser.add_argument("--max-us", type=float, default=25.0)
+    parser.add_argument("--model", type=Path, help="a model of your own; three shipped ones else")
+    parser.add_argument("--max-us", type=float, help="target of the median; each model's own else")
     options = parser.parse_args()
-    tick_us, exchange_us = ticks_us(options)
-    print(f"tick beside the device  {figures(tick_us)}")
-    print(f"simulated device        {figures(exchange_us)}")
+    for step in prepare(Realtime(priority=options.priority)):
+        print(f"{step.name:>13}  {step.outcome}: {step.detail}")
+    shipped = [MODELS / f"{name}.yaml" for name in TARGETS_US]
+    missed = False
+    for model in [options.model] if options.model else shipped:
+        tick_us, exchange_us = ticks_us(options, model)
+        target_us = options.max_us or TARGETS_US.get(model.stem, min(TARGETS_US.values()))
+        ratio = np.median(tick_us) / target_us
+        missed |= ratio > 1.0
+        print(f"{model.stem}: {ratio:.2f} of the target, {target_us:g} us")
+        print(f"  tick beside the device  {figures(tick_us)}")
+        print(f"  simulated device        {figures(exchange_us)}")
     print(f"LinuxCNC HAL thread     {linuxcnc(options)}")
-    return int(np.median(tick_us) > options.max_us)
+    return int(missed)
 
 
 if __name__ == "__main__":

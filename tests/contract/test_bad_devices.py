@@ -1,6 +1,7 @@
 """The contract of devices must be able to fail: each of these breaks one rule, and is found out."""
 
 import importlib.util
+from collections import deque
 from dataclasses import replace
 from inspect import signature
 from pathlib import Path
@@ -47,13 +48,18 @@ class Ideal:
         max_rate_hz=20_000.0,
     )
 
+    um_per_a = UM_PER_A
+
     def __init__(self):
         self.current_a, self.is_open = 0.0, False
 
     def open(self, sample_rate_hz, block):
         if sample_rate_hz > self.info.max_rate_hz:
-            raise DeviceError("modbus_dac: too fast")
+            raise self.error("too fast")
         self.is_open = True
+
+    def error(self, text):
+        return DeviceError(f"{self.info.name}: {text}")
 
     def output(self):
         self.need_open()
@@ -61,17 +67,18 @@ class Ideal:
 
     def need_open(self):
         if not self.is_open:
-            raise DeviceError("modbus_dac: not open")
+            raise self.error("not open")
 
     def refuse(self, command):
-        if not (np.abs(command) <= HIGHEST_A).all():
-            raise DeviceError("modbus_dac: out of range, nothing was sent")
+        low, high = self.info.command_min, self.info.command_max
+        if not ((command >= low) & (command <= high)).all():
+            raise self.error("out of range, nothing was sent")
 
     def exchange(self, first_sample, command, displacement_um, measured):
         self.need_open()
         self.refuse(command)
         for j, value in enumerate(command):
-            displacement_um[j] = UM_PER_A * self.current_a
+            displacement_um[j] = self.um_per_a * self.current_a
             self.current_a = float(value)
 
     def make_safe(self, command):
@@ -85,6 +92,89 @@ class GoesToTheEndsOfItsSensor(Ideal):
     """Reads its lowest value at rest and its highest at the command that it is tried with."""
 
     info = replace(Ideal.info, sensor_min_um=0.0, sensor_max_um=0.5 * HIGHEST_A * UM_PER_A)
+
+
+class DrivesOneWay(Ideal):
+    """As supplies do, and amplifiers of piezos."""
+
+    info = replace(Ideal.info, command_min=0.0)
+
+
+class KeepsJustThisRate(Ideal):
+    info = replace(Ideal.info, max_rate_hz=CONTRACT.RATE_HZ)
+
+
+class MovesLittle(Ideal):
+    """1.5 um at the command that it is tried with."""
+
+    um_per_a = 0.6
+
+
+class CountsItsSamples(Ideal):
+    """Takes no block that does not follow the one before; the first has number 0."""
+
+    due = 0
+
+    def open(self, sample_rate_hz, block):
+        super().open(sample_rate_hz, block)
+        self.due = 0
+
+    def exchange(self, first_sample, command, displacement_um, measured):
+        if first_sample != self.due:
+            raise self.error("samples are missing")
+        super().exchange(first_sample, command, displacement_um, measured)
+        self.due += command.size
+
+
+class OpensOnlyWhenClosed(Ideal):
+    def open(self, sample_rate_hz, block):
+        if self.is_open:
+            raise self.error("is open already")
+        super().open(sample_rate_hz, block)
+
+
+class HasAnOffset(Ideal):
+    """Its sensor was not set to zero."""
+
+    def exchange(self, first_sample, command, displacement_um, measured):
+        super().exchange(first_sample, command, displacement_um, measured)
+        displacement_um += 0.3
+
+
+class MovesOnlyInTheEnd(Ideal):
+    """Nearly a whole block later."""
+
+    def __init__(self):
+        super().__init__()
+        self.waiting_um = deque([0.0] * (CONTRACT.SAMPLES - 2))
+
+    def exchange(self, first_sample, command, displacement_um, measured):
+        super().exchange(first_sample, command, displacement_um, measured)
+        for j, value in enumerate(displacement_um):
+            self.waiting_um.append(value)
+            displacement_um[j] = self.waiting_um.popleft()
+
+
+class Sluggish(Ideal):
+    """Goes a twentieth of the way with each sample: 1.3 um after one block, 0.5 after two."""
+
+    um_per_a = 28.0
+    reached_um = 0.0
+
+    def exchange(self, first_sample, command, displacement_um, measured):
+        super().exchange(first_sample, command, displacement_um, measured)
+        for j, value in enumerate(displacement_um):
+            displacement_um[j] = self.reached_um = 0.95 * self.reached_um + 0.05 * value
+
+
+class BeginsAtRest(Ideal):
+    """As simulated ones do: with each opening."""
+
+    info = replace(Ideal.info, name=CONTRACT.SIMULATED[0])
+
+    def open(self, sample_rate_hz, block):
+        super().open(sample_rate_hz, block)
+        self.current_a = 0.0
 
 
 class DoesNothing(Ideal):
@@ -182,6 +272,22 @@ class SaysItsOutputWhenClosed(Ideal):
         return self.current_a
 
 
+class MovesTooLittle(Ideal):
+    """1 um at the command that it is tried with: as much as a reading may be off."""
+
+    um_per_a = 0.4
+
+
+class PutsOutHalf(Ideal):
+    """With a reading to go with it, as where the wiring's scale is wrong twice."""
+
+    um_per_a = 2.0 * UM_PER_A
+
+    def exchange(self, first_sample, command, displacement_um, measured):
+        super().exchange(first_sample, command, displacement_um, measured)
+        self.current_a *= 0.5
+
+
 class NeverMoves(Ideal):
     """Fills every reading with that of its rest."""
 
@@ -227,14 +333,14 @@ class TakesMore(Ideal):
     """A little, above its range only."""
 
     def refuse(self, command):
-        super().refuse(np.where(command > HIGHEST_A, command / 1.002, command))
+        super().refuse(np.where(command > HIGHEST_A, command / 1.003, command))
 
 
 class TakesLess(Ideal):
     """A little, below its range only."""
 
     def refuse(self, command):
-        super().refuse(np.where(command < -HIGHEST_A, command / 1.002, command))
+        super().refuse(np.where(command < -HIGHEST_A, command / 1.003, command))
 
 
 class RefusesInNobodysName(Ideal):
@@ -267,6 +373,14 @@ class SendsTheGoodPart(Ideal):
             super().exchange(first_sample + j, command[part], displacement_um[part], measured[part])
 
 
+class SendsALittle(Ideal):
+    """Of a block that it refuses."""
+
+    def refuse(self, command):
+        self.current_a = 0.05
+        super().refuse(command)
+
+
 class RoundsItsRange(Ideal):
     """Takes a little less than it says."""
 
@@ -294,6 +408,14 @@ class Early(Ideal):
     def exchange(self, first_sample, command, displacement_um, measured):
         super().exchange(first_sample, command, displacement_um, measured)
         displacement_um[:] = UM_PER_A * command
+
+
+class EarlyByAFifth(Ideal):
+    """Reads its sensor while the command begins to act: 0.5 um of the step that is tried."""
+
+    def exchange(self, first_sample, command, displacement_um, measured):
+        super().exchange(first_sample, command, displacement_um, measured)
+        displacement_um[0] += 0.02 * UM_PER_A * command[0]
 
 
 class NeverFillsReadings(Ideal):
@@ -324,6 +446,12 @@ class MovesAtOpen(Ideal):
     def open(self, sample_rate_hz, block):
         super().open(sample_rate_hz, block)
         self.current_a = 0.0
+
+
+class MovesALittleAtOpen(Ideal):
+    def open(self, sample_rate_hz, block):
+        super().open(sample_rate_hz, block)
+        self.current_a -= 0.1
 
 
 class MovesAtClose(Ideal):
@@ -407,6 +535,11 @@ class ByChance(Ideal):
         displacement_um += 0.01 * np.random.default_rng().normal(size=command.size)
 
 
+KEEPS_IT = (
+    Ideal, GoesToTheEndsOfItsSensor, DrivesOneWay, KeepsJustThisRate, MovesLittle, CountsItsSamples,
+    OpensOnlyWhenClosed, HasAnOffset, MovesOnlyInTheEnd, Sluggish, BeginsAtRest,
+)  # fmt: skip
+"""Each in another way."""
 MUST_FAIL = {
     DoesNothing: {"exchanges_blocks", "make_safe_works_open_or_closed"},
     NeverMadeSafe: {"make_safe_works_open_or_closed"},
@@ -419,6 +552,8 @@ MUST_FAIL = {
     LiesAboutItsOutput: {"says_what_it_puts_out"},
     DoesNotSayWhatItKnows: {"says_what_it_puts_out"},
     SaysItsOutputWhenClosed: {"says_what_it_puts_out"},
+    MovesTooLittle: {"exchanges_blocks", "displacement_is_sampled_before_the_command_acts"},
+    PutsOutHalf: {"make_safe_works_open_or_closed"},
     NeverMoves: {"exchanges_blocks", "displacement_is_sampled_before_the_command_acts"},
     ReadsBeyondItsSensor: {"exchanges_blocks"},
     ReadsBelowItsSensor: {"exchanges_blocks"},
@@ -432,14 +567,17 @@ MUST_FAIL = {
     Clips: {"refuses_what_it_can_not_do"},
     ClipsWhatIsWritten: {"refuses_what_it_can_not_do"},
     SendsTheGoodPart: {"refuses_what_it_can_not_do"},
+    SendsALittle: {"refuses_what_it_can_not_do"},
     RoundsItsRange: {"takes_its_whole_range"},
     Late: {"displacement_is_sampled_before_the_command_acts"},
     Early: {"displacement_is_sampled_before_the_command_acts"},
+    EarlyByAFifth: {"displacement_is_sampled_before_the_command_acts"},
     NeverFillsReadings: {"exchanges_blocks", "displacement_is_sampled_before_the_command_acts"},
     FillsTheFirstReading: {"exchanges_blocks"},
     FillsWhatItDoesNotMeasure: {"exchanges_blocks"},
     WritesTheCommand: {"does_not_change_the_command"},
     MovesAtOpen: {"opening_does_not_move_the_output"},
+    MovesALittleAtOpen: {"opening_does_not_move_the_output"},
     MovesAtClose: {"opening_does_not_move_the_output", "make_safe_works_open_or_closed"},
     OpensOnce: {"use_before_open_and_after_close_is_refused"},
     NeedsNoOpening: {"use_before_open_and_after_close_is_refused"},
@@ -481,7 +619,7 @@ def failures(kind):
     return found
 
 
-@pytest.mark.parametrize("kind", [Ideal, GoesToTheEndsOfItsSensor])
+@pytest.mark.parametrize("kind", KEEPS_IT)
 def test_a_device_that_keeps_the_contract_fails_nothing(kind):
     """So what others fail is what they break."""
     assert failures(kind) == set()

@@ -21,6 +21,7 @@ WIDE = CommandLimits(low=-200.0, high=200.0, slew_per_s=2e5, safe=0.0, ramp_per_
 FREE = {"limits": WIDE, "stroke_um": (-1e4, 1e4)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("frequency_hz", [1.0, 50.0, 250.0])
 @pytest.mark.parametrize("kind", KINDS)
 def test_command_after_skipped_ticks_is_the_one_that_was_due(kind, frequency_hz):

@@ -85,6 +85,7 @@ def test_the_edge_of_the_band_is_not_left():
         assert w[0] == pytest.approx(float(np.interp(end, NODES, CENTRE)) + edge, abs=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(5))
 def test_the_field_rises_with_the_displacement_however_rough_the_table(seed):
     """Which is what gives each command one displacement; over all lengths of a step."""

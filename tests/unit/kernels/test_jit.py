@@ -41,6 +41,7 @@ def test_compiled_and_python_agree_bit_for_bit(name):
     np.testing.assert_array_equal(memory, plain_memory)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", STREAMING)
 def test_callable_from_another_kernel(name):
     """Called inside somebody else's compiled function, a kernel does the same."""

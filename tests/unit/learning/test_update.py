@@ -91,6 +91,7 @@ def test_the_error_goes_to_the_noise_floor(response, coupling):
     assert max(peaks(state)) == peaks(state)[0]
 
 
+@pytest.mark.slow
 def test_it_stops_at_the_noise_floor():
     """Once the error is that of the noise, there is nothing to learn."""
     state = learned(Plant(Response()))
@@ -126,6 +127,7 @@ def test_the_reach_grows_while_the_error_falls():
     assert further.reach_hz > state.reach_hz
 
 
+@pytest.mark.slow
 def test_it_backs_off_to_the_best_where_the_error_grows():
     """Half the gain, and the next correction starts from the best one again."""
     plant = Plant(Response())

@@ -66,6 +66,7 @@ def follow(adapting, actuator, block, noise=None, reference=REFERENCE):
     return np.concatenate(errors)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("block", [1, 50])
 @pytest.mark.parametrize("delay", [0, 13])
 def test_it_finds_what_the_actuator_does(block, delay):
@@ -234,6 +235,7 @@ class TestLoop:
         loop.begin_at(0.0)
         return loop.run(0), adapting, host
 
+    @pytest.mark.slow
     @pytest.mark.parametrize(("latency", "block"), [(0, 1), (0, 50), (3, 10)])
     def test_offset_and_gain_are_found_through_a_fifo(self, latency, block):
         """Of a device that shows 4 % more, and 2 um beside it."""

@@ -1,8 +1,6 @@
 """A block is views of one slot: what is written in it stands in the slot's own arrays."""
 
-import numpy as np
-
-from hilctl.base.samples import COLUMNS, Head
+from hilctl.base.samples import COLUMNS, Batch
 from hilctl.loop.block import Block
 
 BLOCK_NAMES = {"reference_um": "reference"}  # in the command's unit where nothing compensates
@@ -10,9 +8,8 @@ BLOCK_NAMES = {"reference_um": "reference"}  # in the command's unit where nothi
 
 def test_each_name_is_the_column_of_that_name():
     """In the order of the recorded columns, without a copy."""
-    head = memoryview(bytearray(8 * len(Head))).cast("q")
-    state, columns = np.zeros(4), np.zeros((len(COLUMNS), 5))
-    block = Block(head, state, columns, np.zeros(5, dtype=np.uint32))
+    area = Batch.empty(3, 5, 4)
+    block, columns = Block(area.heads[1].data, area, 1), area.columns[1]
     for number, name in enumerate(COLUMNS, start=1):
         getattr(block, BLOCK_NAMES.get(name, name))[:] = number
     assert columns[:, 2].tolist() == list(range(1, len(COLUMNS) + 1))
@@ -20,9 +17,8 @@ def test_each_name_is_the_column_of_that_name():
 
 def test_memory_is_the_state_without_the_command_before():
     """The compensator writes there, and the limiter's last command stands behind it."""
-    head = memoryview(bytearray(8 * len(Head))).cast("q")
-    state = np.zeros(4)
-    block = Block(head, state, np.zeros((len(COLUMNS), 1)), np.zeros(1, dtype=np.uint32))
+    area = Batch.empty(3, 1, 4)
+    block = Block(area.heads[1].data, area, 1)
     block.memory[:] = 1.0
-    assert state.tolist() == [1.0, 1.0, 1.0, 0.0]
+    assert area.states[1].tolist() == [1.0, 1.0, 1.0, 0.0]
     assert (block.due, block.guarded, block.number, block.skipped) == (True, True, 0, 0)

@@ -1,7 +1,10 @@
 """The loop's host: heartbeats out, stop words and tunings in, through the shared page."""
 
+import math
+
 import pytest
 
+from hilctl.kernels import tick
 from hilctl.loop.host import StraightLine, Tuning
 from hilctl.run.host import RingHost
 from hilctl.run.ring import SampleRing
@@ -85,3 +88,9 @@ def test_closing_is_shown_before_the_device_takes_its_time(host, ring, clock):
     host.closing()
     assert ring.page.get(Field.PHASE) == Phase.CLOSING
     assert ring.page.get(Field.LOOP_HEARTBEAT_NS) == clock.now
+
+
+def test_a_supervisor_may_be_silent_for_ever(ring, clock):
+    """Where the experiment says that the run goes on without it."""
+    direct = RingHost(ring, clock, 77, math.inf).direct()
+    assert direct.numbers[tick.SILENCE_NS] > 100 * 365 * 86_400 * 10**9

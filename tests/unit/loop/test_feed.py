@@ -1,0 +1,48 @@
+"""What the compensator is fed with, in a tick and where ticks were skipped."""
+
+import numpy as np
+
+from hilctl.loop.beginning import Beginning
+from hilctl.loop.feed import feed, pass_over
+from hilctl.loop.host import Tuning
+from hilctl.loop.tuning import Factors, Tuner
+from tests.fakes import made_block
+from tests.unit.loop.test_composed import plan
+
+BEFORE = Beginning(None, 0)
+
+
+def fed(made, factors=None, start=10, n=7):
+    block = made_block(7)
+    feed(made, BEFORE, factors, block, (block.reference[:n], block.input_um[:n]), start)
+    return block
+
+
+def test_reference_and_input_as_they_were_planned():
+    """Each its own samples; the reference stands for both where there is one only."""
+    made = plan(block=7)
+    block = fed(made)
+    assert block.reference.tolist() == made.reference[10:17].tolist()
+    assert block.input_um.tolist() == made.input_um[10:17].tolist()
+    alone = plan("none", block=7)
+    assert fed(alone).input_um.tolist() == alone.reference[10:17].tolist()
+
+
+def test_both_are_tuned():
+    """By the same gain and offset; samples beyond the part are left alone."""
+    made = plan(block=7)
+    block = fed(made, Factors(0.5, 2.0, 1.0), n=4)
+    assert block.reference[:4].tolist() == (0.5 * made.reference[10:14] + 2.0).tolist()
+    assert block.input_um[:4].tolist() == (0.5 * made.input_um[10:14] + 2.0).tolist()
+    assert np.isnan(block.reference[4:]).all()
+
+
+def test_what_is_passed_over_moves_the_compensator():
+    """As if it had been put out, tuned as it would have been."""
+    passed, followed = plan(), plan()
+    tuner = Tuner()
+    tuner.move(Tuning(0.5, 2.0, 0))
+    pass_over(passed, BEFORE, tuner, 10, 20)
+    wanted = np.empty(10)
+    followed.compensator.process(0.5 * followed.input_um[10:20] + 2.0, wanted)
+    assert passed.compensator.state().tolist() == followed.compensator.state().tolist()
