@@ -1,6 +1,8 @@
 """Doubles that tests of several rooms share: clocks, devices, hosts and links."""
 
 import math
+import os
+import select
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -12,7 +14,7 @@ import numpy as np
 
 from hilctl.base.errors import DeviceError, InputError
 from hilctl.base.events import Event
-from hilctl.base.samples import COLUMNS, Head
+from hilctl.base.samples import Batch, Head
 from hilctl.loop.block import Block
 from hilctl.loop.host import Tuning
 from hilctl.loop.interlocks import InterlockContext, Interlocks, InterlockSettings
@@ -189,6 +191,9 @@ class FakeHost:
         self.sent: list[tuple[int, list[float]]] = []
         self.closed = False
 
+    def direct(self):
+        return None
+
     def claim(self, *, due=True):
         made = made_block(*self._shape)
         made.due = due
@@ -201,7 +206,7 @@ class FakeHost:
         if block.head[Head.FIRST_SAMPLE] in self.full:
             return False
         self.heads.append(list(block.head))
-        self.columns.append(block.reference.base.copy())
+        self.columns.append(block.columns.copy())
         self.flags.append(block.flags.copy())
         self.states.append(block.state.copy())
         return True
@@ -225,9 +230,9 @@ class FakeHost:
 
 def made_block(block=1, state_size=1, fill=np.nan):
     """Return a block in memory of its own."""
-    head = memoryview(bytearray(8 * len(Head))).cast("q")
-    columns = np.full((len(COLUMNS), block), fill)
-    return Block(head, np.zeros(state_size), columns, np.zeros(block, dtype=np.uint32))
+    area = Batch.empty(1, block, state_size)
+    area.columns[:] = fill
+    return Block(area.heads[0].data.cast("B").cast("q"), area, 0)
 
 
 @dataclass(frozen=True)
@@ -454,3 +459,11 @@ def loop_of(supervisor: int) -> int:
         if b"hilctl.run.loop_process" in Path(f"/proc/{child}/cmdline").read_bytes():
             return int(child)
     raise AssertionError("the run has no loop process")
+
+
+def received(descriptor: int, size: int, wait_s: float = 5.0) -> bytes:
+    """Read so many bytes of a line, which come in parts where the system is busy."""
+    got = b""
+    while len(got) < size and select.select([descriptor], [], [], wait_s)[0]:
+        got += os.read(descriptor, size - len(got))
+    return got

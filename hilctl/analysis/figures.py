@@ -10,6 +10,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from hilctl.base.device import CommandUnit
+from hilctl.machine.usage import ProcessUsage
 from hilctl.recording.facts import LabelValue
 
 
@@ -108,6 +109,8 @@ class RunReport(Figures):
         lateness_by_minute: The same of each minute, with ``minute`` from 0 and its ``ticks``.
         adapted: What adaptation made of the model by the end, by name, see
             :data:`hilctl.base.events.ADAPTED`; empty without it.
+        processes: What ``loop`` and ``supervisor`` took of the machine while the run went on, by
+            name; empty where its record does not say.
         marks: Time since the start of the run, in s, and text of each mark.
         exchange_us: The same of how long exchanges with the device took.
         segments: Figures of each segment.
@@ -142,6 +145,7 @@ class RunReport(Figures):
     lateness_by_minute: list[dict[str, float]]
     exchange_us: dict[str, float]
     adapted: dict[str, float]
+    processes: dict[str, ProcessUsage]
     marks: tuple[tuple[float, str], ...]
     segments: tuple[SegmentReport, ...]
 

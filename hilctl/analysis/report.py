@@ -8,6 +8,7 @@ import numpy as np
 
 from hilctl.analysis import timing
 from hilctl.analysis.figures import RunReport, SegmentReport
+from hilctl.analysis.processes import processes_of
 from hilctl.analysis.segment_figures import SegmentGathering
 from hilctl.analysis.steady import judged, waveform_end
 from hilctl.base.arrays import F64
@@ -186,6 +187,7 @@ class RunGathering:
             "lateness_us": ticks.late_us(),
             "lateness_by_minute": ticks.by_minute(),
             "exchange_us": ticks.exchange_us(),
+            "processes": processes_of(last),
         }
 
 

@@ -1,6 +1,7 @@
 """A report for people, as rows of text."""
 
 from hilctl.analysis.figures import RunReport, SegmentReport
+from hilctl.analysis.processes import usage_text
 from hilctl.base.events import adapted_text
 from hilctl.base.printable import printable
 from hilctl.base.quantity import MISSING, quantity
@@ -53,6 +54,7 @@ def run_rows(report: RunReport) -> list[tuple[str, str]]:
         *(("mark", f"{at_s:.6g} s: {printable(text)}") for at_s, text in report.marks),
         ("lateness", _percentiles(report.lateness_us)),
         ("exchange", _percentiles(report.exchange_us)),
+        *((f"{name} took", usage_text(each)) for name, each in report.processes.items()),
     ]
 
 

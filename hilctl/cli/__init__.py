@@ -6,7 +6,9 @@ quick.
 application.py  what all commands hang on
 commands.py    which commands there are, and where each one's function is
 options.py     options that they share; output.py  JSON, and what all of them say
+examples.py    a demonstration, examples to copy; starting.py  a first experiment
 running.py     start and check runs; shown by run_view.py
+compiling.py   says what is compiled meanwhile
 steering.py    status, set, mark and stop, in a tenth of a second; shown by status_view.py
 watching.py    a run in the terminal: watcher.py  keys and screens, watch_view.py  what is on them,
                braille.py  curves, terminal.py  the terminal itself
@@ -20,6 +22,7 @@ campaigning.py  many runs of one experiment; campaign_view.py
 characterising.py  a model of a wired actuator; characterise_view.py
 machine.py     this computer and its devices; machine_view.py and probe_view.py
 console.py     the console that tables go to, and what replay prints; progress.py  a progress bar
+volume.py      --quiet and --verbose
 streams.py     standard output and error, which all text passes: no control character goes through
 
 Exit codes: 0 done; 1 a replay that differs, an export that left recordings out, a rate that this
@@ -29,7 +32,6 @@ be characterised; 128 + n a run stopped by signal n.
 """
 
 import gc
-import logging
 import signal
 import sys
 from collections.abc import Sequence
@@ -37,8 +39,10 @@ from importlib import import_module
 from typing import Any, NoReturn
 
 from hilctl.base.errors import ConfigError, HilctlError, InputError, RunError
+from hilctl.base.remedy import reason
 from hilctl.cli.output import print_json
 from hilctl.cli.streams import plain_streams
+from hilctl.cli.volume import heard_as_asked, print_origin, take_volume
 
 STEERING = ("status", "set", "mark", "stop")
 """Commands about runs that are going on."""
@@ -59,17 +63,17 @@ def __getattr__(name: str) -> Any:
 
 def main() -> None:
     """Run the command line; every error raised on purpose becomes a message and an exit code."""
-    with plain_streams():
-        shown = logging.StreamHandler()
-        shown.setFormatter(logging.Formatter("hilctl: %(message)s"))
-        logging.getLogger("hilctl").handlers[:] = [shown]
+    take_volume(sys.argv)
+    with plain_streams(), heard_as_asked(as_json="--json" in sys.argv):
         try:
             _command()
         except HilctlError as error:
+            print_origin()
             _refuse(error)
         except KeyboardInterrupt:
             raise SystemExit(128 + signal.SIGINT) from None
         except (OSError, MemoryError, ImportError, SystemError) as error:
+            print_origin()
             _refuse(RunError(_machine_refused(error)))
 
 
@@ -99,7 +103,7 @@ def _machine_refused(error: Exception) -> str:
         return "the folder that it is started in has been deleted: change to another one"
     if isinstance(error, OSError):
         where = f"{error.filename}: " if error.filename is not None else ""
-        return f"{where}{error.strerror or error}"
+        return f"{where}{reason(error)}"
     if isinstance(error, MemoryError):
         return f"not enough memory{f': {error}' if str(error) else ''}"
     if isinstance(error, ModuleNotFoundError) and error.name in OF_LINUX:

@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 
 from hilctl.base.errors import HilctlError, InputError
+from hilctl.cli.compiling import compiling_shown
 from hilctl.cli.options import AsJson, ExperimentFile, LabelTexts, Overwrite, Settings, with_labels
 from hilctl.cli.output import finish_orphans, print_json
 
@@ -45,6 +46,34 @@ def run(
     if detach:
         _detach(experiment, output, settings, overwrite=overwrite, as_json=as_json)
         return
+    with _loop_ahead(experiment):
+        _run(experiment, output, settings, overwrite, watch=watch, live=live, as_json=as_json)
+
+
+@contextmanager
+def _loop_ahead(experiment: Path) -> Iterator[None]:
+    """Have the loop's process import while this one does, where there may be a run."""
+    from hilctl.run.architecture import require_real_time_machine
+    from hilctl.run.waiting_loop import started_ahead
+
+    require_real_time_machine()
+    if not experiment.is_file():
+        yield  # and is refused in words
+        return
+    with started_ahead(), compiling_shown():
+        yield
+
+
+def _run(
+    experiment: Path,
+    output: Path | None,
+    settings: list[str],
+    overwrite: bool,
+    *,
+    watch: bool,
+    live: bool,
+    as_json: bool,
+) -> None:
     from hilctl import api
     from hilctl.cli.run_view import LiveView, print_run, report_of, run_mapping
 

@@ -1,8 +1,10 @@
 """What this computer can do: real-time set-up, and what stands in its way.
 
 settings.py   how the loop's process asks for real time
-realtime.py   asks for it, step by step; linux.py  the system calls
+realtime.py   asks for it, step by step; linux.py  the system calls,
+              memory.py  what is mapped, and which of it no tick needs
 files.py      what is read of a machine: its /proc and /sys, or those of a test
+usage.py      what a process has taken of it
 findings.py   one function a check: good, worth knowing, or bad, with the remedy
 hardware.py   the same for serial ports, CPUs and disks
 latency.py    wake-up lateness, measured with the loop's pacer in a process of its own

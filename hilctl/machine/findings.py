@@ -7,6 +7,7 @@ from hilctl.machine.linux import DMA_LATENCY
 from hilctl.machine.realtime import (
     ISOLATED,
     LIMITS_FILE,
+    PRIORITY_REMEDY,
     RT_PERIOD,
     RT_RUNTIME,
     cpu_numbers,
@@ -50,8 +51,8 @@ def fifo(machine: Machine, settings: Realtime) -> Finding:
     if limit is None or limit >= wanted:
         shown = "unlimited" if limit is None else f"up to {limit}"
         return Finding("SCHED_FIFO", "ok", f"priority {wanted} allowed ({shown})")
-    remedy = f"put '@realtime - rtprio 98' into {LIMITS_FILE}, join that group, log in anew"
-    return Finding("SCHED_FIFO", "bad", f"rtprio limit {limit}, {wanted} is wanted", remedy)
+    detail = f"rtprio limit {limit}, {wanted} is wanted"
+    return Finding("SCHED_FIFO", "bad", detail, PRIORITY_REMEDY)
 
 
 def locked_memory(machine: Machine) -> Finding:

@@ -21,7 +21,7 @@ import numpy as np
 from hilctl.base.arrays import I64
 from hilctl.base.device import Clock
 from hilctl.base.errors import InputError, RunError
-from hilctl.loop.pacer import LateRules, Pacer, SystemClock
+from hilctl.loop.pacer import LatePolicy, LateRules, Pacer, SystemClock
 from hilctl.machine.realtime import SetUpStep, prepare
 from hilctl.machine.settings import Realtime
 
@@ -76,6 +76,7 @@ def measure(
     seconds: float,
     settings: Realtime,
     on_progress: Callable[[float], None] = lambda _: None,
+    policy: LatePolicy = "catch_up",
 ) -> Latency:
     """Measure wake-up lateness in a new process.
 
@@ -84,6 +85,8 @@ def measure(
         seconds: How long.
         settings: How that process is set up.
         on_progress: Called a few times a second with the time since the start, in s.
+        policy: What follows a tick that woke a period late: the others at once, each of them late,
+            or with ``skip`` the next that is not due yet, so that a stall counts once.
 
     Raises:
         InputError: The rate is beyond what is measured.
@@ -99,6 +102,7 @@ def measure(
             "ticks": max(2, round(rate_hz * seconds)),
             "settings": settings.model_dump(),
             "parent": os.getpid(),
+            "policy": policy,
         }
         answer = _ask(json.dumps(job), seconds, on_progress)
         steps = tuple(SetUpStep(**step) for step in json.loads(answer))
@@ -154,7 +158,7 @@ def watch(pacer: Pacer, late_ns: I64, clock: Clock, supervised: Callable[[], boo
 def _run(job: dict[str, Any]) -> tuple[SetUpStep, ...]:
     clock = SystemClock()
     period_ns = 1e9 / job["rate_hz"]
-    pacer = Pacer(clock, period_ns, "catch_up", LateRules(period_ns))
+    pacer = Pacer(clock, period_ns, job["policy"], LateRules(period_ns))
     late_ns = np.zeros(job["ticks"], dtype=np.int64)
     # After the array: memory that is claimed later would be faulted in while lateness is measured.
     steps = prepare(Realtime(**job["settings"]))

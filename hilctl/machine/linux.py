@@ -11,11 +11,12 @@ import os
 from pathlib import Path
 from typing import Any
 
+from hilctl.machine.memory import ProcessMemory
+
 DMA_LATENCY = "/dev/cpu_dma_latency"
 
 _STACK_DEPTH = 250
 _CAP_IPC_LOCK = 14
-_MCL_CURRENT_AND_FUTURE = 3
 _PR_SET_TIMERSLACK = 29
 _M_TRIM_THRESHOLD, _M_MMAP_MAX = -1, -4
 
@@ -84,8 +85,8 @@ class LinuxProcess:
         _descend(_STACK_DEPTH)
 
     def lock_memory(self) -> None:
-        """Keep all memory, present and future, in RAM."""
-        self._call("mlockall", _MCL_CURRENT_AND_FUTURE)
+        """Keep in RAM what a tick may need, and what is touched from now on."""
+        ProcessMemory().lock()
 
     def set_timer_slack(self, slack_ns: int) -> None:
         """Let timers fire this much late; 0 for the system's own value."""
@@ -116,9 +117,17 @@ class LinuxProcess:
         """Share the CPU with everybody else."""
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 
-    def policy(self) -> int:
-        """Return the scheduling policy, such as ``os.SCHED_OTHER``."""
-        return os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK
+    def policy(self, process: int = 0) -> int:
+        """Return a scheduling policy, such as ``os.SCHED_OTHER``: of a process, or of this one."""
+        return os.sched_getscheduler(process) & ~os.SCHED_RESET_ON_FORK
+
+    def nice(self) -> int:
+        """Return how far this thread stands back behind others; below 0, before them."""
+        return os.getpriority(os.PRIO_PROCESS, 0)
+
+    def set_nice(self, nice: int) -> None:
+        """Set it, for the threads and processes too that this one starts from now on."""
+        os.setpriority(os.PRIO_PROCESS, 0, nice)
 
     def undo(self) -> None:
         """Go back to an ordinary process, as far as each step was taken."""

@@ -6,8 +6,8 @@ recording.
 """
 
 import os
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Literal, Protocol, TypeAlias
 
@@ -23,8 +23,15 @@ RT_RUNTIME = "/proc/sys/kernel/sched_rt_runtime_us"
 RT_PERIOD = "/proc/sys/kernel/sched_rt_period_us"
 ISOLATED = "/sys/devices/system/cpu/isolated"
 
-_HEAP_BYTES = 32 << 20
+PRIORITY_REMEDY = (
+    f"put '@realtime - rtprio 98' and '@realtime - nice -10' into {LIMITS_FILE}, join that group, "
+    "log in anew"
+)
+"""What to do where SCHED_FIFO is refused, or its supervisor may not come before others."""
+
+_HEAP_BYTES = 8 << 20
 _HEADROOM_BYTES = 256 << 20
+_FAVOURED_NICE = -10
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +75,7 @@ class System(Protocol):
         ...
 
     def lock_memory(self) -> None:
-        """Keep all memory, present and future, in RAM."""
+        """Keep in RAM what a tick may need, and what is touched from now on."""
         ...
 
     def set_timer_slack(self, slack_ns: int) -> None:
@@ -91,8 +98,16 @@ class System(Protocol):
         """Share the CPU with everybody else."""
         ...
 
-    def policy(self) -> int:
-        """Return the scheduling policy, such as ``os.SCHED_OTHER``."""
+    def policy(self, process: int = 0) -> int:
+        """Return a scheduling policy, such as ``os.SCHED_OTHER``: of a process, or of this one."""
+        ...
+
+    def nice(self) -> int:
+        """Return how far this thread stands back behind others; below 0, before them."""
+        ...
+
+    def set_nice(self, nice: int) -> None:
+        """Set it, for the threads and processes too that this one starts from now on."""
         ...
 
     def undo(self) -> None:
@@ -116,7 +131,8 @@ def _lock_memory(system: System) -> SetUpStep:
     if limit is not None and limit < needed:
         detail = f"only {limit >> 20} MB may be locked, {needed >> 20} MB are needed"
         return SetUpStep("memory", "refused", detail, remedy)
-    return _step("memory", "all locked, present and future", system.lock_memory, remedy)
+    detail = "locked: what a tick may need, and what is touched later"
+    return _step("memory", detail, system.lock_memory, remedy)
 
 
 def _pin(settings: Realtime, system: System) -> SetUpStep:
@@ -135,7 +151,7 @@ def _set_fifo(settings: Realtime, system: System) -> SetUpStep:
     try:
         system.set_fifo(priority)
     except OSError as error:
-        remedy = f"put '@realtime - rtprio 98' into {LIMITS_FILE}, join that group, log in anew"
+        remedy = PRIORITY_REMEDY
         if rt_group_runtime_us(system.read) == 0:
             remedy = (
                 "this control group has no real-time share: "
@@ -240,6 +256,28 @@ def be_ordinary(system: System = _THIS_PROCESS) -> bool:
         return False
     system.set_ordinary()
     return True
+
+
+@contextmanager
+def favoured(loop: int, system: System = _THIS_PROCESS) -> Iterator[None]:
+    """Put the calling thread, and those that it starts, before ordinary ones, where that may be.
+
+    A supervisor that waits for its turn on a busy machine can't make the output safe in time. Only
+    beside a loop that is real-time: another would have to wait for it.
+
+    Args:
+        loop: Process number of the loop.
+        system: The operating system.
+    """
+    nice = system.nice()
+    with suppress(OSError):  # of the loop too: it may be gone
+        if system.policy(loop) != os.SCHED_OTHER:
+            system.set_nice(min(nice, _FAVOURED_NICE))
+    try:
+        yield
+    finally:
+        with suppress(OSError):
+            system.set_nice(nice)
 
 
 def rt_group_runtime_us(read: Callable[[str], str]) -> int | None:

@@ -7,9 +7,11 @@ job.py             the experiment as it goes to the loop's process
 assemble.py        from a checked experiment to the plan of its loop
 supervisor.py      starts loop, guardian and recorder; started_run.py  sees to them to the end
 child.py           the supervisor's hold on the loop's process; hang_watch.py  whether it hangs
-guardian.py        a process that makes the output safe where the loop can't; safety.py  sees to
-                   it, and stands in for it; safe_action.py  what both do then
-loop_process.py    the loop's process; host.py  its side of the shared memory
+guardian.py        a process that makes the output safe where the loop can't, started by
+                   guardian_process.py; safety.py  sees to it, and stands in for it;
+                   safe_action.py  what both do then
+loop_process.py    the loop's process; host.py  its side of the shared memory,
+                   waiting_loop.py  started before its run is known
 starting.py        where the output is before a run
 ring.py            sample blocks in shared memory, behind shared_page.py
 recorder.py        into the recording; metadata.py what it says of the run, end_figures.py of
@@ -25,7 +27,7 @@ changes.py         gain, offset and inverse on their way to the loop; change_wor
                    them out
 systemd.py         readiness and watchdog of a service
 probe.py           whether a device answers, and whether that can be true
-orphans.py         what dead runs left behind
+orphans.py         what dead runs left behind; dead_runs.py  finished before anything is read
 by_hand.py         a device put at its safe value with no run
 unpaced.py         a run of a simulated device that needs no real time
 result.py          where a run stands, and how it ended; end_commands.py  programs that are told so

@@ -3,7 +3,6 @@
 import os
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -14,6 +13,7 @@ from hilctl.run.job import Job
 from hilctl.run.ring import SampleRing
 from hilctl.run.run_folder import RunFolder
 from hilctl.run.shared_page import Field, PageText, Phase
+from hilctl.run.waiting_loop import taken
 
 _READY_TIMEOUT_S = 120.0
 _DEATH_S = 0.1
@@ -40,17 +40,8 @@ class LoopChild:
     ) -> None:
         self._page = ring.page
         job = Job.of(checked, folder, supervisor=os.getpid(), silence_s=silence_s)
-        self._process = subprocess.Popen(
-            # -P: what lies in the working folder is not to be imported.
-            [sys.executable, "-P", "-m", "hilctl.run.loop_process"],
-            stdin=subprocess.PIPE,
-            start_new_session=True,  # a Ctrl-C in the terminal is the supervisor's to handle
-            pass_fds=inherits,
-        )
-        assert self._process.stdin is not None
-        with suppress(BrokenPipeError):  # it died at once, which await_ready reports
-            self._process.stdin.write(job.to_json().encode())
-            self._process.stdin.close()
+        # One that died at once is reported by await_ready.
+        self._process = taken().give(job.to_json(), inherits)
 
     def await_ready(self, stopped: Callable[[], bool]) -> None:
         """Wait until it needs only the start signal.

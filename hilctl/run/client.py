@@ -36,10 +36,11 @@ def find_run(name: str | None) -> RunFolder:
     exact = [run for run in chosen if run.card.name == name]
     if len(exact or chosen) == 1:
         return (exact or chosen)[0]
-    known = ", ".join(run.card.name for run in going) or "none"
+    if not going:
+        raise InputError("no run is going on")
+    known = ", ".join(run.card.name for run in going)
     if not chosen:
-        what = f"no run is named {name!r}" if name else "no run is going on"
-        raise InputError(f"{what} (going on: {known})")
+        raise InputError(f"no run is named {name!r} (going on: {known})")
     raise InputError(f"more than one run is meant, say which with --run (going on: {known})")
 
 

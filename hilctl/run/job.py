@@ -4,7 +4,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
@@ -12,10 +12,11 @@ from hilctl.base.arrays import F64
 from hilctl.base.errors import RunError
 from hilctl.base.files import TextFiles
 from hilctl.base.yaml.document import Document
-from hilctl.experiment.check import Checked
 from hilctl.experiment.load import LoadedExperiment, resolve
-from hilctl.run.description import RunDescription
-from hilctl.run.run_folder import RunFolder
+
+if TYPE_CHECKING:  # the loop's process has no use for what these import
+    from hilctl.experiment.check import Checked
+    from hilctl.run.run_folder import RunFolder
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +50,9 @@ class Job:
     silence_s: float
 
     @classmethod
-    def of(cls, checked: Checked, folder: RunFolder, *, supervisor: int, silence_s: float) -> Self:
+    def of(
+        cls, checked: "Checked", folder: "RunFolder", *, supervisor: int, silence_s: float
+    ) -> Self:
         """Return the job of a checked experiment; its arrays are left in the run's folder.
 
         So is what the run says of itself to those who look on.
@@ -57,6 +60,8 @@ class Job:
         Raises:
             RunError: There is no room for them.
         """
+        from hilctl.run.description import RunDescription
+
         begun = checked.begun
         reference = input_um = folder.reference
         _save(reference, checked.reference.values)

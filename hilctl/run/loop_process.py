@@ -1,7 +1,8 @@
 """The loop's own process: prepares everything, runs the loop, says how it went.
 
-Started by the supervisor as ``python -m hilctl.run.loop_process`` with a JSON job on its standard
-input. It prints nothing and writes no file: all it has to say goes into the ring's page.
+Started by the supervisor as ``python -m hilctl.run.loop_process``, before that has its experiment;
+the job comes as JSON over the socket that is its standard input, and the locks with it. It prints
+nothing and writes no file: all it has to say goes into the ring's page.
 """
 
 import json
@@ -12,23 +13,34 @@ import time
 from hilctl.base.errors import DeviceError, HilctlError, InputError, RunError
 from hilctl.experiment.condition import conditioning_of
 from hilctl.experiment.load import LoadedExperiment
+from hilctl.kernels.jit import load
+from hilctl.kernels.limit import limit_block
 from hilctl.loop.loop import Loop
 from hilctl.loop.pacer import SystemClock
 from hilctl.loop.plan import Outcome
-from hilctl.machine.realtime import prepare, refusals, require, step_facts
+from hilctl.machine.memory import ProcessMemory
+from hilctl.machine.realtime import be_ordinary, prepare, refusals, require, step_facts
+from hilctl.machine.usage import ProcessUsage
 from hilctl.run.assemble import assemble
 from hilctl.run.host import RingHost
 from hilctl.run.job import Job
 from hilctl.run.ring import SampleRing
 from hilctl.run.shared_page import Field, PageText, Phase, SharedPage
 from hilctl.run.starting import starting_output
+from hilctl.run.waiting_loop import received_job
 
 
 def main() -> int:
     """Run one job; the exit code is 0 where the loop ended by its safe ramp."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)  # the supervisor decides, and the loop ramps down
-    job = Job.from_json(sys.stdin.read())
+    be_ordinary()  # as its maker is by the time that it has a job
+    # Every loop has a limiter, and the first kernel of a process takes longer than all others.
+    load(limit_block)
+    text = received_job(sys.stdin.fileno())
+    if not text:
+        return 0  # there is no run for this one
+    job = Job.from_json(text)
     ring = SampleRing(job.ring_path)
     page = ring.page
     try:
@@ -73,13 +85,17 @@ def run_job(job: Job, ring: SampleRing, loaded: LoadedExperiment) -> Outcome:
         device.close()  # and no safe value: what starts elsewhere is not to step there
         raise
     try:
+        # A device may load kernels of its own when it is opened.
+        ProcessMemory().release()
         page.put(Field.WAVEFORM_AT, waveform_at)
         page.write_text(PageText.SET_UP, json.dumps([step_facts(steps), refusals(steps)]))
         # After the text, which the supervisor reads then.
         page.put(Field.PHASE, Phase.READY)
         start_ns = _await_go(page, host)
         page.put(Field.PHASE, Phase.RUNNING)
+        before = ProcessUsage.now()
         outcome = loop.run(start_ns)
+        page.leave_usage(ProcessUsage.now().since(before))
         # Before the device is closed: that may take its time-outs, and is no hang.
         host.closing()
     except BaseException as error:

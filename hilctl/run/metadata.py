@@ -10,6 +10,7 @@ import platform
 import sys
 import uuid
 from collections.abc import Iterator
+from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -22,7 +23,14 @@ from hilctl.base.yaml.plain import dump
 from hilctl.loop.pacer import Lateness
 from hilctl.loop.plan import Outcome
 from hilctl.machine.diagnosis import machine_facts
-from hilctl.recording.facts import HEAT_FACT, HOLDS_FACT, LABELS_FACT, OVERRIDES_FACT
+from hilctl.machine.usage import ProcessUsage
+from hilctl.recording.facts import (
+    HEAT_FACT,
+    HOLDS_FACT,
+    LABELS_FACT,
+    OVERRIDES_FACT,
+    USAGE_FACT,
+)
 
 if TYPE_CHECKING:
     from hilctl.experiment.check import Checked
@@ -123,3 +131,14 @@ def end_facts(outcome: Outcome, counters: Lateness, lost_events: int = 0) -> dic
         "dropped_in_ring": str(outcome.dropped),
         "lost_events": str(lost_events),
     }
+
+
+def usage_facts(loop: ProcessUsage | None, supervisor: ProcessUsage) -> dict[str, str]:
+    """Return what a run took of the machine, as text.
+
+    Args:
+        loop: In the loop's process, from its start signal on; None where it could not say it.
+        supervisor: In the supervisor's.
+    """
+    known = {"loop": loop, "supervisor": supervisor}
+    return {USAGE_FACT: json.dumps({name: asdict(each) for name, each in known.items() if each})}

@@ -1,4 +1,6 @@
-"""The protocol of a run's control socket: its version, its requests; docs/protocol.md tells of it.
+"""The protocol of a run's control socket: its version and its requests.
+
+``docs/reference/protocol.md`` tells of it.
 
 Importing it costs nothing: clients must not wait for a compiler. What a request may hold is checked
 by the run, see ``run/requests.py``.

@@ -12,6 +12,8 @@ import numpy as np
 
 from hilctl.base.errors import InputError
 from hilctl.base.events import ADAPTED, Event
+from hilctl.base.files import already_there
+from hilctl.base.remedy import reason
 from hilctl.base.samples import Batch, Head, Samples
 from hilctl.experiment.check import Checked
 from hilctl.experiment.correction import dump_correction
@@ -62,14 +64,12 @@ class Recorder:
         try:
             self._file = OutputFile(path, overwrite=overwrite)
         except FileExistsError:
-            raise InputError(
-                f"{path}: exists already: give another --output, or --overwrite"
-            ) from None
+            raise already_there(path, "give another --output, or --overwrite") from None
         except OSError as error:
             raise self._unwritable(error) from None
 
     def _unwritable(self, error: OSError) -> InputError:
-        return InputError(f"{self.path}: can't be written: {error.strerror}")
+        return InputError(f"{self.path}: can't be written: {reason(error)}")
 
     def begin(self, start_unix_ns: int, set_up: Mapping[str, str], waveform_at: int = 0) -> None:
         """Write what is known before the first sample.

@@ -13,7 +13,8 @@ from dataclasses import replace
 from hilctl.base.events import Event
 from hilctl.base.samples import Batch
 from hilctl.loop.plan import Outcome
-from hilctl.run.metadata import end_facts
+from hilctl.machine.usage import ProcessUsage
+from hilctl.run.metadata import end_facts, usage_facts
 from hilctl.run.recorder import Recorder
 from hilctl.run.ring import SampleRing
 from hilctl.run.shared_page import Field
@@ -39,14 +40,17 @@ class RingRecorder:
         """A copy of the newest block."""
         self._ring, self._flush_s = ring, flush_s
         self._events: deque[Event] = deque()
+        self._of_loop: deque[Event] = deque()
         self._outcome: Outcome | None = None
         self._lost_loop = False
         self._ending = threading.Event()
         self._released_s = time.monotonic()
+        self._before = ProcessUsage.now()
         self._thread = threading.Thread(target=self._run, name="recorder")
 
     def start(self) -> None:
         """Begin to record."""
+        self._before = ProcessUsage.now()
         self._released_s = time.monotonic()
         self._thread.start()
 
@@ -102,32 +106,47 @@ class RingRecorder:
                 self._ring.take_again()
             self._released_s = time.monotonic()
 
-    def _drain(self) -> None:
+    def _drain(self) -> bool:
+        """Record what is there now; return whether there were samples."""
         page, recorder = self._ring.page, self.recorder
-        while (batch := self._ring.pop()) is not None:
+        took = False
+        # Before the samples: whatever an event refers to stands in the ring by the time it is seen.
+        self._of_loop.extend(page.pop_events())
+        # Twice, as a batch ends where the ring does. Not until there is none: on a busy machine
+        # there always is another block by then, and nothing would ever be flushed.
+        for _ in range(2):
+            if (batch := self._ring.pop()) is None:
+                break
             self.newest = batch.rows(slice(-1, None))
             recorder.batch(batch)
+            took = True
         # After the samples: an event is recorded with those that led to it.
-        for event in page.pop_events():
-            recorder.event(event)
+        while self._of_loop:
+            recorder.event(self._of_loop.popleft())
         while self._events:
             event = self._events.popleft()
             recorder.event(event)
             page.leave_note(event)
+        return took
+
+    def _drain_all(self) -> None:
+        while self._drain():
+            pass
 
     def _finish(self) -> None:
         outcome, page, recorder = self._outcome, self._ring.page, self.recorder
         assert outcome is not None
-        self._drain()
+        self._drain_all()
         if not recorder.flush():
             self._ring.take_again()
-            self._drain()
+            self._drain_all()
         while self._ring.skip_damaged():  # no more will come: take what stands behind them
-            self._drain()
+            self._drain_all()
         if self._lost_loop:
             if (batch := self._ring.unanswered(recorder.next_sample)) is not None:
                 recorder.batch(batch)
             ended_at = max(recorder.next_sample, page.get(Field.ENDED_AT))
             outcome = replace(outcome, ended_at=ended_at)
         facts = end_facts(outcome, page.lateness(), page.get(Field.EVENTS_LOST))
+        facts |= usage_facts(page.usage(), ProcessUsage.now().since(self._before))
         recorder.finish(facts, outcome.ended_at)

@@ -5,11 +5,7 @@ acts where there is none: for a simulated device, and where the guardian has die
 has not started again yet. It kills the guardian first, so that one of them holds the device only.
 """
 
-import os
-import subprocess
-import sys
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable
 from functools import partial
 
 from hilctl.base.errors import RunError
@@ -17,11 +13,11 @@ from hilctl.base.events import Event
 from hilctl.experiment.check import Checked
 from hilctl.machine.realtime import be_ordinary, be_quick
 from hilctl.run.child import LoopChild
-from hilctl.run.guardian import LAST_CALL_MS, GuardianJob
-from hilctl.run.hang_watch import HangWatch, SilenceLimits, is_stopped
-from hilctl.run.run_folder import RunFolder
+from hilctl.run.guardian import LAST_CALL_MS
+from hilctl.run.guardian_process import GuardianProcess, safe_priority, silence_limits
+from hilctl.run.hang_watch import HangWatch, is_stopped
 from hilctl.run.safe_action import SafeAction
-from hilctl.run.shared_page import Field, GuardianPhase, MadeSafe, PageText, SharedPage
+from hilctl.run.shared_page import Field, GuardianPhase, MadeSafe, SharedPage
 
 _AWAKE_NS = 50_000_000
 _LOST_NS = 1_000_000_000
@@ -29,135 +25,6 @@ _LOST_LOOKS = 3
 _START_NS = 60_000_000_000
 _AGAIN_NS = 5_000_000_000
 _ACTING_NS = 60_000_000_000
-_END_S = 1.0
-_SIMULATED_MARGIN_S = 0.5
-_HANG_S = 0.08
-_STOPPED_S = 0.02
-
-
-def silence_limits(checked: Checked) -> SilenceLimits:
-    """Return how long the loop of an experiment may be silent."""
-    config = checked.loaded.config
-    timing = config.timing
-    simulated = checked.loaded.device.info.simulated
-    hang_s = timing.hang_s
-    if hang_s is None:
-        hang_s = timing.max_late_s + _SIMULATED_MARGIN_S if simulated else _HANG_S
-    periods_s = 2.0 * config.tick_s
-    return SilenceLimits(
-        loop_s=periods_s + hang_s,
-        # A device that takes longer makes the next tick too late, which ends the run as well.
-        exchange_s=timing.max_late_s,
-        # Without a coil to protect, who stops a loop may be looking into it with a debugger.
-        stopped_s=periods_s + (hang_s if simulated else min(hang_s, _STOPPED_S)),
-    )
-
-
-def _priority(checked: Checked) -> int:
-    """Return the SCHED_FIFO priority of whoever makes the output safe.
-
-    Above the loop: one that runs wild at its own priority must not keep that waiting.
-    """
-    return checked.loaded.config.realtime.priority + 1
-
-
-class GuardianProcess:
-    """The guardian of one run; see :mod:`hilctl.run.guardian`.
-
-    Args:
-        job: What it guards.
-        folder: The run's folder.
-        page: Shared with it.
-        inherits: Descriptors of locks that it is to hold.
-
-    Raises:
-        OSError: It can't be started.
-    """
-
-    def __init__(
-        self, job: GuardianJob, folder: RunFolder, page: SharedPage, inherits: Sequence[int]
-    ) -> None:
-        self._page = page
-        # A file and not a pipe: a pipe could keep the supervisor waiting.
-        folder.guardian_job.write_text(job.to_json(), encoding="utf-8")
-        page.put(Field.GUARDIAN_PHASE, GuardianPhase.STARTING)
-        page.put(Field.GUARDIAN_HEARTBEAT_NS, 0)
-        loop = os.pidfd_open(job.loop)
-        try:
-            self._process = subprocess.Popen(
-                [
-                    *(sys.executable, "-P", "-m", "hilctl.run.guardian"),
-                    *(str(folder.guardian_job), str(loop)),
-                ],
-                stdin=subprocess.DEVNULL,
-                start_new_session=True,
-                pass_fds=(*inherits, loop),
-            )
-        finally:
-            os.close(loop)
-
-    @property
-    def ended(self) -> bool:
-        """Whether the process is gone."""
-        return self._process.poll() is not None
-
-    @property
-    def phase(self) -> GuardianPhase:
-        """How far it has come."""
-        return GuardianPhase(self._page.get(Field.GUARDIAN_PHASE))
-
-    @property
-    def heartbeat_ns(self) -> int:
-        """When it gave a sign last, monotonic time; 0 where it never did."""
-        return self._page.get(Field.GUARDIAN_HEARTBEAT_NS)
-
-    @property
-    def error(self) -> str:
-        """Why it could not start."""
-        return self._page.read_text(PageText.GUARDIAN) or "it died"
-
-    def kill(self, wait_s: float | None = None) -> None:
-        """End it at once.
-
-        Args:
-            wait_s: Longest wait until it is gone; None for as long as that takes.
-        """
-        self._process.kill()
-        with suppress(subprocess.TimeoutExpired):
-            self._process.wait(wait_s)
-
-    def end(self) -> None:
-        """Let it end by itself, as it does once the loop has; not for long."""
-        with suppress(subprocess.TimeoutExpired):
-            self._process.wait(_END_S)
-            return
-        self.kill()
-
-
-def guardian_of(
-    checked: Checked, folder: RunFolder, page: SharedPage, loop: int, inherits: Sequence[int]
-) -> Callable[[], GuardianProcess]:
-    """Return what starts the guardian of a run, any number of times.
-
-    Args:
-        checked: The experiment.
-        folder: The run's folder, with its ring.
-        page: The ring's page.
-        loop: Process number of the loop.
-        inherits: Descriptors of locks that the guardian is to hold.
-    """
-    loaded = checked.loaded
-    job = GuardianJob(
-        experiment=loaded.yaml_text,
-        files=loaded.files.texts,
-        folder=str(loaded.folder.resolve()),
-        ring=str(folder.ring),
-        safe_value=loaded.config.safe.value,
-        limits=silence_limits(checked),
-        loop=loop,
-        priority=_priority(checked),
-    )
-    return lambda: GuardianProcess(job, folder, page, inherits)
 
 
 class Safety:
@@ -182,7 +49,7 @@ class Safety:
         self._page, self._child = page, child
         self._device = checked.loaded.device
         self._safe_value = checked.loaded.config.safe.value
-        self._priority = _priority(checked)
+        self._priority = safe_priority(checked)
         self._watch = HangWatch(page, silence_limits(checked), lambda: is_stopped(child.pid))
         self._start_guardian, self._record_event = start_guardian, record_event
         self._guardian = start_guardian() if start_guardian else None
@@ -257,12 +124,12 @@ class Safety:
 
     def _guardian_acts(self, now_ns: int) -> bool:
         guardian = self._guardian
-        if guardian is None or guardian.ended or now_ns - self._trouble_ns > _ACTING_NS:
+        if guardian is None or guardian.ended:
             return False
-        if guardian.phase == GuardianPhase.DONE:
-            return True
         at_it = guardian.phase in {GuardianPhase.WATCHING, GuardianPhase.ACTING}
-        return at_it and now_ns - guardian.heartbeat_ns < _AWAKE_NS
+        awake = at_it and now_ns - guardian.heartbeat_ns < _AWAKE_NS
+        in_time = now_ns - self._trouble_ns <= _ACTING_NS
+        return in_time and (awake or guardian.phase == GuardianPhase.DONE)
 
     def _keep_guardian(self, now_ns: int) -> None:
         """Start another guardian where this one is lost, and say so."""

@@ -21,6 +21,7 @@ from hilctl.base.events import Event
 if TYPE_CHECKING:
     from hilctl.loop.pacer import Lateness
     from hilctl.loop.plan import Outcome
+    from hilctl.machine.usage import ProcessUsage
 
 _PAGE = 4096
 _TEXT_BYTES = 4096
@@ -92,6 +93,11 @@ class Field(IntEnum):
     TUNE_INVERSE_SHARE = 58
     TUNE_LINE_SLOPE = 59
     TUNE_LINE_AT_ZERO = 60
+    RESIDENT_BYTES = 64
+    CPU_NS = 65
+    MINOR_FAULTS = 66
+    MAJOR_FAULTS = 67
+    INVOLUNTARY_SWITCHES = 68
 
 
 class Phase(IntEnum):
@@ -171,6 +177,15 @@ _LATENESS = (
 )
 """Where each field of :class:`~hilctl.loop.pacer.Lateness` stands, in its order."""
 
+_USAGE = (
+    Field.RESIDENT_BYTES,
+    Field.CPU_NS,
+    Field.MINOR_FAULTS,
+    Field.MAJOR_FAULTS,
+    Field.INVOLUNTARY_SWITCHES,
+)
+"""Where each field of :class:`~hilctl.machine.usage.ProcessUsage` stands, in its order."""
+
 
 class SharedPage:
     """The page, seen from either side.
@@ -221,6 +236,18 @@ class SharedPage:
         """Leave the counters of late ticks for the supervisor."""
         for field, count in zip(_LATENESS, astuple(lateness), strict=True):
             self.put(field, count)
+
+    def usage(self) -> "ProcessUsage | None":
+        """Return what the loop's process said that its run took; None where it said nothing."""
+        from hilctl.machine.usage import ProcessUsage
+
+        found = ProcessUsage(*map(self.get, _USAGE))
+        return found if found.resident_bytes else None
+
+    def leave_usage(self, usage: "ProcessUsage") -> None:
+        """Leave what the run took of the loop's process for the supervisor."""
+        for field, value in zip(_USAGE, astuple(usage), strict=True):
+            self.put(field, value)
 
     def leave_outcome(self, outcome: "Outcome") -> None:
         """Leave how the run ended for the supervisor."""

@@ -7,11 +7,13 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from hilctl.base.errors import InputError
+from hilctl.base.remedy import reason
 from hilctl.experiment.check import Checked, check
 from hilctl.experiment.load import load_experiment
 from hilctl.run.architecture import require_real_time_machine
 from hilctl.run.end_commands import with_end_commands
 from hilctl.run.result import Progress, RunResult
+from hilctl.run.waiting_loop import started_ahead
 
 _log = logging.getLogger(__name__)
 
@@ -45,7 +47,7 @@ def output_of(checked: Checked, output: Path | None) -> Path:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"{folder}: can't be made: {error.strerror}") from None
+        raise InputError(f"{folder}: can't be made: {reason(error)}") from None
     return default_output(checked.loaded.config.name, folder, time.localtime())
 
 
@@ -72,6 +74,18 @@ def start_run(
         RunError: The device could not be opened; nothing has moved, and no file is left.
     """
     require_real_time_machine()
+    with started_ahead():
+        return _run(path, settings, output, overwrite, on_progress, heat_a2)
+
+
+def _run(
+    path: Path,
+    settings: Sequence[str],
+    output: Path | None,
+    overwrite: bool,
+    on_progress: Callable[[Progress], None],
+    heat_a2: float,
+) -> RunResult:
     # Not before: what only checks or computes works where a supervisor can't be imported.
     from hilctl.run.supervisor import Supervisor
 

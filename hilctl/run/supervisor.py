@@ -16,10 +16,12 @@ from types import FrameType
 from hilctl.base.errors import RunError
 from hilctl.experiment.check import Checked
 from hilctl.loop.pacer import deadline_misses
-from hilctl.machine.realtime import be_ordinary
+from hilctl.machine.memory import ProcessMemory
+from hilctl.machine.realtime import be_ordinary, favoured
 from hilctl.run.change_worker import ChangeWorker
 from hilctl.run.child import LoopChild
 from hilctl.run.control_socket import ControlServer
+from hilctl.run.guardian_process import guardian_of
 from hilctl.run.progress import ProgressThread
 from hilctl.run.recorder import Recorder
 from hilctl.run.requests import Requests
@@ -27,7 +29,7 @@ from hilctl.run.result import Progress, RunResult
 from hilctl.run.ring import SampleRing
 from hilctl.run.ring_recorder import RingRecorder
 from hilctl.run.run_folder import RunFolder, held_devices, run_folder
-from hilctl.run.safety import Safety, guardian_of
+from hilctl.run.safety import Safety
 from hilctl.run.shared_page import Field, PageText, SharedPage
 from hilctl.run.started_run import STOPS, StartedRun
 from hilctl.run.stopping import STOP_SIGNAL
@@ -97,7 +99,7 @@ class Supervisor:
             except BaseException:
                 recorder.give_back()
                 raise
-            safety = self._start(folder, ring, child, recording, locks + own)
+            safety = self._start(stack, folder, ring, child, recording, locks + own)
             started = StartedRun(self._checked, ring, child, safety, recording)
             self._attend(started, server, requests)
             safety.close()
@@ -105,6 +107,7 @@ class Supervisor:
 
     def _start(
         self,
+        stack: ExitStack,
         folder: RunFolder,
         ring: SampleRing,
         child: LoopChild,
@@ -122,7 +125,10 @@ class Supervisor:
             # It is started after the loop, to watch its process, and ready long before it.
             while not safety.ready():
                 time.sleep(0.005)
+            ProcessMemory().release()  # all is compiled
             start_ns = self._begin(recording.recorder, page)
+            # Before there are threads: all that share the interpreter with this one come along.
+            stack.enter_context(favoured(child.pid))
             recording.start()
         except BaseException as error:
             child.kill()  # it waits for the start signal, so nothing has moved

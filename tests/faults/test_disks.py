@@ -98,7 +98,7 @@ def end(process, code: int) -> dict:
     """Wait for the end; return the JSON it printed."""
     out, err = process.communicate(timeout=240)
     assert "Traceback" not in err
-    assert process.returncode == code, err
+    assert process.returncode == code, f"{out}\n{err}"
     return json.loads(out)
 
 

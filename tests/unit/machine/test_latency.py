@@ -78,6 +78,14 @@ def test_lateness_is_the_pacers():
     assert late_ns.tolist() == [10, 2_500_000, 1_500_010, 500_020, 10]
 
 
+def test_a_stall_counts_once_where_it_is_asked_for():
+    """As cyclictest counts: the ticks that it made late are left out."""
+    wanted = [10, 2_500_000, 10, 10, 10]
+    clock, late_ns = FakeClock(stall_ns=dict(enumerate(wanted))), np.zeros(5, dtype=np.int64)
+    watch(Pacer(clock, 1e6, "skip", LateRules(1e6)), late_ns, clock, lambda: True)
+    assert late_ns.tolist() == [10, 2_500_000, 10, 10, 10]
+
+
 def test_measuring_ends_with_the_parent():
     """Where nobody waits for the result, measuring stops at the next tick."""
     clock, late_ns = FakeClock(stall_ns=dict(enumerate([7] * 100))), np.zeros(100, dtype=np.int64)

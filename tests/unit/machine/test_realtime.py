@@ -18,6 +18,7 @@ from hilctl.machine.realtime import (
     SetUpStep,
     be_ordinary,
     cpu_numbers,
+    favoured,
     prepare,
     require,
     rt_group_runtime_us,
@@ -37,6 +38,8 @@ class FakeSystem:
     lockable: int | None = None
     mapped: int = 400 << 20
     policy_now: int = os.SCHED_OTHER
+    policies: dict[int, int] = field(default_factory=dict)
+    nice_now: int = 0
     asked: list[tuple] = field(default_factory=list)
 
     def _take(self, name, *values):
@@ -79,8 +82,17 @@ class FakeSystem:
     def set_ordinary(self):
         self._take("set_ordinary")
 
-    def policy(self):
-        return self.policy_now
+    def policy(self, process=0):
+        if process and process not in self.policies:
+            raise ProcessLookupError(errno.ESRCH, os.strerror(errno.ESRCH))
+        return self.policies[process] if process else self.policy_now
+
+    def nice(self):
+        return self.nice_now
+
+    def set_nice(self, nice):
+        self._take("set_nice", nice)
+        self.nice_now = nice
 
     def undo(self):
         self._take("undo")
@@ -241,6 +253,26 @@ def test_an_ordinary_process_stays_one():
     system = FakeSystem()
     assert not be_ordinary(system)
     assert system.asked == []
+
+
+@pytest.mark.parametrize("before", [0, 10, -15])
+def test_beside_a_real_time_loop_a_thread_is_favoured_for_a_while(before):
+    """Never less than it was; the loop's own policy decides, which is of another process."""
+    system = FakeSystem(policies={7: os.SCHED_FIFO}, nice_now=before)
+    with favoured(7, system):
+        assert system.nice_now == min(before, -10)
+    assert system.nice_now == before
+
+
+@pytest.mark.parametrize("system", [
+    FakeSystem(policies={7: os.SCHED_OTHER}),
+    FakeSystem(policies={7: os.SCHED_FIFO}, refuses={"set_nice"}),
+    FakeSystem(),
+], ids=["the loop is ordinary", "it is not allowed", "the loop is gone"])  # fmt: skip
+def test_otherwise_nothing_changes(system):
+    with favoured(7, system):
+        assert system.nice_now == 0
+    assert system.nice_now == 0
 
 
 @pytest.mark.parametrize(

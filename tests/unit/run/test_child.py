@@ -16,13 +16,7 @@ from hilctl.run.shared_page import Field, PageText, Phase
 class FakeProcess:
     """A process that has ended with a code, or lives where that is None."""
 
-    def __init__(self, command, **options):
-        self.command, self.options, self.code = command, options, None
-        self.stdin = SimpleNamespace(write=self.take, close=lambda: None)
-        self.job = b""
-
-    def take(self, data):
-        self.job += data
+    code = None
 
     def poll(self):
         return self.code
@@ -33,7 +27,13 @@ class FakeProcess:
 @pytest.fixture
 def started(tmp_path, monkeypatch):
     """A child that was started, and its page."""
-    monkeypatch.setattr(module.subprocess, "Popen", FakeProcess)
+    process = FakeProcess()
+
+    def give(job, inherits):
+        process.job, process.inherits = job, inherits
+        return process
+
+    monkeypatch.setattr(module, "taken", lambda: SimpleNamespace(give=give))
     monkeypatch.setattr(
         module.Job, "of", lambda *a, **k: SimpleNamespace(to_json=lambda: '{"job": 1}')
     )
@@ -45,12 +45,10 @@ def never():
     return False
 
 
-def test_the_job_goes_in_by_standard_input_and_locks_are_inherited(started):
-    """A stop from the terminal reaches the supervisor only: the loop has a session of its own."""
+def test_the_job_is_given_with_the_locks(started):
     process = started[0]._process
-    assert process.job == b'{"job": 1}'
-    assert process.options["pass_fds"] == (5, 6)
-    assert process.options["start_new_session"] is True
+    assert process.job == '{"job": 1}'
+    assert process.inherits == (5, 6)
 
 
 @pytest.mark.parametrize(

@@ -87,7 +87,7 @@ def test_an_impatient_user_ends_the_wait_and_keeps_the_result(result, number):
     # Where the tests run in the background, a shell has had SIGINT ignored.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     before = signal.getsignal(number)
-    found = ended(result, f"kill -{number.name[3:]} {os.getpid()}; sleep 60", "exit 0")
+    found = ended(result, f"sleep 0.5; kill -{number.name[3:]} {os.getpid()}; sleep 60", "exit 0")
     assert [(each.exit_code, each.error) for each in found.on_end] == [(None, "interrupted")] * 2
     assert signal.getsignal(number) == before
     assert found.code == "stopped"

@@ -63,7 +63,7 @@ class ProbedRig:
     def __init__(self, emulator, clock, folder, **device):
         self.emulator, self.clock, self.log = emulator, clock, folder / "writes.jsonl"
         kind = "modbus_dac" if "host" in emulator.options else "serial_dac"
-        self.device = {**emulator.options, "kind": kind, "timeout_s": 2.0, **device}
+        self.device = {**emulator.options, "kind": kind, "timeout_s": 20.0, **device}
         self.experiment = folder / "probed.yaml"
         section = {
             "name": "probed",

@@ -76,6 +76,30 @@ def test_room_is_given_back_once_the_file_has_what_stood_there(ring, recording):
     assert recording.newest.heads[-1, Head.FIRST_SAMPLE] == 2
 
 
+def test_a_loop_that_is_never_waited_for_keeps_no_sample_from_the_file(ring, recording):
+    """However busy the machine: there is another block each time that one has been recorded."""
+    exchange(ring, 1)
+    flushed = []
+    batch, flush = recording.recorder.batch, recording.recorder.flush
+
+    def slow(taken):
+        batch(taken)
+        exchange(ring, len(taken.heads))
+
+    recording.recorder.batch = slow
+    recording.recorder.flush = lambda: flushed.append(recording.recorder.next_sample) or flush()
+    for _ in range(4):
+        recording._work()
+    assert flushed == sorted(set(flushed))
+    assert len(flushed) == 4
+    recording.recorder.batch = batch
+    recording.end(ENDED, lost_loop=False)
+    recording._finish()
+    numbers = recording.recorder.firsts
+    assert numbers == list(range(len(numbers)))
+    assert ring.pop() is None
+
+
 def test_what_an_emptied_file_has_lost_is_written_once_more(ring, recording):
     exchange(ring, 2)
     recording.recorder.emptied = True
@@ -92,6 +116,24 @@ def test_events_of_both_sides_come_after_the_samples(ring, recording):
     recording.record_event(Event(0, "warning", "of_the_supervisor", ""))
     recording._work()
     assert recording.recorder.events == ["of_the_loop", "of_the_supervisor"]
+
+
+def test_an_event_of_the_loop_never_comes_before_its_samples(ring, recording, monkeypatch):
+    """A block and its event that come while the samples are taken wait for the next time."""
+    pop, recorder = ring.pop, recording.recorder
+
+    def pop_and_go_on():
+        batch = pop()
+        if not recorder.events and batch is None:
+            exchange(ring, 1)
+            ring.page.push_event(Event(0, "error", "stroke", ""))
+        return batch
+
+    monkeypatch.setattr(ring, "pop", pop_and_go_on)
+    recording._drain()
+    assert (recorder.firsts, recorder.events) == ([], [])
+    recording._drain()
+    assert (recorder.firsts[:1], recorder.events) == ([0], ["stroke"])
 
 
 def test_what_a_dead_loop_had_sent_is_recorded_as_not_answered(ring, recording):

@@ -9,6 +9,7 @@ import pytest
 from hilctl.base.events import Event
 from hilctl.loop.pacer import Lateness
 from hilctl.loop.plan import Outcome
+from hilctl.machine.usage import ProcessUsage
 from hilctl.run.shared_page import SIZE, Field, PageText, Phase, SharedPage, Stop
 
 
@@ -99,3 +100,12 @@ def test_notes_are_seen_by_all_and_the_oldest_give_way(sides):
     assert (after, other.look_at_notes(after)) == (40, ([], 40))
     one.leave_note(Event(40, "info", "mark", "more"))
     assert [note.text for note in other.look_at_notes(after)[0]] == ["more"]
+
+
+def test_what_a_run_took_passes_to_the_other_side(sides):
+    """Nothing is known of a loop that died before it could say it."""
+    one, other = sides
+    assert other.usage() is None
+    usage = ProcessUsage(98_000_000, 1_500, 12, 3, 4)
+    one.leave_usage(usage)
+    assert other.usage() == usage

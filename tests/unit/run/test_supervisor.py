@@ -23,8 +23,8 @@ from hilctl.run.supervisor import Supervisor
 
 MS = 1_000_000
 STARTED = ["ordinary", "worker", "devices", "claimed", "folder", "server", "child", "guardian"]
-READY = [*STARTED, "await ready", "begin", "recording"]
-UNDONE = ["server closed", "folder removed", "devices let go", "worker closed"]
+READY = [*STARTED, "await ready", "begin", "favoured", "recording"]
+UNDONE = ["ordinary again", "server closed", "folder removed", "devices let go", "worker closed"]
 
 
 class Time:
@@ -71,6 +71,7 @@ class Neighbours:
         for name, double in {
             "time": self.time,
             "be_ordinary": lambda: self.note("ordinary"),
+            "favoured": lambda loop: self.around("favoured", "ordinary again", loop),
             "ChangeWorker": lambda checked: self.around("worker", "worker closed", None),
             "held_devices": lambda holds: self.around("devices", "devices let go", [*holds]),
             "Recorder": lambda *a, overwrite: self.note("claimed", self.recorder),
@@ -236,7 +237,7 @@ def test_whatever_fails_before_the_start_signal_leaves_nothing(stage, number):
         expected.append("safety closed")
     if number > READY.index("claimed"):
         expected.append("given back")
-    undo = dict(zip(("server", "folder", "devices", "worker"), UNDONE, strict=True))
+    undo = dict(zip(("favoured", "server", "folder", "devices", "worker"), UNDONE, strict=True))
     expected += [undone for begun, undone in undo.items() if READY.index(begun) < number]
     assert stage.log[number + 1 :] == expected
     if stage.ring is not None:
@@ -286,7 +287,7 @@ def test_what_breaks_afterwards_costs_neither_coil_nor_recording(stage):
     assert stage.log[len(READY) :][:4] == [
         "requests", "serve", "broken off: a bug", "progress ended",
     ]  # fmt: skip
-    assert stage.log[-5:] == ["safety closed", *UNDONE]
+    assert stage.log[-6:] == ["safety closed", *UNDONE]
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, STOP_SIGNAL])
@@ -377,4 +378,4 @@ def test_memory_that_is_not_to_be_had_is_told(stage, monkeypatch):
     monkeypatch.setattr(SampleRing, "create", create)
     with pytest.raises(RunError, match="ring: no memory: No space left on device; less recording"):
         stage.run()
-    assert stage.log[-4:] == ["given back", *UNDONE[1:]]
+    assert stage.log[-4:] == ["given back", *UNDONE[2:]]

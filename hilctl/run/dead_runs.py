@@ -1,0 +1,21 @@
+"""Runs whose processes have died: what they left in memory belongs into their recordings."""
+
+import logging
+
+_log = logging.getLogger(__name__)
+
+
+def finish_dead_runs() -> None:
+    """Recover what dead runs left in memory, and log what was done for each."""
+    from hilctl.run.run_folder import runs
+
+    if all(run.alive for run in runs()):
+        return
+    # Only where there is a dead one: what recovers it takes a second to import.
+    from hilctl.run.orphans import recover_orphans
+
+    for orphan in recover_orphans():
+        kept = f"its samples are kept in {orphan.kept}; the next command tries again"
+        done = f"recovered into {orphan.recording}"
+        _log.warning("%s had died: %s", orphan.name, orphan.text)
+        _log.warning("%s", kept if orphan.kept else done)

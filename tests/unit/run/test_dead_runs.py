@@ -1,0 +1,21 @@
+"""What dead runs left is put into their recordings, and logged; nothing is done where none died."""
+
+from pathlib import Path
+from types import SimpleNamespace
+
+from hilctl.run.dead_runs import finish_dead_runs
+from hilctl.run.orphans import Orphan
+
+
+def test_what_was_done_is_logged(monkeypatch, caplog):
+    found = [Orphan("sine-7", Path("a.mcap"), safe=False, text="supervisor and loop died")]
+    monkeypatch.setattr("hilctl.run.orphans.recover_orphans", lambda: found)
+    monkeypatch.setattr("hilctl.run.run_folder.runs", lambda: [SimpleNamespace(alive=True)])
+    finish_dead_runs()
+    assert caplog.messages == []
+    monkeypatch.setattr("hilctl.run.run_folder.runs", lambda: [SimpleNamespace(alive=False)])
+    finish_dead_runs()
+    assert caplog.messages == [
+        "sine-7 had died: supervisor and loop died",
+        "recovered into a.mcap",
+    ]
