@@ -1,6 +1,7 @@
 """What a recording says: figures of merit, tables, plots and a page.
 
 timing.py   lateness percentiles, late ticks; quantiles.py  percentiles in bounded memory
+processes.py  memory and processor time of the run's processes
 steady.py   which part of a recording is judged, and its average cycle
 figures.py  what a report holds
 report.py   from a recording, whole or in pieces, to a report; segment_figures.py  those of one
@@ -12,7 +13,7 @@ plots.py    plots over time and frequency: history, error, spectrum.py, lateness
 loops.py    the hysteresis loop, and before and after
 html.py     parts of self-contained pages; definitions.py  what their figures mean
 run_page.py the page of a run; provenance.py  when, by whom and with what it was made
-replay.py   the same commands again
+replay.py   the same commands again; predicted.py  the error of another model
 export.py   samples as a table; export_files.py  CSV, Parquet, NPZ, MAT; export_all.py  all
             recordings of a folder as one data set
 catalogue.py  the recordings below a folder, over catalogue_cache.py; run_entry.py  what is known

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from itertools import pairwise
 from typing import Any
@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from hilctl.analysis.predicted import ErrorPrediction, PredictedError
 from hilctl.base.arrays import F64, U32
 from hilctl.base.errors import DataError, ModelError
 from hilctl.base.events import INVERSE, Event
@@ -46,6 +47,7 @@ class ReplayResult:
         command_min: Lowest recomputed command.
         command_max: Highest recomputed command.
         limited_samples: Recomputed samples that the limiter held back.
+        predicted: The error that another model would have had; None of the recorded one.
     """
 
     samples: int
@@ -59,6 +61,7 @@ class ReplayResult:
     command_min: float
     command_max: float
     limited_samples: int
+    predicted: PredictedError | None = None
 
     def to_mapping(self) -> dict[str, Any]:
         """Return the fields as plain values."""
@@ -80,7 +83,7 @@ def replay(
 
     Raises:
         DataError: The recording holds no samples or not what a replay needs, or ``model`` does not
-            fit a run without a compensator.
+            fit a run without a compensator, or one that was driven in another unit.
         ConfigError: The recorded experiment or model breaks a rule.
         ModelError: The model has no inverse.
     """
@@ -114,6 +117,11 @@ class _Running:
         self._fades: Sequence[Event] | None = None
         if model is not None and not first.compensated:
             raise DataError(f"{first.path}: had no compensator: there is no reference to replay")
+        if model is not None and model.input_unit != first.command_unit:
+            driven = f"{first.path}: was driven in {first.command_unit}"
+            raise DataError(f"{driven}, the other model gives commands in {model.input_unit}")
+        rate_hz = first.sample_rate_hz
+        self._prediction = None if model is None else ErrorPrediction(model, rate_hz)
         self._recorded = first.compensated
         self._other = model is not None
         self._compensator, self._limiter = _parts_of(first, model)
@@ -137,6 +145,8 @@ class _Running:
             self._fades = self._find_fades()
         self._any_start = self._any_start or bool(piece.starts)
         self._starts += piece.starts
+        if self._prediction is not None:
+            self._prediction.add(samples)
         if self._waiting is not None:
             samples = self._waiting.followed_by(samples)
         ready = max(0, samples.index.size - self._held_back)
@@ -153,7 +163,8 @@ class _Running:
             self._go(self._waiting, self._waiting.index.size)
         if not self._any_start or self._comparison.compared == 0:
             raise DataError(f"{self._path}: holds no samples to replay")
-        return self._comparison.result()
+        predicted = None if self._prediction is None else self._prediction.result()
+        return replace(self._comparison.result(), predicted=predicted)
 
     def _go(self, samples: Samples, ready: int) -> None:
         """Recompute the rows before ``ready``."""

@@ -98,9 +98,34 @@ def _figures(recording: Recording, report: RunReport, before: Recording | None) 
     if not _drawable(recording):
         yield html.paragraph("No figure is drawn: readings are near the end of all numbers.")
         return
+    drawn = _sheets(recording, report, before)
+    sheets = [sheet for sheet, _ in drawn if sheet is not None]
+    if sheets:
+        yield html.figures(sheets)
+    for sheet, otherwise in drawn:
+        if sheet is None and otherwise:
+            yield html.paragraph(otherwise)
+
+
+def run_sheets(recording: Recording, report: RunReport) -> list[Sheet]:
+    """Return the figures of a run's page, those that apply.
+
+    Args:
+        recording: The run.
+        report: Its figures.
+    """
+    if not _drawable(recording):
+        return []
+    return [sheet for sheet, _ in _sheets(recording, report, None) if sheet is not None]
+
+
+def _sheets(
+    recording: Recording, report: RunReport, before: Recording | None
+) -> list[tuple[Sheet | None, str]]:
+    """Return each figure, or what is said in its place."""
     focus = worst_segment(report.segments)
     no_error = "No error is drawn: no sample has a reference displacement."
-    drawn: list[tuple[Sheet | None, str]] = [
+    return [
         (loops.before_and_after(before, recording) if before else None, ""),
         (loops.hysteresis_loop(recording, focus), "No steady samples were recorded."),
         (plots.steady_cycles(recording, focus), ""),
@@ -109,12 +134,6 @@ def _figures(recording: Recording, report: RunReport, before: Recording | None) 
         (plots.time_history(recording), "No samples were recorded."),
         (plots.lateness(recording), "No ticks were recorded, or the run did not keep real time."),
     ]
-    sheets = [sheet for sheet, _ in drawn if sheet is not None]
-    if sheets:
-        yield html.figures(sheets)
-    for sheet, otherwise in drawn:
-        if sheet is None and otherwise:
-            yield html.paragraph(otherwise)
 
 
 def _drawable(recording: Recording) -> bool:

@@ -7,8 +7,10 @@
     print(api.summarize(recorded).peak_error_percent)
     frame = recorded.table.to_pandas()
 
-running.py      load, check, run, learn, characterise, campaign: what moves an actuator
-recordings.py   read, summarize, replay, export, list_runs, figures
+starting.py     init: a first experiment for a device
+running.py      load, check, run, learn: what moves an actuator
+campaigns.py    characterise, campaign: many runs
+recordings.py   read, summarize, report_page, report_runs, replay, export, list_runs, figures
 models.py       identify, refine, compare
 connection.py   connect: a run that is going on
 table.py        samples as named columns with units
@@ -19,6 +21,7 @@ may change. Errors are :class:`hilctl.base.errors.HilctlError`: ``InputError`` w
 moved and nothing was written. Each function imports what it needs when it is called.
 """
 
+from hilctl.api.campaigns import campaign, characterise
 from hilctl.api.connection import RunConnection, connect
 from hilctl.api.models import compare, identify, refine
 from hilctl.api.recordings import (
@@ -28,15 +31,19 @@ from hilctl.api.recordings import (
     list_runs,
     read,
     replay,
+    report_page,
+    report_runs,
     summarize,
 )
-from hilctl.api.running import campaign, characterise, check, learn, load, run
+from hilctl.api.running import check, learn, load, run
+from hilctl.api.starting import WrittenExperiment, init
 from hilctl.api.table import SampleTable
 
 __all__ = [
     "RecordedRun",
     "RunConnection",
     "SampleTable",
+    "WrittenExperiment",
     "campaign",
     "characterise",
     "check",
@@ -45,12 +52,15 @@ __all__ = [
     "export",
     "figures",
     "identify",
+    "init",
     "learn",
     "list_runs",
     "load",
     "read",
     "refine",
     "replay",
+    "report_page",
+    "report_runs",
     "run",
     "summarize",
 ]

@@ -1,6 +1,7 @@
 """A run that is going on, to look at, to change, to mark, to stop.
 
-It speaks the protocol of ``docs/protocol.md`` and imports nothing heavy until it is needed.
+It speaks the protocol of ``docs/reference/protocol.md``, and imports nothing heavy until it is
+needed.
 """
 
 import time

@@ -2,10 +2,12 @@
 
 import time
 from collections.abc import Callable, Sequence
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hilctl.api.given import PathLike, Paths, Settings, path_or_none, paths_of, texts_of
+from hilctl.run.dead_runs import finish_dead_runs
 
 if TYPE_CHECKING:
     from hilctl.comparison.compare import Comparison
@@ -97,6 +99,9 @@ def compare(
     settings: Settings = (),
     frequencies_hz: Sequence[float] | None = None,
     points: int | None = None,
+    html: PathLike | None = None,
+    save: PathLike | None = None,
+    overwrite: bool = False,
     on_progress: Callable[[float, str], None] = lambda done, text: None,
 ) -> "Comparison":
     """Identify models of the literature on the same loops, and try their inverses.
@@ -109,20 +114,37 @@ def compare(
         settings: Over that experiment.
         frequencies_hz: Of the trials; 10, 100 and 200 Hz for sines where None.
         points: Points a loop; 300 where None.
+        html: Page with table and figure to write; None for none.
+        save: Folder for a model file of each that was identified; None for none.
+        overwrite: Whether files of these names may be replaced.
         on_progress: Called with how much is done, from 0 to 1, and what is being done.
 
     Raises:
-        InputError: A file or a model can't be used.
+        InputError: A file or a model can't be used, or a file can't be written.
     """
-    from hilctl.comparison.compare import POINTS, ComparisonRequest
-    from hilctl.comparison.compare import compare as compare_models
+    from hilctl.base.files import check_writable
+    from hilctl.comparison import compare as library
 
-    request = ComparisonRequest(
+    if html is not None:
+        check_writable(Path(html), overwrite=overwrite)
+    if save is not None:
+        library.check_free(models or list(library.COMPARED), Path(save), overwrite=overwrite)
+    finish_dead_runs()
+
+    request = library.ComparisonRequest(
         recordings=paths_of(recordings),
         models=models,
         experiment=path_or_none(experiment),
         settings=texts_of(settings),
         frequencies_hz=frequencies_hz,
-        points=POINTS if points is None else points,
+        points=library.POINTS if points is None else points,
     )
-    return compare_models(request, time.perf_counter, on_progress)
+    comparison = library.compare(request, time.perf_counter, on_progress)
+    if html is not None:
+        from hilctl.comparison.page import write_comparison
+
+        write_comparison(comparison, Path(html))
+    if save is not None:
+        created = datetime.now(UTC).isoformat(timespec="seconds")
+        library.save_models(comparison, Path(save), created=created, overwrite=overwrite)
+    return comparison

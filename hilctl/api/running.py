@@ -1,7 +1,6 @@
 """What moves an actuator, and what is held against it before."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -9,8 +8,6 @@ from hilctl.api.given import PathLike, Settings, path_or_none, texts_of
 from hilctl.base.errors import InputError
 
 if TYPE_CHECKING:
-    from hilctl.campaign.session import SeriesResult
-    from hilctl.characterise.results import Characterisation
     from hilctl.experiment.check import Checked
     from hilctl.experiment.load import LoadedExperiment
     from hilctl.learning.results import Learned, Row
@@ -130,86 +127,3 @@ def runs_folder(output: PathLike, folder: PathLike | None = None) -> Path:
     """Return where the runs that lead to a file are kept."""
     file = Path(output)
     return path_or_none(folder) or file.with_name(f"{file.stem}-runs")
-
-
-def characterise(
-    experiment: PathLike,
-    output: PathLike,
-    *,
-    folder: PathLike | None = None,
-    settings: Settings = (),
-    highest_hz: float | None = None,
-    fast: bool = False,
-    overwrite: bool = False,
-    on_progress: Callable[[float, str], None] = lambda done, text: None,
-) -> "Characterisation":
-    """Find a model of a wired actuator: measure within its limits, identify, judge.
-
-    It goes on where it was stopped.
-
-    Args:
-        experiment: Experiment file that gives device and limits.
-        output: Model file to write.
-        folder: Where each run is kept; ``OUTPUT-runs`` where None.
-        settings: Over the experiment.
-        highest_hz: Highest frequency of loops; from the sample rate where None.
-        fast: Do not wait for real time; simulated devices only.
-        overwrite: Whether to begin anew where runs stand.
-        on_progress: Called with how much is done, from 0 to 1, and what is being done.
-
-    Raises:
-        InputError: Something can't be used or written; nothing has moved.
-        RunError: A step ended by a fault; those before it stand.
-    """
-    from hilctl.base.files import check_writable
-    from hilctl.characterise.session import Campaign, CampaignHost
-    from hilctl.run.step import paced, unpaced
-
-    file, chosen = Path(output), runs_folder(output, folder)
-    host = CampaignHost(run=unpaced if fast else paced, on_progress=on_progress)
-    found = Campaign(Path(experiment), texts_of(settings), chosen, highest_hz, host)
-    check_writable(file, overwrite=overwrite)
-    if overwrite:
-        found.discard()
-    return found.characterise(file, overwrite=overwrite)
-
-
-def campaign(
-    file: PathLike,
-    folder: PathLike | None = None,
-    *,
-    settings: Settings = (),
-    fast: bool = False,
-    scheduler: str = "none",
-    on_progress: Callable[[float, str], None] = lambda done, text: None,
-) -> "SeriesResult":
-    """Run an experiment again and again with other values of its keys; goes on where it was.
-
-    Args:
-        file: Campaign file (YAML).
-        folder: Where recordings, table and page go; one named after the campaign where None.
-        settings: Over the experiment of every step.
-        fast: Do not wait for real time; simulated devices only.
-        scheduler: With ``fast``, where steps run: ``none``, ``processes``, or a Dask address.
-        on_progress: Called with how much is done, from 0 to 1, and what is being done.
-
-    Raises:
-        InputError: Something can't be used; nothing has moved.
-        RunError: A danger to device or rig ended it; what stands is kept.
-    """
-    from hilctl.campaign.fast import planned_fast, run_fast
-    from hilctl.campaign.folder import campaign_folder
-    from hilctl.campaign.session import SeriesHost, planned_in_real_time, prepared, run_series
-    from hilctl.campaign.steps import load_campaign
-
-    if scheduler != "none" and not fast:
-        raise InputError(
-            "scheduler: for fast runs only; those that keep real time follow each other"
-        )
-    steps = load_campaign(Path(file), texts_of(settings))
-    chosen = path_or_none(folder) or campaign_folder(steps)
-    host = replace(SeriesHost(), on_progress=on_progress)
-    with prepared(chosen, host):
-        if fast:
-            return run_fast(planned_fast(steps, chosen), host, scheduler)
-        return run_series(planned_in_real_time(steps, chosen, host.now_s()), host)

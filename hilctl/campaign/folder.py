@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from mcap.writer import MCAP0_MAGIC
@@ -58,6 +58,7 @@ def held_folder(
     Raises:
         InputError: It can't be made, or another campaign works on it.
     """
+    made = [each for each in (folder, *folder.parents) if not each.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)
         held = os.open(folder, os.O_RDONLY)
@@ -70,7 +71,13 @@ def held_folder(
                 raise InputError(f"{folder}: another campaign is writing to it")
             sleep_s(_POLL_S)
             waited_s += _POLL_S
-        yield
+        try:
+            yield
+        except InputError:  # nothing has been written: the folders are not left behind either
+            for each in made:
+                with suppress(OSError):  # something stands in it, which is somebody's
+                    each.rmdir()
+            raise
     finally:
         os.close(held)
 

@@ -14,7 +14,7 @@ from hilctl.base.yaml.document import Document, load_document
 from hilctl.base.yaml.messages import Loc, dotted
 from hilctl.campaign.file import CampaignFile
 from hilctl.campaign.vary import MOST_STEPS, Point, groups_of, points
-from hilctl.experiment.load import LoadedExperiment, resolve
+from hilctl.experiment.load import LoadedExperiment, named_from, resolve
 from hilctl.experiment.registry import device_class, known_devices
 
 _SEEDS = 1_000_000
@@ -148,7 +148,8 @@ def campaign_of(document: Document, folder: Path, settings: Sequence[str]) -> Ca
         raise ConfigError(problems)
     steps = tuple(_steps(config, points(groups, config.order, config.seed, config.repeat)))
     experiment = folder / config.experiment
-    return CampaignSteps(config, document, experiment, tuple(settings), keys, steps)
+    from_here = tuple(named_from(experiment.parent, text) for text in settings)
+    return CampaignSteps(config, document, experiment, from_here, keys, steps)
 
 
 def _clash(one: str, other: str) -> bool:

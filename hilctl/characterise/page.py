@@ -6,6 +6,7 @@ from pathlib import Path
 
 from hilctl.analysis.html import document, grid, image, write_page
 from hilctl.base.printable import printable
+from hilctl.base.quantity import quantity, significant
 from hilctl.characterise import plots
 from hilctl.characterise.results import Characterisation, Measured, UnseenReference
 from hilctl.identify.page import loops_figure
@@ -28,32 +29,41 @@ def _percents(each: UnseenReference) -> Iterator[str]:
 
 def figure_rows(measured: Measured, unit: str) -> Iterator[tuple[str, str]]:
     """Give what was measured, as name and text."""
+    per = f"um/{unit}"
     if (rest := measured.rest) is not None:
-        yield "noise at rest", f"{rest.noise_um:.3g} um rms"
-        yield "strongest line in it", f"{rest.line_um:.2g} um at {rest.line_hz:.4g} Hz"
-        yield "drift at rest", f"{rest.drift_um_per_s:+.2g} um/s"
+        yield "noise at rest", f"{quantity(rest.noise_um, 'um')} rms"
+        yield (
+            "strongest line in it",
+            f"{quantity(rest.line_um, 'um', 2)} at {quantity(rest.line_hz, 'Hz', 4)}",
+        )
+        yield "drift at rest", quantity(rest.drift_um_per_s, "um/s", 2)
     if (reaction := measured.reaction) is not None:
         sign = "rises" if reaction.gain_um > 0.0 else "falls"
         yield "polarity", f"the displacement {sign} with the command"
-        doubt = f"{reaction.gain_um:.4g} ± {reaction.doubt_um:.1g} um/{unit}"
+        doubt = f"{significant(reaction.gain_um, 4)} ± {quantity(reaction.doubt_um, per, 1)}"
         yield "first reaction", f"{doubt} at {reaction.amplitude:.3g} {unit}"
     if (small := measured.small) is not None:
-        yield "small-signal gain", f"{small.gain_um:.4g} um/{unit}"
-        yield "delay", f"{1e3 * small.delay_s:.3g} ms"
-        yield "lag", f"{1e3 * small.lag_s:.3g} ms"
+        yield "small-signal gain", quantity(small.gain_um, per, 4)
+        yield "delay", quantity(small.delay_s, "s")
+        yield "lag", quantity(small.lag_s, "s")
         resonance = "none found"
         if small.natural_hz is not None:
-            resonance = f"{small.natural_hz:.4g} Hz, damping ratio {small.damping_ratio:.2g}"
+            resonance = (
+                f"{quantity(small.natural_hz, 'Hz', 4)}, damping ratio {small.damping_ratio:.2g}"
+            )
         yield "resonance", resonance
         yield "left by that fit", f"{small.misfit_percent:.2g} % rms of the gain"
     if measured.growing:
         largest = measured.growing[-1]
-        low_high = f"{largest.low_um:.4g} to {largest.high_um:.4g} um"
+        low_high = f"{significant(largest.low_um, 4)} to {significant(largest.high_um, 4)} µm"
         yield "largest amplitude", f"{largest.amplitude:.4g} {unit}, {low_high}"
     if (curves := measured.reversal) is not None:
-        yield "return to one point", f"{curves.return_um:.2g} um, {curves.return_percent:.2g} %"
+        yield (
+            "return to one point",
+            f"{quantity(curves.return_um, 'um', 2)}, {curves.return_percent:.2g} %",
+        )
     if (repeated := measured.repeated) is not None:
-        shift = f"{repeated.shift_um:+.2g} um in place"
+        shift = f"{quantity(repeated.shift_um, 'um', 2)} in place"
         yield "repeats at the end", f"{repeated.shape_percent:.2g} % in shape, {shift}"
 
 

@@ -3,7 +3,6 @@
 import json
 import signal
 import sys
-from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -16,10 +15,10 @@ from hilctl.cli.options import AsJson, ExperimentFile, Settings
 from hilctl.cli.output import print_json
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Sequence
 
     from hilctl.campaign.plan import SeriesPlan
-    from hilctl.campaign.session import SeriesHost, SeriesResult
+    from hilctl.campaign.session import SeriesResult
     from hilctl.campaign.steps import CampaignSteps
 
 _GOES_ON = "the same command goes on from there"
@@ -61,7 +60,9 @@ def sweep(
     vary: Annotated[
         list[str],
         typer.Option(
-            "--vary", help="KEY=1,2,5 or KEY=first:last:count, ...countlog; several are crossed."
+            "--vary",
+            metavar="KEY=VALUES",
+            help="KEY=1,2,5 or KEY=first:last:count, ...countlog; several are crossed.",
         ),
     ],
     folder: Folder = None,
@@ -114,61 +115,37 @@ def _do(
     dry_run: bool,
     as_json: bool,
 ) -> None:
-    from hilctl.campaign.folder import campaign_folder
-    from hilctl.campaign.session import prepared
-    from hilctl.cli.campaign_view import plan_mapping, print_plan
+    from hilctl.api.campaigns import run_steps
+    from hilctl.campaign.session import SeriesHost
+    from hilctl.cli.campaign_view import plan_mapping, print_plan, print_row
     from hilctl.cli.progress import shown_progress
 
     if scheduler != "none" and not fast:
         raise InputError("--scheduler is for --fast: runs that keep real time follow each other")
-    chosen = folder or campaign_folder(steps)
+
+    def on_plan(plan: "SeriesPlan") -> None:
+        if not as_json:
+            print_plan(plan, fast=fast, every_step=dry_run)
+        elif dry_run:
+            print_json(plan_mapping(plan))
+
     with shown_progress("campaign", quiet=as_json) as on_progress:
-        host = _host(on_progress, quiet=as_json)
-        with nullcontext() if dry_run else prepared(chosen, host):
-            plan = _plan(steps, chosen, host, fast=fast)
-            if not as_json:
-                print_plan(plan, fast=fast, every_step=dry_run)
-            elif dry_run:
-                print_json(plan_mapping(plan))
-            if dry_run:
-                return
-            result = _result(plan, host, scheduler, fast=fast)
-    _finish(result, as_json=as_json)
-
-
-def _plan(steps: "CampaignSteps", folder: Path, host: "SeriesHost", *, fast: bool) -> "SeriesPlan":
-    from hilctl.campaign.fast import planned_fast
-    from hilctl.campaign.session import planned_in_real_time
-
-    host.on_progress(0.0, "check every step")
-    if fast:
-        return planned_fast(steps, folder)
-    return planned_in_real_time(steps, folder, host.now_s())
-
-
-def _host(on_progress: "Callable[[float, str], None]", *, quiet: bool) -> "SeriesHost":
-    from hilctl.campaign.session import SeriesHost
-    from hilctl.cli.campaign_view import print_row
-
-    host = SeriesHost(on_progress=on_progress, on_note=_note)
-    return host if quiet else replace(host, on_row=print_row)
+        host = SeriesHost(on_progress=on_progress, on_note=_note)
+        host = host if as_json else replace(host, on_row=print_row)
+        try:
+            result = run_steps(
+                steps, folder, host,
+                fast=fast, scheduler=scheduler, dry_run=dry_run, on_plan=on_plan,
+            )  # fmt: skip
+        except KeyboardInterrupt:  # between two runs, or while the coil cools: nothing moves
+            print(f"hilctl: stopped by Ctrl-C between two steps; {_GOES_ON}", file=sys.stderr)
+            raise typer.Exit(128 + signal.SIGINT) from None
+    if result is not None:
+        _finish(result, as_json=as_json)
 
 
 def _note(text: str) -> None:
     print(f"hilctl: {text}", file=sys.stderr)
-
-
-def _result(
-    plan: "SeriesPlan", host: "SeriesHost", scheduler: str, *, fast: bool
-) -> "SeriesResult":
-    from hilctl.campaign.fast import run_fast
-    from hilctl.campaign.session import run_series
-
-    try:
-        return run_fast(plan, host, scheduler) if fast else run_series(plan, host)
-    except KeyboardInterrupt:  # between two runs, or while the coil cools: nothing moves
-        print(f"hilctl: stopped by Ctrl-C between two steps; {_GOES_ON}", file=sys.stderr)
-        raise typer.Exit(128 + signal.SIGINT) from None
 
 
 def _finish(result: "SeriesResult", *, as_json: bool) -> None:

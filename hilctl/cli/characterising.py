@@ -2,22 +2,18 @@
 
 import signal
 import sys
-from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from hilctl.base.errors import InputError, RunError
-from hilctl.base.files import check_writable
+from hilctl.base.errors import RunError
 from hilctl.cli.options import AsJson, ExperimentFile, LabelTexts, Overwrite, Settings, with_labels
-from hilctl.cli.output import finish_orphans, print_json
+from hilctl.cli.output import print_json
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from hilctl.characterise.results import Characterisation
-    from hilctl.characterise.session import Campaign, CampaignHost
+    from hilctl.characterise.session import CampaignPlan
 
 _GOES_ON = "the same command goes on from this step"
 
@@ -43,48 +39,42 @@ def characterise(
     as_json: AsJson = False,
 ) -> None:
     """Find a model of a wired actuator: measure within its limits, identify, judge."""
-    from hilctl.characterise.session import Campaign
-    from hilctl.cli.characterise_view import plan_mapping, print_plan
+    from hilctl.api.running import runs_folder
+    from hilctl.cli.characterise_view import plan_mapping, print_plan, print_step
     from hilctl.cli.progress import shown_progress
 
-    page = output.with_suffix(".html")
-    if page == output:
-        raise InputError(f"{output}: is the name of the page: give the model another one, .yaml")
-    chosen = folder or output.with_name(f"{output.stem}-runs")
-    with shown_progress("characterise", quiet=as_json) as on_progress:
-        host = _host(on_progress, fast=fast, quiet=as_json)
-        campaign = Campaign(experiment, with_labels(settings, labels), chosen, highest_hz, host)
-        plan = campaign.plan
-        if dry_run:
-            print_json(plan_mapping(plan)) if as_json else print_plan(plan, chosen)
-            return
-        check_writable(output, overwrite=overwrite)
-        check_writable(page, overwrite=overwrite or any(chosen.glob("*.mcap")))
-        finish_orphans()
+    chosen = runs_folder(output, folder)
+
+    def on_plan(plan: "CampaignPlan") -> None:
         if not as_json:
             print_plan(plan, chosen)
-        if overwrite:
-            campaign.discard()
-        found = _characterised(campaign, output, overwrite=overwrite)
-    _finish(found, output, page, chosen, as_json=as_json)
+        elif dry_run:
+            print_json(plan_mapping(plan))
+
+    with shown_progress("characterise", quiet=as_json) as on_progress:
+        found = _characterised(
+            experiment,
+            output,
+            folder=chosen,
+            settings=with_labels(settings, labels),
+            highest_hz=highest_hz,
+            fast=fast,
+            overwrite=overwrite,
+            dry_run=dry_run,
+            on_progress=on_progress,
+            on_plan=on_plan,
+            on_step=(lambda row: None) if as_json else print_step,
+        )
+    if found is not None:
+        _finish(found, output, output.with_suffix(".html"), chosen, as_json=as_json)
 
 
-def _host(
-    on_progress: "Callable[[float, str], None]", *, fast: bool, quiet: bool
-) -> "CampaignHost":
-    from hilctl.characterise.session import CampaignHost
-    from hilctl.cli.characterise_view import print_step
-    from hilctl.run.step import paced, unpaced
-
-    host = CampaignHost(run=unpaced if fast else paced, on_progress=on_progress)
-    return host if quiet else replace(host, on_step=print_step)
-
-
-def _characterised(campaign: "Campaign", output: Path, *, overwrite: bool) -> "Characterisation":
+def _characterised(experiment: Path, output: Path, **asked: Any) -> "Characterisation | None":
+    from hilctl import api
     from hilctl.run.step import StepStoppedError
 
     try:
-        return campaign.characterise(output, overwrite=overwrite)
+        return api.characterise(experiment, output, **asked)
     except (StepStoppedError, KeyboardInterrupt) as error:
         number = getattr(error, "signal", signal.SIGINT)
         print(f"hilctl: stopped: {error or 'Ctrl-C'}; {_GOES_ON}", file=sys.stderr)
@@ -96,10 +86,8 @@ def _characterised(campaign: "Campaign", output: Path, *, overwrite: bool) -> "C
 def _finish(
     found: "Characterisation", output: Path, page: Path, folder: Path, *, as_json: bool
 ) -> None:
-    from hilctl.characterise.page import write_characterisation
     from hilctl.cli.characterise_view import print_characterisation
 
-    write_characterisation(found, page)
     model = output if found.is_model else None
     if as_json:
         places = {"output": str(model) if model else None, "page": str(page)}

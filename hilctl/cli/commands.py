@@ -35,6 +35,10 @@ COMMANDS: dict[str, CommandEntry] = {
         "hilctl.cli.examples:examples",
         "List the examples, or copy one and the files it names to where they can be changed.",
     ),
+    "init": CommandEntry(
+        "hilctl.cli.starting:init",
+        "Write a first experiment for a device, small, slow and explained; it asks in a terminal.",
+    ),
     "run": CommandEntry(
         "hilctl.cli.running:run",
         "Run an experiment and record it; Ctrl-C ramps to the safe value first.",

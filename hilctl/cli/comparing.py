@@ -1,24 +1,20 @@
 """The command that compares models."""
 
-import time
-from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from hilctl.base.errors import InputError
 from hilctl.base.files import check_writable
 from hilctl.cli.options import AsJson, Overwrite, Settings
-from hilctl.cli.output import finish_orphans, print_json
-
-if TYPE_CHECKING:
-    from hilctl.comparison.compare import Comparison
-
+from hilctl.cli.output import print_json
 
 Models = Annotated[
     list[str] | None,
-    typer.Option(help="Kinds, commas between, or model files; else all. May be repeated."),
+    typer.Option(
+        metavar="KIND", help="Kinds, commas between, or model files; else all. May be repeated."
+    ),
 ]
 TryIn = Annotated[
     Path | None,
@@ -30,7 +26,9 @@ Frequencies = Annotated[
 
 
 def compare(
-    files: Annotated[list[Path], typer.Argument(help="Recordings (MCAP) of steady loops.")],
+    files: Annotated[
+        list[Path], typer.Argument(metavar="RUN", help="Recordings (MCAP) of steady loops.")
+    ],
     models: Models = None,
     experiment: TryIn = None,
     frequencies: Frequencies = None,
@@ -42,44 +40,30 @@ def compare(
     as_json: AsJson = False,
 ) -> None:
     """Identify models of the literature on the same loops, and compare them."""
+    from hilctl import api
     from hilctl.cli.compare_view import render
     from hilctl.cli.console import print_rich
     from hilctl.cli.progress import shown_progress
-    from hilctl.comparison import compare as library
 
-    check_page(html, overwrite=overwrite)
     names = [name for text in models or [] for name in text.split(",") if name]
-    if save is not None:
-        library.check_free(names or list(library.COMPARED), save, overwrite=overwrite)
-    finish_orphans()
-    request = library.ComparisonRequest(
-        recordings=files,
-        models=names,
-        experiment=experiment,
-        settings=settings or [],
-        frequencies_hz=_numbers(frequencies),
-        points=points,
-    )
+    numbers = _numbers(frequencies)
     with shown_progress("compare", quiet=as_json) as on_progress:
-        comparison = library.compare(request, time.perf_counter, on_progress)
-    _write(comparison, html, save, overwrite=overwrite)
+        comparison = api.compare(
+            files,
+            names,
+            experiment=experiment,
+            settings=settings or [],
+            frequencies_hz=numbers,
+            points=points,
+            html=html,
+            save=save,
+            overwrite=overwrite,
+            on_progress=on_progress,
+        )
     if as_json:
         print_json(comparison.to_mapping())
     else:
         print_rich(render(comparison))
-
-
-def _write(
-    comparison: "Comparison", html: Path | None, save: Path | None, *, overwrite: bool
-) -> None:
-    from hilctl.comparison.compare import save_models
-    from hilctl.comparison.page import write_comparison
-
-    if html is not None:
-        write_comparison(comparison, html)
-    if save is not None:
-        created = datetime.now(UTC).isoformat(timespec="seconds")
-        save_models(comparison, save, created=created, overwrite=overwrite)
 
 
 def _numbers(text: str | None) -> list[float] | None:

@@ -1,5 +1,6 @@
 """Tables and colours in a terminal: the only console, and results of studies on it."""
 
+import io
 import sys
 from collections.abc import Iterable
 from pathlib import Path
@@ -10,7 +11,9 @@ from rich.text import Text
 
 from hilctl.analysis.replay import ReplayResult
 from hilctl.base.printable import printable
+from hilctl.base.quantity import quantity
 from hilctl.cli.streams import PlainStream
+from hilctl.cli.volume import Volume
 
 
 class PlainConsole(Console):
@@ -32,6 +35,8 @@ class PlainConsole(Console):
 def console(*, stderr: bool = False) -> Console:
     """Return the console on standard output or error."""
     stream = sys.stderr if stderr else sys.stdout
+    if stderr and Volume.quiet:  # bars of progress; what is wrong does not come this way
+        stream = io.StringIO()
     return PlainConsole(
         file=stream.styled if isinstance(stream, PlainStream) else stream,
         markup=False,
@@ -63,6 +68,13 @@ def print_replay(result: ReplayResult, *, other: Path | None) -> None:
         terminal.print(
             f"with {other} the command would have run from {result.command_min:.4g} to "
             f"{result.command_max:.4g} {unit}, {result.limited_samples} samples limited"
+        )
+    if (error := result.predicted) is not None:
+        terminal.print(
+            f"error that it would have had: {quantity(error.peak_percent, '%')} peak, "
+            f"{quantity(error.rms_percent, '%')} rms; recorded on the same samples: "
+            f"{quantity(error.recorded_peak_percent, '%')} peak, "
+            f"{quantity(error.recorded_rms_percent, '%')} rms"
         )
     terminal.print(
         f"largest difference {result.largest_difference:.4g} {unit}, "

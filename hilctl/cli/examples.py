@@ -21,7 +21,9 @@ _SHOWN = (
 
 
 def examples(
-    name: Annotated[str | None, typer.Argument(help="Example to copy; else list them.")] = None,
+    name: Annotated[
+        str | None, typer.Argument(metavar="NAME", help="Example to copy; else list them.")
+    ] = None,
     into: Annotated[Path, typer.Option(help="Folder for the copies.")] = Path(),
     as_json: AsJson = False,
 ) -> None:

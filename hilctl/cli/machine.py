@@ -76,10 +76,10 @@ def devices(context: typer.Context, as_json: AsJson = False) -> None:
 
 @devices_app.command()
 def show(
-    name: Annotated[str, typer.Argument(help="Device, or shipped profile.")],
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Device, or shipped profile.")],
     as_json: AsJson = False,
 ) -> None:
-    """Show a device's options, or a profile's inputs, outputs, sources and notes."""
+    """Show a device's options, or what a profile has."""
     from hilctl.cli.machine_view import print_described
     from hilctl.experiment.inventory import describe
 
@@ -92,7 +92,7 @@ def show(
 
 @devices_app.command()
 def probe(experiment: ExperimentFile, settings: Settings = None, as_json: AsJson = False) -> None:
-    """Read an experiment's device and judge what it says; only reads, so nothing moves."""
+    """Read an experiment's device and judge it; nothing moves."""
     from hilctl.cli.probe_view import print_probed
     from hilctl.run.probe import probe as read_device
 

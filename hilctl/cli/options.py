@@ -11,11 +11,13 @@ ExperimentFile = Annotated[
 RecordingFile = Annotated[Path, typer.Argument(help="Recording (MCAP).", metavar="RUN")]
 Settings = Annotated[
     list[str] | None,
-    typer.Option("--set", help="Set dotted.key=value over the file; may be repeated."),
+    typer.Option(
+        "--set", metavar="KEY=VALUE", help="Set a dotted key over the file; may be repeated."
+    ),
 ]
 LabelTexts = Annotated[
     list[str] | None,
-    typer.Option("--label", help="key=value that the run is found by; may be repeated."),
+    typer.Option("--label", metavar="KEY=VALUE", help="What the run is found by; may be repeated."),
 ]
 FromS = Annotated[float | None, typer.Option("--from", help="From this time of the run, in s.")]
 ToS = Annotated[float | None, typer.Option("--to", help="Up to this time of the run, in s.")]

@@ -4,7 +4,7 @@ import json
 import sys
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -14,27 +14,29 @@ from hilctl.cli.options import AsJson, FromS, Overwrite, RecordingFile, ToS
 from hilctl.cli.output import finish_orphans, print_json
 from hilctl.cli.series import OtherModel, RunsInput, report_series
 
-if TYPE_CHECKING:
-    from hilctl.recording.stretch import Stretch
-
-IdentifyInput = Annotated[list[Path], typer.Argument(help="Recordings (MCAP) or text tables.")]
+IdentifyInput = Annotated[
+    list[Path], typer.Argument(metavar="FILE", help="Recordings (MCAP) or text tables.")
+]
 TableUnit = Annotated[str | None, typer.Option(help="Unit of a table's command, A or V.")]
 TableColumn = Annotated[str | None, typer.Option(help="Column of a table: name, or number from 1.")]
 RateHz = Annotated[float | None, typer.Option(help="Of a table without a time column.")]
 Whole = Annotated[bool, typer.Option(help="Judge whole histories, not steady cycles.")]
 LeaveOut = Annotated[
     list[str] | None,
-    typer.Option(help="Loop not to use, by its label or how that begins; may be repeated."),
+    typer.Option(
+        metavar="LABEL", help="Loop not to use, by its label or how that begins; may be repeated."
+    ),
 ]
 Validate = Annotated[
-    list[Path] | None, typer.Option(help="File to judge the model on; may be repeated.")
+    list[Path] | None,
+    typer.Option(metavar="FILE", help="File to judge the model on; may be repeated."),
 ]
 Scheduler = Annotated[
     str, typer.Option(help="none, threads, processes, or a Dask scheduler's address.")
 ]
 FitTexts = Annotated[
     list[str] | None,
-    typer.Option("--set", help="key=value; --settings lists all of them. May be repeated."),
+    typer.Option("--set", metavar="KEY=VALUE", help="--settings lists all keys. May be repeated."),
 ]
 
 
@@ -58,37 +60,18 @@ def report(
         return
     if model is not None:
         raise InputError("--model is for the report of several recordings")
-    _report_one(runs[0], html, before, _stretch(from_s, to_s), overwrite=overwrite, as_json=as_json)
-
-
-def _report_one(
-    recording: Path,
-    html: Path | None,
-    before: Path | None,
-    stretch: "Stretch | None",
-    *,
-    overwrite: bool,
-    as_json: bool,
-) -> None:
-    from hilctl.analysis.report import summarize
-    from hilctl.cli.console import print_rich
-    from hilctl.cli.report_view import render
-    from hilctl.recording.reader import Pieces
-
-    finish_orphans()
     if before is not None and html is None:
         raise InputError("--before is drawn on the page: name one with --html")
-    pieces = Pieces(recording, stretch)
-    if html is None:
-        summary = summarize(pieces)
-    else:
-        from hilctl.analysis.overview import overview
-        from hilctl.analysis.run_page import write_html
+    from hilctl import api
+    from hilctl.cli.console import print_rich
+    from hilctl.cli.report_view import render
 
-        check_page(html, overwrite=overwrite)
-        earlier = overview(Pieces(before))[1] if before is not None else None
-        summary, shown = overview(pieces)
-        write_html(shown, summary, html, earlier)
+    if html is None:
+        summary = api.summarize(runs[0], from_s=from_s, to_s=to_s)
+    else:
+        summary = api.report_page(
+            runs[0], html, before=before, from_s=from_s, to_s=to_s, overwrite=overwrite
+        )
     if as_json:
         print_json(summary.to_mapping())
     else:
@@ -220,9 +203,14 @@ def _column(text: str | None) -> str | int | None:
 
 
 def export(
-    recording: Annotated[Path, typer.Argument(help="Recording (MCAP), or a folder of them.")],
+    recording: Annotated[
+        Path, typer.Argument(metavar="RUN", help="Recording (MCAP), or a folder of them.")
+    ],
     output: Annotated[
-        Path, typer.Argument(help=".csv, .npz, .parquet or .mat file to write, or a folder.")
+        Path,
+        typer.Argument(
+            metavar="OUTPUT", help=".csv, .npz, .parquet or .mat file to write, or a folder."
+        ),
     ],
     every: Annotated[
         bool, typer.Option("--all", help="All recordings of a folder, as Hive-style Parquet.")
@@ -246,12 +234,6 @@ def export(
         print_json({"output": str(output), "rows": rows})
     else:
         print(f"{output}: {rows} samples")
-
-
-def _stretch(from_s: float | None, to_s: float | None) -> "Stretch | None":
-    from hilctl.recording.stretch import Stretch
-
-    return None if from_s is None and to_s is None else Stretch(from_s, to_s)
 
 
 def _export_all(folder: Path, output: Path, *, as_json: bool) -> None:

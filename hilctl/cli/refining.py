@@ -13,14 +13,16 @@ if TYPE_CHECKING:
     from hilctl.identify.refine.command import Refinement
 
 Validate = Annotated[
-    list[Path] | None, typer.Option(help="Recording to judge the model on; may be repeated.")
+    list[Path] | None,
+    typer.Option(metavar="RUN", help="Recording to judge the model on; may be repeated."),
 ]
 
 
 def refine(
     model: Annotated[Path, typer.Argument(help="Model file.", metavar="MODEL")],
     runs: Annotated[
-        list[Path], typer.Argument(help="Recordings (MCAP): compensated, learned, or neither.")
+        list[Path],
+        typer.Argument(metavar="RUN", help="Recordings (MCAP): compensated, learned, or neither."),
     ],
     output: Annotated[Path | None, typer.Option(help="Model file to write.")] = None,
     validate: Validate = None,

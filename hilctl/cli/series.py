@@ -2,19 +2,15 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import typer
 
-from hilctl.cli.comparing import check_page
 from hilctl.cli.options import AsJson, Overwrite
-from hilctl.cli.output import finish_orphans, print_json
-
-if TYPE_CHECKING:
-    from hilctl.series.collect import RunSeries
+from hilctl.cli.output import print_json
 
 RunsInput = Annotated[
-    list[Path], typer.Argument(help="Recordings (MCAP), or a campaign's folder.", metavar="RUN...")
+    list[Path], typer.Argument(help="Recordings (MCAP), or a campaign's folder.", metavar="RUN")
 ]  # fmt: skip
 OtherModel = Annotated[
     Path | None, typer.Option(help="Model to hold against measured loops; else the recorded ones.")
@@ -40,36 +36,21 @@ def figures(
     as_json: AsJson = False,
 ) -> None:
     """Draw the figures that apply to runs, by what varied among them: loops, trends, errors."""
-    from hilctl.analysis.vector import formats_of
+    from hilctl import api
     from hilctl.cli.progress import shown_progress
-    from hilctl.series.files import write_sheets
 
-    chosen = formats_of(formats)
     folder = output or (runs[0] / FOLDER if runs[0].is_dir() else Path(FOLDER))
-    series = collected(runs, model, quiet=as_json)
-    with shown_progress("figures", quiet=as_json) as on_done:
-        written = write_sheets(series, folder, chosen, width, overwrite=overwrite, on_done=on_done)
+    written: dict[Path, str] = {}
+    with shown_progress("figures", quiet=as_json) as on_progress:
+        api.figures(
+            runs, folder, formats=formats, width=width, model=model, overwrite=overwrite,
+            on_progress=on_progress, on_written=written.__setitem__,
+        )  # fmt: skip
     if as_json:
         print_json({"figures": {str(path): caption for path, caption in written.items()}})
         return
     for path, caption in written.items():
         print(f"{path}: {caption}")
-
-
-def collected(runs: Sequence[Path], model: Path | None, *, quiet: bool) -> "RunSeries":
-    """Read runs, with a bar of progress.
-
-    Raises:
-        InputError: They, or the model, can't be read.
-    """
-    from hilctl.cli.progress import shown_progress
-    from hilctl.models.files import load_model
-    from hilctl.series.collect import collect
-
-    finish_orphans()
-    known = load_model(model) if model else None
-    with shown_progress("read", quiet=quiet) as on_read:
-        return collect(runs, known, on_read)
 
 
 def report_series(
@@ -81,15 +62,16 @@ def report_series(
     as_json: bool,
 ) -> None:
     """Say what came out of several runs, and write the page of all of them where one is wanted."""
+    from hilctl import api
     from hilctl.cli.console import print_rich
+    from hilctl.cli.progress import shown_progress
     from hilctl.cli.series_view import render_series
-    from hilctl.series.page import write_series
     from hilctl.series.result import series_mapping
 
-    check_page(html, overwrite=overwrite)
-    series = collected(runs, model, quiet=as_json)
-    if html is not None:
-        write_series(series, html)
+    with shown_progress("read", quiet=as_json) as on_progress:
+        series = api.report_runs(
+            runs, html, model=model, overwrite=overwrite, on_progress=on_progress
+        )
     if as_json:
         print_json(series_mapping(series))
     else:

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from hilctl.base.errors import InputError
-from hilctl.base.files import write_text
+from hilctl.base.files import already_there, write_text
 from hilctl.base.yaml.document import Document
 from hilctl.comparison.trials import (
     InverseTrial,
@@ -273,9 +273,10 @@ def check_free(names: Sequence[str], folder: Path, *, overwrite: bool) -> None:
     Raises:
         InputError: One does, and may not be replaced.
     """
-    taken = [str(folder / f"{name}.yaml") for name in names if (folder / f"{name}.yaml").exists()]
+    paths = [folder / f"{name}.yaml" for name in names]
+    taken = [path for path in paths if path.exists()]
     if taken and not overwrite:
-        raise InputError(f"{taken[0]}: exists already: give another --save, or --overwrite")
+        raise already_there(taken[0], "give another --save, or --overwrite")
 
 
 def save_models(

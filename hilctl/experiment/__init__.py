@@ -11,6 +11,7 @@ model_range.py    whether the reference stays within what the model was identifi
 forecast.py       what a run will do; tuned.py  what it would with another gain and offset
 interlocks.py     interlocks, feedback.py feedback and adaptation.py adaptation, by the file's keys
 device.py         the device that it names; registry.py  devices by name
-inventory.py      what there is on this machine
+inventory.py      what there is on this machine; examples.py  what comes with hilctl, to copy
+starting.py       a first experiment for a device
 schema.py         the file's JSON schema
 """

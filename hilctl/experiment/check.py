@@ -200,7 +200,7 @@ def _state_before(
         except DataError as error:
             problems.append(_problem(loaded, "compensator.initial_state", str(error)))
     if before is None and conditioned.size:
-        before = left_by(conditioned, model, rate_hz)
+        before = left_by([conditioned], model, rate_hz)
     return before, begins
 
 

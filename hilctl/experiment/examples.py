@@ -1,4 +1,7 @@
-"""The experiments, campaigns and models that come with hilctl, and copies of them to work on."""
+"""What comes with hilctl to begin with, and copies of it to work on.
+
+Experiments, campaigns, models, layouts of other programs, and profiles of devices.
+"""
 
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
@@ -9,9 +12,12 @@ from hilctl.base.errors import InputError
 from hilctl.base.files import read_text, write_text
 from hilctl.base.yaml.document import load_document
 from hilctl.base.yaml.messages import did_you_mean
+from hilctl.experiment.inventory import shipped_profiles
 
 _PACKAGE = Path(__file__).parents[1]
 _SCHEMA = "schema.json"
+_PROFILES = "profiles"
+_LAYOUTS = {".json": "Foxglove and Lichtblick", ".xml": "PlotJuggler"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,7 +25,7 @@ class Example:
     """A file that comes with hilctl.
 
     Attributes:
-        name: By which it is asked for: its path in the folder, without the ending.
+        name: By which it is asked for: where its copy stands, without the ending.
         description: What it is for, as it says itself.
         path: Where it stands.
     """
@@ -27,6 +33,11 @@ class Example:
     name: str
     description: str
     path: Path
+
+    @property
+    def copy(self) -> Path:
+        """Where its copy stands, in the folder of copies."""
+        return Path(self.name + self.path.suffix)
 
     def to_mapping(self) -> dict[str, Any]:
         """Return the fields as plain values."""
@@ -40,16 +51,27 @@ def examples_folder() -> Path:
 
 
 def shipped_examples(folder: Path) -> tuple[Example, ...]:
-    """Return the YAML files of a folder of examples, those of the folder itself first."""
+    """Return a folder's examples, those of the folder itself first, and the shipped profiles."""
     paths = sorted(folder.rglob("*.yaml"), key=lambda path: (len(path.parts), path))
-    return tuple(
-        Example(
-            path.relative_to(folder).with_suffix("").as_posix(),
-            _description(load_document(path).data),
-            path,
-        )
-        for path in paths
-    )
+    found = {path.relative_to(folder): _description(load_document(path).data) for path in paths}
+    found |= {
+        path.relative_to(folder): f"layout for {programs}"
+        for ending, programs in _LAYOUTS.items()
+        for path in sorted((folder / "layouts").glob(f"*{ending}"))
+    }
+    found |= {
+        path.relative_to(folder): "a run as a service of systemd"
+        for path in folder.glob("*.service")
+    }
+    examples = [
+        Example(place.with_suffix("").as_posix(), description, folder / place)
+        for place, description in found.items()
+    ]
+    for name, file in shipped_profiles().items():
+        profile = load_document(Path(file)).data
+        title = f"profile of {profile['vendor']} {profile['model']}"
+        examples.append(Example(f"{_PROFILES}/{name}", title, Path(file)))
+    return tuple(examples)
 
 
 def _description(data: dict[str, Any]) -> str:
@@ -73,10 +95,16 @@ def copy_example(name: str, into: Path, folder: Path) -> tuple[Path, ...]:
         InputError: There is no such example, a copy can't be written, or another file has its name;
             then nothing is written.
     """
-    known = {example.name: example.path for example in shipped_examples(folder)}
+    known = {example.name: example for example in shipped_examples(folder)}
     if name not in known:
         raise InputError(f"there is no example '{name}' ({did_you_mean(name, list(known))})")
-    places = {path: into / path.relative_to(folder) for path in _needed(known[name], folder)}
+    places = {known[name].path: into / known[name].copy}
+    if name.startswith(f"{_PROFILES}/"):
+        schema = known[name].path.with_name(_SCHEMA)
+        places[schema] = into / _PROFILES / _SCHEMA
+    elif known[name].path.suffix == ".yaml":
+        needed = _needed(known[name].path, folder)
+        places |= {path: into / path.relative_to(folder) for path in needed}
     texts = {copy: read_text(path) for path, copy in places.items()}
     for copy, text in texts.items():
         if copy.exists() and read_text(copy) != text:
@@ -89,6 +117,18 @@ def copy_example(name: str, into: Path, folder: Path) -> tuple[Path, ...]:
         if not copy.exists():
             write_text(copy, text, overwrite=False)
     return tuple(texts)
+
+
+def copy_schema(into: Path) -> Path:
+    """Put the schema that editors check experiments by beside one, unless one is there.
+
+    Raises:
+        InputError: It can't be written.
+    """
+    copy = into / _SCHEMA
+    if not copy.exists():
+        write_text(copy, read_text(examples_folder() / _SCHEMA), overwrite=False)
+    return copy
 
 
 def _needed(path: Path, folder: Path) -> tuple[Path, ...]:

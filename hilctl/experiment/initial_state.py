@@ -1,6 +1,7 @@
 """What a compensator begins with: the memory that a run before left in the actuator, or rest."""
 
 import math
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from hilctl.base.samples import Flag
 from hilctl.loop.compensator import Compensator
 from hilctl.models.base import HysteresisModel
 from hilctl.recording.data import Recording
-from hilctl.recording.reader import read
+from hilctl.recording.reader import Pieces
 
 _STILL_S = 1.0
 
@@ -118,36 +119,80 @@ def initial_state_after(path: Path, model: HysteresisModel, sample_rate_hz: floa
         DataError: The recording can't be read, or is not of a whole run of such commands.
         ModelError: The model has no inverse.
     """
-    recording = read(path)
-    _check(recording, model, sample_rate_hz)
-    left = left_by(recording.samples.command, model, sample_rate_hz)
+    followed = _Followed(path, model, sample_rate_hz)
+    left = left_by(followed.commands(), model, sample_rate_hz)
     if not math.isfinite(left.stands_um):
         raise DataError(f"{path}: has commands that the model has no displacement for")
-    return replace(left, run_id=recording.run.get("run_id", ""))
+    return replace(left, run_id=followed.run_id)
 
 
-def left_by(command: F64, model: HysteresisModel, sample_rate_hz: float) -> InitialState:
-    """Return where commands from rest leave the model, once it has stood still for a second."""
-    still = np.full(round(_STILL_S * sample_rate_hz), command[-1])
-    came = model.forward(sample_rate_hz).process(np.concatenate((command, still)))
-    inverse = model.inverse(sample_rate_hz)
-    if not np.isfinite(came).all():
-        return InitialState(inverse.state(), math.nan, "")
-    inverse.process(came[inverse.preview :])
-    return InitialState(inverse.state(), float(came[-1]), "")
+def left_by(commands: Iterable[F64], model: HysteresisModel, sample_rate_hz: float) -> InitialState:
+    """Return where commands from rest leave the model, once it has stood still for a second.
+
+    Args:
+        commands: float64[n] each, one after the other.
+        model: The model.
+        sample_rate_hz: Samples a second.
+    """
+    forward, inverse = model.forward(sample_rate_hz), model.inverse(sample_rate_hz)
+    rest = inverse.state()
+    ahead, stands_um = inverse.preview, 0.0
+    for command in _and_still(commands, round(_STILL_S * sample_rate_hz)):
+        came = forward.process(command)
+        if not np.isfinite(came).all():
+            return InitialState(rest, math.nan, "")
+        if came.size > ahead:
+            inverse.process(came[ahead:])
+        ahead, stands_um = max(ahead - came.size, 0), float(came[-1])
+    return InitialState(inverse.state(), stands_um, "")
 
 
-def _check(recording: Recording, model: HysteresisModel, sample_rate_hz: float) -> None:
-    path, index = recording.path, recording.samples.index
-    if recording.command_unit != model.input_unit:
-        units = f"{recording.command_unit}, the model takes {model.input_unit}"
-        raise DataError(f"{path}: was recorded in {units}")
-    if recording.sample_rate_hz != sample_rate_hz:
-        rates = f"{recording.sample_rate_hz:g} Hz, this run is at {sample_rate_hz:g} Hz"
-        raise DataError(f"{path}: was recorded at {rates}")
-    if index.size == 0 or recording.dropped or index[-1] + 1 != index.size or not recording.end:
-        raise DataError(f"{path}: is not of a whole run: where it left the actuator is not known")
-    unanswered = np.any(recording.samples.flags & Flag.UNANSWERED.value)
-    if unanswered or recording.end.get("output_safe") == "false":
-        lost = "lost its device, or did not confirm its safe value"
-        raise DataError(f"{path}: {lost}: where it left the actuator is not known")
+def _and_still(commands: Iterable[F64], samples: int) -> Iterator[F64]:
+    last = 0.0
+    for command in commands:
+        if command.size:
+            yield command
+            last = float(command[-1])
+    yield np.full(samples, last)
+
+
+class _Followed:
+    """The commands of a recorded run, and whether it is one that can be followed."""
+
+    def __init__(self, path: Path, model: HysteresisModel, sample_rate_hz: float) -> None:
+        self._path, self._unit, self._rate_hz = path, model.input_unit, sample_rate_hz
+        self.run_id = ""
+
+    def commands(self) -> Iterator[F64]:
+        """Yield them, from the first sample to the last."""
+        samples = 0
+        unanswered = False
+        for piece in Pieces(self._path):
+            self._check(piece)
+            index, flags = piece.samples.index, piece.samples.flags
+            unanswered |= bool(np.any(flags & Flag.UNANSWERED.value))
+            if index.size:
+                self._check_whole(
+                    whole=index[0] == samples and index[-1] + 1 == samples + index.size
+                )
+            samples += index.size
+            yield piece.samples.command
+        self._check_whole(whole=bool(samples and not piece.dropped and piece.end))
+        if unanswered or piece.end.get("output_safe") == "false":
+            lost = "lost its device, or did not confirm its safe value"
+            raise DataError(f"{self._path}: {lost}: where it left the actuator is not known")
+        self.run_id = piece.run.get("run_id", "")
+
+    def _check(self, recording: Recording) -> None:
+        path = self._path
+        if recording.command_unit != self._unit:
+            units = f"{recording.command_unit}, the model takes {self._unit}"
+            raise DataError(f"{path}: was recorded in {units}")
+        if recording.sample_rate_hz != self._rate_hz:
+            rates = f"{recording.sample_rate_hz:g} Hz, this run is at {self._rate_hz:g} Hz"
+            raise DataError(f"{path}: was recorded at {rates}")
+
+    def _check_whole(self, *, whole: bool) -> None:
+        if not whole:
+            lost = "where it left the actuator is not known"
+            raise DataError(f"{self._path}: is not of a whole run: {lost}")

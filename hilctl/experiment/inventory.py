@@ -48,7 +48,7 @@ class Inventory:
 
 def inventory() -> Inventory:
     """Look for devices, profiles and serial ports; nothing is opened."""
-    return Inventory(known_devices(), _profiles(), _serial_ports())
+    return Inventory(known_devices(), shipped_profiles(), _serial_ports())
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +93,7 @@ def describe(name: str) -> Described:
     Raises:
         InputError: There is none of this name, or it can't be loaded.
     """
-    kinds, profiles = known_devices(), _profiles()
+    kinds, profiles = known_devices(), shipped_profiles()
     if name in profiles:
         path = Path(profiles[name])
         return Described(name, str(path), (), load_document(path).data)
@@ -113,7 +113,12 @@ def describe(name: str) -> Described:
     return Described(name, kinds[name], options, {})
 
 
-def _profiles() -> dict[str, str]:
+def shipped_profiles() -> dict[str, str]:
+    """Return the shipped profiles, each with its file.
+
+    Raises:
+        InputError: The drivers are not installed.
+    """
     module_name, _, name = SHIPPED_PROFILES.partition(":")
     try:
         shipped = cast("Callable[[], dict[str, Path]]", getattr(import_module(module_name), name))

@@ -1,5 +1,7 @@
 """From an experiment file to the experiment with all that the file refers to."""
 
+import json
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,6 +19,9 @@ from hilctl.models.base import HysteresisModel
 from hilctl.models.files import load_model
 
 T = TypeVar("T")
+FILE_KEYS = {"compensator.model", "compensator.correction", "compensator.initial_state",
+             "waveform.path", "device.profile", "device.reader.profile"}  # fmt: skip
+"""Keys of an experiment that name files, relative to its own folder."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,11 +52,31 @@ class LoadedExperiment:
 def load_experiment(path: Path, settings: Sequence[str] = ()) -> LoadedExperiment:
     """Read an experiment file, apply ``key=value`` settings, and load what it refers to.
 
+    A file that a setting names is looked for in the working folder first, where whoever types it
+    sees it, and then in the experiment's.
+
     Raises:
         InputError: The file can't be read.
         ConfigError: Rules are broken; the error lists every one of them.
     """
-    return resolve(load_document(path), path.parent, settings)
+    from_here = [named_from(path.parent, setting) for setting in settings]
+    return resolve(load_document(path), path.parent, from_here)
+
+
+def named_from(folder: Path, setting: str) -> str:
+    """Return a setting with the file that it names in the working folder named from another one.
+
+    Args:
+        folder: What file names in the experiment are relative to.
+        setting: ``key=value``.
+    """
+    key, _, text = setting.partition("=")
+    name = text.strip().strip("'\"")
+    if key.strip() not in FILE_KEYS or not name or Path(name).is_absolute():
+        return setting
+    if not Path(name).is_file():
+        return setting
+    return f"{key}={json.dumps(os.path.relpath(name, folder), ensure_ascii=False)}"
 
 
 def resolve(

@@ -17,6 +17,9 @@ from hilctl.series.run_figures import RunFigures
 OnRead = Callable[[float, str], None]
 """Called with what is done, from 0 to 1, and what is being read."""
 
+MOST_BYTES = 512 << 20
+"""Largest recording that is read into memory, where it takes some eight times as much."""
+
 
 @dataclass(frozen=True, slots=True)
 class SeriesRun:
@@ -158,6 +161,15 @@ def series_of(
     return RunSeries(name, runs, keys, tuple(missing), is_campaign=True)
 
 
+def _digest(path: Path, model: HysteresisModel | None) -> RunDigest:
+    if path.is_file() and path.stat().st_size > MOST_BYTES:
+        raise DataError(
+            f"{path}: is larger than {MOST_BYTES >> 20} MB, too long for a page of many runs: "
+            f"'hilctl report {path}' makes one of its own, in little memory"
+        )
+    return digest_of(read(path), model)
+
+
 def _of_campaign(table: Path, model: HysteresisModel | None, on_read: OnRead) -> RunSeries:
     entries = read_entries(table)
     named = [entry for entry in entries if entry.recording and entry.result == COMPLETED]
@@ -167,7 +179,7 @@ def _of_campaign(table: Path, model: HysteresisModel | None, on_read: OnRead) ->
         # A name in the table must not lead elsewhere.
         path = table.parent / Path(entry.recording).name
         try:
-            digests[entry.recording] = digest_of(read(path), model)
+            digests[entry.recording] = _digest(path, model)
         except DataError as error:
             missing.append(str(error))
     return series_of(table.stem, entries, digests, missing)
@@ -185,7 +197,7 @@ def _of_files(
     for number, path in enumerate(paths):
         on_read(number / len(paths), f"read {path.name}")
         try:
-            digests.append((path, digest_of(read(path), model)))
+            digests.append((path, _digest(path, model)))
         except DataError as error:
             if missing is None:
                 raise

@@ -8,12 +8,13 @@ from matplotlib.figure import Figure
 from hilctl.analysis.sheet import ColumnWidth, Sheet, drawn
 from hilctl.analysis.vector import write_figure
 from hilctl.base.errors import InputError
+from hilctl.base.files import already_there
 from hilctl.series.collect import OnRead, RunSeries
 from hilctl.series.sheets import sheets_of
 
 
 def write_sheets(
-    series: RunSeries,
+    sheets: Sequence[Sheet],
     folder: Path,
     formats: Sequence[str],
     width: ColumnWidth,
@@ -22,10 +23,10 @@ def write_sheets(
     on_done: OnRead = lambda done, text: None,
     on_drawn: Callable[[str, Figure], None] = lambda name, figure: None,
 ) -> dict[Path, str]:
-    """Write all figures that apply to runs.
+    """Write figures.
 
     Args:
-        series: The runs.
+        sheets: The figures.
         folder: Where they go; made where it is missing.
         formats: See :data:`hilctl.analysis.vector.FORMATS`.
         width: Of one column of a journal, or of two.
@@ -37,13 +38,12 @@ def write_sheets(
         The files, each with its caption.
 
     Raises:
-        InputError: No figure applies, or a file exists or can't be written.
+        InputError: A file exists or can't be written.
     """
-    sheets = _applying(series)
     names = [folder / f"{sheet.name}.{each}" for sheet in sheets for each in formats]
     taken = [path for path in names if path.exists()]
     if taken and not overwrite:
-        raise InputError(f"{taken[0]}: exists already: give another --output, or --overwrite")
+        raise already_there(taken[0], "give another --output, or --overwrite")
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -59,27 +59,28 @@ def write_sheets(
 
 
 def draw_sheets(
-    series: RunSeries, width: ColumnWidth, on_done: OnRead = lambda done, text: None
+    sheets: Sequence[Sheet], width: ColumnWidth, on_done: OnRead = lambda done, text: None
 ) -> dict[str, Figure]:
-    """Draw all figures that apply to runs; return them by their names.
+    """Draw figures; return them by their names.
 
     Args:
-        series: The runs.
+        sheets: The figures.
         width: Of one column of a journal, or of two.
         on_done: Told of progress.
-
-    Raises:
-        InputError: No figure applies.
     """
     figures = {}
-    sheets = _applying(series)
     for number, sheet in enumerate(sheets):
         on_done(number / len(sheets), f"draw {sheet.name}")
         figures[sheet.name] = drawn(sheet, width)
     return figures
 
 
-def _applying(series: RunSeries) -> list[Sheet]:
+def applying_sheets(series: RunSeries) -> list[Sheet]:
+    """Return all figures that apply to runs.
+
+    Raises:
+        InputError: There is none.
+    """
     sheets = sheets_of(series)
     if not sheets:
         raise InputError(f"{series.name}: no completed run holds what a figure could be drawn of")

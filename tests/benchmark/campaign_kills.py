@@ -51,6 +51,8 @@ reference_run: {{every: 10}}
 BEYOND_S = 3.0
 IN_RUNS = 0.7
 TOLERANCE = 0.02
+MOST_FAULTS = 10
+_LAST_WORDS = 60
 
 
 class KilledCampaign:
@@ -79,8 +81,8 @@ class KilledCampaign:
         log = (self._folder / "log").open("ab")
         return subprocess.Popen(self._command, env=self._environment, stdout=log, stderr=log)
 
-    def kill(self, after_s: float, *, in_runs: bool) -> bool:
-        """Start it and kill it; return whether it was still running.
+    def kill(self, after_s: float, *, in_runs: bool) -> int:
+        """Start it and kill it; return its exit code, which says whether it was still running.
 
         Args:
             after_s: How long after.
@@ -97,13 +99,18 @@ class KilledCampaign:
             process.send_signal(signal.SIGKILL)
             process.wait()
         self.look()
-        return process.returncode == -signal.SIGKILL
+        return process.returncode
 
     def finish(self) -> int:
         """Let it come to its end; return its exit code."""
         code = self.start().wait()
         self.look()
         return code
+
+    def said(self) -> str:
+        """Return the last words of what it has printed."""
+        words = (self._folder / "log").read_text(encoding="utf-8", errors="replace").split()
+        return " ".join(words[-_LAST_WORDS:])
 
     def look(self) -> None:
         """Note every completed recording; one that was seen before must be what it was."""
@@ -177,14 +184,21 @@ def main() -> None:
         process.send_signal(signal.SIGKILL)
         process.wait()
         killed = 1
+        faults: list[str] = []
         while killed < options.kills:
             in_runs = chosen.random() < IN_RUNS  # a busy machine takes long to start
             after_s = chosen.uniform(0.0, BEYOND_S if in_runs else longest_s)
-            if not campaign.kill(after_s, in_runs=in_runs):
+            code = campaign.kill(after_s, in_runs=in_runs)
+            if code == -signal.SIGKILL:
+                killed += 1
+            elif code == 0 or len(faults) == MOST_FAULTS:
                 break  # it has come to its end
-            killed += 1
+            else:  # a run of it failed, as on a machine too busy for it: it goes on from there
+                faults.append(campaign.said())
         code = campaign.finish()
-        found = {"kills": killed, "exit_code": code, **campaign.judge()}
+        found = {"kills": killed, "exit_code": code, "faults": faults, **campaign.judge()}
+        if code:
+            found["ended"] = campaign.said()
     print(json.dumps(found, indent=2))
     wrong = ("missing", "completed_runs_repeated", "completed_runs_changed", "broken_files")
     sys.exit(int(code != 0 or any(found[name] for name in (*wrong, "heat_lost"))))

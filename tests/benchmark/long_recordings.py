@@ -1,4 +1,4 @@
-"""Report, replay and export of recordings of any length: samples a second, and peak of memory.
+"""Reading commands on recordings of any length: samples a second, and peak of memory.
 
     python -m tests.benchmark.long_recordings [--seconds 60 900] [--folder FOLDER] [--keep]
 
@@ -40,6 +40,7 @@ SPAN = RATE_HZ
 BATCH = 5_000  # a run closes a chunk every 100 ms
 NOISE_UM = 0.02
 SENSOR_STEP_UM = 2.0**-9
+COMMANDS = "replay,report,report --html,export,identify --model ppi"
 MOST_BYTES = 2**30
 FLAT = 1.25
 
@@ -148,7 +149,9 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, help="Where to make them; a temporary one if none.")
     parser.add_argument("--keep", action="store_true", help="Leave the recordings there.")
     parser.add_argument("--goal", type=float, default=5.0, help="Million samples a second.")
-    parser.add_argument("--commands", default="replay,report,report --html,export")
+    parser.add_argument(
+        "--commands", default="replay,report,report --html,export,identify --model ppi"
+    )
     options = parser.parse_args()
     if options.folder is not None:
         options.folder.mkdir(parents=True, exist_ok=True)
@@ -163,7 +166,7 @@ def judge(folder: Path, options: argparse.Namespace) -> bool:
     missed = False
     peaks: dict[str, list[int]] = {}
     out = folder / "out.parquet"
-    print(f"{'command':>14} {'samples':>14} {'M/s':>6} {'M/cpu-s':>8} {'MiB':>6} {'ratio':>6}")
+    print(f"{'command':>20} {'samples':>14} {'M/s':>6} {'M/cpu-s':>8} {'MiB':>6} {'ratio':>6}")
     for seconds in sorted(options.seconds):
         path = folder / f"made_{seconds}_s.mcap"
         samples = SOFT + seconds * SPAN
@@ -172,15 +175,19 @@ def judge(folder: Path, options: argparse.Namespace) -> bool:
             make(path, seconds)
             each = (time.process_time() - began) / samples * 1e6
             size = path.stat().st_size / samples
-            print(f"{'made':>14} {samples:14,} {each:.2f} cpu-s a million, {size:.1f} B a sample")
+            print(f"{'made':>20} {samples:14,} {each:.2f} cpu-s a million, {size:.1f} B a sample")
         for name in options.commands.split(","):
             verb, *flags = name.split()
-            extra = {"export": [str(out), "--overwrite"]}.get(verb, [])
-            page = [str(folder / "page.html"), "--overwrite"] if flags else []
+            (folder / "model.yaml").unlink(missing_ok=True)
+            extra = {
+                "export": [str(out), "--overwrite"],
+                "identify": ["--output", str(folder / "model.yaml")],
+            }.get(verb, [])
+            page = [str(folder / "page.html"), "--overwrite"] if "--html" in flags else []
             wall_s, cpu_s, peak = measured(verb, str(path), *extra, *flags, *page)
             rate, ratio = samples / wall_s / 1e6, samples / wall_s / 1e6 / options.goal
             peaks.setdefault(name, []).append(peak)
-            line = f"{name:>14} {samples:14,} {rate:6.2f} {samples / cpu_s / 1e6:8.2f}"
+            line = f"{name:>20} {samples:14,} {rate:6.2f} {samples / cpu_s / 1e6:8.2f}"
             print(f"{line} {peak / 2**20:6.0f} {ratio:6.2f}", flush=True)
             missed |= (ratio < 1.0 and seconds == max(options.seconds)) or peak > MOST_BYTES
     out.unlink(missing_ok=True)

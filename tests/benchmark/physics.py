@@ -136,14 +136,16 @@ def identified(rig: Rig, kind: str, seed: int) -> tuple[FittedModel, float]:
     measured = driven(rig.at_rest(noise=True, seed=seed), command)
     records = [History("campaign", command, measured, RATE_HZ)]
     start = time.process_time()
+    end = None
     if kind == "auto":
         settings: FitSettings
-        settings, _, _ = choose_kind(
+        settings, held_out, _ = choose_kind(
             records, IdentifySettings(whole=True), "A", one_by_one, ignore_progress
         )
+        end = held_out.end
     else:
         settings = FitSettings.model_validate({"kind": kind})
-    fit = fit_model(records, settings, time.process_time)
+    fit = fit_model(records, settings, time.process_time, start=end)
     return fit, time.process_time() - start
 
 
@@ -156,7 +158,7 @@ def conditioned(
     assert conditioning is not None
     stands = rig.at_rest()
     driven(stands, conditioning.command)
-    return loaded, left_by(conditioning.command, model, RATE_HZ), stands
+    return loaded, left_by([conditioning.command], model, RATE_HZ), stands
 
 
 def compensated(model: HysteresisModel, reference_um: F64, before: InitialState | None) -> F64:

@@ -91,6 +91,7 @@ def ahead(tmp_path_factory) -> Recording:
     return record(tmp_path_factory.mktemp("ahead"), STAGED, 0.2)
 
 
+@pytest.mark.slow
 def test_own_recording_is_identical(recording):
     """Every wanted command, command and flag comes out bit for bit, the ramp included."""
     result = replay(recording)
@@ -138,6 +139,7 @@ def test_run_that_goes_on_after_another_is_identical(ahead, tmp_path):
     assert replay(after).identical
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("block", [1, 50])
 @pytest.mark.parametrize("output", [0.0, 2.0])
 def test_run_with_a_condition_is_identical(tmp_path, block, output):

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from hilctl import api
 from hilctl.base.errors import DataError, InputError
@@ -49,6 +50,7 @@ def test_a_file_and_what_was_read_of_it_give_the_same(file, tmp_path):
     assert (tmp_path / "a.csv").read_bytes() == (tmp_path / "b.csv").read_bytes()
 
 
+@pytest.mark.slow
 def test_figures_are_axes_and_files(file, tmp_path):
     settings = SHORT | {"waveform": SHORT["waveform"] | {"amplitude": 2.0}}
     other = api.run(SINE, tmp_path / "b.mcap", settings=settings, fast=True).path
@@ -70,3 +72,29 @@ def test_what_is_no_recording_is_refused(tmp_path):
         api.read(tmp_path / "x.mcap")
     with pytest.raises(InputError):
         api.summarize(tmp_path / "y.mcap")
+
+
+def test_figures_of_one_recording_are_those_of_its_page(file, tmp_path, monkeypatch):
+    pages, seen = [], {}
+    monkeypatch.setattr("hilctl.analysis.html.figures", lambda sheets: pages.extend(sheets) or "")
+    monkeypatch.setattr("hilctl.series.files.drawn", lambda sheet, width: Figure())
+    page = tmp_path / "page.html"
+    assert api.report_page(file, page) == api.summarize(file)
+    figures = api.figures(file, tmp_path / "one", formats="svg", on_written=seen.__setitem__)
+    assert [sheet.name for sheet in pages] == list(figures) == [path.stem for path in seen]
+    assert [sheet.caption for sheet in pages] == list(seen.values())
+    with pytest.raises(InputError, match="exists already"):
+        api.report_page(file, page)
+
+
+def test_a_stretch_is_judged(file):
+    whole, part = api.summarize(file), api.summarize(file, from_s=0.1, to_s=0.2)
+    assert part.samples < whole.samples
+
+
+def test_dead_runs_are_finished_before_anything_is_read(file, monkeypatch):
+    finished = []
+    monkeypatch.setattr("hilctl.api.recordings.finish_dead_runs", lambda: finished.append(True))
+    for act in (api.read, api.summarize, api.replay):
+        act(file)
+    assert len(finished) == 3

@@ -58,6 +58,7 @@ def test_a_real_run_goes_the_way_of_the_command(monkeypatch, tmp_path):
     assert given == (SINE, ["block=5"], None, True, seen)
 
 
+@pytest.mark.slow
 def test_learning_keeps_its_runs_and_writes_a_correction(tmp_path):
     rows = []
     settings = {
@@ -77,18 +78,3 @@ def test_learning_keeps_its_runs_and_writes_a_correction(tmp_path):
         api.learn(SINE, file, fast=True)
     with pytest.raises(InputError, match="holds runs already"):
         api.learn(SINE, tmp_path / "c.yml", folder=tmp_path / "c-runs", fast=True)
-
-
-def test_a_campaign_runs_every_step(tmp_path):
-    file = tmp_path / "two.yaml"
-    file.write_text(f"name: two\nexperiment: {SINE}\nvary:\n  waveform.amplitude: [0.5, 1.0]\n")
-    texts = []
-    result = api.campaign(
-        file, tmp_path / "runs", settings=SHORT, fast=True,
-        on_progress=lambda done, text: texts.append(text),
-    )  # fmt: skip
-    assert [row.code for _, row in result.ordered] == ["completed"] * 2
-    assert texts
-    assert len(api.list_runs(tmp_path / "runs", where="waveform.amplitude > 0.7")) == 1
-    with pytest.raises(InputError, match="scheduler: for fast runs only"):
-        api.campaign(file, tmp_path / "runs", settings=SHORT, scheduler="processes")

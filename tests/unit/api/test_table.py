@@ -36,3 +36,17 @@ def test_what_is_not_installed_is_said(name, monkeypatch):
     made = SimpleNamespace(DataFrame=lambda columns: SimpleNamespace(columns=columns, attrs={}))
     monkeypatch.setitem(sys.modules, name, made)
     assert list(getattr(TABLE, f"to_{name}")().columns) == list(TABLE)
+
+
+@pytest.mark.parametrize("name", ["pandas", "polars"])
+def test_the_library_itself_takes_it(name):
+    """Where it is installed: neither is needed for anything else here."""
+    pytest.importorskip(name)
+    frame = getattr(TABLE, f"to_{name}")()
+    assert list(frame.columns) == list(TABLE)
+    for column, values in TABLE.items():
+        found = frame[column].to_numpy()
+        np.testing.assert_array_equal(found, values)
+        assert found.dtype == values.dtype
+    if name == "pandas":
+        assert frame.attrs["units"] == TABLE.units

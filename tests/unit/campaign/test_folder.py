@@ -64,6 +64,15 @@ def test_one_campaign_at_a_time(tmp_path):
         pass
 
 
+def test_a_refusal_leaves_no_folder_that_it_has_made(tmp_path):
+    """Nothing is written where there is a mistake; what stood there before is somebody's."""
+    (tmp_path / "mine").mkdir()
+    for name in ("mine", "new/deep"):
+        with pytest.raises(InputError, match="wrong"), held_folder(tmp_path / name, never):
+            raise InputError("wrong")
+    assert [each.name for each in tmp_path.iterdir()] == ["mine"]
+
+
 def test_only_completed_runs_stand(recorded, tmp_path):
     """By what they are of; not one that was cut short, and not other files."""
     path, key = recorded("a.mcap")

@@ -164,6 +164,7 @@ def test_what_says_nothing_of_the_rig(monkeypatch, events, safe, harmless, make_
     assert is_harmless(SimpleNamespace(safe=safe, path=None)) is harmless
 
 
+@pytest.mark.slow
 def test_the_coil_cools_and_its_heat_goes_on(run, tmp_path):
     """Each run begins with what the one before has left, cooled by the time in between."""
     rig = Rig()
@@ -220,6 +221,7 @@ def test_a_folder_is_prepared_for_one(tmp_path):
     assert notes == []
 
 
+@pytest.mark.slow
 def test_the_page_follows_as_long_as_it_takes_little_of_the_time(run, drawn_pages):
     """Within the first minute it is written at the end only; then between steps as well."""
     rig = Rig()

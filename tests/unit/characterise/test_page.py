@@ -42,7 +42,7 @@ def test_what_ended_a_campaign_stands_on_top():
     )  # fmt: skip
     page = characterisation_page(stopped)
     assert '<p class="note">no &lt;reaction&gt;: look</p>' in page
-    assert "0.03 um rms" in page
+    assert "30.0 nm rms" in page
     assert "noise &amp; drift" in page
     assert "01-rest.mcap" in page
     assert "data:image/png" not in page

@@ -78,6 +78,7 @@ def run(experiment, rig, *settings, folder="runs"):
     return campaign.characterise(experiment.parent / "model.yaml")
 
 
+@pytest.mark.slow
 def test_each_step_is_a_run_with_noise_of_its_own(experiment):
     rig = Rig()
     found = run(experiment, rig)
@@ -122,6 +123,7 @@ def test_a_file_that_is_no_recording_is_run_over(experiment):
     assert len(rig.runs) == 4
 
 
+@pytest.mark.slow
 def test_recordings_of_another_experiment_do_not_count(experiment):
     run(experiment, Rig())
     rig = Rig()
@@ -169,6 +171,7 @@ def test_a_later_step_that_is_refused_is_no_bad_input(experiment):
         run(experiment, Rig(ends_at=1, error=InputError("too fast")), folder="others")
 
 
+@pytest.mark.slow
 def test_the_coil_is_let_cool(experiment):
     """The second of the growing loops waits for what the first has left."""
     budget = ["limits.rms_current_a=0.05", "limits.thermal_time_constant_s=20.0"]
@@ -191,6 +194,7 @@ def test_a_coil_that_has_cooled_since_is_not_waited_for(experiment):
     assert rig.pauses == []
 
 
+@pytest.mark.slow
 def test_where_the_output_is_given_by_hand_it_is_at_rest_after_the_first_step(experiment):
     rig = Rig()
     run(experiment, rig, "safe={value: 0.0, at_start: 0.5}", "device.output_at_open=null")
@@ -243,6 +247,7 @@ def test_a_broken_experiment_is_refused_at_once(experiment):
         Campaign(experiment, ["sample_rate_hz=5e5"], experiment.parent / "runs")
 
 
+@pytest.mark.slow
 def test_fast_runs_wait_for_no_coil(experiment):
     """There is none."""
     rig = Rig()

@@ -73,6 +73,7 @@ def test_the_stroke_holds_amplitudes_down(walked, limits_with):
     assert full_amplitude(limits, measured) < 0.9 * limits.reach
 
 
+@pytest.mark.slow
 def test_a_faint_reaction_is_asked_for_again(walked, limits):
     """At 1 % it drowns, at 3 or 10 % it does not; and so with the small-signal response."""
     measured, names = walked(limits, lambda v: 0.2 * v, noise_um=0.15, last="response-2")
@@ -128,6 +129,7 @@ def test_a_sensor_that_ends_early(walked, limits):
     assert error.code == "saturated_sensor"
 
 
+@pytest.mark.slow
 def test_an_actuator_that_is_another_at_the_end(walked, limits):
     error = problem_of(walked, limits, changed={"repeated": lambda v: plays(v, 1.3)})
     assert error.code == "not_repeatable"

@@ -27,6 +27,7 @@ WAVEFORMS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("settings", [(), PIEZO, RESTING_HIGH, BUDGET], ids=lambda s: s[:1])
 @pytest.mark.parametrize("name", WAVEFORMS)
 def test_every_step_may_start(experiment, limits_with, settings, name):

@@ -21,7 +21,7 @@ __all__ = ["experiment", "limits", "limits_with"]
 @pytest.fixture
 def ends(monkeypatch, limits):
     """Let a campaign end as told; return what was asked of it."""
-    monkeypatch.setattr("hilctl.cli.characterising.finish_orphans", lambda: None)
+    monkeypatch.setattr("hilctl.api.campaigns.finish_dead_runs", lambda: None)
     measured = FOUND.measured.also(growing=(), reversal=None)
     asked = {"found": replace(FOUND, measured=measured, held_out=())}
     monkeypatch.setattr(Characterisation, "is_model", property(lambda self: asked["is_model"]))
@@ -58,7 +58,7 @@ def test_people_read_what_it_does_and_what_came_of_it(ends, tmp_path, capsys):
     shown = capsys.readouterr().out
     assert "within -4 to 4 A, -50 to 50 um; loops at 0.5 to 80 Hz" in shown
     assert "at most 2 s of rig time" in shown
-    assert "0.03 um rms" in shown
+    assert "30.0 nm rms" in shown
     assert (tmp_path / "model.html").is_file()
     assert ends["folder"] == tmp_path / "model-runs"
     assert ends["run"] is unpaced

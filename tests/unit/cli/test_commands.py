@@ -59,7 +59,9 @@ finally:
 """
     ended = in_a_process(code, *words)
     loaded = ended.stdout.splitlines()[-1]
-    modules = [f"hilctl.cli.{name}" for name in ("output", "streams", "commands", "application")]
+    modules = [
+        f"hilctl.cli.{name}" for name in ("output", "streams", "volume", "commands", "application")
+    ]
     assert loaded == f"loaded: {modules}"
     assert ended.returncode == (2 if words == ["stauts"] else 0)
 

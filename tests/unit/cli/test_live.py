@@ -53,9 +53,12 @@ def test_a_run_is_found_by_the_beginning_of_its_name(served, tmp_path):
         assert served["chosen"]([]) == folder
 
 
-def test_a_run_that_is_not_there_is_refused(served):
+def test_a_run_that_is_not_there_is_refused(served, tmp_path):
     said = CliRunner().invoke(app, ["live", "x"])
-    assert "no run is named 'x'" in str(said.exception)
+    assert str(said.exception) == "no run is going on"
+    with run_folder("demo", tmp_path / "a.mcap", 1.0):
+        said = CliRunner().invoke(app, ["live", "x"])
+    assert str(said.exception).startswith("no run is named 'x' (going on: demo-")
     assert not served
 
 

@@ -3,6 +3,7 @@
 import io
 import os
 import pty
+import select
 import termios
 from types import SimpleNamespace
 
@@ -43,7 +44,10 @@ def test_keys_come_one_by_one_and_all_is_put_back(terminal):
 
     with pytest.raises(KeyError):
         look()
-    shown = os.read(terminal, 1000).decode()
+    shown = ""
+    # A part at a time: the system passes on what was written when it comes to it.
+    while not shown.endswith("\x1b[?1049l") and select.select([terminal], [], [], 5.0)[0]:
+        shown += os.read(terminal, 1000).decode()
     assert shown.startswith("\x1b[?1049h\x1b[?25l\x1b[Ha\x1b[K\r\n")
     assert shown.endswith("b\x1b[K\x1b[J\x1b[?25h\x1b[?1049l")
     assert termios.tcgetattr(keyboard) == before

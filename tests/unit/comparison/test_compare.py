@@ -56,6 +56,7 @@ def test_everything_goes_into_json(comparison):
     assert "simulated" in mapping["device"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("text", ["", "device: {kind: serial_dac, port: /dev/ttyUSB9}"])
 def test_loops_of_a_real_device_are_judged_without_trials(monkeypatch, text):
     """No device is made, and table, figure and page do without compensated errors."""

@@ -7,7 +7,9 @@ import pytest
 from hilctl.base.errors import InputError
 from hilctl.experiment import examples
 from hilctl.experiment.examples import copy_example, examples_folder, shipped_examples
+from hilctl.experiment.inventory import shipped_profiles
 from hilctl.experiment.load import load_experiment
+from hilctl_drivers.profile import load_profile
 
 CONFIGS = Path(__file__).parents[3] / "configs"
 
@@ -25,7 +27,24 @@ def test_each_says_what_it_is_for():
     assert {example.name for example in found} >= {"demo", "models/terfenol_staged"}
     assert not [example.name for example in found if not example.description]
     paths = {example.path for example in found}
-    assert paths == set(CONFIGS.rglob("*.yaml"))
+    files = {path for path in CONFIGS.rglob("*.*") if path.suffix != ".md"}
+    profiles = {Path(path) for path in shipped_profiles().values()}
+    assert paths == (files - {CONFIGS / "schema.json"}) | profiles
+
+
+@pytest.mark.parametrize(
+    ("name", "files"),
+    [
+        ("layouts/foxglove", ["layouts/foxglove.json"]),
+        ("hilctl@", ["hilctl@.service"]),
+        ("layouts/plotjuggler", ["layouts/plotjuggler.xml"]),
+        ("profiles/labjack_t7", ["profiles/labjack_t7.yaml", "profiles/schema.json"]),
+    ],
+)
+def test_layouts_and_profiles_are_copied_too(tmp_path, name, files):
+    assert copy_example(name, tmp_path, CONFIGS) == tuple(tmp_path / file for file in files)
+    if name.startswith("profiles"):
+        assert load_profile(str(tmp_path / files[0])).outputs
 
 
 @pytest.mark.parametrize("name", ["demo", "modbus_adam_6224"])

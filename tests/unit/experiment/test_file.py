@@ -248,7 +248,7 @@ ONE_RULE: list[tuple[str, str, str, str]] = [
     ("block", "block: 50", "block: 4097", "block: must be <= 4096, got 4097"),
     ("block", "block: 50", "block: 50.5", "block: must be a whole number, got 50.5"),
     ("block", "block: 50", "block: true", "block: must be a whole number, got true"),
-    ("block", "block: 50", "block: 5e1", "block: must be a whole number, got 50.0 (write 50)"),
+    ("block", "block: 50", "block: 55e-1", "block: must be a whole number, got 5.5"),
     ("unit", "unit: um", "unit: mm", "waveform.unit: must be one of 'um', 'A' or 'V', got 'mm'"),
     ("unit", "unit: um", "unit: A",
      "waveform.unit: must be um where a compensator stands, got A"),
@@ -257,8 +257,8 @@ ONE_RULE: list[tuple[str, str, str, str]] = [
      "waveform.amplitude: must be a finite number, got nan"),
     ("amplitude", "amplitude: 2.5", "amplitude: [2.5]",
      "waveform.amplitude: must be a number, got [2.5]"),
-    ("offset", "offset: -1.0", "offset: -1,0", "waveform.offset: must be a number, got '-1,0' "
-     "(write a decimal point)"),
+    ("offset", "offset: -1.0", "offset: -1,250", "waveform.offset: must be a number, got '-1,250' "
+     "(-1.250 or -1250? write a decimal point, or none)"),
     ("frequency_hz", "frequency_hz: 10.0", "frequency_hz: 1:30",
      "waveform.frequency_hz: must be a number, got '1:30' (write a plain number, such as 1000, 0.5 "
      "or 1e-3)"),
@@ -548,7 +548,9 @@ class TestModel:
         """A model file that is not there is a problem of the line that names it."""
         found = problems(changed("model: model.yaml", "model: sub/lost.yaml"), folder)
         path = folder / "sub" / "lost.yaml"
-        assert found == [f"x.yaml:{LINES['model']}: compensator.model: {path}: no such file"]
+        (said,) = found
+        assert said.startswith(f"x.yaml:{LINES['model']}: compensator.model: {path}: no such file")
+        assert said.endswith(f"(there is no folder {path.parent})")
 
     def test_folder(self, folder: Path) -> None:
         """A folder is no model file."""

@@ -7,7 +7,7 @@ import pytest
 
 from hilctl.base.errors import DataError
 from hilctl.base.samples import COLUMNS, Batch, Flag, Head
-from hilctl.experiment.initial_state import InitialState, initial_state_after
+from hilctl.experiment.initial_state import InitialState, initial_state_after, left_by
 from hilctl.models.published import exponential_integrated
 from hilctl.models.staged import FieldLag, StagedModel
 from hilctl.recording.messages import RecordingLayout
@@ -71,6 +71,16 @@ def test_compensator_goes_on_where_the_actuator_was_left(tmp_path, model):
     wanted = np.concatenate((np.full(inverse.preview, memory.stands_um), fed))[:500]
     np.testing.assert_allclose(came, wanted, atol=1e-9)
     np.testing.assert_allclose(came[110:], reference[110:], atol=1e-9)
+
+
+@pytest.mark.parametrize("model", [OMEGA, STAGED], ids=["integrated", "staged"])
+def test_a_run_in_pieces_leaves_what_the_whole_leaves(model):
+    """To the bit, where a piece is shorter than what the inverse looks ahead, and where empty."""
+    whole = left_by([COMMAND], model, RATE_HZ)
+    pieces = np.split(COMMAND, [1, 2, 2, COMMAND.size // 2])
+    left = left_by(pieces, model, RATE_HZ)
+    assert left.stands_um == whole.stands_um
+    np.testing.assert_array_equal(left.state, whole.state)
 
 
 def test_from_rest_the_same_reference_is_missed(tmp_path):

@@ -53,6 +53,21 @@ def test_profiles_are_found_from_the_experiments_folder(written, tmp_path, monke
     assert load_experiment(path).device.info.details["profile"] == "mine/module.yaml"
 
 
+def test_a_file_of_a_setting_is_looked_for_in_the_working_folder_first(
+    written, tmp_path, monkeypatch
+):
+    """Then in the experiment's: what a shell completes is what is meant."""
+    path, shell = written(), tmp_path / "shell"
+    shell.mkdir()
+    (shell / "own.yaml").write_text(PROFILE.read_text(encoding="utf-8"), encoding="utf-8")
+    monkeypatch.chdir(shell)
+    found = load_experiment(path, ["device.profile=own.yaml"]).device.info.details["profile"]
+    assert found == "shell/own.yaml"
+    other = load_experiment(path, ["device.profile=mine/module.yaml", "name=own.yaml"])
+    assert other.device.info.details["profile"] == "mine/module.yaml"
+    assert other.config.name == "own.yaml"
+
+
 def test_profiles_are_carried_with_the_experiment(written, tmp_path):
     """Shipped ones and one's own: with the texts at hand, nothing is read from disk."""
     reader = {"profile": "icp_m7017", "serial_port": "/dev/ttyOTHER"}

@@ -171,6 +171,7 @@ def soft(waveform):
     return waveform.replace("duration_s", "soft_start_s: 0.1, soft_end_s: 0.1, duration_s")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", [None, LOOKING_AHEAD])
 @pytest.mark.parametrize("waveform", [SINE, CHIRP])
 @pytest.mark.parametrize("chunks", [1, 3, 10**9])

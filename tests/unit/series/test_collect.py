@@ -9,6 +9,7 @@ import pytest
 from hilctl.base.errors import DataError, InputError
 from hilctl.campaign.steps import SeriesStep
 from hilctl.campaign.table import SeriesRow, columns_of, csv_text
+from hilctl.series import collect as module
 from hilctl.series.collect import collect
 from hilctl.series.run_figures import RunFigures
 
@@ -69,6 +70,15 @@ def test_what_was_named_must_be_there(folder, tmp_path):
     empty.mkdir()
     with pytest.raises(InputError, match="holds no recordings"):
         collect([empty])
+
+
+def test_a_recording_too_long_for_memory_is_left_out_and_named(folder, monkeypatch):
+    monkeypatch.setattr(module, "MOST_BYTES", 180_000)
+    short = [path for path in folder.glob("*.mcap") if path.stat().st_size <= module.MOST_BYTES]
+    series = collect([folder])
+    assert len(series.runs) == len(short) > 0
+    assert all("too long for a page of many runs" in text for text in series.missing)
+    assert len(series.missing) == len(list(folder.glob("*.mcap"))) - len(short) > 0
 
 
 def test_a_recording_without_an_end_is_not_completed(monkeypatch):

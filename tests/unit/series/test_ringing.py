@@ -17,6 +17,7 @@ def answer(natural_hz, damping, creep_um=1.0, noise_um=0.0):
     return 7.0 - 3.0 * ring - creep_um * np.exp(-T / 2e-3) + noise
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("natural_hz", [100.0, 300.0, 2300.0])
 @pytest.mark.parametrize("damping", [0.02, 0.12, 0.4])
 def test_frequency_and_damping_are_found(natural_hz, damping):

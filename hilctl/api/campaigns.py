@@ -1,0 +1,170 @@
+"""Many runs after one another: to characterise an actuator, or with other values of keys."""
+
+from collections.abc import Callable
+from contextlib import nullcontext
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from hilctl.api.given import PathLike, Settings, path_or_none, texts_of
+from hilctl.api.running import runs_folder
+from hilctl.base.errors import InputError
+from hilctl.run.dead_runs import finish_dead_runs
+
+if TYPE_CHECKING:
+    from hilctl.campaign.plan import SeriesPlan
+    from hilctl.campaign.session import SeriesHost, SeriesResult
+    from hilctl.campaign.steps import CampaignSteps, SeriesStep
+    from hilctl.campaign.table import SeriesRow
+    from hilctl.characterise.results import Characterisation, StepRow
+    from hilctl.characterise.session import CampaignPlan
+
+
+def _nothing(*_ignored: object) -> None:
+    pass
+
+
+def characterise(
+    experiment: PathLike,
+    output: PathLike,
+    *,
+    folder: PathLike | None = None,
+    settings: Settings = (),
+    highest_hz: float | None = None,
+    fast: bool = False,
+    overwrite: bool = False,
+    dry_run: bool = False,
+    on_progress: Callable[[float, str], None] = _nothing,
+    on_plan: "Callable[[CampaignPlan], None]" = _nothing,
+    on_step: "Callable[[StepRow], None]" = _nothing,
+) -> "Characterisation | None":
+    """Find a model of a wired actuator: measure within its limits, identify, judge.
+
+    It goes on where it was stopped.
+
+    Args:
+        experiment: Experiment file that gives device and limits.
+        output: Model file to write; a page of the same name, .html, is written beside it.
+        folder: Where each run is kept; ``OUTPUT-runs`` where None.
+        settings: Over the experiment.
+        highest_hz: Highest frequency of loops; from the sample rate where None.
+        fast: Do not wait for real time; simulated devices only.
+        overwrite: Whether to begin anew where runs stand.
+        dry_run: Only work out what it would do: nothing moves, and nothing is written.
+        on_progress: Called with how much is done, from 0 to 1, and what is being done.
+        on_plan: Called with what it will do, before anything moves.
+        on_step: Called with each step that is done.
+
+    Returns:
+        What was found; None of a dry run.
+
+    Raises:
+        InputError: Something can't be used or written; nothing has moved.
+        RunError: A step ended by a fault; those before it stand.
+    """
+    from hilctl.base.files import check_writable
+    from hilctl.characterise.session import Campaign, CampaignHost
+    from hilctl.run.step import paced, unpaced
+
+    file, chosen = Path(output), runs_folder(output, folder)
+    page = file.with_suffix(".html")
+    if page == file:
+        raise InputError(f"{file}: is the name of the page: give the model another one, .yaml")
+    host = CampaignHost(run=unpaced if fast else paced, on_progress=on_progress, on_step=on_step)
+    measured = Campaign(Path(experiment), texts_of(settings), chosen, highest_hz, host)
+    if not dry_run:
+        check_writable(file, overwrite=overwrite)
+        check_writable(page, overwrite=overwrite or any(chosen.glob("*.mcap")))
+        finish_dead_runs()
+    on_plan(measured.plan)
+    if dry_run:
+        return None
+    if overwrite:
+        measured.discard()
+    found = measured.characterise(file, overwrite=overwrite)
+    from hilctl.characterise.page import write_characterisation
+
+    write_characterisation(found, page)
+    return found
+
+
+def campaign(
+    file: PathLike,
+    folder: PathLike | None = None,
+    *,
+    settings: Settings = (),
+    fast: bool = False,
+    scheduler: str = "none",
+    dry_run: bool = False,
+    on_progress: Callable[[float, str], None] = _nothing,
+    on_plan: "Callable[[SeriesPlan], None]" = _nothing,
+    on_row: "Callable[[SeriesStep, SeriesRow], None]" = _nothing,
+    on_note: Callable[[str], None] = _nothing,
+) -> "SeriesResult | None":
+    """Run an experiment again and again with other values of its keys; goes on where it was.
+
+    Args:
+        file: Campaign file (YAML).
+        folder: Where recordings, table and page go; one named after the campaign where None.
+        settings: Over the experiment of every step.
+        fast: Do not wait for real time; simulated devices only.
+        scheduler: With ``fast``, where steps run: ``none``, ``processes``, or a Dask address.
+        dry_run: Only work out what it would do: nothing moves, and nothing is written.
+        on_progress: Called with how much is done, from 0 to 1, and what is being done.
+        on_plan: Called with what it will do, before anything moves.
+        on_row: Called with each step that is done, and what became of it.
+        on_note: Called with what was done for runs that were cut short.
+
+    Returns:
+        What came of it; None of a dry run.
+
+    Raises:
+        InputError: Something can't be used; nothing has moved.
+        RunError: A danger to device or rig ended it; what stands is kept.
+    """
+    from hilctl.campaign.session import SeriesHost
+    from hilctl.campaign.steps import load_campaign
+
+    host = replace(SeriesHost(), on_progress=on_progress, on_row=on_row, on_note=on_note)
+    steps = load_campaign(Path(file), texts_of(settings))
+    return run_steps(
+        steps, path_or_none(folder), host,
+        fast=fast, scheduler=scheduler, dry_run=dry_run, on_plan=on_plan,
+    )  # fmt: skip
+
+
+def run_steps(
+    steps: "CampaignSteps",
+    folder: Path | None,
+    host: "SeriesHost",
+    *,
+    fast: bool,
+    scheduler: str,
+    dry_run: bool,
+    on_plan: "Callable[[SeriesPlan], None]",
+) -> "SeriesResult | None":
+    """Run the steps of a campaign, wherever they come from; see :func:`campaign`."""
+    from hilctl.campaign.fast import run_fast
+    from hilctl.campaign.folder import campaign_folder
+    from hilctl.campaign.session import prepared, run_series
+
+    if scheduler != "none" and not fast:
+        rule = "for fast runs only; those that keep real time follow each other"
+        raise InputError(f"scheduler: {rule}")
+    chosen = folder or campaign_folder(steps)
+    with nullcontext() if dry_run else prepared(chosen, host):
+        plan = _plan(steps, chosen, host, fast=fast)
+        on_plan(plan)
+        if dry_run:
+            return None
+        return run_fast(plan, host, scheduler) if fast else run_series(plan, host)
+
+
+def _plan(steps: "CampaignSteps", folder: Path, host: "SeriesHost", *, fast: bool) -> "SeriesPlan":
+    from hilctl.campaign.fast import planned_fast
+    from hilctl.campaign.session import planned_in_real_time
+
+    host.on_progress(0.0, "check every step")
+    if fast:
+        return planned_fast(steps, folder)
+    return planned_in_real_time(steps, folder, host.now_s())
