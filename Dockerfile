@@ -1,0 +1,26 @@
+# The offline half of hilctl, and its continuous integration.
+#   docker build --target hilctl --tag hilctl .
+#   docker run --rm --user "$(id -u):$(id -g)" --volume "$PWD:/work" hilctl report run.mcap --html run.html
+#   docker build --target ci --tag hilctl-ci . && docker run --rm --shm-size=1g hilctl-ci
+# A run that must keep real time belongs on the machine itself: docs/howto/install.md.
+
+FROM python:3.11-slim-bookworm AS build
+RUN apt-get update && apt-get install --yes --no-install-recommends gcc libc6-dev && rm -rf /var/lib/apt/lists/*
+RUN python -m venv /opt/hilctl
+COPY requirements.txt /src/
+RUN /opt/hilctl/bin/pip install --no-cache-dir --require-hashes --requirement /src/requirements.txt
+COPY . /src
+RUN /opt/hilctl/bin/pip install --no-cache-dir --no-deps --no-build-isolation /src
+
+FROM python:3.11-slim-bookworm AS hilctl
+COPY --from=build /opt/hilctl /opt/hilctl
+# Whoever runs it has no home there: compiled kernels and fonts are kept where anybody may write.
+ENV PATH=/opt/hilctl/bin:$PATH NUMBA_CACHE_DIR=/tmp/kernels MPLCONFIGDIR=/tmp/matplotlib
+WORKDIR /work
+ENTRYPOINT ["hilctl"]
+CMD ["--help"]
+
+FROM python:3.11-bookworm AS ci
+COPY . /src
+WORKDIR /src
+CMD [".ci/run"]

@@ -1,0 +1,243 @@
+"""What the pages take from elsewhere, so that it is written once: run by conf.py before each build.
+
+Into ``_generated``: the sections of the repository's own documents, tables of the keys that the
+schemas have, and the help of commands. Into ``decisions``: a page a record.
+"""
+
+import ast
+import contextlib
+import io
+import json
+import re
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from hilctl import api
+from hilctl.analysis.definitions import DEFINITIONS
+from hilctl.cli import QUICK, quick
+from hilctl.cli.commands import COMMANDS, load
+
+ROOT = Path(__file__).parents[1]
+DOCUMENTS = {
+    "readme": "README.md",
+    "configs": "configs/README.md",
+    "drivers": "drivers/README.md",
+    "recordings": "recordings/README.md",
+    "examples": "examples/README.md",
+    "contributing": "CONTRIBUTING.md",
+    "changelog": "CHANGELOG.md",
+}
+"""Documents that pages show, by the name of the folder of their sections."""
+
+PAGES = {
+    "CONTRIBUTING.md": "/contributing.md",
+    "CHANGELOG.md": "/changelog.md",
+    "drivers/README.md": "/reference/devices.md",
+    "configs/README.md": "/reference/experiment.md",
+    "recordings/README.md": "/reference/recording.md",
+    "examples/README.md": "/howto/examples.md",
+    ".github/decisions": "/decisions.md",
+}
+"""Pages that show what a document links to."""
+
+_SECTION = re.compile(r"^#{1,2} (.+)$", re.MULTILINE)
+_LINK = re.compile(r"\[([^\]]+)\]\((?!https?:|#)([^)#]+)(#[^)]*)?\)")
+_ATTRIBUTE = re.compile(r"^ {4}(\w+): (.+?)(?=^ {4}\w|\Z)", re.MULTILINE | re.DOTALL)
+_LITERAL = re.compile(r"``(.+?)``")
+
+
+def gather_all(docs: Path) -> None:
+    """Write all that pages include.
+
+    Args:
+        docs: Folder of the pages.
+    """
+    generated = docs / "_generated"
+    shutil.rmtree(generated, ignore_errors=True)
+    for name, document in DOCUMENTS.items():
+        for slug, text in sections(ROOT / document, docs):
+            _write(generated / name / f"{slug}.md", text)
+    schema = json.loads((ROOT / "configs" / "schema.json").read_text())
+    _write(generated / "experiment_keys.md", keys_page(schema))
+    profiles = ROOT / "drivers" / "hilctl_drivers" / "profiles" / "schema.json"
+    _write(generated / "profile_keys.md", keys_page(json.loads(profiles.read_text())))
+    _write(generated / "commands.md", commands_page())
+    _write(generated / "api_names.md", api_page())
+    _write(generated / "api_returned.md", returned_page())
+    terms = "\n".join(f"**{term}**\n: {meaning}\n" for term, meaning in DEFINITIONS)
+    _write(generated / "definitions.md", terms)
+    shutil.rmtree(docs / "decisions", ignore_errors=True)
+    for record in sorted((ROOT / ".github" / "decisions").glob("*.md")):
+        _write(docs / "decisions" / record.name, record.read_text())
+
+
+def _write(path: Path, text: str) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text, encoding="utf-8")
+
+
+def sections(document: Path, docs: Path) -> Iterator[tuple[str, str]]:
+    """Split a document where headings of the first two levels stand.
+
+    Returns:
+        Of each section its heading in small letters with hyphens, and its text without the
+        heading. Links lead to pages; what no page shows stands there as the name of a file.
+
+    Raises:
+        ValueError: There is no such file.
+    """
+    parts = _SECTION.split(document.read_text(encoding="utf-8"))
+    for heading, text in zip(parts[1::2], parts[2::2], strict=True):
+
+        def page(found: re.Match[str]) -> str:
+            target = (document.parent / found[2]).resolve()
+            if not target.exists():
+                raise ValueError(f"{document}: leads to what is not there: {found[2]}")
+            if target.is_relative_to(docs):
+                return f"[{found[1]}](/{target.relative_to(docs)}{found[3] or ''})"
+            name = str(target.relative_to(ROOT))
+            return f"[{found[1]}]({PAGES[name]}{found[3] or ''})" if name in PAGES else f"`{name}`"
+
+        slug = re.sub(r"[^a-z0-9]+", "-", heading.lower()).strip("-")
+        yield slug, _LINK.sub(page, text)
+
+
+def keys_page(schema: dict[str, Any]) -> str:
+    """Return tables of all keys of a schema: its own, then those of each mapping within."""
+    blocks = [_table(schema)] if "properties" in schema else [f"{_values(schema)}\n"]
+    for name, part in schema["$defs"].items():
+        if "properties" in part:
+            blocks.append(f"({_anchor(name)})=\n### {name.removeprefix('device_')}\n")
+            blocks.append(_intro(part) + _table(part))
+    return "\n".join(blocks)
+
+
+def _anchor(name: str) -> str:
+    return f"key-{name.lower().replace('_', '-')}"
+
+
+def _intro(part: dict[str, Any]) -> str:
+    text = part.get("description", "").partition("Attributes:")[0]
+    return _plain(text).strip() + "\n\n"
+
+
+def _plain(text: str) -> str:
+    text = re.sub(r":\w+:`~?([^`]*\.)?([^`]+)`", r"`\2`", " ".join(text.split()))
+    return _LITERAL.sub(r"`\1`", text).replace("|", r"\|")
+
+
+def _table(part: dict[str, Any]) -> str:
+    said = dict(_ATTRIBUTE.findall(part.get("description", "").partition("Attributes:\n")[2]))
+    rows = ["| key | value | default | meaning |", "|---|---|---|---|"]
+    for key, value in part["properties"].items():
+        meaning = value.get("description") or said.get(key, "")
+        default = "*required*" if key in part.get("required", ()) else _default(value)
+        rows.append(f"| `{key}` | {_values(value)} | {default} | {_plain(meaning)} |")
+    return "\n".join(rows) + "\n"
+
+
+def _default(value: dict[str, Any]) -> str:
+    default = value.get("default")
+    return "" if default in (None, "") else f"`{json.dumps(default)}`"
+
+
+_RULES = {
+    "minimum": "≥ {}", "exclusiveMinimum": "> {}", "maximum": "≤ {}", "exclusiveMaximum": "< {}",
+    "minItems": "at least {} of them", "maxItems": "at most {} of them",
+}  # fmt: skip
+
+
+def _values(value: dict[str, Any]) -> str:
+    """Say in a few words which values a key takes."""
+    if "$ref" in value:
+        name = value["$ref"].rpartition("/")[2]
+        return f"[{name.removeprefix('device_')}](#{_anchor(name)})"
+    if "const" in value:
+        return f"`{value['const']}`"
+    if "enum" in value:
+        return ", ".join(f"`{each}`" for each in value["enum"])
+    for choice in ("anyOf", "oneOf"):
+        if choice in value:
+            found = [_values(each) for each in value[choice] if each.get("type") != "null"]
+            return " or ".join(dict.fromkeys(found))
+    rules = [text.format(value[rule]) for rule, text in _RULES.items() if rule in value]
+    return ", ".join([_kind(value), *rules])
+
+
+def _kind(value: dict[str, Any]) -> str:
+    kind = value.get("type", "any")
+    if kind == "array":
+        inner = value.get("prefixItems")
+        if inner is None:
+            return f"list of {_values(value['items'])}" if value.get("items") else "list"
+        return f"[{', '.join(_values(each) for each in inner)}]"
+    if kind == "object":
+        inner = value.get("additionalProperties")
+        return f"mapping of {_values(inner)}" if isinstance(inner, dict) else "mapping"
+    return {"string": "text", "boolean": "`true`, `false`"}.get(kind, kind)
+
+
+def commands_page() -> str:
+    """Return a section a command, with its help."""
+    return "\n".join(map(_command, COMMANDS))
+
+
+def _command(name: str) -> str:
+    if name in QUICK:  # typer knows nothing of those that read their own arguments
+        printed = io.StringIO()
+        with contextlib.redirect_stdout(printed), contextlib.suppress(SystemExit):
+            quick(name, ["--help"])
+        return f"## {name}\n\n```text\n{printed.getvalue()}```\n"
+    inner = getattr(load(name), "commands", {})
+    blocks = [f"## {name}\n", _typer(name, f"hilctl {name}")]
+    for each in inner:
+        blocks += [f"### {name} {each}\n", _typer(f"{name}:{each}", f"hilctl {name} {each}")]
+    return "\n".join(blocks)
+
+
+def _typer(place: str, name: str) -> str:
+    return (
+        f"```{{typer}} gather.{place}\n"
+        f":prog: {name}\n:preferred: text\n:markup-mode: markdown\n:width: 68\n```\n"
+    )
+
+
+def api_page() -> str:
+    """Return a section with every public name of ``hilctl.api``, and what its docstring says."""
+    blocks = ["```{eval-rst}", ".. currentmodule:: hilctl.api", ""]
+    for name in api.__all__:
+        kind = "class" if isinstance(getattr(api, name), type) else "function"
+        blocks += [f".. auto{kind}:: {name}", *(["   :members:"] * (kind == "class")), ""]
+    return "\n".join([*blocks, "```", ""])
+
+
+def returned_page() -> str:
+    """Return what the functions of ``hilctl.api`` return, as their annotations have it.
+
+    The modules import these classes for the type checker only, so it is read from their text.
+    """
+    found: dict[str, str] = {}
+    for module in sorted((ROOT / "hilctl" / "api").glob("*.py")):
+        tree = ast.parse(module.read_text(encoding="utf-8"))
+        imported = {
+            alias.name: f"{line.module}.{alias.name}"
+            for line in ast.walk(tree)
+            if isinstance(line, ast.ImportFrom)
+            for alias in line.names
+        }
+        for function in tree.body:
+            if isinstance(function, ast.FunctionDef) and function.name in api.__all__:
+                name = ast.unparse(function.returns or ast.Constant("")).strip("'")
+                if name in imported and name not in api.__all__:
+                    found[name] = imported[name]
+    blocks = [f".. autoclass:: {place}\n   :members:\n" for place in found.values()]
+    return "\n".join(["```{eval-rst}", *blocks, "```", ""])
+
+
+def __getattr__(name: str) -> Any:
+    """Return a command, for the directive that shows its help."""
+    if name not in COMMANDS:
+        raise AttributeError(name)
+    return load(name)
