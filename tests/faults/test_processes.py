@@ -36,7 +36,7 @@ EXPERIMENT = {
     "compensator": "none",
     "limits": {"peak_current_a": 5.0, "slew_a_per_s": 1000.0, "stroke_um": [-60.0, 60.0]},
     "safe": {"value": 0.0, "ramp_s": 0.2},
-    "timing": {"max_late_s": 1.0, "on_misses": "warn"},
+    "timing": {"max_late_s": 3.0, "on_misses": "warn"},
     "recording": {"flush_s": 0.1, "ring_s": 5.0},
 }
 

@@ -57,7 +57,7 @@ def neighbour(nobody, device):
 def test_the_second_user_of_a_device_is_refused(neighbour, device, run):
     """In one message, and the first one's run goes on."""
     mine = run(device.section, **PATIENT)
-    device.log.await_events("DAC0", 40)
+    device.log.await_events("DAC0", 40, mine.process)
     theirs = neighbour.start()
     out, err = theirs.communicate(timeout=240)
     assert theirs.returncode == 2, err
@@ -65,7 +65,7 @@ def test_the_second_user_of_a_device_is_refused(neighbour, device, run):
     assert f" is in use by process {mine.process.pid} of root: wait for its end" in err
     assert json.loads(out)["error"]
     assert not (neighbour.folder / "theirs.mcap").exists()
-    device.log.await_events("DAC0", len(device.log.events("DAC0")) + 20)
+    device.log.await_events("DAC0", len(device.log.events("DAC0")) + 20, mine.process)
     assert mine.interrupt()["code"] == "stopped"
 
 
@@ -73,11 +73,11 @@ def test_the_second_user_of_a_device_is_refused(neighbour, device, run):
 def test_root_does_not_take_a_device_from_a_user(neighbour, device, run):
     """Who may do anything is refused as well: the lock is the kernel's, not a file's."""
     theirs = neighbour.start()
-    device.log.await_events("DAC0", 40)
+    device.log.await_events("DAC0", 40, theirs)
     said = run(device.section, **PATIENT).refused()
     assert f" is in use by process {theirs.pid} of nobody: wait for its end" in said
     assert len(said.splitlines()) == 1
-    device.log.await_events("DAC0", len(device.log.events("DAC0")) + 20)
+    device.log.await_events("DAC0", len(device.log.events("DAC0")) + 20, theirs)
     theirs.terminate()
     out, err = theirs.communicate(timeout=240)
     assert "Traceback" not in err

@@ -18,8 +18,8 @@ EXPERIMENT = {
     "limits": {"peak_current_a": 5.0, "slew_a_per_s": 500.0, "stroke_um": [-100.0, 100.0]},
     "safe": {"value": 0.0, "ramp_s": 0.2},
 }
-TIMEOUT_S = 0.5
-WATCHDOG_S = 1.0
+TIMEOUT_S = 2.0
+WATCHDOG_S = 4.0
 FAULT_AT = 250
 T7 = {
     "kind": "modbus_dac",
@@ -48,9 +48,9 @@ def over_tcp(address: str) -> dict:
 
 
 TCP_FAULTS: dict[str, str] = {
-    "silence": "no answer within 0.5 s",
-    "delay:2": "no answer within 0.5 s",
-    "late:0.8": "no answer within 0.5 s",
+    "silence": "no answer within 2 s",
+    "delay:6": "no answer within 2 s",
+    "late:3": "no answer within 2 s",
     "exception": "function 76 refused with exception 4 (device failure)",
     "corrupt": "not a Modbus TCP header",
     "reset": "connection lost: connection reset by peer",
@@ -58,7 +58,7 @@ TCP_FAULTS: dict[str, str] = {
 """Ways in which a run meets trouble; more, without a run, are in ``test_modbus_dac.py``."""
 
 
-@pytest.mark.parametrize("fault", each_kind(TCP_FAULTS, {"silence", "late:0.8", "corrupt"}))
+@pytest.mark.parametrize("fault", each_kind(TCP_FAULTS, {"silence", "late:3", "corrupt"}))
 def test_tcp_fault_ends_the_run_safely(emulate, run, fault):
     """The run stops in time, says in one line what happened where, and the output is safe."""
     device = emulate("labjack_t7", "--fault", f"{fault}@{FAULT_AT}")
@@ -76,7 +76,7 @@ def test_tcp_fault_ends_the_run_safely(emulate, run, fault):
     # What is carried out late comes between two writes of the safe value.
     tail = 3 if fault.startswith("late") else 1
     waited_s = writes[-tail]["unix_s"] - writes[-tail - 1]["unix_s"]
-    assert waited_s < TIMEOUT_S + 1.0
+    assert waited_s < 2.0 * TIMEOUT_S
     started.assert_put_out(writes[1:], tail=tail)  # the first, at opening, repeats what it held
 
 
@@ -88,18 +88,18 @@ def test_pulled_cable_leaves_it_to_the_watchdog(emulate, run):
     trip = device.log.await_event("DAC0", "watchdog")
     writes = device.log.writes("DAC0")
     assert printed["output_safe"] is False
-    assert "no answer within 0.5 s" in printed["reason"]
+    assert "no answer within 2 s" in printed["reason"]
     assert "the safe value could not be confirmed" in printed["reason"]
     assert trip["current_a"] == pytest.approx(0.0, abs=1e-5)
     silent_s = (trip["monotonic_ns"] - writes[-1]["monotonic_ns"]) * 1e-9
-    assert silent_s == pytest.approx(WATCHDOG_S, rel=0.05)
+    assert 0.99 * WATCHDOG_S < silent_s < 2.0 * WATCHDOG_S
     started.assert_put_out(writes[1:], tail=0)
 
 
 @pytest.mark.parametrize(
     ("fault", "words", "safe"),
     [
-        ("silence", "no answer within 0.5 s", True),
+        ("silence", "no answer within 2 s", True),
         pytest.param(
             "exception", "function 23 refused with exception 4", True, marks=pytest.mark.long
         ),
@@ -127,7 +127,7 @@ def test_killed_loop_is_made_safe_by_the_supervisor(emulate, run):
     """Its connection is gone with it; the supervisor's own reaches the device."""
     device = emulate("labjack_t7")
     started = run(over_tcp(device.address))
-    device.log.await_events("DAC0", FAULT_AT)
+    device.log.await_events("DAC0", FAULT_AT, started.process)
     os.kill(started.loop_pid(), signal.SIGKILL)
     printed = started.end()
     assert "the loop process died: killed by SIGKILL" in printed["reason"]
@@ -139,13 +139,14 @@ def test_dead_host_is_noticed_by_the_device(emulate, run):
     """With all of hilctl killed at once, the device's watchdog makes the output safe in time."""
     device = emulate("labjack_t7")
     started = run(over_tcp(device.address))
-    device.log.await_events("DAC0", 2 * FAULT_AT)  # long enough for the recording to be flushed
+    # Long enough for the recording to be flushed.
+    device.log.await_events("DAC0", 2 * FAULT_AT, started.process)
     started.kill_all(signal.SIGKILL)
     trip = device.log.await_event("DAC0", "watchdog")
     last = device.log.writes("DAC0")[-1]
     assert trip["current_a"] == pytest.approx(0.0, abs=1e-5)
     silent_s = (trip["monotonic_ns"] - last["monotonic_ns"]) * 1e-9
-    assert silent_s == pytest.approx(WATCHDOG_S, rel=0.05)
+    assert 0.99 * WATCHDOG_S < silent_s < 2.0 * WATCHDOG_S
     assert started.readable_samples() > 100
 
 
@@ -154,13 +155,13 @@ def test_second_run_on_the_same_device_is_refused(emulate, run):
     device = emulate("labjack_t7")
     section = {**over_tcp(device.address), **PATIENT_DEVICE}
     first = run(section, timing=PATIENT_TIMING)
-    device.log.await_events("DAC0", FAULT_AT)
+    device.log.await_events("DAC0", FAULT_AT, first.process)
     said = run({**section, "host": "localhost"}, name="second").refused()
     who = f"run wire_fault (process {first.process.pid}, recording {first.output})"
     assert f"is in use by {who}" in said
     assert "wait for its end, or stop it first" in said
     seen = len(device.log.events("DAC0"))
-    device.log.await_events("DAC0", seen + 50)
+    device.log.await_events("DAC0", seen + 50, first.process)
     printed = first.interrupt()
     assert printed["code"] == "stopped"
     assert printed["dropped"] == printed["skipped_ticks"]  # a busy machine may be late
