@@ -82,7 +82,8 @@ class RunReport(Figures):
         device: Name of the device.
         simulated: Whether that is a simulation.
         reason: Why the run ended, or that its record is cut short.
-        complete: Whether it has a record of its end and the last sample of its last segment.
+        complete: Whether it has a record of its end, and the last sample of its last segment or as
+            many samples counted as dropped as are lacking there.
         samples: Samples of the waveform.
         ramp_samples: Samples of the ramps to the safe value, before and after it.
         recorded_samples: Both.

@@ -164,7 +164,8 @@ class RunGathering:
         counts = {name: self._counts[name] for name in names}
         return {
             **counts,
-            "complete": bool(self._last.end) and stop >= end,
+            # Ticks that a busy machine skipped may have been the last ones.
+            "complete": bool(self._last.end) and stop + self._last.dropped >= end,
             "ramp_samples": counts["recorded_samples"] - counts["samples"],
             "duration_s": (stop - first) / self._last.sample_rate_hz,
             "dropped": self._last.dropped,

@@ -22,7 +22,7 @@ PRIORITY = 50
 STALL_S = 0.045
 STALL_EVERY_S = 0.5
 AMPLIFIER = {"amplifier": {"gain_a_per_v": 1.0}}
-COMMON = {"sensor": {"um_per_v": 12.5}, "timeout_s": 0.5, "watchdog": "none"}
+COMMON = {"sensor": {"um_per_v": 12.5}, "timeout_s": 2.0, "watchdog": "none"}
 BOARD = {"kind": "serial_dac", "output": "DAC", "input": "ADC", **AMPLIFIER}
 DCON_READER = ROOT / "tests" / "data" / "dcon_module.yaml"
 
@@ -164,7 +164,7 @@ def write_experiment(
         },
         "safe": {"value": 0.0, "ramp_s": 0.2},
         # Misses are what is counted here, not what ends the run.
-        "timing": {"on_misses": "warn", "hang_s": 0.5},
+        "timing": {"on_misses": "warn", "max_late_s": 5.0, "hang_s": 5.0},
     }
     path.write_text(yaml.safe_dump(experiment), encoding="utf-8")
 

@@ -304,8 +304,11 @@ class TestWholeRun:
         recording = lagging()
         assert summarize(recording).complete
         assert not summarize(replace(recording, end={})).complete
-        short = replace(recording, samples=recording.samples.part(0, 4999))
+        short = replace(recording, samples=recording.samples.part(0, 4997))
         assert not summarize(short).complete
+        lacking = recording.samples.index.size - short.samples.index.size
+        assert not summarize(replace(short, dropped=lacking - 1)).complete
+        assert summarize(replace(short, dropped=lacking)).complete
 
     def test_counters_of_the_run_go_before_those_counted_here(self, lagging) -> None:
         """The record of the end knows best; without it, late ticks are counted."""
