@@ -103,7 +103,8 @@ def sweep_document(experiment: Path, vary: "Sequence[str]", repeat: int) -> Docu
         lines.append(f"  {json.dumps(key)}: {listed}")
     if problems:
         raise ConfigError(problems)
-    return Document("--vary", "\n".join(lines) + "\n")
+    names = [""] * (len(lines) - len(vary)) + [f"--vary {text}" for text in vary]
+    return Document("--vary", "\n".join(lines) + "\n", names)
 
 
 def _do(

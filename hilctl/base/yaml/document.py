@@ -5,7 +5,7 @@ A document remembers where each value stands, so that a broken rule is reported 
 """
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -32,13 +32,16 @@ class Document:
     Args:
         name: File name as it should appear in messages.
         text: The YAML text.
+        lines: How messages name lines that nobody wrote as such, from the first on; those that
+            are left out or empty are named by file and number.
 
     Raises:
         ConfigError: The text is not YAML, holds a key twice, or is not a mapping.
     """
 
-    def __init__(self, name: str, text: str) -> None:
+    def __init__(self, name: str, text: str, lines: Sequence[str] = ()) -> None:
         self.name = name
+        self._lines = lines
         self.assignments: list[str] = []
         self._places: dict[Loc, str] = {}
         self._duplicates: list[Problem] = []
@@ -46,7 +49,7 @@ class Document:
             node = compose(text)
         except yaml.MarkedYAMLError as error:
             line = error.problem_mark.line + 1 if error.problem_mark else 1
-            problem = Problem(f"{name}:{line}", "", _UNREADABLE, hint=str(error.problem))
+            problem = Problem(self._line(line), "", _UNREADABLE, hint=str(error.problem))
             raise ConfigError([problem]) from None
         if not isinstance(node, yaml.MappingNode):
             rule = "must hold a mapping of keys to values"
@@ -55,8 +58,12 @@ class Document:
         if self._duplicates:
             raise ConfigError(self._duplicates)
 
+    def _line(self, number: int) -> str:
+        named = self._lines[number - 1] if number <= len(self._lines) else ""
+        return named or f"{self.name}:{number}"
+
     def _build(self, node: yaml.Node, loc: Loc) -> Any:
-        self._places.setdefault(loc, f"{self.name}:{node.start_mark.line + 1}")
+        self._places.setdefault(loc, self._line(node.start_mark.line + 1))
         if isinstance(node, yaml.MappingNode):
             mapping: dict[Any, Any] = {}
             for key_node, value_node in node.value:
@@ -66,9 +73,9 @@ class Document:
                 if key in mapping:
                     first = self._places[inner]
                     self._duplicates.append(
-                        Problem(f"{self.name}:{line}", dotted(inner), f"stands already at {first}")
+                        Problem(self._line(line), dotted(inner), f"stands already at {first}")
                     )
-                self._places[inner] = f"{self.name}:{line}"
+                self._places[inner] = self._line(line)
                 mapping[key] = self._build(value_node, inner)
             return mapping
         if isinstance(node, yaml.SequenceNode):

@@ -110,6 +110,8 @@ def test_values_of_a_sweep(tmp_path):
     document = sweep_document(tmp_path / "rig.yaml", ["a.b=1:3:3", "c=none,{model: x.yaml}"], 2)
     vary = document.data["vary"]
     assert vary == {"a.b": "1:3:3", "c": ("none", {"model": "x.yaml"})}
+    assert document.where(("vary", "a.b")) == "--vary a.b=1:3:3"
+    assert document.where(("vary", "c")) == "--vary c=none,{model: x.yaml}"
     with pytest.raises(ConfigError, match=r"--vary a: must be KEY=1,2,5"):
         sweep_document(tmp_path / "rig.yaml", ["a"], 1)
     with pytest.raises(ConfigError, match="stands already"):
