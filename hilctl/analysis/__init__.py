@@ -7,7 +7,7 @@ figures.py  what a report holds
 report.py   from a recording, whole or in pieces, to a report; segment_figures.py  those of one
             segment; overview.py  what plots need of a recording of any length
 table.py    a report for people, as rows of text
-canvas.py   what all plots share: style, colours, signals over time, PNG
+canvas.py   what all plots share: style, colours, signals over time
 sheet.py    a figure before its size is known; vector.py  figures as files, and as SVG of a page
 plots.py    plots over time and frequency: history, error, spectrum.py, lateness
 loops.py    the hysteresis loop, and before and after

@@ -4,13 +4,10 @@ Long signals are reduced to what a plot can show, without hiding spikes or inven
 Colours are those of Okabe and Ito, which colour-blind people can tell apart.
 """
 
-import io
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from hilctl.base.arrays import F64, I64
 from hilctl.recording.data import Recording
@@ -56,14 +53,6 @@ STYLE: dict[Any, Any] = {
     "svg.hashsalt": "hilctl",  # the same run gives the same bytes
     "pdf.fonttype": 42,  # journals refuse outlines of bitmaps
 }
-
-
-@mpl.rc_context(STYLE)
-def png(figure: Figure, dpi: int = 110) -> bytes:
-    """Return a figure as a PNG file."""
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=dpi, metadata={"Software": None})
-    return buffer.getvalue()
 
 
 def pieces(recording: Recording) -> list[tuple[int, int, float]]:

@@ -5,14 +5,12 @@ room, on paper two, on a phone one, and none is shrunk. In the dark they are tur
 dark and hues stay.
 """
 
-import base64
 import html
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from hilctl.analysis import canvas
 from hilctl.analysis.sheet import Sheet, drawn
 from hilctl.analysis.vector import svg
 from hilctl.base.files import write_text
@@ -24,7 +22,7 @@ _CSS = """
 @media screen and (prefers-color-scheme: dark) {
   :root { --ink: #e6e6e6; --quiet: #a2a2a2; --paper: #131416; --line: #3a3c40; --pale: #1e2023;
     --note: #3d3212; --bad: #4a1d18; }
-  figure svg, img { filter: invert(0.93) hue-rotate(180deg); }
+  figure svg { filter: invert(0.93) hue-rotate(180deg); }
 }
 body { font: 15px/1.45 system-ui, "DejaVu Sans", sans-serif; color: var(--ink);
   background: var(--paper); max-width: 1160px; margin: 0 auto; padding: 1.2rem; }
@@ -39,6 +37,7 @@ h2 { font-size: 1.1rem; margin: 1.8rem 0 .5rem; border-bottom: 1px solid var(--l
 .figures { columns: 20.1rem; column-gap: 1.5rem; }
 figure { margin: 0 0 1.2rem; break-inside: avoid; }
 figure svg { display: block; width: 100%; height: auto; max-width: 30rem; }
+.alone svg { max-width: none; }
 figcaption { color: var(--quiet); font-size: .85rem; max-width: 30rem; }
 table { border-collapse: collapse; margin: .3rem 0; }
 th, td { text-align: left; vertical-align: top; padding: .2rem .9rem .2rem 0;
@@ -47,7 +46,6 @@ th { font-weight: 600; white-space: nowrap; }
 td { font-variant-numeric: tabular-nums; overflow-wrap: anywhere; }
 .numbers td, .numbers th { overflow-wrap: normal; white-space: nowrap; }
 .numbers td:not(:first-child), .numbers th:not(:first-child) { text-align: right; }
-img { max-width: 100%; height: auto; display: block; margin: .6rem 0; }
 pre { background: var(--pale); padding: .8rem; overflow-x: auto; font-size: 13px; }
 summary { cursor: pointer; }
 dt { font-weight: 600; } dd { margin: 0 0 .4rem 1rem; }
@@ -112,10 +110,10 @@ def figures(sheets: Iterable[Sheet]) -> str:
     return f'<div class="figures">{blocks}</div>'
 
 
-def image(alternative: str, figure: Figure) -> str:
-    """Return a figure of any size as a PNG within the page."""
-    data = base64.b64encode(canvas.png(figure)).decode("ascii")
-    return f'<img alt="{alternative}" src="data:image/png;base64,{data}">'
+def wide_figure(alternative: str, figure: Figure) -> str:
+    """Return a figure of its own size, or as wide as the page allows; the text is HTML."""
+    inner = f'style="max-width: {figure.get_figwidth():g}in">{svg(figure)}'
+    return f'<figure class="alone" role="img" aria-label="{alternative}" {inner}</figure>\n'
 
 
 def details(heading: str, plain: str) -> str:

@@ -4,7 +4,7 @@ import html
 from collections.abc import Iterator
 from pathlib import Path
 
-from hilctl.analysis.html import document, grid, image, write_page
+from hilctl.analysis.html import document, grid, wide_figure, write_page
 from hilctl.base.printable import printable
 from hilctl.base.quantity import quantity, significant
 from hilctl.characterise import plots
@@ -104,7 +104,7 @@ def _held_out(found: Characterisation) -> list[str]:
         *(f"<p>{_text(note)}</p>" for note in (found.verdict.notes if found.verdict else ())),
         grid(HELD_OUT_HEADINGS, held_out_rows(found), "numbers"),
         *(
-            image(_text(each.label), plots.held_out_figure(each, close=i == 0))
+            wide_figure(_text(each.label), plots.held_out_figure(each, close=i == 0))
             for i, each in enumerate(found.held_out)
         ),
     ]
@@ -115,7 +115,7 @@ def _drawn(found: Characterisation) -> Iterator[str]:
     if measured.small is not None:
         yield "<h2>Small-signal response</h2>"
         yield "<p>Grey: the band of the loops. Dashed: the resonance.</p>"
-        yield image("response", plots.response_figure(measured.small, found.band_hz, unit))
+        yield wide_figure("response", plots.response_figure(measured.small, found.band_hz, unit))
     groups = [
         ("Growing amplitude", measured.growing),
         ("Lowest frequency", measured.slow),
@@ -124,10 +124,10 @@ def _drawn(found: Characterisation) -> Iterator[str]:
     ]
     if any(loops for _, loops in groups):
         yield "<h2>Loops</h2>"
-        yield image("loops", plots.loops_figure(groups, unit))
+        yield wide_figure("loops", plots.loops_figure(groups, unit))
     if measured.reversal is not None:
         yield "<h2>First-order reversal curves</h2>"
-        yield image("reversal curves", plots.reversal_figure(measured.reversal, unit))
+        yield wide_figure("reversal curves", plots.reversal_figure(measured.reversal, unit))
 
 
 def _large(loop: object, measured: Measured) -> bool:
@@ -146,7 +146,7 @@ def _model(found: Characterisation) -> Iterator[str]:
     yield from (f"<p>{_text(line)}</p>" for line in summary(known))
     yield grid(HEADINGS, error_rows(fit.errors), "numbers")
     shown = known.data[:_FITTED_SHOWN]
-    yield image("model and data", loops_figure(fit.modelled_um, shown, fit.model.input_unit))
+    yield wide_figure("model and data", loops_figure(fit.modelled_um, shown, fit.model.input_unit))
     model = _text(dump_model(fit.model), lines=True)
     yield f"<details><summary>Model file</summary><pre>{model}</pre></details>"
 

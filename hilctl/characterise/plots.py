@@ -45,7 +45,7 @@ def response_figure(small: SmallSignal, band_hz: tuple[float, float], unit: str)
         label="measured",
     )
     upper.loglog(small.frequency_hz, np.abs(fitted), color=REFERENCE, label="fitted")
-    upper.set(ylabel=f"um/{unit}", title="Small-signal response")
+    upper.set(ylabel=f"µm/{unit}", title="Small-signal response")
     for signal, style, colour in ((measured, ".", DISPLACEMENT), (fitted, "-", REFERENCE)):
         degrees = np.degrees(np.unwrap(np.angle(signal)))
         lower.semilogx(small.frequency_hz, degrees, style, color=colour, markersize=3)
@@ -74,7 +74,7 @@ def loops_figure(groups: Sequence[tuple[str, Sequence[LoopFigures]]], unit: str)
     for axes, (title, loops) in zip(panels.flat, drawn, strict=False):
         axes.set_visible(True)
         _loops(axes, loops, unit)
-        axes.set(title=title, xlabel=f"command, {unit}", ylabel="displacement, um")
+        axes.set(title=title, xlabel=f"command, {unit}", ylabel="displacement, µm")
     return figure
 
 
@@ -99,8 +99,8 @@ def reversal_figure(found: ReversalCurves, unit: str) -> Figure:
         left.plot(command, displacement_um, color=shade, linewidth=0.8)
         apart = curve[1] - np.interp(curve[0], outer[0], outer[1])
         right.plot(*min_max(curve[0], apart), color=shade, linewidth=0.8)
-    left.set(title="Reversal curves", xlabel=f"command, {unit}", ylabel="displacement, um")
-    right.set(title="Above the outer one", xlabel=f"command, {unit}", ylabel="um")
+    left.set(title="Reversal curves", xlabel=f"command, {unit}", ylabel="displacement, µm")
+    right.set(title="Above the outer one", xlabel=f"command, {unit}", ylabel="µm")
     return figure
 
 
@@ -123,9 +123,9 @@ def held_out_figure(found: UnseenReference, *, close: bool) -> Figure:
     draw_line(upper, time_s[shown], measured_um[shown], DISPLACEMENT)
     draw_line(upper, time_s[shown], modelled_um[shown], REFERENCE, dashed=True)
     about = " (about the largest error)" if close else ""
-    upper.set(ylabel="um", title=f"{found.label}: measured, and the model dashed{about}")
+    upper.set(ylabel="µm", title=f"{found.label}: measured, and the model dashed{about}")
     draw_line(lower, time_s, error_um, ERROR)
-    lower.set(xlabel="s", ylabel="error, um")
+    lower.set(xlabel="s", ylabel="error, µm")
     return figure
 
 

@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 
 from hilctl.analysis.canvas import DISPLACEMENT, QUIET, REFERENCE, STYLE
-from hilctl.analysis.html import document, grid, image, write_page
+from hilctl.analysis.html import document, grid, wide_figure, write_page
 from hilctl.base.arrays import F64
 from hilctl.comparison.compare import ComparedModel, Comparison
 from hilctl.comparison.summary import headings, notes, table_rows, titles
@@ -44,7 +44,7 @@ def comparison_page(comparison: Comparison) -> str:
         grid(headings(comparison), table_rows(comparison), "numbers"),
         *(f"<p>{html.escape(note)}</p>" for note in notes(comparison)),
         grid(("model", "what it is"), titles(comparison.rows)),
-        image("Errors against frequency, and loops", comparison_figure(comparison)),
+        wide_figure("Errors against frequency, and loops", comparison_figure(comparison)),
     ]
     return document("Models compared", body)
 

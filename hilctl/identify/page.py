@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from hilctl.analysis.canvas import DISPLACEMENT, ERROR, REFERENCE, STYLE
-from hilctl.analysis.html import document, grid, image, write_page
+from hilctl.analysis.html import document, grid, wide_figure, write_page
 from hilctl.base.arrays import F64
 from hilctl.identify.command import Identification
 from hilctl.identify.data.records import Record, SteadyLoop
@@ -56,7 +56,7 @@ def _drawn(heading: str, judged: Judgement, data: Sequence[Record], unit: str) -
     shown = data[:MOST_RECORDS]
     left_out = [f"<p>The first {len(shown)} of {len(data)}.</p>"] if len(shown) < len(data) else []
     figure = loops_figure(judged.modelled_um, shown, unit)
-    return [f"<h2>{heading}</h2>", *left_out, image(heading, figure)]
+    return [f"<h2>{heading}</h2>", *left_out, wide_figure(heading, figure)]
 
 
 @mpl.rc_context(STYLE)
@@ -86,8 +86,8 @@ def loops_figure(modelled_um: Sequence[F64], data: Sequence[Record], unit: str) 
         upper.plot(x, measured[::step], color=REFERENCE, label="measured", linewidth=1.6)
         upper.plot(x, modelled[::step], color=DISPLACEMENT, label="model", linewidth=0.9)
         lower.plot(x, (modelled - measured)[::step], color=ERROR)
-        upper.set(title=record.label, ylabel="um")
-        lower.set(xlabel=f"command, {unit}" if steady else "sample", ylabel="error, um")
+        upper.set(title=record.label, ylabel="µm")
+        lower.set(xlabel=f"command, {unit}" if steady else "sample", ylabel="error, µm")
         upper.set_visible(True)
         lower.set_visible(True)
     axes[0, 0].legend(loc="upper left")

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilctl.analysis import canvas, html
+from hilctl.analysis import html
 from hilctl.base.arrays import F64, I64, U32
 from hilctl.base.events import Event
 from hilctl.base.samples import Flag, Samples
@@ -14,13 +14,11 @@ from hilctl.base.segments import Segment
 from hilctl.recording.data import Recording, Ticks
 
 MakeRecording = Callable[..., Recording]
-WHITE = b"\x89PNG\r\n\x1a\n"
 
 
 @pytest.fixture
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leave all figures white, for tests of something else: to draw one takes half a second."""
-    monkeypatch.setattr(canvas, "png", lambda figure: WHITE)
     monkeypatch.setattr(html, "drawn", lambda sheet: None)
     monkeypatch.setattr(html, "svg", lambda figure: "<svg></svg>")
 

@@ -3,7 +3,7 @@
 import html
 from pathlib import Path
 
-from hilctl.analysis.html import document, grid, image, write_page
+from hilctl.analysis.html import document, grid, wide_figure, write_page
 from hilctl.identify.page import loops_figure
 from hilctl.identify.refine.command import Refinement
 from hilctl.models.files import dump_model
@@ -57,6 +57,6 @@ def refinement_page(found: Refinement) -> str:
     for heading, held in (("Before", found.choice.before), ("After", after)):
         modelled = held.judgement.modelled_um[:MOST_RUNS]
         figure = loops_figure(modelled, shown, found.model.input_unit)
-        body += [f"<h2>{heading}</h2>", image(heading, figure)]
+        body += [f"<h2>{heading}</h2>", wide_figure(heading, figure)]
     body += [f"<details><summary>Model</summary><pre>{html.escape(dump_model(found.model))}</pre>"]
     return document(title, [*body, "</details>"])

@@ -23,7 +23,7 @@ SMALL = SmallSignal(
 
 def test_the_response_shows_band_and_resonance():
     upper, lower = response_figure(SMALL, (1.0, 50.0), "A").axes
-    assert upper.get_ylabel() == "um/A"
+    assert upper.get_ylabel() == "µm/A"
     assert any(np.allclose(line.get_xdata(), 700.0) for line in upper.lines)
     np.testing.assert_allclose(lower.lines[1].get_ydata()[-1], np.degrees(-np.arctan(1000 / 300)))
     assert len(response_figure(replace(SMALL, natural_hz=None), (1.0, 50.0), "A").axes) == 2
