@@ -33,7 +33,7 @@ print(result.code, result.reason)
 
 # %% Figures of the run: hysteresis, errors, timing.
 report = api.summarize(result.path)
-print(f"peak hysteresis {report.peak_hysteresis_percent:.1f} % of {report.peak_to_peak_um:.1f} um")
+print(f"peak hysteresis {report.peak_hysteresis_percent:.1f} % of {report.peak_to_peak_um:.1f} µm")
 
 # %% Samples are named columns with units.
 run = api.read(result.path, from_s=0.5, to_s=0.6)

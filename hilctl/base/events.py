@@ -68,6 +68,6 @@ class Event:
 def adapted_text(parameters: Mapping[str, float]) -> str:
     """Return the values of an :data:`ADAPTED` event in words."""
     weights = [f"{value:+.4f}" for name, value in parameters.items() if name.startswith("weight")]
-    named = {"offset_um": "offset {:+.4g} um", "gain": "gain {:.4f}"}
+    named = {"offset_um": "offset {:+.4g} µm", "gain": "gain {:.4f}"}
     parts = [text.format(parameters[name]) for name, text in named.items() if name in parameters]
     return ", ".join([*parts, *([f"weights {', '.join(weights)}"] if weights else [])])

@@ -116,7 +116,7 @@ def _refuse_saturated(displacement_um: F64, label: str) -> None:
         if share > _AT_END:
             raise RigProblemError(
                 "saturated_sensor",
-                f"{label}: the sensor stands at {end:.4g} um for {100.0 * share:.0f} % of the time",
+                f"{label}: the sensor stands at {end:.4g} µm for {100.0 * share:.0f} % of the time",
                 "move the sensor, give it a wider range, or narrow limits.stroke_um to less than "
                 "that",
             )

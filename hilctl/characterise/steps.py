@@ -67,7 +67,7 @@ def _take_rest(
 ) -> tuple[Measured, str]:
     del limits
     found = rest_noise(recording)
-    text = f"noise {found.noise_um:.3g} um rms, drift {found.drift_um_per_s:+.2g} um/s"
+    text = f"noise {found.noise_um:.3g} µm rms, drift {found.drift_um_per_s:+.2g} µm/s"
     return measured.also(rest=found), text
 
 
@@ -91,12 +91,12 @@ def _take_polarity(
     last = found.amplitude > 0.9 * POLARITY_PARTS[-1] * limits.reach
     if found.clear and not found.even:
         _refuse_negative(found.gain_um, percent, limits.unit)
-        return after, f"{found.gain_um:.3g} um/{limits.unit} at {percent:.2g} % of the range"
+        return after, f"{found.gain_um:.3g} µm/{limits.unit} at {percent:.2g} % of the range"
     if last and found.even:
         raise RigProblemError(
             "no_bias",
-            f"the displacement reacts alike to both signs of the command ({found.second_um:.3g} um "
-            f"at twice its frequency, {found.motion_um:.3g} um at it)",
+            f"the displacement reacts alike to both signs of the command ({found.second_um:.3g} µm "
+            f"at twice its frequency, {found.motion_um:.3g} µm at it)",
             "give the rods their bias, magnet or current, or record loops and use 'hilctl identify "
             "--model butterfly'",
         )
@@ -109,7 +109,7 @@ def _refuse_negative(gain_um: float, percent: float, unit: str) -> None:
     if gain_um < 0.0:
         raise RigProblemError(
             "wrong_polarity",
-            f"the displacement falls as the command rises, {gain_um:.3g} um/{unit} at "
+            f"the displacement falls as the command rises, {gain_um:.3g} µm/{unit} at "
             f"{percent:.2g} % of the range",
             "swap the wires of coil or sensor, or turn the sign of the sensor's scale in the "
             "device's profile",
@@ -125,13 +125,13 @@ def _refuse_silent(
         share = 100.0 * noise_um / limits.stroke_span_um
         raise RigProblemError(
             "noise",
-            f"noise is larger than the motion: {noise_um:.3g} um rms at rest, {share:.0f} % of the "
+            f"noise is larger than the motion: {noise_um:.3g} µm rms at rest, {share:.0f} % of the "
             f"allowed stroke, hides what {moved} does",
             "look at the sensor's ground, shield and range",
         )
     raise RigProblemError(
         "no_reaction",
-        f"no reaction: {moved} moves nothing that shows above {noise_um:.3g} um rms of noise",
+        f"no reaction: {moved} moves nothing that shows above {noise_um:.3g} µm rms of noise",
         "look whether the amplifier is on and enabled, at the coil's wires, and whether the sensor "
         "sees the actuator",
     )
@@ -158,7 +158,7 @@ def _take_response(
         return measured, f"lost in noise at {100.0 * tried / limits.reach:.2g} % of the range"
     natural_hz = found.natural_hz
     delay = f"delay {1e3 * found.delay_s:.3g} ms, lag {1e3 * found.lag_s:.3g} ms"
-    text = f"gain {found.gain_um:.3g} um/{limits.unit}, {delay}"
+    text = f"gain {found.gain_um:.3g} µm/{limits.unit}, {delay}"
     if natural_hz is None:
         return measured.also(small=found), f"{text}, no resonance"
     if natural_hz < _CLEAR_OF_BAND * limits.highest_hz:
@@ -190,11 +190,11 @@ def _take_growing(
     recording: Recording, limits: CampaignLimits, measured: Measured
 ) -> tuple[Measured, str]:
     found = loop_figures(recording, recording.segments[-1])
-    loop = f"{found.amplitude:.3g} {limits.unit} moves {found.peak_to_peak_um:.3g} um"
+    loop = f"{found.amplitude:.3g} {limits.unit} moves {found.peak_to_peak_um:.3g} µm"
     if found.scatter_percent > _MOST_SCATTER_PERCENT:
         _refuse_unrepeatable(f"cycles of {loop} differ by {found.scatter_percent:.2g} % rms")
     low_um, high_um = limits.stroke_um
-    span = f"{found.low_um:.3g} to {found.high_um:.3g} um of {low_um:g} to {high_um:g}"
+    span = f"{found.low_um:.3g} to {found.high_um:.3g} µm of {low_um:g} to {high_um:g}"
     return measured.also(growing=(*measured.growing, found)), f"{loop}: {span}"
 
 
@@ -229,8 +229,8 @@ def _take_slow(
     if measured.rest and largest.peak_to_peak_um < _LEAST_MOTION * measured.rest.noise_um:
         raise RigProblemError(
             "noise",
-            f"noise is larger than the motion: {measured.rest.noise_um:.3g} um rms at rest, "
-            f"{largest.peak_to_peak_um:.3g} um peak-to-peak at the largest amplitude",
+            f"noise is larger than the motion: {measured.rest.noise_um:.3g} µm rms at rest, "
+            f"{largest.peak_to_peak_um:.3g} µm peak-to-peak at the largest amplitude",
             "widen the limits as far as the actuator allows, or take a better sensor",
         )
     after = measured.also(slow=all_loops(recording))
@@ -270,7 +270,7 @@ def _take_biased(
 ) -> tuple[Measured, str]:
     found = all_loops(recording)
     gains = [each.gain_um for each in found]
-    text = f"gain {min(gains):.3g} to {max(gains):.3g} um/{limits.unit} over the range"
+    text = f"gain {min(gains):.3g} to {max(gains):.3g} µm/{limits.unit} over the range"
     return measured.also(biased=found), text
 
 
@@ -311,7 +311,7 @@ def _take_again(
     shape, shift = f"{found.shape_percent:.2g} % in shape", f"{found.shift_percent:.2g} % in place"
     if math.hypot(found.shape_percent, found.shift_percent) > _MOST_SCATTER_PERCENT:
         _refuse_unrepeatable(f"the largest loop has changed by {shape} and {shift}")
-    return measured.also(repeated=found), f"differs by {shape}, {shift} ({found.shift_um:+.3g} um)"
+    return measured.also(repeated=found), f"differs by {shape}, {shift} ({found.shift_um:+.3g} µm)"
 
 
 def _numbered(

@@ -96,7 +96,7 @@ def print_row(step: SeriesStep, row: SeriesRow) -> None:
     values = "  ".join(f"{key}={_shown(value)}" for key, value in step.point.items())
     figures = row.figures
     parts = [
-        (figures.peak_to_peak_um, "{:.4g} um"),
+        (figures.peak_to_peak_um, "{:.4g} µm"),
         (figures.peak_hysteresis_percent, "hysteresis {:.3g} %"),
         (figures.peak_error_percent, "error {:.3g} %"),
         (figures.natural_hz, "resonance {:.4g} Hz"),

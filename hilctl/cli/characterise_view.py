@@ -43,7 +43,7 @@ def print_plan(plan: CampaignPlan, folder: Path) -> None:
     terminal = console()
     terminal.print(table)
     low_um, high_um = limits.stroke_um
-    within = f"{limits.low:g} to {limits.high:g} {limits.unit}, {low_um:g} to {high_um:g} um"
+    within = f"{limits.low:g} to {limits.high:g} {limits.unit}, {low_um:g} to {high_um:g} µm"
     terminal.print(f"within {within}; loops at {limits.lowest_hz:g} to {limits.highest_hz:g} Hz")
     heat = "no thermal budget is given"
     if limits.loaded.config.limits.rms_current_a is not None:

@@ -11,7 +11,7 @@ def print_probed(answered: Probed) -> None:
     if answered.safe_note:
         print(f"safe value: {answered.safe_note}")
     if answered.displacement_um is not None:
-        print(f"reads {answered.displacement_um:.6g} um")
+        print(f"reads {answered.displacement_um:.6g} µm")
     if answered.output is None:
         print("what it puts out is not known")
     else:

@@ -15,6 +15,7 @@ from rich.text import Text
 from hilctl.analysis.figures import RunReport
 from hilctl.analysis.report import summarize
 from hilctl.base.events import adapted_text
+from hilctl.base.quantity import unit_text
 from hilctl.cli.console import console
 from hilctl.cli.report_view import render
 from hilctl.experiment.check import Checked
@@ -83,9 +84,9 @@ def _live_text(progress: RunProgress) -> str:
     command, displacement_um = newest.command, newest.displacement_um
     error_um = displacement_um - newest.reference_um
     shown = progress.compensated and np.isfinite(error_um[-1])
-    error = f"error {error_um[-1]:+7.2f} um  " if shown else ""
+    error = f"error {error_um[-1]:+7.2f} µm  " if shown else ""
     return (
-        f"{error}x {displacement_um[-1]:+8.2f} um  command {command[-1]:+7.3f}  "
+        f"{error}x {displacement_um[-1]:+8.2f} µm  command {command[-1]:+7.3f}  "
         f"late {progress.late_ticks}"
     )
 
@@ -147,7 +148,7 @@ def print_forecast(checked: Checked) -> None:
         "duration": f"{forecast.duration_s:g} s"
         + (f", after {forecast.before_s:g} s of condition and rest" if forecast.before_s else ""),
         "reference": f"{forecast.reference_min:.4g} to {forecast.reference_max:.4g} "
-        f"{reference_unit}",
+        f"{unit_text(reference_unit)}",
         "command": f"{forecast.command_min:.4g} to {forecast.command_max:.4g} {unit} "
         f"(limits {low:g} to {high:g})",
         "slew": f"{forecast.slew_per_s:.4g} {unit}/s (limit {limits.slew_per_s:g})",

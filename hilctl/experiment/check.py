@@ -244,7 +244,7 @@ def _device_problems(loaded: LoadedExperiment) -> list[Problem]:
         add("block", rule, config.block)
     low_um, high_um = config.limits.stroke_um
     if low_um < info.sensor_min_um or high_um > info.sensor_max_um:
-        span = f"{info.sensor_min_um:g} to {info.sensor_max_um:g} um"
+        span = f"{info.sensor_min_um:g} to {info.sensor_max_um:g} µm"
         value = f"{low_um:g} to {high_um:g}"
         add("limits.stroke_um", f"must lie within what the sensor can report, {span}", value)
     model = loaded.model
@@ -291,12 +291,12 @@ def _start_problems(loaded: LoadedExperiment, begun: Begun, forecast: Forecast) 
         return []
     still = model.forward(rate_hz).process(np.full(max(round(STILL_S * rate_hz), 1), safe))
     rests_um = float(still[-1])
-    rule = f"must begin where the actuator rests at {safe:g} {unit}, by the model {rests_um:.4g} um"
+    rule = f"must begin where the actuator rests at {safe:g} {unit}, by the model {rests_um:.4g} µm"
     hint = (
         f"its first command would step to {float(first[0]):.4g} {unit} at once: begin there, by "
-        "waveform.offset and without a soft start, which begins at 0 um"
+        "waveform.offset and without a soft start, which begins at 0 µm"
     )
-    return [_problem(loaded, "waveform", rule, f"{float(begun.input_um[0]):.4g} um", hint)]
+    return [_problem(loaded, "waveform", rule, f"{float(begun.input_um[0]):.4g} µm", hint)]
 
 
 def reference_problems(
@@ -312,9 +312,9 @@ def reference_problems(
     for name, (lowest, highest) in spans.items():
         excess = max(lowest - low, high - highest)
         if excess > 0.0:
-            rule = f"reference must stay within {name}, {lowest:g} to {highest:g} um"
-            value = f"{low:.6g} to {high:.6g} um"
-            hint = f"{excess:.3g} um too far: change the waveform's amplitude or offset"
+            rule = f"reference must stay within {name}, {lowest:g} to {highest:g} µm"
+            value = f"{low:.6g} to {high:.6g} µm"
+            hint = f"{excess:.3g} µm too far: change the waveform's amplitude or offset"
             found.append(_problem(loaded, "waveform", rule, value, hint))
     return found
 

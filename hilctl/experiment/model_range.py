@@ -124,8 +124,8 @@ def _motion_warnings(
     smallest_um = known.peak_to_peak_um[0]
     if moves and min(moves) < SMALL * smallest_um:
         yield (
-            f"the reference moves by {min(moves):.3g} um peak-to-peak; the smallest motion that "
-            f"the model was identified on is {smallest_um:.3g} um"
+            f"the reference moves by {min(moves):.3g} µm peak-to-peak; the smallest motion that "
+            f"the model was identified on is {smallest_um:.3g} µm"
         )
     turns_hz = [sample_rate_hz / each.period for each in segments if each.period > 0.0]
     if turns_hz and min(turns_hz) < SLOW * known.frequency_hz[0]:
@@ -136,8 +136,8 @@ def _motion_warnings(
     speed = float(np.max(np.abs(np.diff(values_um)), initial=0.0)) * sample_rate_hz
     if speed > FAST * known.speed_um_per_s:
         yield (
-            f"the reference moves at up to {speed:.3g} um/s; the model was identified at up to "
-            f"{known.speed_um_per_s:.3g} um/s"
+            f"the reference moves at up to {speed:.3g} µm/s; the model was identified at up to "
+            f"{known.speed_um_per_s:.3g} µm/s"
         )
 
 

@@ -6,7 +6,7 @@ from hilctl.identify.command import Identification
 from hilctl.identify.fit_model import FittedModel
 from hilctl.identify.judge import Judgement, LoopError
 
-HEADINGS = ("loop", "p-p um", "peak %", "rms %", "area %")
+HEADINGS = ("loop", "p-p µm", "peak %", "rms %", "area %")
 
 
 def error_rows(errors: Sequence[LoopError]) -> list[tuple[str, ...]]:
@@ -52,8 +52,8 @@ def summary(found: Identification) -> list[str]:
         lines.append(f"on a bound, so not found but as far as they may go: {shown}")
     if known is not None:
         lines.append(
-            f"found for {_span(known.peak_to_peak_um)} um peak-to-peak, "
-            f"{_span(known.frequency_hz)} Hz, up to {known.speed_um_per_s:.4g} um/s"
+            f"found for {_span(known.peak_to_peak_um)} µm peak-to-peak, "
+            f"{_span(known.frequency_hz)} Hz, up to {known.speed_um_per_s:.4g} µm/s"
         )
     if found.lag_samples:
         lines.append(f"displacements taken {found.lag_samples} samples later than the commands")

@@ -98,7 +98,7 @@ def data_reasons(records: Sequence[Record], *, even: bool = False) -> Iterator[s
     largest = int(np.argmax(moves))
     if moves[largest] > MOST_UM:
         yield (
-            f"'{records[largest].label}' moves by {moves[largest]:.3g} um, further than any such "
+            f"'{records[largest].label}' moves by {moves[largest]:.3g} µm, further than any such "
             "actuator: is the displacement in nm? Give it in um"
         )
         return
@@ -195,10 +195,10 @@ def _suggestions(
     if shown > CLEAR_PERCENT and constant**2 > CONSTANT * float(np.mean(error_um**2)):
         offset = settings.has("offset") and not settings.offset
         hint = ": --set offset=true finds it" if offset else ""
-        share = f"{-constant:.3g} um, {shown:.1f} % of the stroke"
+        share = f"{-constant:.3g} µm, {shown:.1f} % of the stroke"
         yield f"most of the error is a constant, {share}{hint}"
     if stroke_um > LIKELY_UM:
-        yield f"a stroke of {stroke_um:.3g} um is large: is the displacement in um?"
+        yield f"a stroke of {stroke_um:.3g} µm is large: is the displacement in um?"
 
 
 def _explained(fit: FittedModel, records: Sequence[Record]) -> float:

@@ -70,12 +70,12 @@ class Beginning:
         stands_um, measured_um = conditioning.stands_um, resting.resting_um
         offset_um = measured_um - stands_um
         values = {"offset_um": offset_um, "resting_um": measured_um, "model_um": stands_um}
-        rests = f"at rest the sensor shows {measured_um:.4g} um, the model {stands_um:.4g} um"
+        rests = f"at rest the sensor shows {measured_um:.4g} µm, the model {stands_um:.4g} µm"
         if not abs(offset_um) <= conditioning.largest_um:
-            limit = f"an offset beyond {conditioning.largest_um:.4g} um"
+            limit = f"an offset beyond {conditioning.largest_um:.4g} µm"
             return f"{rests}: {limit}: identify the model anew", values, True
         resting.take_out(offset_um)
-        text = f"{rests}: {offset_um:.4g} um are taken out of the compensator's input"
+        text = f"{rests}: {offset_um:.4g} µm are taken out of the compensator's input"
         return text, values, False
 
     @property

@@ -194,8 +194,8 @@ class Polarity:
         left_um = self._sum_um[1] - self._sum_um[0]
         if left_um <= 0.5 * fed_um:
             self.against = (
-                f"the correction grew to its limit of {self._limit_um:g} um and the error with it: "
-                f"input and displacement went opposite ways, over {fed_um:.3g} um: the sign of the "
+                f"the correction grew to its limit of {self._limit_um:g} µm and the error with it: "
+                f"input and displacement went opposite ways, over {fed_um:.3g} µm: the sign of the "
                 "sensor or of the command is wrong"
             )
 

@@ -275,25 +275,25 @@ class Interlocks:
             budget = f"{rms_a:g} A rms over {time_s:g} s"
             text = f"thermal budget of the coil, {budget}, was used up at sample {sample}"
             return Trip(sample, "thermal", text)
-        error = f"tracking error {reference - displacement:.4g} um at sample {sample}"
-        beyond = f"beyond {settings.tracking_error_um:g} um{_since(settings.tracking_s)}"
+        error = f"tracking error {reference - displacement:.4g} µm at sample {sample}"
+        beyond = f"beyond {settings.tracking_error_um:g} µm{_since(settings.tracking_s)}"
         return Trip(sample, "tracking_error", f"{error} is {beyond}")
 
     def _invalid(self, sample: int, displacement_um: float) -> Trip:
-        reading = f"displacement {displacement_um:.4g} um at sample {sample}"
+        reading = f"displacement {displacement_um:.4g} µm at sample {sample}"
         low, high = self.context.sensor_um
         if math.isfinite(displacement_um) and not low < displacement_um < high:
-            text = f"{reading} is at the end of what the sensor can report, {low:g} to {high:g} um"
+            text = f"{reading} is at the end of what the sensor can report, {low:g} to {high:g} µm"
             return Trip(sample, "sensor_range", text)
         low, high = self.context.stroke_um
-        text = f"{reading} is not within the stroke limits {low:g} to {high:g} um"
+        text = f"{reading} is not within the stroke limits {low:g} to {high:g} µm"
         return Trip(sample, "stroke", text)
 
     def _frozen(self, sample: int, displacement_um: float) -> Trip:
         context = self.context
         moved = f"the command had moved by {context.frozen_travel:.3g} {context.unit}"
         text = (
-            f"displacement at sample {sample} is still {displacement_um:.6g} um, "
+            f"displacement at sample {sample} is still {displacement_um:.6g} µm, "
             f"{self.settings.frozen_s:g} s after {moved}: the sensor is frozen"
         )
         return Trip(sample, "sensor_frozen", text)

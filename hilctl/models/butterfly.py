@@ -80,7 +80,7 @@ class ButterflyModel(PlayModel):
             given = "not given" if self.output_range_um is None else list(self.output_range_um)
             raise ModelError(
                 "a butterfly can be inverted on one of its wings only: output_range_um must begin "
-                f"at {turning_um!r} um, where they meet, or above: {given}"
+                f"at {turning_um!r} µm, where they meet, or above: {given}"
             )
         direct, weights, thresholds = self.inverse_parameters()
         rate_gain = self.inverse_rate_gain(sample_rate_hz)

@@ -30,7 +30,7 @@ class SeriesDrift:
     def __str__(self) -> str:
         parts = [
             (self.peak_to_peak_percent, "{:+.3g} % in peak-to-peak"),
-            (self.mean_um, "{:+.3g} um in mean"),
+            (self.mean_um, "{:+.3g} µm in mean"),
             (self.peak_hysteresis_percent, "{:+.3g} points of hysteresis"),
         ]
         known = ", ".join(text.format(value) for value, text in parts if value is not None)

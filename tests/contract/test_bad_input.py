@@ -141,7 +141,7 @@ BROKEN: list[tuple[str, str, str]] = [
         "reference beyond the model",
         IN_UM.replace("amplitude: 1.0", "amplitude: 12.5"),
         "x.yaml:5: waveform: reference must stay within the range that compensator.model was found "
-        "on, -12 to 12 um, got -12.5 to 12.5 um (0.5 um too far",
+        "on, -12 to 12 µm, got -12.5 to 12.5 µm (0.5 µm too far",
     ),
     (
         "unknown device",

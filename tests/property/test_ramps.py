@@ -128,7 +128,7 @@ class TestStart:
         rig = Rig(np.full(100, 1.0), device=FakeDevice(4.0, nan_at=10))
         outcome = rig.run()
         assert (outcome.code, rig.waveform_at) == ("fault", 40)
-        assert "displacement nan um at sample 40" in outcome.reason
+        assert "displacement nan µm at sample 40" in outcome.reason
 
     def test_the_heartbeat_counts_the_waveform_s_samples(self):
         """0 until it begins, and a tuning that comes before waits for it."""

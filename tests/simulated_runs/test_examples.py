@@ -11,7 +11,7 @@ import pytest
 EXAMPLES = Path(__file__).parents[2] / "examples"
 # What the text they print must match, figures within what the simulated rig allows, and files.
 EXPECTED = {
-    "first_run": (r"peak hysteresis 3\d\.\d % of 8\d\.\d um", "first-run/loop.svg"),
+    "first_run": (r"peak hysteresis 3\d\.\d % of 8\d\.\d µm", "first-run/loop.svg"),
     "find_a_model": (r"peak hysteresis \d\.\d\d %", "find-a-model/model.yaml"),
     "before_and_after": (
         r"before: 3\d\.\d+ % .*\nafter: [01]\.\d+ %", "before-and-after/before_and_after.svg",

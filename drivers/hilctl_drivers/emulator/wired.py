@@ -58,8 +58,8 @@ class WiredExperiment:
         assert wiring is not None
         return [
             f"{self.options.output}: current = {wiring.gain_a:g} A x output {wiring.offset_a:+g} A",
-            f"{self.options.sensor}: displacement = {wiring.sensor_um:g} um x input "
-            f"{wiring.offset_um:+g} um",
+            f"{self.options.sensor}: displacement = {wiring.sensor_um:g} µm x input "
+            f"{wiring.offset_um:+g} µm",
         ]
 
 

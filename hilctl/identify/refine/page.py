@@ -8,7 +8,7 @@ from hilctl.identify.page import loops_figure
 from hilctl.identify.refine.command import Refinement
 from hilctl.models.files import dump_model
 
-HEADINGS = ("run", "p-p um", "peak % before", "after", "rms % before", "after")
+HEADINGS = ("run", "p-p µm", "peak % before", "after", "rms % before", "after")
 MOST_RUNS = 12
 
 

@@ -70,7 +70,7 @@ class _Problem:
         self.turning_um = float(target_um.min()) if turning_um is None else turning_um
         above_um = target_um - self.turning_um
         if not above_um.max() > 0.0:
-            raise DataError(f"every displacement is below the turning point, {self.turning_um} um")
+            raise DataError(f"every displacement is below the turning point, {self.turning_um} µm")
         corners = settings.corners
         self.plays = np.arange(1, settings.plays + 1, dtype=np.float64)
         # S is flat where the wings meet: there S^-1 is steep and needs its corners.

@@ -225,7 +225,7 @@ def refine_peak(
     for i in range(ROUNDS):
         if peak <= goal_um:
             break
-        progress(i / ROUNDS, f"peak error {peak:.3g} um, goal {goal_um:.3g} um")
+        progress(i / ROUNDS, f"peak error {peak:.3g} µm, goal {goal_um:.3g} µm")
         # Samples gain little by little as they near the goal: with a sharp border, rounding would
         # decide on which side a sample is.
         near = errors_um / goal_um

@@ -205,7 +205,7 @@ def lower_peak(task: StagedTask, x: F64, goal_um: float, progress: OnProgress) -
     for i in range(PEAK_ROUNDS):
         if peak <= goal_um:
             break
-        progress(0.7 + 0.3 * i / PEAK_ROUNDS, f"peak error {peak:.3g} um, goal {goal_um:.3g} um")
+        progress(0.7 + 0.3 * i / PEAK_ROUNDS, f"peak error {peak:.3g} µm, goal {goal_um:.3g} µm")
         scale = scale * np.sqrt(0.3 + np.abs(errors) / peak)
         scale = scale / float(np.sqrt(np.mean(scale**2)))
         x, _, _ = descend(task.evaluate(scale), x, low, high, PEAK_STEPS)

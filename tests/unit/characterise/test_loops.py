@@ -53,7 +53,7 @@ def test_cycles_that_differ_scatter(limits, played):
 
 
 def test_a_sensor_at_its_end_is_a_problem(limits, played):
-    with pytest.raises(RigProblemError, match="stands at 10 um for") as caught:
+    with pytest.raises(RigProblemError, match="stands at 10 µm for") as caught:
         loop(limits, played, lambda v: np.minimum(plays(v), 10.0), noise_um=0.0)
     assert caught.value.code == "saturated_sensor"
 

@@ -35,7 +35,7 @@ def test_a_row_says_what_came_out(capsys):
     print_row(step, SeriesRow("completed", figures, "a.mcap", "completed", kept=True))
     print_row(step, SeriesRow("fault: late", code="fault"))
     first, second = capsys.readouterr().out.splitlines()
-    assert first == "   7  waveform.amplitude=2.5  stands  12.35 um  resonance 300 Hz"
+    assert first == "   7  waveform.amplitude=2.5  stands  12.35 µm  resonance 300 Hz"
     assert second == "   7  waveform.amplitude=2.5  fault: late"
 
 

@@ -56,7 +56,7 @@ def command(tmp_path, **more):
 def test_people_read_what_it_does_and_what_came_of_it(ends, tmp_path, capsys):
     command(tmp_path)
     shown = capsys.readouterr().out
-    assert "within -4 to 4 A, -50 to 50 um; loops at 0.5 to 80 Hz" in shown
+    assert "within -4 to 4 A, -50 to 50 µm; loops at 0.5 to 80 Hz" in shown
     assert "at most 2 s of rig time" in shown
     assert "30.0 nm rms" in shown
     assert (tmp_path / "model.html").is_file()

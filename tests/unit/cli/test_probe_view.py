@@ -16,7 +16,7 @@ def test_what_a_device_says_is_no_markup(capsys):
     assert "rig answers: a [bold] device\n" in shown
     assert "firmware: [1.2]" in shown
     assert "at most 1000 samples a second\n" in shown
-    assert "reads 2.8e+20 um" in shown
+    assert "reads 2.8e+20 µm" in shown
     assert "what it puts out is not known" in shown
     assert "safe value: a message takes up to 0.3 s" in shown
     assert "wrong: too far" in shown

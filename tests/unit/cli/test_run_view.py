@@ -50,7 +50,7 @@ def test_an_output_that_may_not_be_safe_is_said(capsys, safe):
 def test_what_was_adapted_is_said_of_a_run_without_a_report(capsys):
     adapted = {"offset_um": 1.25, "gain": 1.02, "weight_1": -0.005}
     print_run(RunResult(Path("a.mcap"), "completed", "", True, 0, 9, 0, 0, adapted=adapted), None)
-    assert "adapted: offset +1.25 um, gain 1.0200, weights -0.0050" in capsys.readouterr().out
+    assert "adapted: offset +1.25 µm, gain 1.0200, weights -0.0050" in capsys.readouterr().out
 
 
 def test_what_became_of_programs_after_the_run_is_said(capsys):

@@ -175,8 +175,8 @@ class TestReference:
             model=terfenol_rdpi(),
         )
         assert found == [
-            "x.yaml: waveform: reference must stay within limits.stroke_um, -9.5 to 60 um, got "
-            "-10 to 10 um (0.5 um too far: change the waveform's amplitude or offset)"
+            "x.yaml: waveform: reference must stay within limits.stroke_um, -9.5 to 60 µm, got "
+            "-10 to 10 µm (0.5 µm too far: change the waveform's amplitude or offset)"
         ]
 
     def test_outside_the_model(self) -> None:
@@ -185,7 +185,7 @@ class TestReference:
         found = refusals(DISPLACEMENT, model=model)
         assert found == [
             "x.yaml: waveform: reference must stay within the range that compensator.model was "
-            "found on, -12 to 9.75 um, got -10 to 10 um (0.25 um too far: change the waveform's "
+            "found on, -12 to 9.75 µm, got -10 to 10 µm (0.25 µm too far: change the waveform's "
             "amplitude or offset)"
         ]
         checked(DISPLACEMENT, "waveform.amplitude=9.75", model=model)
@@ -195,10 +195,10 @@ class TestReference:
         model = terfenol_rdpi().model_copy(update={"output_range_um": (-12.0, 12.0)})
         found = refusals(DISPLACEMENT, "waveform.amplitude=80.0", model=model)
         assert len(found) == 3
-        assert "limits.stroke_um, -75 to 60 um" in found[0]
-        assert "(20 um too far" in found[0]
-        assert "-12 to 12 um" in found[1]
-        assert "(68 um too far" in found[1]
+        assert "limits.stroke_um, -75 to 60 µm" in found[0]
+        assert "(20 µm too far" in found[0]
+        assert "-12 to 12 µm" in found[1]
+        assert "(68 µm too far" in found[1]
         assert found[2].startswith("x.yaml: limits.peak_current_a: the run must stay within")
 
     def test_a_current_is_no_displacement(self) -> None:
@@ -380,7 +380,7 @@ class TestDevice:
         found = refusals(CURRENT, f"limits.stroke_um={stroke}")
         assert len(found) == 1
         assert found[0].startswith(
-            "x.yaml: limits.stroke_um: must lie within what the sensor can report, -100 to 100 um"
+            "x.yaml: limits.stroke_um: must lie within what the sensor can report, -100 to 100 µm"
         )
         checked(CURRENT, "limits.stroke_um=[-100.0, 100.0]")
 
@@ -498,8 +498,8 @@ def test_a_reference_that_begins_beside_the_rest_position_is_moved_not_hurried()
         check(loaded(DISPLACEMENT, "waveform.offset=0", model=moved))
     (problem,) = caught.value.problems
     assert problem.key == "waveform"
-    assert "rests at 0 A, by the model 24.5 um" in problem.rule
-    assert problem.value == "0 um"
+    assert "rests at 0 A, by the model 24.5 µm" in problem.rule
+    assert problem.value == "0 µm"
     assert "slew" not in str(problem)
     there = ("waveform.offset=24.5", "waveform.soft_start_s=0")
     assert check(loaded(DISPLACEMENT, *there, model=moved))
@@ -540,7 +540,7 @@ def test_where_it_rests_is_said_once_all_stages_do(rate_hz: float, rests_um: int
     (found,) = refusals(DISPLACEMENT, *slow, "waveform.amplitude=1.0", model=Offset())
     assert found.startswith(
         "x.yaml: waveform: must begin where the actuator rests at 0 A, by the model "
-        f"{rests_um} um, got 0 um (its first command would step to 3 A at once"
+        f"{rests_um} µm, got 0 µm (its first command would step to 3 A at once"
     )
 
 

@@ -45,9 +45,9 @@ def test_a_corner_is_warned_not_refused():
 @pytest.mark.parametrize(
     ("values", "frequency_hz", "text"),
     [
-        (sine(50.0, 4.0), 50.0, "moves by 8 um peak-to-peak"),
+        (sine(50.0, 4.0), 50.0, "moves by 8 µm peak-to-peak"),
         (sine(2.0, 40.0), 2.0, "repeats at 2 Hz"),
-        (sine(50.0, 40.0) + np.where(np.arange(10_000) > 5003, 8.0, 0.0), 0.0, "um/s"),
+        (sine(50.0, 40.0) + np.where(np.arange(10_000) > 5003, 8.0, 0.0), 0.0, "µm/s"),
     ],
 )
 def test_smaller_slower_and_faster_motions_are_warned(values, frequency_hz, text):

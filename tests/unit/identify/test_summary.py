@@ -60,7 +60,7 @@ def test_the_range_that_it_was_found_for_is_said():
     known = IdentifiedRange(
         peak_to_peak_um=(20.0, 80.0), frequency_hz=(50.0, 50.0), speed_um_per_s=12e3
     )
-    line = "found for 20 to 80 um peak-to-peak, 50 Hz, up to 1.2e+04 um/s"
+    line = "found for 20 to 80 µm peak-to-peak, 50 Hz, up to 1.2e+04 µm/s"
     assert summary(found(known=known))[-1] == line
 
 

@@ -142,7 +142,7 @@ class TestOffset:
         rig = Rig(sine(50), conditioning=given)
         outcome = rig.run()
         assert (outcome.code, outcome.safe) == ("fault", True)
-        assert "an offset beyond 2 um: identify the model anew" in outcome.reason
+        assert "an offset beyond 2 µm: identify the model anew" in outcome.reason
         assert np.isnan(rig.host.column(0)).all()
 
     def test_no_reading_is_no_offset(self):
@@ -152,7 +152,7 @@ class TestOffset:
         assert math.isnan(resting.resting_um)
         given = conditioning(block=1, stands_um=math.nan)
         outcome = Rig(sine(50), conditioning=given).run()
-        assert (outcome.code, "the model nan um" in outcome.reason) == ("fault", True)
+        assert (outcome.code, "the model nan µm" in outcome.reason) == ("fault", True)
 
     @pytest.mark.parametrize("size", [1, 7, 20, 200])
     def test_mean_over_the_rest_whatever_the_block(self, size):

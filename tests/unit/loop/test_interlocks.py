@@ -62,7 +62,7 @@ class TestStroke:
         """What is outside, or not a number, trips where it stands and is flagged there only."""
         trip, bench = trips(STROKE, 4, first=100, displacement=[1.0, value, 2.0, value])
         reason = (
-            f"displacement {shown} um at sample 101 is not within the stroke limits -60 to 50 um"
+            f"displacement {shown} µm at sample 101 is not within the stroke limits -60 to 50 µm"
         )
         assert trip == Trip(101, "stroke", reason)
         assert bench.flagged(Flag.SENSOR_INVALID) == [1, 3]
@@ -84,8 +84,8 @@ class TestSensorRange:
         assert trip.code == "sensor_range"
         assert trip.sample == 2
         assert trip.reason == (
-            f"displacement {rail:g} um at sample 2 is at the end of what the sensor can report, "
-            "-100 to 100 um"
+            f"displacement {rail:g} µm at sample 2 is at the end of what the sensor can report, "
+            "-100 to 100 µm"
         )
         assert bench.flagged(Flag.SENSOR_INVALID) == [2]
 
@@ -110,7 +110,7 @@ class TestFrozen:
         assert trip == Trip(
             30,
             "sensor_frozen",
-            "displacement at sample 30 is still 12.3457 um, 0.01 s after the command had moved by "
+            "displacement at sample 30 is still 12.3457 µm, 0.01 s after the command had moved by "
             "0.5 A: the sensor is frozen",
         )
         assert bench.flagged(InterlockFlag.SENSOR_FROZEN) == list(range(30, 60))
@@ -338,7 +338,7 @@ class TestTracking:
         assert trip == Trip(
             15,
             "tracking_error",
-            "tracking error -2.5 um at sample 15 is beyond 2 um for longer than 0.005 s",
+            "tracking error -2.5 µm at sample 15 is beyond 2 µm for longer than 0.005 s",
         )
         assert bench.flagged(InterlockFlag.TRACKING_ERROR) == list(range(15, 30))
 
@@ -348,7 +348,7 @@ class TestTracking:
         assert trips(limits, 9, reference=3.0, displacement=1.0)[0] is None
         assert trips(limits, 9, reference=-1.0, displacement=1.0)[0] is None
         trip, _ = trips(limits, 9, reference=3.01, displacement=1.0)
-        assert trip.reason == "tracking error 2.01 um at sample 0 is beyond 2 um"
+        assert trip.reason == "tracking error 2.01 µm at sample 0 is beyond 2 µm"
 
     def test_back_in_time_starts_anew(self):
         """Errors shorter than the time don't add up."""

@@ -26,7 +26,7 @@ def test_it_has_the_wiring_of_the_experiment():
     assert (wired.options.port, wired.options.link) == (5020, "tcp")
     assert wired.wiring() == [
         "DAC0: current = 4 A x output -10 A",
-        "AIN0: displacement = 12.5 um x input +0 um",
+        "AIN0: displacement = 12.5 µm x input +0 µm",
     ]
 
 
