@@ -24,7 +24,9 @@ called one after another in one call; output and input may be one array.
 """
 
 
-def kernel(*signatures: str, inline: bool = False) -> Callable[[Function], Function]:
+def kernel(
+    *signatures: str, inline: bool = False, nogil: bool = False
+) -> Callable[[Function], Function]:
     """Compile a function for the given signatures only, and keep the result on disk.
 
     That happens at its first call, or by :func:`load`: a process reads only what it needs of all
@@ -41,13 +43,15 @@ def kernel(*signatures: str, inline: bool = False) -> Callable[[Function], Funct
         inline: Always merge it into the kernels that call it: for those called once a sample.
             Such a kernel must not use an array inside ``if`` or leave a loop by ``break``; numba
             then counts references to its arrays at every call, which takes longer than the work.
+        nogil: Leave the interpreter to other threads meanwhile: for long work beside which others
+            go on. No other thread may change its arrays then.
 
     Returns:
         A decorator that keeps the function's Python type.
     """
 
     def decorate(function: Function) -> Function:
-        return cast("Function", _Kernel(function, signatures, inline=inline))
+        return cast("Function", _Kernel(function, signatures, inline=inline, nogil=nogil))
 
     return decorate
 
@@ -89,9 +93,14 @@ class _Kernel(CPUDispatcher):
     """A compiled function that has its declared signatures, from its first use on."""
 
     def __init__(
-        self, function: Callable[..., object], signatures: tuple[str, ...], *, inline: bool
+        self,
+        function: Callable[..., object],
+        signatures: tuple[str, ...],
+        *,
+        inline: bool,
+        nogil: bool,
     ) -> None:
-        options = {"nopython": True, "error_model": "numpy", "forceinline": inline}
+        options = {"nopython": True, "error_model": "numpy", "forceinline": inline, "nogil": nogil}
         super().__init__(function, targetoptions=options)
         self._declared = signatures
         self._loaded = False

@@ -48,7 +48,7 @@ def _varint(data: U8, at: int, end: int) -> tuple[int, int]:
     return 0, -1
 
 
-@kernel("int64(uint8[::1], int64[:, ::1])")
+@kernel("int64(uint8[::1], int64[:, ::1])", nogil=True)
 def walk_messages(data: U8, table: I64) -> int:
     """Find the messages of chunks that hold nothing else.
 
@@ -78,7 +78,7 @@ def walk_messages(data: U8, table: I64) -> int:
     return count
 
 
-@kernel("boolean(uint8[::1], int64[:, ::1], int64[:, ::1], int64[:, ::1])")
+@kernel("boolean(uint8[::1], int64[:, ::1], int64[:, ::1], int64[:, ::1])", nogil=True)
 def are_indexes(raw: U8, indexes: I64, chunks: I64, table: I64) -> bool:
     """Compare message indexes, as they stand in the file, with the messages.
 
@@ -120,7 +120,8 @@ def are_indexes(raw: U8, indexes: I64, chunks: I64, table: I64) -> bool:
 
 
 @kernel(
-    "boolean(uint8[::1], int64[:, ::1], int64[::1], int64[:, ::1], int64[:, ::1], int64[:, ::1])"
+    "boolean(uint8[::1], int64[:, ::1], int64[::1], int64[:, ::1], int64[:, ::1], int64[:, ::1])",
+    nogil=True,
 )
 def find_fields(data: U8, table: I64, kinds: I64, numbers: I64, starts: I64, sizes: I64) -> bool:
     """Find numbers and lists of messages of one kind.
@@ -160,7 +161,7 @@ def find_fields(data: U8, table: I64, kinds: I64, numbers: I64, starts: I64, siz
     return True
 
 
-@kernel("void(uint8[::1], int64[::1], int64[::1], uint8[::1], int64)")
+@kernel("void(uint8[::1], int64[::1], int64[::1], uint8[::1], int64)", nogil=True)
 def join_bytes(data: U8, starts: I64, sizes: I64, out: U8, at: int) -> None:
     """Copy stretches of bytes, one behind the other.
 
@@ -181,6 +182,7 @@ def join_bytes(data: U8, starts: I64, sizes: I64, out: U8, at: int) -> None:
 @kernel(
     "int64(uint8[::1], int64[::1], int64[::1], int64, uint32[::1], int64, int64[::1])",
     "int64(uint8[::1], int64[::1], int64[::1], int64, int64[::1], int64, int64[::1])",
+    nogil=True,
 )
 def join_varints(
     data: U8, starts: I64, sizes: I64, largest: int, out: I64 | U32, at: int, counts: I64
@@ -214,7 +216,7 @@ def join_varints(
     return at
 
 
-@kernel("void(int64[::1], int64[::1], int64[::1], int64)")
+@kernel("void(int64[::1], int64[::1], int64[::1], int64)", nogil=True)
 def join_ranges(firsts: I64, counts: I64, out: I64, at: int) -> None:
     """Write rising numbers, one range behind the other.
 

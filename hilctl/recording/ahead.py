@@ -80,9 +80,6 @@ class _Batch:
         if self.data is None or not self.chunks:
             return None
         begins = np.cumsum([0, *(each.size for each in self.chunks)])
-        for each, at in zip(self.chunks, begins.tolist(), strict=False):
-            if zlib.crc32(self.data[at : at + each.size].data) != each.crc:
-                return None
         messages = Messages.of(self.data)
         if messages is None:
             return None
@@ -181,7 +178,7 @@ class _Walk:
         # The first chunk has schemas and channels, too: it can't be of a run.
         chunks, indexes, end = _records(raw.data, 1 if self._first else _MOST_CHUNKS)
         self._at, self._first = start + end, self._first and not chunks
-        data = _inflated([raw[c.begin : c.end].data for c in chunks], [c.size for c in chunks])
+        data = _inflated(raw.data, chunks)
         return _Batch(start, raw[:end], chunks, indexes, data)
 
     def _read(self, size: int) -> U8:
@@ -244,12 +241,25 @@ def _chunk_of(raw: memoryview, at: int, end: int) -> _Chunk | None:
     return _Chunk(at, begin, end, size, crc) if says == size <= LARGEST_CHUNK_BYTES else None
 
 
-def _inflated(frames: list[memoryview], sizes: list[int]) -> U8 | None:
-    """Return what frames hold, one behind the other; None where one of them is damaged."""
-    data = np.empty(sum(sizes), dtype=np.uint8)
+def _inflated(raw: memoryview, chunks: Sequence[_Chunk]) -> U8 | None:
+    """Return what chunks hold, one behind the other; None where one of them is damaged.
+
+    Args:
+        raw: The bytes that they stand in.
+        chunks: The chunks.
+    """
+    data = np.empty(sum(each.size for each in chunks), dtype=np.uint8)
+    frames = b"".join([raw[each.begin : each.end] for each in chunks])
     decompressor = zstandard.ZstdDecompressor(max_window_size=LARGEST_CHUNK_BYTES)
+    begin = 0
     try:
-        with decompressor.stream_reader(b"".join(frames), read_across_frames=True) as stream:
-            return data if stream.readinto(data.data) == data.size else None
+        with decompressor.stream_reader(frames, read_across_frames=True) as stream:
+            for each in chunks:
+                part = data[begin : begin + each.size].data
+                # At once, as it is still in a processor's cache.
+                if stream.readinto(part) != each.size or zlib.crc32(part) != each.crc:
+                    return None
+                begin += each.size
     except zstandard.ZstdError:
         return None
+    return data

@@ -2,7 +2,9 @@
 
 import logging
 import os
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Generator, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, closing
 from pathlib import Path
 
@@ -24,6 +26,8 @@ LONG_CHUNKS = 64
 """So is a stretch of one in as many places."""
 PIECE_SAMPLES = 2**18
 """Fewest samples of a piece: what is worked on then stays in a processor's cache."""
+
+_PIECES = 2  # at once in the making
 
 
 def read(path: Path, stretch: Stretch | None = None) -> Recording:
@@ -68,11 +72,26 @@ class Pieces:
         Raises:
             DataError: As :func:`read` does, and where facts of the run stand behind samples.
         """
-        pieces = _read(self.path, self.stretch, PIECE_SAMPLES)
+        pieces = _beforehand(_read(self.path, self.stretch, PIECE_SAMPLES))
         return self.stretch.cut_pieces(pieces) if self.stretch else pieces
 
 
-def _read(path: Path, stretch: Stretch | None, piece_samples: int | None) -> Iterator[Recording]:
+def _beforehand(pieces: Generator[Recording, None, None]) -> Iterator[Recording]:
+    """Yield pieces, while a thread gathers those that come next."""
+    thread = ThreadPoolExecutor(1, thread_name_prefix="gathering")
+    try:
+        coming = deque(thread.submit(next, pieces, None) for _ in range(_PIECES))
+        while (piece := coming.popleft().result()) is not None:
+            coming.append(thread.submit(next, pieces, None))
+            yield piece
+    finally:
+        thread.shutdown(cancel_futures=True)
+        pieces.close()
+
+
+def _read(
+    path: Path, stretch: Stretch | None, piece_samples: int | None
+) -> Generator[Recording, None, None]:
     """Yield pieces of that many samples, uncut; all in one where None."""
     try:
         with path.open("rb") as stream, ExitStack() as closed:
