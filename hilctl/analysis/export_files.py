@@ -20,6 +20,7 @@ Facts: TypeAlias = Mapping[str, str]
 
 _CSV_ROWS = 20_000
 _GROUP_ROWS = 2**20  # as pyarrow has it
+_BATCH_ROWS = 2**16  # that are encoded at once; pages are of as many or twice that
 _LARGEST_MAT_BYTES = 2**31 - 1  # of a variable, as MATLAB reads files of this version
 _MAT_HEADER_BYTES = 128
 _MATRIX, _DIMENSIONS, _NAME, _FLAGS = 14, 5, 1, 6
@@ -97,9 +98,21 @@ class ParquetFile:
 
     def add(self, columns: Columns) -> None:
         """Write a row group where there is enough for one, else keep the rows."""
-        self._waiting.append(self._pa.table(dict(columns)))
+        self._waiting.append(self._table(columns))
         if sum(each.num_rows for each in self._waiting) >= _GROUP_ROWS:
             self._write()
+
+    def _table(self, columns: Columns) -> Any:
+        """Return a table whose schema says which columns can't have nulls.
+
+        To look for them in numbers of NumPy, which have none, takes a third of the writing.
+        """
+        table = self._pa.table(dict(columns))
+        fields = [
+            each.with_nullable(getattr(columns[each.name], "dtype", np.dtype(object)) == object)
+            for each in table.schema
+        ]
+        return self._pa.Table.from_arrays(table.columns, schema=self._pa.schema(fields))
 
     def finish(self, facts: Facts) -> None:
         """Write the last row group and the facts."""
@@ -142,6 +155,7 @@ class ParquetFile:
             store_schema=store_schema,
             use_dictionary=repeated,
             column_encoding=encoded,
+            write_batch_size=_BATCH_ROWS,
         )
 
 

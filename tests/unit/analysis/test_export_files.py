@@ -5,6 +5,7 @@ import json
 from tempfile import TemporaryFile
 
 import numpy as np
+import pyarrow as pa
 import pytest
 from pyarrow import parquet
 from scipy.io import savemat
@@ -89,6 +90,17 @@ def test_parquet_row_groups_fill_up_across_pieces(tmp_path, monkeypatch, rows):
     assert {f"hilctl.{name}".encode(): text.encode() for name, text in FACTS.items()}.items() <= (
         metadata.items()
     )
+
+
+def test_only_columns_that_can_have_nulls_say_so(tmp_path):
+    """Arrow's, which readers of a folder of files want alike, and those of any Python object."""
+    given = {**WHOLE, "b": pa.array([None] * 30_001, pa.float64()), "c": ["x", None, "y"] * 10_000}
+    given["c"] += ["z"]
+    given["d"] = np.array(given["c"], dtype=object)
+    file = parquet.ParquetFile(written(ParquetFile, tmp_path / "x.parquet", [given]))
+    nullable = {field.name for field in file.schema_arrow if field.nullable}
+    assert nullable == {"b", "c", "d"}
+    assert file.read()["d"].to_pylist() == given["c"]
 
 
 def test_measured_numbers_lie_side_by_side(tmp_path):

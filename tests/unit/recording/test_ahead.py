@@ -2,6 +2,7 @@
 
 import io
 import struct
+import zlib
 from contextlib import closing
 
 import numpy as np
@@ -137,7 +138,8 @@ def test_chunks_that_hold_much_are_not_opened_together(make, tmp_path, monkeypat
     import zstandard
 
     data = zstandard.ZstdCompressor().compress(bytes(2**20))
-    body = struct.pack("<QQQII4sQ", 0, 0, 2**20, 1, 4, b"zstd", len(data)) + data
+    crc = zlib.crc32(bytes(2**20))
+    body = struct.pack("<QQQII4sQ", 0, 0, 2**20, crc, 4, b"zstd", len(data)) + data
     path = tmp_path / "run.mcap"
     path.write_bytes((b"\x06" + struct.pack("<Q", len(body)) + body) * 50)
     monkeypatch.setattr(ahead, "_MOST_BYTES", 5 * 2**20)
