@@ -171,8 +171,10 @@ def _extreme_rows(samples: Samples, per_stretch: int) -> I64:
     for values in (samples.displacement_um, samples.reference_um, samples.command, error_um):
         shaped = values[:whole].reshape(-1, per_stretch)
         finite = np.isfinite(shaped)
-        rows.append(places + np.where(finite, shaped, np.inf).argmin(axis=1))
-        rows.append(places + np.where(finite, shaped, -np.inf).argmax(axis=1))
+        low = high = shaped
+        if not finite.all():
+            low, high = np.where(finite, shaped, np.inf), np.where(finite, shaped, -np.inf)
+        rows += places + low.argmin(axis=1), places + high.argmax(axis=1)
     return np.unique(np.concatenate(rows))
 
 

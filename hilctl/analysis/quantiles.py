@@ -13,7 +13,6 @@ MOST_EXACT = 2**21
 _BITS = 13  # of the fraction; a bin is 1.2e-4 of its value wide
 _SHIFT = 52 - _BITS
 _SIGN = np.int64(2**63 - 1)
-_WIDEST = 2**20
 _MIDDLE = 2 ** (63 - _SHIFT)
 
 
@@ -46,24 +45,15 @@ class Quantiles:
 
     def _count(self, values: F64 | I64) -> None:
         """Count values by the first bits of their floating-point form, which rise as they do."""
-        bits = values.astype(np.float64).view(np.int64)
-        keys = (bits ^ ((bits >> 63) & _SIGN)) >> _SHIFT
-        # A reading that stands still gives zeros, far from all other numbers.
-        others = keys[keys != 0]
-        self._zeros += keys.size - others.size
-        if others.size == 0:
-            return
+        from hilctl.kernels.counting import count_keys  # what short runs never need
+
         if not self._counts.size:  # pages that nothing is counted in take no memory
             self._counts = np.zeros(2 * _MIDDLE, dtype=np.int64)
-        places = others + _MIDDLE
-        low, high = int(places.min()), int(places.max())
-        self._reach = min(low, self._reach[0]), max(high + 1, self._reach[1])
-        if high - low < _WIDEST:
-            counts = np.bincount(places - low)
-            self._counts[low : low + counts.size] += counts
-        else:
-            numbers, counts = np.unique(places, return_counts=True)
-            self._counts[numbers] += counts
+        bits = np.ascontiguousarray(values, dtype=np.float64).view(np.int64)
+        # A reading that stands still gives zeros, far from all other numbers.
+        zeros, low, high = count_keys(bits, _SHIFT, self._counts)
+        self._zeros += zeros
+        self._reach = min(low, self._reach[0]), max(high, self._reach[1])
 
     @property
     def largest(self) -> float:

@@ -120,7 +120,9 @@ class RunGathering:
 
     def _count(self, samples: Samples) -> None:
         waveform = (samples.flags & np.uint32(NO_WAVEFORM)) == 0
-        index, flags = samples.index[waveform], samples.flags[waveform]
+        index, flags = samples.index, samples.flags
+        if not waveform.all():
+            index, flags = index[waveform], flags[waveform]
         if index.size:
             first = self._waveform[0] if self._waveform else int(index[0])
             self._waveform = first, int(index[-1]) + 1
