@@ -108,10 +108,7 @@ class ParquetFile:
         To look for them in numbers of NumPy, which have none, takes a third of the writing.
         """
         table = self._pa.table(dict(columns))
-        fields = [
-            each.with_nullable(getattr(columns[each.name], "dtype", np.dtype(object)) == object)
-            for each in table.schema
-        ]
+        fields = [each.with_nullable(not _is_full(columns[each.name])) for each in table.schema]
         return self._pa.Table.from_arrays(table.columns, schema=self._pa.schema(fields))
 
     def finish(self, facts: Facts) -> None:
@@ -157,6 +154,11 @@ class ParquetFile:
             column_encoding=encoded,
             write_batch_size=_BATCH_ROWS,
         )
+
+
+def _is_full(values: Any) -> bool:
+    """Return whether a column is of NumPy's numbers, and so without nulls."""
+    return isinstance(values, np.ndarray) and values.dtype.kind in "iuf"
 
 
 class _Aside:

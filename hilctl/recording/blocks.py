@@ -165,17 +165,18 @@ class TickTable:
         self._put_away()
         self._table.add({name: getattr(ticks, name) for name in TICK_COLUMNS})
 
-    def add_all(self, messages: Messages, rows: I64) -> int | None:
-        """Take all ticks of some chunks, if every message is plain.
+    def add_all(self, messages: Messages, rows: I64, bounds: Bounds) -> int | None:
+        """Take the ticks of some chunks, if every message is plain.
 
         That is one that :func:`hilctl.recording.checks.ticks_problem` finds nothing in.
 
         Args:
             messages: The messages of some chunks.
             rows: int64[m, PLACES], those with ticks.
+            bounds: None is kept where all lie before or behind them.
 
         Returns:
-            How many; None where one is not plain: then none was taken.
+            How many were kept; None where one is not plain: then none was taken.
         """
         found = _lists(messages, rows, wire.TICK_KINDS)
         if found is None:
@@ -199,6 +200,9 @@ class TickTable:
                 return None
         if (counts != counts[0]).any():
             return None
+        firsts = self._rows[0, self._used : end]
+        if not ((firsts < bounds[1]).any() and (firsts >= bounds[0]).any()):
+            return 0
         times = self._rows[1:, self._used : end]
         times[:] = wire.signed(times.view(np.uint64))
         taken, self._used = end - self._used, end

@@ -151,8 +151,9 @@ class Gathering:
             for start in starts:
                 self._begins(start)
             return True
-        if topic == "/ticks" and self._stretch is None:
-            ticks = self._ticks.add_all(messages, messages.under(channel))
+        if topic == "/ticks":
+            rows = messages.under(channel)
+            ticks = self._ticks.add_all(messages, rows, self._stretch_bounds())
             self._allowance.keep(_NUMBER_BYTES * (ticks or 0) * len(TICK_COLUMNS))
             return ticks is not None
         return False

@@ -183,6 +183,7 @@ class Salvage:
         for at in places:
             if at < end:  # it has been given out with those before it
                 continue
+            self._indexes = {}  # what follows a chunk is not looked at
             if run := self._run_of_chunks(at):
                 yield run.messages
                 end = run.end
@@ -191,7 +192,6 @@ class Salvage:
             if found is None:
                 self._note(at, 0, "damaged record")
                 continue
-            self._indexes = {}  # what follows a chunk is not looked at
             yield from self._with_channels(self._take(at, found), at)
         self.finished = True
 

@@ -13,6 +13,7 @@ from hilctl.base.samples import COLUMNS
 from hilctl.recording import ahead, reader
 from hilctl.recording.ahead import ReadAhead
 from hilctl.recording.data import TICK_COLUMNS
+from hilctl.recording.index import places_of
 from hilctl.recording.salvage import Salvage
 from hilctl.recording.stretch import Stretch
 from hilctl.recording.torn import own_channels
@@ -123,6 +124,17 @@ def test_chunks_come_many_at_once(whole, tmp_path):
     assert sum(len(run.table) for run in runs) > 0.9 * salvage._messages
     assert len(runs) < CHUNKS / 2
     assert runs[-1].records(runs[-1].table)[-1] in records
+
+
+def test_chunks_of_a_stretch_come_many_at_once(whole, tmp_path):
+    """Behind one that is opened by itself as well."""
+    path = tmp_path / "run.mcap"
+    path.write_bytes(whole)
+    with path.open("rb", buffering=0) as stream, closing(ReadAhead(stream)) as first:
+        salvage = Salvage(io.BytesIO(whole), ahead=first)
+        places = places_of(io.BytesIO(whole), Stretch(0.0, None))
+        runs = [each for each in salvage.taken_at(places) if not hasattr(each, "write")]
+    assert sum(len(run.table) for run in runs) > 0.9 * salvage._messages
 
 
 def test_records_are_given_out_one_by_one_all_the_same(whole, tmp_path):

@@ -104,7 +104,7 @@ def test_ticks_of_a_chunk_are_those_one_by_one(make):
         if each.channel_id == 2:
             one.add(tick_block(each.data))
     for _ in range(2):
-        assert all_.add_all(messages, messages.under(2)) == 36
+        assert all_.add_all(messages, messages.under(2), EVERY) == 36
         mine, right = all_.ticks(), one.ticks()
         for name in ("first_sample", "deadline_ns", "late_ns", "exchange_ns"):
             assert getattr(mine, name).tobytes() == getattr(right, name).tobytes()
@@ -114,10 +114,22 @@ def test_ticks_of_a_chunk_are_those_one_by_one(make):
                 one.add(tick_block(each.data))
 
 
+@pytest.mark.parametrize(
+    ("bounds", "kept"),
+    [((0, 1), 8), ((350, 360), 8), ((351, 900), 0), ((-9, 0), 0), ((99, 200), 8)],
+)
+def test_ticks_that_all_lie_elsewhere_take_no_room(make, bounds, kept):
+    """They are of samples 0 to 350; what is kept is cut later, to the tick."""
+    messages, _ = messages_of(make, make.batch(0, 4), make.batch(200, 4))
+    table = TickTable()
+    assert table.add_all(messages, messages.under(2), bounds) == kept
+    assert table.ticks().first_sample.size == kept
+
+
 def test_ticks_beyond_any_run_are_not_taken(make):
     batch = make.batch(0, 4)
     batch.heads[2, 5] = -(2**60) - 1
     messages, _ = messages_of(make, make.batch(0, 4), batch)
-    assert TickTable().add_all(messages, messages.under(2)) is None
-    assert TickTable().add_all(messages, messages.under(2)[:1]) == 4
+    assert TickTable().add_all(messages, messages.under(2), EVERY) is None
+    assert TickTable().add_all(messages, messages.under(2)[:1], EVERY) == 4
     assert messages.table[:, packed.CHANNEL].tolist() == [1, 2, 1, 2]

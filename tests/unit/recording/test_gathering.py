@@ -1,6 +1,8 @@
 """Pieces of a recording: together they are the whole, and each is of one shape."""
 
+import threading
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -44,6 +46,44 @@ def test_pieces_are_the_whole(monkeypatch, recorded, size, stretch):
     last = pieces[-1]
     assert (last.end, last.dropped, last.segments) == (whole.end, whole.dropped, whole.segments)
     assert not any(piece.end or piece.dropped for piece in pieces[:-1])
+
+
+@pytest.mark.parametrize("long_bytes", [0, 2**60])
+def test_pieces_of_a_stretch_are_cut_from_the_whole(monkeypatch, recorded, long_bytes):
+    """By many chunks at once and record by record."""
+    monkeypatch.setattr(reader, "PIECE_SAMPLES", 500)
+    monkeypatch.setattr(reader, "LONG_CHUNKS", 0)
+    monkeypatch.setattr(reader, "LONG_BYTES", long_bytes)
+    stretch = Stretch(0.0123, 0.05)
+    cut, pieces = stretch.cut(read(recorded)), list(Pieces(recorded, stretch))
+    assert cut.samples.index.size > 1000
+    for name in ("index", *COLUMNS, "flags"):
+        joined = np.concatenate([getattr(piece.samples, name) for piece in pieces])
+        assert joined.tobytes() == getattr(cut.samples, name).tobytes()
+    for name in TICK_COLUMNS:
+        joined = np.concatenate([getattr(piece.ticks, name) for piece in pieces])
+        assert joined.tobytes() == getattr(cut.ticks, name).tobytes()
+    assert (pieces[-1].dropped, pieces[-1].segments) == (cut.dropped, cut.segments)
+
+
+def test_a_walk_that_is_left_leaves_nothing_behind(monkeypatch, recorded):
+    """Neither the thread that gathers pieces nor the open file."""
+    monkeypatch.setattr(reader, "PIECE_SAMPLES", 1)
+    before = threading.active_count()
+    opened, streams = Path.open, []
+
+    def noted(path, *args, **named):
+        streams.append(opened(path, *args, **named))
+        return streams[-1]
+
+    monkeypatch.setattr(Path, "open", noted)
+    walk = iter(Pieces(recorded))
+    next(walk)
+    assert threading.active_count() == before + 1
+    walk.close()
+    assert threading.active_count() == before
+    assert streams
+    assert all(stream.closed for stream in streams)
 
 
 def test_a_walk_can_be_repeated(recorded):
