@@ -1,12 +1,14 @@
 """The command ``hilctl emulate``: serves an emulator until a signal ends it."""
 
 import gc
+import json
+import shlex
 import signal
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from types import FrameType
-from typing import Annotated, cast
+from typing import Annotated, Any, cast
 
 import typer
 
@@ -54,8 +56,12 @@ def emulate(
     current_a: Annotated[
         float | None, typer.Option(help="Current at the start, A; else as the device powers up.")
     ] = None,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print one line of JSON once it answers.")
+    ] = False,
 ) -> None:
     """Serve the simulated rig as a real device would, until Ctrl-C."""
+    say = _say_json if as_json else _say
     faults = tuple(parse_fault(text) for text in fault or ())
     if is_experiment(profile):
         own = {"--link": link, "--output": output, "--sensor": sensor, "--reader": reader,
@@ -66,7 +72,7 @@ def emulate(
         options = replace(wired.options, log=log, faults=faults, current_a=current_a)
         if reader_port:
             options = replace(options, reader_port=reader_port)
-        serve(options, _say, wired)
+        serve(options, lambda places, emulator: say(places, emulator, wired))
         return
     if reader is None and sensor is not None and ":" in sensor:
         reader, _, sensor = sensor.rpartition(":")
@@ -85,24 +91,48 @@ def emulate(
         reader_port=reader_port,
         current_a=current_a,
     )
-    serve(options, _say)
+    serve(options, say)
 
 
-def _say(name: str, address: str) -> None:
-    typer.echo(f"{name} answers at {address}")
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where an emulated device answers.
+
+    Attributes:
+        profile: Its profile.
+        address: ``host:port`` or device file.
+        unit_id: Its unit id, where another Modbus device is served beside it.
+    """
+
+    profile: str
+    address: str
+    unit_id: int | None = None
 
 
-def serve(
-    options: EmulatorOptions,
-    on_ready: Callable[[str, str], None],
-    wired: WiredExperiment | None = None,
+def _say(places: Sequence[Place], emulator: Emulator, wired: WiredExperiment | None = None) -> None:
+    for each in places:
+        unit = f", unit {each.unit_id}" if each.unit_id is not None else ""
+        typer.echo(f"{each.profile} answers at {each.address}{unit}")
+    if wired is not None:
+        typer.echo("\n".join([*wired.wiring(), f"hilctl {shlex.join(wired.words(emulator))}"]))
+
+
+def _say_json(
+    places: Sequence[Place], emulator: Emulator, wired: WiredExperiment | None = None
 ) -> None:
+    said: dict[str, Any] = {"devices": [asdict(each) for each in places]}
+    if wired is not None:
+        said["wiring"] = wired.wiring_mapping()
+        said["arguments"] = wired.words(emulator)
+    typer.echo(json.dumps(said))
+
+
+def serve(options: EmulatorOptions, on_ready: Callable[[Sequence[Place], Emulator], None]) -> None:
     """Serve an emulator until SIGINT or SIGTERM.
 
     Args:
         options: What to emulate.
-        on_ready: Called with a profile and its ``host:port`` or device file once it answers.
-        wired: The experiment that the options are of: its wiring is printed, and how to run it.
+        on_ready: Called with where its devices answer, and itself, once they do.
 
     Raises:
         InputError: See :func:`~hilctl_drivers.emulator.setup.build`.
@@ -117,10 +147,7 @@ def serve(
     gc.freeze()  # a collection of all that was imported takes tens of ms
     before = {each: signal.signal(each, stop) for each in (signal.SIGINT, signal.SIGTERM)}
     try:
-        for name, address in _places(options, emulator):
-            on_ready(name, address)
-        if wired is not None:
-            typer.echo("\n".join([*wired.wiring(), wired.command(emulator)]))
+        on_ready(_places(options, emulator), emulator)
         emulator.server.run()
     finally:
         for number, handler in before.items():
@@ -128,15 +155,14 @@ def serve(
         emulator.log.close()
 
 
-def _places(options: EmulatorOptions, emulator: Emulator) -> list[tuple[str, str]]:
-    """Return each profile that is served, and where; with the unit ids of two Modbus devices."""
+def _places(options: EmulatorOptions, emulator: Emulator) -> list[Place]:
     if options.reader is None:
-        return [(options.profile, emulator.address)]
-    unit = reader_unit = ""
+        return [Place(options.profile, emulator.address)]
+    unit_id = reader_unit_id = None
     if isinstance(emulator.device, EmulatedModbus):
-        unit = f", unit {emulator.device.profile.unit_id}"
-        reader_unit = f", unit {emulator.reader_unit_id}"
+        unit_id = emulator.device.profile.unit_id
+        reader_unit_id = emulator.reader_unit_id
     return [
-        (options.profile, emulator.address + unit),
-        (options.reader, emulator.reader_address + reader_unit),
+        Place(options.profile, emulator.address, unit_id),
+        Place(options.reader, emulator.reader_address, reader_unit_id),
     ]

@@ -1,8 +1,7 @@
 """What to emulate for an experiment: its device, wired to the rig as its device section says."""
 
-import shlex
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -37,8 +36,11 @@ class WiredExperiment:
     section: Mapping[str, Any]
     options: EmulatorOptions
 
-    def command(self, emulator: Emulator) -> str:
-        """Return the command that runs it on an emulator, which may be elsewhere than it says."""
+    def words(self, emulator: Emulator) -> list[str]:
+        """Return the words behind ``hilctl`` that run it on an emulator.
+
+        That may be elsewhere than the experiment says.
+        """
         places: dict[str, Any] = {
             key: emulator.options[key]
             for key in ("host", "tcp_port", "serial_port", "reader")
@@ -48,19 +50,30 @@ class WiredExperiment:
         unit = getattr(emulator.device, "profile", None)
         if own is not None and isinstance(unit, ModbusProfile) and own != unit.unit_id:
             places["unit_id"] = unit.unit_id
-        words = [f"device.{key}={value}" for key, value in _differing(places, self.section)]
-        more = "".join(f" --set {shlex.quote(word)}" for word in words)
-        return f"hilctl run {shlex.quote(str(self.path))}{more}"
+        settings = [f"device.{key}={value}" for key, value in _differing(places, self.section)]
+        return ["run", str(self.path), *(word for each in settings for word in ("--set", each))]
 
     def wiring(self) -> list[str]:
         """Return what is wired to what, a line each, for people."""
-        wiring = self.options.wiring
-        assert wiring is not None
+        wiring = self._wiring()
         return [
             f"{self.options.output}: current = {wiring.gain_a:g} A x output {wiring.offset_a:+g} A",
             f"{self.options.sensor}: displacement = {wiring.sensor_um:g} µm x input "
             f"{wiring.offset_um:+g} µm",
         ]
+
+    def wiring_mapping(self) -> dict[str, Any]:
+        """Return what is wired to what, for programs.
+
+        The current is ``gain_a`` x output + ``offset_a``; the displacement ``sensor_um`` x input +
+        ``offset_um``.
+        """
+        ends = {"output": self.options.output, "input": self.options.sensor}
+        return {**ends, **asdict(self._wiring())}
+
+    def _wiring(self) -> Wiring:
+        assert self.options.wiring is not None
+        return self.options.wiring
 
 
 def is_experiment(name: str) -> bool:

@@ -42,14 +42,14 @@ def test_the_command_names_what_is_elsewhere():
     wired = wired_experiment(path)
     emulator = build(wired.options)
     try:
-        words = wired.command(emulator).split()
+        words = wired.words(emulator)
     finally:
         emulator.server.close()
         emulator.log.close()
-    assert words[:3] == ["hilctl", "run", str(path)]
+    assert words[:2] == ["run", str(path)]
     assert f"device.serial_port={emulator.address}" in words
     assert f"device.reader.serial_port={emulator.reader_address}" in words
-    assert len(words) == 7
+    assert len(words) == 6
 
 
 def test_a_port_that_no_user_may_listen_on_is_another_one(tmp_path):
@@ -63,7 +63,7 @@ def test_a_port_that_no_user_may_listen_on_is_another_one(tmp_path):
     emulator = build(wired.options)
     try:
         port = emulator.address.rpartition(":")[2]
-        assert wired.command(emulator) == f"hilctl run {path} --set device.tcp_port={port}"
+        assert wired.words(emulator) == ["run", str(path), "--set", f"device.tcp_port={port}"]
     finally:
         emulator.server.close()
         emulator.log.close()
