@@ -251,7 +251,7 @@ class SampleRing:
             what is missing between was overwritten, or damaged.
         """
         head = self.page.get(Field.HEAD)
-        numbers = np.arange(max(since, self.page.get(Field.CLEANED), head - self.slots), head)
+        numbers = _numbers(max(since, self.page.get(Field.CLEANED), head - self.slots), head)
         batch = self._area.rows(numbers % self.slots)
         # Looked at again: of what is given back meanwhile, a part may be clean already.
         whole = numbers >= self.page.get(Field.CLEANED)
@@ -293,7 +293,7 @@ class SampleRing:
             None. The last may not have reached the device.
         """
         sent = self.page.get(Field.SENT)
-        numbers = np.arange(max(self.page.get(Field.HEAD), sent - self.slots, 0), sent)
+        numbers = _numbers(max(self.page.get(Field.HEAD), sent - self.slots), sent)
         slots: I64 = numbers % self.slots
         heads = self._area.heads[slots]
         under_way = heads[:, Head.SEQUENCE] == -numbers - 1
@@ -305,6 +305,11 @@ class SampleRing:
         ends = [next_sample, *(batch.heads[:-1, Head.FIRST_SAMPLE] + self.block).tolist()]
         batch.heads[:, Head.DROPPED_BEFORE] = batch.heads[:, Head.FIRST_SAMPLE] - ends
         return batch
+
+
+def _numbers(first: int, stop: int) -> I64:
+    """Return the numbers of blocks in between; none where damage has put one far off another."""
+    return np.arange(max(first, 0), stop) if first < stop and stop > 0 else np.empty(0, np.int64)
 
 
 def _whole(heads: I64, number: int) -> npt.NDArray[np.bool_]:

@@ -55,7 +55,7 @@ def test_an_empty_envelope_has_no_points():
 @given(st.floats(-1e6, 1e6), st.floats(1e-6, 1e6), st.integers(1, 6))
 def test_ticks_are_round_and_span_the_values(low, span, most):
     ticks = round_ticks(np.array((low, low + span)), most)
-    assert ticks[0] <= low + 1e-9 * abs(low)
+    assert ticks[0] <= low + 1e-9 * max(abs(low), span)
     assert ticks[-1] >= low + span - 1e-9 * max(abs(low), span)
     assert 2 <= ticks.size <= 2 * most + 3
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from hilctl.base.samples import LAST_SAMPLE, LONGEST_NS, Flag, Head
@@ -177,6 +177,8 @@ def test_block_that_is_not_due_is_never_seen(tmp_path):
 
 @settings(max_examples=60)
 @given(st.binary(min_size=1, max_size=64), st.integers(0, 60_000))
+@example(b"\x00\x00\x00\x00\x00\x00\x80\x00\x00\x01", 57)  # numbers 2**63 from each other
+@example(b"\xff" * 7 + b"\x7f", 56)
 def test_damaged_ring_is_survived(tmp_path_factory, garbage, at):
     """Whatever stands in the memory, the consumer comes to an end, and raises nothing."""
     ring = make(tmp_path_factory.mktemp("ring"), slots=3)
@@ -191,6 +193,7 @@ def test_damaged_ring_is_survived(tmp_path_factory, garbage, at):
         other.skip_damaged()
         other.release()
     other.unanswered(0)
+    other.look(0)
     other.page.read_text(PageText.ERROR)
     other.page.outcome()
 
