@@ -261,10 +261,11 @@ def adapt_block(
         good = near and abs(error) <= settings[LARGEST_UM]
         held_um = settings[MIDDLE_UM] + settings[HALF_UM] * memory[last]
         _regressors(x_um if near else held_um, settings, table, shape, thresholds, memory, found)
-        error = error / _excess(found, table, settings[COUNT]) if good else 0.0
+        if good:  # of what is not, the regressors may be infinite
+            error /= _excess(found, table, settings[COUNT])
+            for j in range(total.size):
+                total[j] += found[j] * error
         taken += good
-        for j in range(total.size):
-            total[j] += found[j] * error
     if taken:
         part = size * settings[SMOOTHING] / (1.0 + size * settings[SMOOTHING])
         for j in range(total.size):

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from hilctl.base.samples import Flag
@@ -37,6 +37,7 @@ def within(adaptation, operator):
 
 
 @given(BOUNDS, st.lists(st.tuples(VALUES, VALUES, st.booleans()), min_size=1, max_size=60))
+@example(AdaptationBounds(0.0, 0.0, 0.0625), [(1e308, 0.0, False), (0.0, 0.0, False)])
 def test_any_displacements(bounds, rows):
     """Readings of any kind, flagged or not, after any references."""
     adaptation, operator = adapting(bounds)
