@@ -8,6 +8,7 @@ samples they are of, so that no spike is lost.
 
 import json
 from collections.abc import Collection, Iterator
+from itertools import repeat
 from typing import Any, Literal
 
 import numpy as np
@@ -17,8 +18,8 @@ from hilctl.base.samples import COLUMNS
 from hilctl.desk.feed import RunFeed
 from hilctl.desk.signals import ROW
 from hilctl.recording.messages import Encoded, MessageMaker, RecordingLayout
+from hilctl.recording.rows import SCOPE_T_REL, scope_rows
 from hilctl.recording.schema import TOPICS
-from hilctl.recording.wire import SCOPE_T_REL, scope_bytes
 
 SCOPE_TOPICS: dict[str, Literal["first", "low", "high"]] = {
     "/scope": "first",
@@ -111,12 +112,13 @@ class LiveTopics:
         self._next_bucket = first + count
         for topic in wanted:
             values: F64 = getattr(buckets, SCOPE_TOPICS[topic])[list(self._rows.values())]
-            for at in np.flatnonzero(~np.isnan(values).all(axis=0)).tolist():
-                sample = (first + at) * width
-                doubles = dict(zip(self._rows, values[:, at].tolist(), strict=True))
-                doubles[SCOPE_T_REL] = sample / self._layout.sample_rate_hz
-                data = scope_bytes(sample, 0, doubles)
-                yield Encoded(topic, self._layout.time_ns(sample), data)
+            at = np.flatnonzero(~np.isnan(values).all(axis=0))
+            samples = (first + at) * width
+            doubles = dict(zip(self._rows, values[:, at], strict=True))
+            doubles[SCOPE_T_REL] = samples / self._layout.sample_rate_hz
+            rows = scope_rows(samples, np.zeros(at.size, dtype=np.uint32), doubles)
+            times_ns = self._layout.times_ns(samples).tolist()
+            yield from map(Encoded, repeat(topic), times_ns, rows.split())
 
     def events(self) -> Iterator[Encoded]:
         """Yield the messages of the events since the last time."""

@@ -3,8 +3,8 @@
 data.py     a recording in memory: arrays and facts
 facts.py    names of facts that several modules go by
 schema.py   protobuf messages of the file's topics
-messages.py from ring batches to messages
-writer.py   from messages to a file
+messages.py from ring batches to messages, small ones by rows.py many at a time
+writer.py   from messages to a file; mcap_file.py  its chunks and its index
 reader.py   from a file, sound or not, to a recording in memory or in pieces, which gathering.py
             makes; wire.py  blocks between bytes and arrays, blocks.py gathers them by columns;
             ahead.py  chunks before they are asked for; ends.py  the facts at both its ends

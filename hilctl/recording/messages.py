@@ -5,9 +5,8 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple, Self
 
 import numpy as np
-from mcap.writer import Writer
 
-from hilctl.base.arrays import F64
+from hilctl.base.arrays import F64, I64
 from hilctl.base.device import CommandUnit
 from hilctl.base.errors import DataError, InputError
 from hilctl.base.events import Event
@@ -15,7 +14,9 @@ from hilctl.base.samples import COLUMNS, Batch, Head, RecordedField, SampleColum
 from hilctl.recording import schema
 from hilctl.recording.checks import MAX_UNIX_NS, RATES_HZ
 from hilctl.recording.data import TICK_COLUMNS
-from hilctl.recording.wire import SCOPE_T_REL, BlockArrays, block_bytes, scope_bytes
+from hilctl.recording.mcap_file import McapWriter
+from hilctl.recording.rows import SCOPE_T_REL, MessageRows, scope_rows
+from hilctl.recording.wire import BlockArrays, block_bytes
 
 _MAX_BLOCK = 500
 _NONE = np.empty(0)
@@ -28,6 +29,24 @@ class Encoded(NamedTuple):
     topic: str
     time_ns: int
     data: bytes
+
+    @property
+    def last_ns(self) -> int:
+        """Its time."""
+        return self.time_ns
+
+
+class EncodedRows(NamedTuple):
+    """Messages of one topic: their Unix times in ns, int64[n], and their bytes."""
+
+    topic: str
+    times_ns: I64
+    rows: MessageRows
+
+    @property
+    def last_ns(self) -> int:
+        """The latest of their times."""
+        return int(self.times_ns.max())
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,6 +105,11 @@ class RecordingLayout:
     def time_ns(self, sample: int) -> int:
         """Return the Unix time at which a sample was due, in ns."""
         return self.start_unix_ns + round(sample * 1e9 / self.sample_rate_hz)
+
+    def times_ns(self, samples: I64) -> I64:
+        """Return :meth:`time_ns` of each sample: int64[n]."""
+        since_ns: I64 = np.rint(samples * 1e9 / self.sample_rate_hz).astype(np.int64)
+        return self.start_unix_ns + since_ns
 
     def to_facts(self) -> dict[str, str]:
         """Return the fields as text, for a recording's metadata."""
@@ -165,24 +189,31 @@ class MessageMaker:
         before = self._layout.recorded(event.before) if event.before is not None else ()
         return event_message(event, before)
 
-    def batch(self, batch: Batch) -> Iterator[Encoded]:
+    def batch(self, batch: Batch) -> Iterator[Encoded | EncodedRows]:
         """Yield the messages of all samples and ticks of a batch."""
-        firsts = batch.heads[:, Head.FIRST_SAMPLE]
         gaps = batch.heads[:, Head.DROPPED_BEFORE]
         block = batch.flags.shape[1]
         largest = max(1, _MAX_BLOCK // block)
+        samples = batch.samples()
+        columns = list(self._layout.recorded(samples))
+        t_rel = samples.index / self._layout.sample_rate_hz
         row = 0
-        while row < firsts.size:
+        while row < gaps.size:
             stop = row + 1
-            while stop < firsts.size and stop - row < largest and gaps[stop] == 0:
+            while stop < gaps.size and stop - row < largest and gaps[stop] == 0:
                 stop += 1
-            yield from self._block(batch, row, stop)
+            part = slice(row * block, stop * block)
+            cut = {field.name: values[part] for field, values in columns}
+            yield self._block(batch, row, samples.rows(part), cut, t_rel[part])
             row = stop
+        shown = samples.index % self._stride == 0
+        if shown.any():
+            yield self._scope(samples.rows(shown), [(field, of[shown]) for field, of in columns])
         yield self._ticks(batch)
 
-    def _block(self, batch: Batch, row: int, stop: int) -> Iterator[Encoded]:
-        samples = batch.samples(slice(row, stop))
-        columns = list(self._layout.recorded(samples))
+    def _block(
+        self, batch: Batch, row: int, samples: Samples, columns: dict[str, F64], t_rel: F64
+    ) -> Encoded:
         first = int(batch.heads[row, Head.FIRST_SAMPLE])
         dropped = int(batch.heads[row, Head.DROPPED_BEFORE])
         begins = self.samples == 0 or bool(dropped)
@@ -192,28 +223,19 @@ class MessageMaker:
             n=samples.index.size,
             dropped=dropped,
             flags=samples.flags,
-            columns={field.name: values for field, values in columns},
+            columns=columns,
             state=state[:-1],
             previous_command=state[-1:],
         )
-        data = block_bytes(block, samples.index / self._layout.sample_rate_hz)
-        yield Encoded("/samples", self._layout.time_ns(first), data)
         self.samples += samples.index.size
         self.missing += dropped
-        yield from self._scope(samples, columns)
+        return Encoded("/samples", self._layout.time_ns(first), block_bytes(block, t_rel))
 
-    def _scope(
-        self, samples: Samples, columns: list[tuple[RecordedField, F64]]
-    ) -> Iterator[Encoded]:
-        first = int(samples.index[0])
-        rows = slice(-first % self._stride, None, self._stride)
-        shown = {field.scope: values[rows].tolist() for field, values in columns if field.scope}
-        flags = samples.flags[rows].tolist()
-        for k, sample in enumerate(samples.index[rows].tolist()):
-            doubles = {field: values[k] for field, values in shown.items()}
-            doubles[SCOPE_T_REL] = sample / self._layout.sample_rate_hz
-            data = scope_bytes(sample, flags[k], doubles)
-            yield Encoded("/scope", self._layout.time_ns(sample), data)
+    def _scope(self, samples: Samples, columns: list[tuple[RecordedField, F64]]) -> EncodedRows:
+        doubles = {field.scope: values for field, values in columns if field.scope}
+        doubles[SCOPE_T_REL] = samples.index / self._layout.sample_rate_hz
+        rows = scope_rows(samples.index, samples.flags, doubles)
+        return EncodedRows("/scope", self._layout.times_ns(samples.index), rows)
 
     def _ticks(self, batch: Batch) -> Encoded:
         out = schema.message("TickBlock")
@@ -230,7 +252,7 @@ class Topics:
         writer: File to write to.
     """
 
-    def __init__(self, writer: Writer) -> None:
+    def __init__(self, writer: McapWriter) -> None:
         self._writer = writer
         self._channels: dict[str, int] = {}
         self._sequence: dict[str, int] = {}
@@ -253,13 +275,13 @@ class Topics:
                 number = self._writer.register_schema(f"hilctl.{name}", "protobuf", descriptors)
                 self.know(topic, self._writer.register_channel(topic, "protobuf", number), 0)
 
-    def add(self, message: Encoded) -> None:
-        """Write one message."""
-        self._writer.add_message(
-            self._channels[message.topic],
-            log_time=message.time_ns,
-            data=message.data,
-            publish_time=message.time_ns,
-            sequence=self._sequence[message.topic],
-        )
-        self._sequence[message.topic] += 1
+    def add(self, message: Encoded | EncodedRows) -> None:
+        """Write one message, or many of one topic."""
+        channel, number = self._channels[message.topic], self._sequence[message.topic]
+        if isinstance(message, Encoded):
+            time_ns = message.time_ns
+            self._writer.add_message(channel, time_ns, message.data, time_ns, number)
+            self._sequence[message.topic] += 1
+        else:
+            self._writer.add_rows(channel, message.times_ns, message.rows, number)
+            self._sequence[message.topic] += message.times_ns.size

@@ -4,13 +4,13 @@ from collections.abc import Iterable, Mapping
 from typing import Any, BinaryIO
 
 from mcap.records import Attachment, Channel, McapRecord, Message, Metadata, Schema
-from mcap.writer import CompressionType, Writer
 
 from hilctl import __version__
 from hilctl.base.events import Event
 from hilctl.base.samples import Batch
 from hilctl.recording import schema
 from hilctl.recording.checks import SoundMessages, count_of
+from hilctl.recording.mcap_file import McapWriter
 from hilctl.recording.messages import MessageMaker, RecordingLayout, Topics, event_message
 from hilctl.recording.salvage import Salvage
 
@@ -87,7 +87,7 @@ class Resaved:
     def __init__(self, stream: BinaryIO, survey: Survey) -> None:
         header = survey.salvage.header
         self._survey = survey
-        self._writer = Writer(stream, compression=CompressionType.ZSTD)
+        self._writer = McapWriter(stream)
         self._topics = Topics(self._writer)
         self._names: dict[int, str] = {}
         self._schemas: dict[int, int] = {0: 0}
@@ -151,7 +151,7 @@ class Resaved:
         for batch in batches:
             for message in maker.batch(batch):
                 self._topics.add(message)
-                self._last_time_ns = max(self._last_time_ns, message.time_ns)
+                self._last_time_ns = max(self._last_time_ns, message.last_ns)
         for event in events:
             self._topics.add(maker.event(event))
         self.added = maker.samples - self.samples

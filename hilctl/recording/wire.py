@@ -5,9 +5,9 @@ all else there is the protobuf library, which knows every way to write a message
 as long.
 """
 
-import struct
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -45,10 +45,6 @@ LARGEST_N = 2**32
 """No block has as many samples."""
 _LARGEST = 2**63 - 1
 _NONE = np.empty(0)
-_EIGHT_BYTES = 1
-_DOUBLE = struct.Struct("<Bd")
-_ZERO = bytes(8)
-_SCOPE_SAMPLE, SCOPE_T_REL, _SCOPE_FLAGS = 1, 2, 7
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,29 +126,15 @@ def block_bytes(block: BlockArrays, t_rel: F64) -> bytes:
     numbers = {TICK0: block.tick0, N: block.n, _DROPPED: block.dropped}
     heads = [_number(field << 3) + _number(value) for field, value in numbers.items() if value]
     return b"".join(heads) + b"".join(
-        _number(field << 3 | _BYTES) + _number(len(packed[field])) + packed[field]
+        _list_head(field, len(packed[field])) + packed[field]
         for field in sorted(packed)
         if packed[field]
     )
 
 
-def scope_bytes(sample: int, flags: int, doubles: Mapping[int, float]) -> bytes:
-    """Return a ``Sample`` as the protobuf library writes it.
-
-    Args:
-        sample: Index of the sample.
-        flags: Its flags.
-        doubles: Its numbers by field, in any order.
-    """
-    parts = {
-        field: _DOUBLE.pack(field << 3 | _EIGHT_BYTES, each) for field, each in doubles.items()
-    }
-    parts |= {field: b"" for field, part in parts.items() if part[1:] == _ZERO}  # as by default
-    if sample:
-        parts[_SCOPE_SAMPLE] = _number(_SCOPE_SAMPLE << 3) + _number(sample)
-    if flags:
-        parts[_SCOPE_FLAGS] = _number(_SCOPE_FLAGS << 3) + _number(flags)
-    return b"".join(parts[field] for field in sorted(parts))
+@lru_cache(maxsize=1024)  # one block after the other has lists of the same lengths
+def _list_head(field: int, size: int) -> bytes:
+    return _number(field << 3 | _BYTES) + _number(size)
 
 
 def _packed(values: U32) -> bytes:

@@ -13,16 +13,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
-from mcap.writer import CompressionType, Writer
-
 from hilctl import __version__
 from hilctl.base.events import Event
 from hilctl.base.samples import Batch
 from hilctl.base.segments import Segment
 from hilctl.recording.locks import lock
+from hilctl.recording.mcap_file import McapWriter
 from hilctl.recording.messages import MessageMaker, RecordingLayout, Topics
-
-_CHUNK_BYTES = 8 << 20  # each chunk's index stays in memory until the end of the run
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +52,7 @@ class RecordingWriter:
     """
 
     def __init__(self, stream: BinaryIO, run: RunFacts) -> None:
-        self._writer = Writer(stream, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
+        self._writer = McapWriter(stream)
         self._topics = Topics(self._writer)
         self._maker = MessageMaker(run.layout)
         self._late_missing = 0

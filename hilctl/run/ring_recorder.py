@@ -19,7 +19,7 @@ from hilctl.run.recorder import Recorder
 from hilctl.run.ring import SampleRing
 from hilctl.run.shared_page import Field
 
-_POLL_S = 0.02
+_POLL_S = 0.05
 _MOST_WAITING = 64
 _KEPT = 8
 """One part in so many of the ring stays for those who look on."""

@@ -58,7 +58,7 @@ def test_a_sector_of_zeros_ends_a_compressed_stream(make):
         records, what = take_chunk(holed, Allowance(2**20), last=True)
         assert what == "torn chunk"
         assert records == every[: len(records)]
-        assert len(records) > 20 or at < 150_000
+        assert len(records) > 5 or at < 150_000
 
 
 def test_a_likely_record_is_found_across_windows(monkeypatch):

@@ -58,18 +58,6 @@ def test_a_block_is_what_the_library_reads(fields):
     assert wire.block_bytes(wire.sample_block(data), np.array(message.t_rel)) == data
 
 
-@pytest.mark.parametrize("value", [0.0, -0.0, 1.5, float("nan"), 5e-324])
-@pytest.mark.parametrize(("sample", "flags"), [(0, 0), (127, 8), (2**40, 2**32 - 1)])
-def test_a_sample_of_the_scope_is_what_the_library_writes(value, sample, flags):
-    message = schema.message("Sample")
-    message.sample, message.flags, message.t_rel = sample, flags, 0.25
-    doubles = {wire.SCOPE_T_REL: 0.25}
-    for field in (each for each in RECORDED_FIELDS if each.scope):
-        setattr(message, field.name, value)
-        doubles[field.scope] = value
-    assert wire.scope_bytes(sample, flags, doubles) == message.SerializeToString()
-
-
 @given(lists(integers(0, 2**64 - 1)), lists(integers(-(2**63), 2**63 - 1)))
 def test_ticks_are_what_the_library_reads(first, times):
     message = schema.message("TickBlock")

@@ -1,0 +1,288 @@
+"""An MCAP file in the making: chunks of messages, then an index of them.
+
+Byte for byte what the ``mcap`` package writes, whose classes it takes for all that is rare. Of what
+is not, messages, that package makes several Python objects each, and keeps an object with a
+dictionary for every chunk until the end of the run.
+"""
+
+import struct
+import zlib
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping
+from typing import BinaryIO
+
+import numpy as np
+import zstandard
+from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
+from mcap.records import (
+    Attachment,
+    AttachmentIndex,
+    Channel,
+    Chunk,
+    ChunkIndex,
+    DataEnd,
+    Footer,
+    Header,
+    McapRecord,
+    Metadata,
+    MetadataIndex,
+    Schema,
+    Statistics,
+    SummaryOffset,
+)
+from mcap.writer import MCAP0_MAGIC
+
+from hilctl.base.arrays import I64
+from hilctl.recording.rows import MessageRows
+
+CHUNK_BYTES = 8 << 20
+"""A chunk is closed once it holds more than this."""
+LEVEL = 1
+"""Of compression: of noise, higher ones take twice the time and save a few percent."""
+
+_MESSAGE = struct.Struct("<BQHIQQ")
+_MESSAGE_ROW = np.dtype([("opcode", "u1"), ("size", "<u8"), ("channel", "<u2"),
+                         ("sequence", "<u4"), ("logged", "<u8"), ("published", "<u8")])  # fmt: skip
+_FIXED = _MESSAGE.size - 9
+"""Bytes of a message record that are neither its opcode and size nor its data."""
+_INDEX = struct.Struct("<BQHI")
+_INDEX_ROW = struct.Struct("<QQ")
+_FOOTER = struct.Struct("<BQQQ")
+_FOOTER_BYTES = 8 + 8 + 4
+_PACKED_BYTES = 1 << 16
+
+
+class McapWriter:
+    """Writes one file.
+
+    Args:
+        stream: Open binary file; the writer does not close it.
+        chunk_bytes: A chunk is closed once it holds more than this.
+        level: Of zstd.
+    """
+
+    def __init__(
+        self, stream: BinaryIO, *, chunk_bytes: int = CHUNK_BYTES, level: int = LEVEL
+    ) -> None:
+        self._stream = stream
+        self._chunk_bytes = chunk_bytes
+        self._compressor = zstandard.ZstdCompressor(level=level)
+        self._chunk = _OpenChunk()
+        self._schemas: list[Schema] = []
+        self._channels: list[Channel] = []
+        self._attachments: list[AttachmentIndex] = []
+        self._metadata: list[MetadataIndex] = []
+        self._chunk_indexes = _PackedRecords()
+        self._statistics = Statistics(
+            attachment_count=0, channel_count=0, channel_message_counts=defaultdict(int),
+            chunk_count=0, message_count=0, message_end_time=0, message_start_time=0,
+            metadata_count=0, schema_count=0,
+        )  # fmt: skip
+
+    def start(self, profile: str, library: str) -> None:
+        """Write the head of the file."""
+        self._stream.write(MCAP0_MAGIC)
+        self._stream.write(_bytes(Header(profile, library)))
+
+    def register_schema(self, name: str, encoding: str, data: bytes) -> int:
+        """Enter a schema; return its number."""
+        schema = Schema(id=len(self._schemas) + 1, data=data, encoding=encoding, name=name)
+        self._schemas.append(schema)
+        self._statistics.schema_count += 1
+        self._chunk.add(_bytes(schema))
+        return schema.id
+
+    def register_channel(
+        self, topic: str, encoding: str, schema: int, metadata: Mapping[str, str] | None = None
+    ) -> int:
+        """Enter a channel; return its number."""
+        channel = Channel(
+            id=len(self._channels) + 1, topic=topic, message_encoding=encoding, schema_id=schema,
+            metadata=dict(metadata or {}),
+        )  # fmt: skip
+        self._channels.append(channel)
+        self._statistics.channel_count += 1
+        self._chunk.add(_bytes(channel))
+        return channel.id
+
+    def add_attachment(
+        self, created_ns: int, logged_ns: int, name: str, media_type: str, data: bytes
+    ) -> None:
+        """Write an attachment."""
+        record = Attachment(created_ns, logged_ns, name, media_type, data)
+        written = _bytes(record)
+        index = AttachmentIndex(
+            offset=self._stream.tell(), length=len(written), create_time=created_ns,
+            log_time=logged_ns, data_size=len(data), name=name, media_type=media_type,
+        )  # fmt: skip
+        self._attachments.append(index)
+        self._statistics.attachment_count += 1
+        self._stream.write(written)
+
+    def add_metadata(self, name: str, data: Mapping[str, str]) -> None:
+        """Write metadata."""
+        written = _bytes(Metadata(name=name, metadata=dict(data)))
+        self._metadata.append(
+            MetadataIndex(length=len(written), name=name, offset=self._stream.tell())
+        )
+        self._statistics.metadata_count += 1
+        self._stream.write(written)
+
+    def add_message(
+        self, channel: int, logged_ns: int, data: bytes, published_ns: int, sequence: int
+    ) -> None:
+        """Write one message; times are Unix times in ns."""
+        head = _MESSAGE.pack(
+            Opcode.MESSAGE, _FIXED + len(data), channel, sequence, logged_ns, published_ns
+        )
+        self._chunk.add_message(channel, logged_ns, head + data)
+        self._count(channel, 1, logged_ns, logged_ns)
+
+    def add_rows(self, channel: int, times_ns: I64, rows: MessageRows, sequence: int) -> None:
+        """Write messages of one channel.
+
+        Args:
+            channel: Its number.
+            times_ns: int64[n], Unix time at which each is logged and published, in ns.
+            rows: The messages, n of them and one at least.
+            sequence: Number of the first.
+        """
+        count, sizes = times_ns.size, rows.sizes()
+        heads = np.empty(count, dtype=_MESSAGE_ROW)
+        heads["opcode"] = Opcode.MESSAGE
+        heads["size"] = _FIXED + sizes
+        heads["channel"] = channel
+        heads["sequence"] = np.arange(sequence, sequence + count)
+        heads["logged"] = heads["published"] = times_ns
+        data = rows.behind(heads.view(np.uint8).reshape(count, -1))
+        self._chunk.add_messages(channel, times_ns, _MESSAGE.size + sizes, data)
+        self._count(channel, count, int(times_ns.min()), int(times_ns.max()))
+
+    def _count(self, channel: int, messages: int, first_ns: int, last_ns: int) -> None:
+        found = self._statistics
+        earlier_ns = found.message_start_time if found.message_count else first_ns
+        found.message_start_time = min(earlier_ns, first_ns)
+        found.message_end_time = max(found.message_end_time, last_ns)
+        found.channel_message_counts[channel] += messages
+        found.message_count += messages
+        if self._chunk.size > self._chunk_bytes:
+            self._close_chunk()
+
+    def flush(self) -> None:
+        """Close the chunk in work and hand it to the kernel; one without a message stays open."""
+        self._close_chunk()
+        self._stream.flush()
+
+    def _close_chunk(self) -> None:
+        closing = self._chunk
+        if not closing.indexes:
+            return
+        self._chunk = _OpenChunk()
+        data = b"".join(closing.parts)
+        compressed = self._compressor.compress(data)
+        chunk = Chunk(
+            compression="zstd", data=compressed, message_end_time=closing.last_ns,
+            message_start_time=closing.first_ns, uncompressed_crc=zlib.crc32(data),
+            uncompressed_size=len(data),
+        )  # fmt: skip
+        start, written = self._stream.tell(), _bytes(chunk)
+        offsets, indexes = {}, bytearray()
+        for channel, places in closing.indexes.items():
+            offsets[channel] = start + len(written) + len(indexes)
+            size = _INDEX.size - 9 + len(places)
+            indexes += _INDEX.pack(Opcode.MESSAGE_INDEX, size, channel, len(places)) + places
+        index = ChunkIndex(
+            chunk_length=len(written), chunk_start_offset=start, compression=chunk.compression,
+            compressed_size=len(compressed), message_end_time=chunk.message_end_time,
+            message_index_length=len(indexes), message_index_offsets=offsets,
+            message_start_time=chunk.message_start_time, uncompressed_size=len(data),
+        )  # fmt: skip
+        self._stream.write(written)
+        self._stream.write(indexes)
+        self._chunk_indexes.add(_bytes(index))
+        self._statistics.chunk_count += 1
+
+    def finish(self) -> None:
+        """Close the chunk in work, and write index and foot of the file."""
+        self._close_chunk()
+        self._stream.write(_bytes(DataEnd(0)))
+        start = end = self._stream.tell()
+        crc, offsets = 0, bytearray()
+        groups: tuple[tuple[int, Iterable[bytes]], ...] = (
+            (Opcode.SCHEMA, map(_bytes, self._schemas)),
+            (Opcode.CHANNEL, map(_bytes, self._channels)),
+            (Opcode.STATISTICS, [_bytes(self._statistics)]),
+            (Opcode.CHUNK_INDEX, self._chunk_indexes),
+            (Opcode.ATTACHMENT_INDEX, map(_bytes, self._attachments)),
+            (Opcode.METADATA_INDEX, map(_bytes, self._metadata)),
+        )
+        for opcode, parts in groups:
+            began = end
+            for part in parts:
+                self._stream.write(part)
+                crc, end = zlib.crc32(part, crc), end + len(part)
+            offsets += _bytes(SummaryOffset(opcode, began, end - began))
+        self._stream.write(offsets)
+        head = _FOOTER.pack(Opcode.FOOTER, _FOOTER_BYTES, start, end)
+        crc = zlib.crc32(head, zlib.crc32(offsets, crc))
+        self._stream.write(_bytes(Footer(start, end, crc)))
+        self._stream.write(MCAP0_MAGIC)
+
+
+class _PackedRecords:
+    """Records that nobody reads until the end, packed: of ten chunks a second 1 MB an hour."""
+
+    def __init__(self) -> None:
+        self._packed: list[bytes] = []
+        self._newest = bytearray()
+
+    def add(self, record: bytes) -> None:
+        self._newest += record
+        if len(self._newest) > _PACKED_BYTES:
+            self._packed.append(zlib.compress(self._newest, 1))
+            self._newest = bytearray()
+
+    def __iter__(self) -> Iterator[bytes]:
+        yield from map(zlib.decompress, self._packed)
+        yield bytes(self._newest)
+
+
+class _OpenChunk:
+    """The chunk in work."""
+
+    def __init__(self) -> None:
+        self.parts: list[bytes] = []
+        self.size = 0
+        self.first_ns = self.last_ns = 0
+        self.indexes: dict[int, bytearray] = {}
+        """Time and place of each message, by channel."""
+
+    def add(self, record: bytes) -> None:
+        self.parts.append(record)
+        self.size += len(record)
+
+    def add_message(self, channel: int, time_ns: int, record: bytes) -> None:
+        self._span(time_ns, time_ns)
+        self.indexes.setdefault(channel, bytearray()).extend(_INDEX_ROW.pack(time_ns, self.size))
+        self.add(record)
+
+    def add_messages(self, channel: int, times_ns: I64, sizes: I64, records: bytes) -> None:
+        self._span(int(times_ns.min()), int(times_ns.max()))
+        places = np.empty((times_ns.size, 2), dtype="<u8")
+        places[:, 0] = times_ns
+        places[:, 1] = self.size + np.cumsum(sizes) - sizes
+        self.indexes.setdefault(channel, bytearray()).extend(places.tobytes())
+        self.add(records)
+
+    def _span(self, first_ns: int, last_ns: int) -> None:
+        self.first_ns = min(self.first_ns, first_ns) if self.indexes else first_ns
+        self.last_ns = max(self.last_ns, last_ns)
+
+
+def _bytes(record: McapRecord) -> bytes:
+    """Return a record as it stands in a file."""
+    builder = RecordBuilder()
+    record.write(builder)
+    found: bytes = builder.end()
+    return found

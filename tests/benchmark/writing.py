@@ -1,0 +1,140 @@
+"""Processor time that recording takes, beside the foxglove SDK writing the same messages.
+
+    python -m tests.benchmark.writing [--seconds 20] [--goal 0.3]
+
+Fifty blocks of 50 samples at a time, as the recorder takes them out of the ring at 50 kHz, with
+noise that does not repeat. Both write zstd with checksums and index into a file, in turns. Exit
+code 1 where a million samples take more than ``--goal`` s, or making and writing messages takes
+longer than the SDK needs to write messages that are made already and hilctl to make them.
+"""
+
+import argparse
+import statistics
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import foxglove
+import numpy as np
+from foxglove.mcap import MCAPWriteOptions
+
+from hilctl.base.samples import COLUMNS, Batch
+from hilctl.recording import schema
+from hilctl.recording.messages import Encoded, MessageMaker, RecordingLayout
+from hilctl.recording.writer import RecordingWriter, RunFacts
+from hilctl.run.start import checked_experiment
+from tests.benchmark import long_recordings as made
+
+BLOCKS = 50
+FLUSH_BATCHES = 2  # every 100 ms
+ROUNDS = 5
+LAYOUT = RecordingLayout(made.RATE_HZ, "A", False, 1000.0, 1_800_000_000 * 10**9)
+RUN = RunFacts({}, (), "name: writing\n", "", LAYOUT)
+
+
+def batches(seconds: int) -> list[Batch]:
+    """Return a run as the recorder takes it out of the ring."""
+    content = made.Content(checked_experiment(made.EXPERIMENT, []))
+    rng = np.random.default_rng(1)
+    displacement = list(COLUMNS).index("displacement_um")
+    found = []
+    for whole in content.batches(seconds):
+        noise_um = rng.normal(0.0, made.NOISE_UM, whole.flags.shape)
+        step_um = made.SENSOR_STEP_UM
+        whole.columns[:, displacement] += np.round(noise_um / step_um) * step_um
+        blocks = range(0, whole.flags.shape[0], BLOCKS)
+        found += [whole.rows(slice(first, first + BLOCKS)) for first in blocks]
+    return found
+
+
+def ours_s(run: list[Batch], path: Path) -> float:
+    """Record a run; return what that took of the processor."""
+    began_s = time.process_time()
+    with path.open("wb") as stream:
+        writer = RecordingWriter(stream, RUN)
+        for number, batch in enumerate(run, start=1):
+            writer.batch(batch)
+            if number % FLUSH_BATCHES == 0:
+                writer.flush()
+        writer.finish({}, 0)
+    return time.process_time() - began_s
+
+
+def making_s(run: list[Batch]) -> float:
+    """Make the messages of a run, and write none."""
+    began_s = time.process_time()
+    maker = MessageMaker(LAYOUT)
+    for batch in run:
+        for _ in maker.batch(batch):
+            pass
+    return time.process_time() - began_s
+
+
+def each_message(run: list[Batch]) -> Iterator[tuple[str, int, bytes]]:
+    """Yield topic, time and bytes of every message of a run."""
+    maker = MessageMaker(LAYOUT)
+    for batch in run:
+        for message in maker.batch(batch):
+            if isinstance(message, Encoded):
+                yield message.topic, message.time_ns, message.data
+            else:
+                for time_ns, data in zip(
+                    message.times_ns.tolist(), message.rows.split(), strict=True
+                ):
+                    yield message.topic, time_ns, data
+
+
+def theirs_s(messages: list[tuple[str, int, bytes]], path: Path) -> float:
+    """Let the SDK write messages; return what that took of the processor, all of its threads."""
+    context = foxglove.Context()
+    channels = {
+        topic: foxglove.Channel(
+            topic,
+            schema=foxglove.Schema(
+                name=f"hilctl.{name}", encoding="protobuf", data=schema.descriptor_set()
+            ),
+            message_encoding="protobuf",
+            context=context,
+        )
+        for topic, name in schema.TOPICS.items()
+    }
+    options = MCAPWriteOptions(compression_level=1, compression_threads=0)
+    began_s = time.process_time()
+    with foxglove.open_mcap(path, context=context, allow_overwrite=True, writer_options=options):
+        for topic, time_ns, data in messages:
+            channels[topic].log(data, log_time=time_ns)
+    return time.process_time() - began_s
+
+
+def main() -> int:
+    """Print the figures; return the exit code."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
+    parser.add_argument("--seconds", type=int, default=20)
+    parser.add_argument("--goal", type=float, default=0.3)
+    asked = parser.parse_args()
+    run = batches(asked.seconds)
+    messages = list(each_message(run))
+    millions = sum(batch.flags.size for batch in run) * 1e-6
+    took: dict[str, list[float]] = {"ours": [], "making": [], "theirs": []}
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "run.mcap"
+        for _ in range(ROUNDS):
+            took["ours"].append(ours_s(run, path))
+            size = path.stat().st_size
+            took["making"].append(making_s(run))
+            took["theirs"].append(theirs_s(messages, path))
+    per_million = {name: statistics.median(times) / millions for name, times in took.items()}
+    ours_cpu_s, theirs_cpu_s = per_million["ours"], per_million["making"] + per_million["theirs"]
+    print(
+        f"hilctl: {ours_cpu_s:.3f} CPU-s a million samples, {size / millions * 1e-6:.1f} bytes each"
+    )
+    print(f"  of it messages: {per_million['making']:.3f}")
+    print(f"foxglove SDK, the same messages ready-made: {per_million['theirs']:.3f}")
+    print(f"hilctl / (messages + SDK): {ours_cpu_s / theirs_cpu_s:.2f}")
+    return int(ours_cpu_s > asked.goal or ours_cpu_s > theirs_cpu_s)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
