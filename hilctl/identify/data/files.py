@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hilctl.base.arrays import F64, I64
+from hilctl.base.arrays import F64
 from hilctl.base.device import CommandUnit
 from hilctl.base.errors import DataError, InputError
 from hilctl.base.samples import Flag
@@ -97,34 +97,46 @@ def history_from_pieces(pieces: Iterable[Recording]) -> History:
             as a whole, or it ramped to its waveform from another output, so the hysteresis can't
             be followed from rest.
     """
-    kept: list[tuple[I64, F64, F64]] = []
+    command: list[F64] = []
+    displacement_um: list[F64] = []
     conditioned = size = begins_at = 0
-    ramped = False
+    ramped = broken = False
     for piece in pieces:
         samples = piece.samples
         condition = (samples.flags & Flag.CONDITION.value) != 0
         if condition.any() and not conditioned:  # what was before its conditioning is forgotten
             samples = samples.rows(slice(int(np.argmax(condition)), None))
-            kept, size, begins_at, ramped = [], 0, int(samples.index[0]), False
+            command, displacement_um, size, begins_at = [], [], 0, int(samples.index[0])
+            ramped = broken = False
         conditioned += int(np.count_nonzero(condition))  # it makes the state, and is not judged
         rows = (samples.flags & Flag.RAMP.value) == 0
         ramped |= bool(rows.size) and samples.index[0] == 0 and not rows[0]
-        kept.append((samples.index[rows], samples.command[rows], samples.displacement_um[rows]))
-        size += int(np.count_nonzero(rows))
+        index = samples.index[rows]
+        broken |= not np.array_equal(index, begins_at + size + np.arange(index.size))
+        command.append(samples.command[rows])
+        displacement_um.append(samples.displacement_um[rows])
+        size += index.size
         _check_length(piece, size)
     if ramped:
         raise DataError(
             f"{piece.path}: begins with a ramp from where the output was, so the actuator was "
             "not at rest: leave out --whole to use its steady cycles"
         )
-    index, command, displacement_um = (np.concatenate(each) for each in zip(*kept, strict=True))
-    whole = index.size > 0 and index[0] == begins_at == index[-1] + 1 - index.size
-    if not whole or not np.isfinite(displacement_um).all():
+    broken |= not all(np.isfinite(each).all() for each in displacement_um)
+    if broken or not size:
         raise DataError(
             f"{piece.path}: samples are missing, so it can't be judged as a whole: "
             "leave out --whole to use its steady cycles"
         )
-    return History(piece.path.name, command, displacement_um, piece.sample_rate_hz, conditioned)
+    label, rate_hz = piece.path.name, piece.sample_rate_hz
+    return History(label, _joined(command), _joined(displacement_um), rate_hz, conditioned)
+
+
+def _joined(parts: list[F64]) -> F64:
+    """Return one array of all parts; they are let go of."""
+    joined = np.concatenate(parts)
+    parts.clear()
+    return joined
 
 
 def _check_length(recording: Recording, size: int) -> None:
