@@ -149,9 +149,7 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, help="Where to make them; a temporary one if none.")
     parser.add_argument("--keep", action="store_true", help="Leave the recordings there.")
     parser.add_argument("--goal", type=float, default=5.0, help="Million samples a second.")
-    parser.add_argument(
-        "--commands", default="replay,report,report --html,export,identify --model ppi"
-    )
+    parser.add_argument("--commands", default=COMMANDS)
     options = parser.parse_args()
     if options.folder is not None:
         options.folder.mkdir(parents=True, exist_ok=True)
