@@ -156,4 +156,6 @@ def respond(
                 for i in range(size):
                     value += motion[row, i] * mechanics[i]
                 moved[row] = value
-            mechanics[: size - 2] = moved
+            # Not as a slice: numba then compiles a message for sizes that differ, which takes 2 s.
+            for row in range(size - 2):
+                mechanics[row] = moved[row]
