@@ -13,6 +13,8 @@ import time
 from hilctl.base.errors import DeviceError, HilctlError, InputError, RunError
 from hilctl.experiment.condition import conditioning_of
 from hilctl.experiment.load import LoadedExperiment
+from hilctl.kernels import tick
+from hilctl.kernels.interlock import interlock_block
 from hilctl.kernels.jit import load
 from hilctl.kernels.limit import limit_block
 from hilctl.loop.loop import Loop
@@ -29,14 +31,23 @@ from hilctl.run.shared_page import Field, PageText, Phase, SharedPage
 from hilctl.run.starting import starting_output
 from hilctl.run.waiting_loop import received_job
 
+_EVERY_RUN = (
+    limit_block,
+    interlock_block,
+    tick.follow_block,
+    tick.plan_block,
+    tick.answer_block,
+    tick.begin_tick,
+    tick.end_tick,
+)
+
 
 def main() -> int:
     """Run one job; the exit code is 0 where the loop ended by its safe ramp."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)  # the supervisor decides, and the loop ramps down
     be_ordinary()  # as its maker is by the time that it has a job
-    # Every loop has a limiter, and the first kernel of a process takes longer than all others.
-    load(limit_block)
+    load(*_EVERY_RUN)  # while the supervisor checks
     text = received_job(sys.stdin.fileno())
     if not text:
         return 0  # there is no run for this one
