@@ -4,16 +4,19 @@ import io
 import sys
 from collections.abc import Iterable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.segment import Segment
 from rich.text import Text
 
-from hilctl.analysis.replay import ReplayResult
 from hilctl.base.printable import printable
 from hilctl.base.quantity import quantity
 from hilctl.cli.streams import PlainStream
 from hilctl.cli.volume import Volume
+
+if TYPE_CHECKING:
+    from hilctl.analysis.replay import ReplayResult
 
 
 class PlainConsole(Console):
@@ -50,7 +53,7 @@ def print_rich(renderable: RenderableType) -> None:
     console().print(renderable)
 
 
-def print_replay(result: ReplayResult, *, other: Path | None) -> None:
+def print_replay(result: "ReplayResult", *, other: Path | None) -> None:
     """Print how recomputed commands compare with the recorded ones."""
     terminal = console()
     unit = result.command_unit

@@ -5,23 +5,22 @@ import sys
 import time
 from collections.abc import Sequence
 from types import TracebackType
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from rich.table import Table
 from rich.text import Text
 
-from hilctl.analysis.figures import RunReport
-from hilctl.analysis.report import summarize
 from hilctl.base.events import adapted_text
 from hilctl.base.quantity import unit_text
 from hilctl.cli.console import console
-from hilctl.cli.report_view import render
-from hilctl.experiment.check import Checked
-from hilctl.recording.reader import read
-from hilctl.run.result import Progress as RunProgress
-from hilctl.run.result import RunResult
+
+if TYPE_CHECKING:
+    from hilctl.analysis.figures import RunReport
+    from hilctl.experiment.check import Checked
+    from hilctl.run.result import Progress as RunProgress
+    from hilctl.run.result import RunResult
 
 _REFRESH_S = 0.1
 _LARGEST_REPORTED = 5_000_000
@@ -62,7 +61,7 @@ class LiveView:
     ) -> None:
         self._progress.stop()
 
-    def update(self, progress: RunProgress) -> None:
+    def update(self, progress: "RunProgress") -> None:
         """Show the newest samples, a few times a second."""
         while self._addresses:
             print(f"live page: {self._addresses.pop()}", file=sys.stderr)
@@ -79,7 +78,7 @@ class LiveView:
         self._progress.update(self._task, completed=done, live=_live_text(progress))
 
 
-def _live_text(progress: RunProgress) -> str:
+def _live_text(progress: "RunProgress") -> str:
     newest = progress.batch.samples(slice(-1, None))
     command, displacement_um = newest.command, newest.displacement_um
     error_um = displacement_um - newest.reference_um
@@ -91,24 +90,29 @@ def _live_text(progress: RunProgress) -> str:
     )
 
 
-def report_of(result: RunResult, *, whole: bool) -> RunReport | None:
+def report_of(result: "RunResult", *, whole: bool) -> "RunReport | None":
     """Return the report of a run that has ended.
 
     Args:
         result: How it ended.
         whole: Whether it is wanted of a very long run too.
     """
+    from hilctl.analysis.report import summarize  # a run should not wait for it
+    from hilctl.recording.reader import read
+
     shown = whole or 0 < result.samples <= _LARGEST_REPORTED
     return summarize(read(result.path)) if shown else None
 
 
-def run_mapping(result: RunResult, report: RunReport | None) -> dict[str, Any]:
+def run_mapping(result: "RunResult", report: "RunReport | None") -> dict[str, Any]:
     """Return a run's end and its report as plain values."""
     return {**(report.to_mapping() if report else {}), **result.to_mapping()}
 
 
-def print_run(result: RunResult, report: RunReport | None) -> None:
+def print_run(result: "RunResult", report: "RunReport | None") -> None:
     """Print how a run ended and, unless it is very long, its report."""
+    from hilctl.cli.report_view import render
+
     terminal = console()
     colour = {"completed": "green", "stopped": "yellow"}.get(result.code, "red")
     terminal.print(Text(result.code, colour) + f": {result.reason}")
@@ -132,7 +136,7 @@ def print_run(result: RunResult, report: RunReport | None) -> None:
     terminal.print(f"  hilctl report {path} --html run.html", soft_wrap=True)
 
 
-def print_forecast(checked: Checked) -> None:
+def print_forecast(checked: "Checked") -> None:
     """Print what a run will do."""
     forecast, config = checked.forecast, checked.loaded.config
     unit, reference_unit = forecast.command_unit, checked.reference.unit

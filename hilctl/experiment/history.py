@@ -18,7 +18,6 @@ from hilctl.experiment.initial_state import InitialState, initial_state_after
 from hilctl.experiment.load import LoadedExperiment
 from hilctl.recording.ends import read_ends
 from hilctl.recording.facts import HEAT_FACT, HOLDS_FACT
-from hilctl.recording.reader import read
 
 _LARGEST_BYTES = 256 << 20  # some minutes at 50 kHz: more would keep the start waiting
 
@@ -104,6 +103,8 @@ def _heat_at_end(path: Path, config: Experiment) -> tuple[float, float]:
         return _finite(end), _unix_s(end["ended"])
     if path.stat().st_size > _LARGEST_BYTES:
         raise DataError(f"{path}: is larger than {_LARGEST_BYTES >> 20} MB")
+    from hilctl.recording.reader import read  # what it takes to import, most runs would wait for
+
     recording = read(path)
     rate_hz, samples = recording.sample_rate_hz, recording.samples
     heat = CoilHeat(config.limits, rate_hz, _finite(run) if HEAT_FACT in run else 0.0)

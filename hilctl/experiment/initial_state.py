@@ -4,6 +4,7 @@ import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,8 +13,9 @@ from hilctl.base.errors import DataError
 from hilctl.base.samples import Flag
 from hilctl.loop.compensator import Compensator
 from hilctl.models.base import HysteresisModel
-from hilctl.recording.data import Recording
-from hilctl.recording.reader import Pieces
+
+if TYPE_CHECKING:
+    from hilctl.recording.data import Recording
 
 _STILL_S = 1.0
 
@@ -165,6 +167,8 @@ class _Followed:
 
     def commands(self) -> Iterator[F64]:
         """Yield them, from the first sample to the last."""
+        from hilctl.recording.reader import Pieces  # most runs begin at rest
+
         samples = 0
         unanswered = False
         for piece in Pieces(self._path):
@@ -183,7 +187,7 @@ class _Followed:
             raise DataError(f"{self._path}: {lost}: where it left the actuator is not known")
         self.run_id = piece.run.get("run_id", "")
 
-    def _check(self, recording: Recording) -> None:
+    def _check(self, recording: "Recording") -> None:
         path = self._path
         if recording.command_unit != self._unit:
             units = f"{recording.command_unit}, the model takes {self._unit}"
