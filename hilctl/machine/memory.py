@@ -2,7 +2,7 @@
 
 A tick needs the interpreter, numpy's core, the compiled kernels, heap and stack. It needs no
 compiler, BLAS or LAPACK: numba and numpy map those, 200 MB of them, and half of it stays resident
-once the kernels are loaded.
+once the kernels are loaded. Nor does it read files, or check what stands in them.
 """
 
 import ctypes
@@ -12,7 +12,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-_NOT_IN_A_TICK = ("libllvmlite", "openblas", "libgfortran", "libquadmath", "/scipy/", "libcrypto")
+_NOT_IN_A_TICK = (
+    "libllvmlite",
+    "openblas",
+    "libgfortran",
+    "libquadmath",
+    "/scipy/",
+    "libcrypto",
+    "_pydantic_core",
+    "/_yaml",
+)
 _RESERVED_BYTES = 8 << 20  # stacks of threads and BLAS' buffers are reserved, and never filled
 _LOCK_ON_FAULT = 7  # MCL_CURRENT | MCL_FUTURE | MCL_ONFAULT
 _DONTNEED = 4
