@@ -1,6 +1,6 @@
 """The loop's own process: prepares everything, runs the loop, says how it went.
 
-Started by the supervisor as ``python -m hilctl.run.loop_process``, before that has its experiment;
+Started by the supervisor in :mod:`hilctl.run.waiting_loop`, before that has its experiment;
 the job comes as JSON over the socket that is its standard input, and the locks with it. It prints
 nothing and writes no file: all it has to say goes into the ring's page.
 """
@@ -132,7 +132,3 @@ def _await_go(page: SharedPage, host: RingHost) -> int:
             return host.clock.now_ns()
         time.sleep(0.001)
     return page.get(Field.START_NS)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
