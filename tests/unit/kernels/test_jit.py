@@ -1,6 +1,8 @@
 """What compilation must not change: bits, block cuts, types."""
 
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numba
@@ -204,6 +206,19 @@ def test_nothing_is_compiled_before_it_is_wanted(in_memory):
     jit.load(deferred)
     jit.load(deferred)
     assert [str(types) for types in deferred.overloads] == ["(float64,)"]
+
+
+def test_a_kept_kernel_is_loaded_without_what_compiling_takes():
+    """numba registers that first otherwise, in half of the time in which a run begins."""
+    jit.load(limit_block)  # it is kept now
+    code = """if True:
+        import sys
+        from hilctl.kernels import jit, limit
+        jit.load(limit.limit_block)
+        print("numba.np.npyimpl" in sys.modules, [*limit.limit_block.stats.cache_hits.values()])
+    """
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert ran.stdout.split() == ["False", "[1]"], ran.stderr
 
 
 def test_called_with_a_type_that_casts():
