@@ -11,7 +11,7 @@ import numba
 from numba.core.caching import FunctionCache, NullCache
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.registry import CPUDispatcher
-from numba.core.runtime import rtsys
+from numba.core.runtime.nrt import rtsys
 
 from hilctl.base.private import private_folder, user_folders
 
@@ -100,9 +100,13 @@ class _Kept(FunctionCache):
         What is compiled already needs only numba's runtime to be linked with, and the compiler does
         the rest where it comes to that.
         """
+        try:
+            guarded, load_kept = self._guard_against_spurious_io_errors, self._load_overload
+        except AttributeError:  # a numba that has it otherwise
+            return super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
         rtsys.initialize(target_context)
-        with self._guard_against_spurious_io_errors():
-            return self._load_overload(sig, target_context)
+        with guarded():
+            return load_kept(sig, target_context)  # type: ignore[no-untyped-call]
 
 
 class _Kernel(CPUDispatcher):
@@ -159,7 +163,8 @@ class _Kernel(CPUDispatcher):
         self._compile_all()
 
     def _compile_kept(self) -> None:
-        self._cache = _Kept(self.py_func)
+        kept: Any = _Kept
+        self._cache = kept(self.py_func)
         done: Any
         for done in self.overloads.values():  # what the folder before had no room for
             self._cache.save_overload(done.signature, done)
