@@ -21,15 +21,18 @@ from hilctl.identify.field.stages import (
 from hilctl.identify.field.weights import Curve
 
 STAGES = ("field", "output", "decay", "growth", "bend", "excess", "radian", "damping", "delay")
-NAMES = (*STAGES, "flux_slope", "flux_bend", "offset")
-"""Of the row; the flux is exp(flux_slope n + flux_bend n^2) steep, n from -1 to 1 over the stroke,
+POWERS = np.arange(1.0, 5.0)
+FLUX = slice(len(STAGES), len(STAGES) + POWERS.size)
+NAMES = (*STAGES, *(f"flux_{power:g}" for power in POWERS), "offset")
+"""Of the row; the flux is exp(flux_1 n + flux_2 n^2 + ...) steep, n from -1 to 1 over the stroke,
 and the offset, in half strokes, is of the displacement at rest from what the first samples say."""
 _FLUX, _OFFSET = 2.0, 0.5  # bounds
 _FLUX_NODES = 33
 
 
 def _row(stages: Stages, flux: float, offset: float) -> F64:
-    return np.array([*(getattr(stages, name) for name in STAGES), flux, flux, offset])
+    fluxes = np.full(POWERS.size, flux)
+    return np.array([*(getattr(stages, name) for name in STAGES), *fluxes, offset])
 
 
 LOWEST = _row(LOW, -_FLUX, -_OFFSET)
@@ -77,7 +80,7 @@ class Signals:
     def flux(self, x: F64) -> Curve:
         """Return the flux of a row, in um, by the displacement."""
         place = np.linspace(-1.0, 1.0, _FLUX_NODES)
-        steep = np.exp(x[-3] * place + x[-2] * place**2)
+        steep = np.exp(place[:, None] ** POWERS @ x[FLUX])
         flux = np.concatenate(([0.0], np.cumsum(steep[1:] + steep[:-1])))
         flux *= 2.0 * self._half_um / flux[-1]
         return Curve(flux, self._middle_um + self._half_um * place)

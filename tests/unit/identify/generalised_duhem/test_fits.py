@@ -71,7 +71,7 @@ def test_the_table_is_of_the_size_that_was_asked_for() -> None:
     assert isinstance(hysteresis, GeneralisedDuhemModel)
     assert len(hysteresis.rising) == len(hysteresis.falling) == SETTINGS.cells + 1
     assert {len(row) for row in hysteresis.rising} == {SETTINGS.across + 1}
-    assert found().numbers == 2 * (SETTINGS.cells + 1) * (SETTINGS.across + 1) + 12
+    assert found().numbers == 2 * (SETTINGS.cells + 1) * (SETTINGS.across + 1) + 14
 
 
 @pytest.mark.slow

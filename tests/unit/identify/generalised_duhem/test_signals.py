@@ -9,9 +9,11 @@ from hilctl.identify.field.stages import HIGH, LOW, STEP
 from hilctl.identify.generalised_duhem.fits import POINTS
 from hilctl.identify.generalised_duhem.signals import (
     FIRST,
+    FLUX,
     HIGHEST,
     LOWEST,
     NAMES,
+    POWERS,
     STAGES,
     STEPS,
     Signals,
@@ -39,12 +41,28 @@ def test_the_row_is_made_of_the_stages_that_the_field_has() -> None:
 
 def test_the_flux_rises_over_the_stroke_whatever_its_row() -> None:
     signals = Signals(data())
-    for flux_slope, flux_bend in ((2.0, 2.0), (-2.0, -2.0), (0.0, 0.0)):
+    for power in (2.0, -2.0, 0.0):
         x = FIRST.copy()
-        x[-3:-1] = flux_slope, flux_bend
+        x[FLUX] = power
         curve = signals.flux(x)
         assert (np.diff(curve.operators) > 0.0).all()
         assert np.ptp(curve.operators) == pytest.approx(np.ptp(curve.displacement_um))
+
+
+def test_the_flux_can_be_a_root_of_the_strain_nearly_down_to_where_that_begins() -> None:
+    """As in a rod whose strain goes with the square of its magnetisation, of which the flux is."""
+    signals = Signals(data())
+    place = np.linspace(-1.0, 1.0, 200)
+    terms = place[:, None] ** POWERS
+    steep = -0.5 * np.log(place + 1.15)
+    x = FIRST.copy()
+    x[FLUX] = np.linalg.lstsq(np.column_stack((terms, np.ones(200))), steep)[0][:-1]
+    curve = signals.flux(x)
+    high_um, low_um = curve.displacement_um.max(), curve.displacement_um.min()
+    root = np.sqrt(0.15 + 2.0 * (curve.displacement_um - low_um) / (high_um - low_um))
+    root = (root - root[0]) / np.ptp(root) * np.ptp(curve.operators)
+    off = np.diff(curve.operators - curve.operators[0]) / np.diff(root)
+    assert np.abs(off - 1.0).max() < 0.08
 
 
 def test_paths_keep_the_turns_and_points_no_further_apart_than_was_asked_for() -> None:
