@@ -86,14 +86,14 @@ class FitSettings(Strict):
     cells: int = _of(
         "field",
         "generalised_duhem",
-        default=24,
+        default=28,
         ge=3,
         le=60,
         description="Pieces of each table, along the effective field or the displacement.",
     )
     across: int = _of(
         "generalised_duhem",
-        default=16,
+        default=20,
         ge=2,
         le=60,
         description="Cells of a table of slopes across its band.",

@@ -72,7 +72,7 @@ def test_more_operators_are_taken_only_where_they_are_worth_it(
 
 
 def test_a_kind_that_is_near_is_tried_in_full_as_well(monkeypatch: pytest.MonkeyPatch) -> None:
-    fake(monkeypatch, {**SMALL, "generalised_duhem 24": 0.25})
+    fake(monkeypatch, {**SMALL, "generalised_duhem 28": 0.25})
     settings, _, errors = chosen([HISTORY])
     assert settings.kind == "generalised_duhem"
     assert [error.rms_percent for error in errors] == [0.6, 0.9, 0.3, 0.25]
@@ -83,7 +83,7 @@ def test_a_plain_kind_is_tried_where_no_other_does_well(
     plain: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     poor = {"field 0 8": 2.0, "generalised_duhem 12": 1.9, "field 0 32": 1.8, "field 3 32": 1.8}
-    fake(monkeypatch, {**poor, "generalised_duhem 24": 1.7, "integrated": plain})
+    fake(monkeypatch, {**poor, "generalised_duhem 28": 1.7, "integrated": plain})
     settings, _, _ = chosen([HISTORY])
     assert settings.kind == ("integrated" if plain < 1.0 else "generalised_duhem")
 
