@@ -10,6 +10,8 @@ from hilctl.analysis.figures import RunReport
 from hilctl.analysis.table import quality_rows, run_rows, segment_table
 from hilctl.base.printable import printable
 
+_MOST_MINUTES = 20
+_COUNTS = {"minute", "ticks"}
 _PAGE_ONLY = {"cycles", "start s", "freq. Hz", "floor %", "loop area"}  # a terminal has 80 columns
 
 
@@ -47,9 +49,17 @@ def _segments(report: RunReport) -> Table:
 
 
 def _minutes(report: RunReport) -> Table:
-    table = Table(title="lateness by minute, us", title_justify="left")
-    for heading in report.lateness_by_minute[0]:
+    minutes = report.lateness_by_minute
+    title = "lateness by minute, µs"
+    if len(minutes) > _MOST_MINUTES:
+        # Of a day nobody reads each; --json has them all.
+        title += f": the {_MOST_MINUTES} latest of {len(minutes)}"
+        worst = sorted(minutes, key=lambda each: -each["max"])[:_MOST_MINUTES]
+        minutes = sorted(worst, key=lambda each: each["minute"])
+    table = Table(title=title, title_justify="left")
+    for heading in minutes[0]:
         table.add_column(heading, justify="right", no_wrap=True)
-    for minute in report.lateness_by_minute:
-        table.add_row(*(f"{value:.4g}" for value in minute.values()))
+    for minute in minutes:
+        cells = (f"{v:,}" if name in _COUNTS else f"{v:.4g}" for name, v in minute.items())
+        table.add_row(*cells)
     return table
