@@ -335,7 +335,7 @@ def test_only_its_own_unit_answers(start, name):
 def test_death_of_the_server_is_an_error_within_the_time_out(start, name):
     """A server that dies between two samples costs one time-out, not the machine."""
     with start(SERVERS[name]) as served:
-        device = served.device(timeout_s=SHORT_S)
+        device = served.device(timeout_s=2.0)
         device.open(RATE_HZ, 1)
         exchange(device, 3.0)
         served.process.kill()

@@ -16,7 +16,7 @@ def test_page_has_verdict_table_figures_and_model(old, runs, tmp_path):
     page = refinement_page(found)
     assert "a&lt;b&gt;.yaml" in page
     assert "<b>" not in page.replace("<body>", "")
-    assert page.count("<img") == 2
+    assert page.count("<svg") == 2
     assert "kind: refined" in page
     write_refinement(found, tmp_path / "page.html")
     assert (tmp_path / "page.html").read_text() == page
