@@ -6,7 +6,7 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
-from hilctl.base.arrays import F64, I64
+from hilctl.base.arrays import F64, I64, U32
 from hilctl.base.device import CommandUnit
 from hilctl.base.errors import DataError, InputError
 from hilctl.base.events import Event
@@ -204,15 +204,19 @@ class MessageMaker:
                 stop += 1
             part = slice(row * block, stop * block)
             cut = {field.name: values[part] for field, values in columns}
-            yield self._block(batch, row, samples.rows(part), cut, t_rel[part])
+            yield self._block(batch, row, samples.flags[part], cut, t_rel[part])
             row = stop
         shown = samples.index % self._stride == 0
         if shown.any():
-            yield self._scope(samples.rows(shown), [(field, of[shown]) for field, of in columns])
+            doubles = {field.scope: of[shown] for field, of in columns if field.scope}
+            doubles[SCOPE_T_REL] = t_rel[shown]
+            index = samples.index[shown]
+            rows = scope_rows(index, samples.flags[shown], doubles)
+            yield EncodedRows("/scope", self._layout.times_ns(index), rows)
         yield self._ticks(batch)
 
     def _block(
-        self, batch: Batch, row: int, samples: Samples, columns: dict[str, F64], t_rel: F64
+        self, batch: Batch, row: int, flags: U32, columns: dict[str, F64], t_rel: F64
     ) -> Encoded:
         first = int(batch.heads[row, Head.FIRST_SAMPLE])
         dropped = int(batch.heads[row, Head.DROPPED_BEFORE])
@@ -220,22 +224,16 @@ class MessageMaker:
         state = batch.states[row] if begins else _NONE
         block = BlockArrays(
             tick0=first,
-            n=samples.index.size,
+            n=flags.size,
             dropped=dropped,
-            flags=samples.flags,
+            flags=flags,
             columns=columns,
             state=state[:-1],
             previous_command=state[-1:],
         )
-        self.samples += samples.index.size
+        self.samples += flags.size
         self.missing += dropped
         return Encoded("/samples", self._layout.time_ns(first), block_bytes(block, t_rel))
-
-    def _scope(self, samples: Samples, columns: list[tuple[RecordedField, F64]]) -> EncodedRows:
-        doubles = {field.scope: values for field, values in columns if field.scope}
-        doubles[SCOPE_T_REL] = samples.index / self._layout.sample_rate_hz
-        rows = scope_rows(samples.index, samples.flags, doubles)
-        return EncodedRows("/scope", self._layout.times_ns(samples.index), rows)
 
     def _ticks(self, batch: Batch) -> Encoded:
         out = schema.message("TickBlock")
