@@ -1,7 +1,6 @@
 """README and tutorial do what they say, command by command, in a copy of the repository."""
 
 import os
-import re
 import shutil
 import sys
 from pathlib import Path
@@ -51,19 +50,7 @@ def test_readme(copy):
 
 
 @pytest.mark.slow
-def test_tutorial_but_the_search_for_a_model(copy):
-    """What each change is held against: the search alone takes longer than all else."""
-    shorter, left_out = re.subn(
-        r"^## 6\. .*?(?=^## )", "", text_of("docs/tutorial.md"), flags=re.MULTILINE | re.DOTALL
-    )
-    assert left_out == 1
-    assert "characterise" not in shorter
-    walked(shorter, copy)
-
-
-@pytest.mark.slow
-@pytest.mark.long
-@pytest.mark.timeout(1800)
+@pytest.mark.timeout(900)  # the search for a model alone takes a minute or two
 def test_tutorial(copy):
     walked(text_of("docs/tutorial.md"), copy)
 
