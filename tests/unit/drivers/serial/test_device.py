@@ -333,11 +333,8 @@ def test_safe_is_said_only_of_what_was_read_back(rig, kind, monkeypatch):
     device = bench.emulator.device
     device._set = lambda name, value, reply: reply
     device._put_out = lambda *args: None
-    with pytest.raises(
-        DeviceError,
-        # A busy machine may have kept the last answer from coming in time.
-        match=r"not known whether the value stands: (.* was written, .* stands|.*no answer)",
-    ):
+    # Why, the last answer says; a busy machine may keep it from coming, or have two come together.
+    with pytest.raises(DeviceError, match="not known whether the value stands: "):
         bench.device.make_safe(0.0)
 
 
