@@ -53,7 +53,7 @@ def _minutes(report: RunReport) -> Table:
     title = "lateness by minute, µs"
     if len(minutes) > _MOST_MINUTES:
         # Of a day nobody reads each; --json has them all.
-        title += f": the {_MOST_MINUTES} latest of {len(minutes)}"
+        title += f": worst {_MOST_MINUTES} of {len(minutes)}"
         worst = sorted(minutes, key=lambda each: -each["max"])[:_MOST_MINUTES]
         minutes = sorted(worst, key=lambda each: each["minute"])
     table = Table(title=title, title_justify="left")

@@ -11,7 +11,7 @@ from hilctl.base.arrays import F64, I64, U32
 
 Cells: TypeAlias = npt.NDArray[np.uint8]
 Kept: TypeAlias = npt.NDArray[np.bool_]
-_Any = TypeVar("_Any", np.uint8, np.bool_)
+_Element = TypeVar("_Element", np.uint8, np.bool_)
 
 SCOPE_T_REL = 2
 """The field of a ``Sample`` that has its time, in s."""
@@ -79,7 +79,7 @@ def scope_rows(samples: I64, flags: U32, doubles: Mapping[int, F64]) -> MessageR
     )
 
 
-def _flat(cells: npt.NDArray[_Any]) -> npt.NDArray[_Any]:
+def _flat(cells: npt.NDArray[_Element]) -> npt.NDArray[_Element]:
     return cells.reshape(cells.shape[0], cells.shape[1] * cells.shape[2])
 
 

@@ -94,13 +94,13 @@ def test_incomplete_run_is_told(lagging) -> None:
 
 
 @pytest.mark.parametrize(("minutes", "shown"), [(20, range(20)), (21, range(1, 21))])
-def test_of_many_minutes_the_latest_are_shown(lagging, minutes, shown) -> None:
+def test_of_many_minutes_the_worst_are_shown(lagging, minutes, shown) -> None:
     """In their order, with whole numbers of ticks."""
     late = {"p50": 80.0, "p90": 90.0, "p99": 95.0, "p99.9": 99.0}
     rows = [{"minute": k, "ticks": 60_000, **late, "max": 100.0 + k} for k in range(minutes)]
     text = terminal(replace(summarize(lagging()), lateness_by_minute=rows))
     table = text[text.index("lateness by minute, µs") :].splitlines()
-    assert ("the 20 latest of 21" in table[0]) == (minutes > 20)
+    assert ("worst 20 of 21" in table[0]) == (minutes > 20)
     cells = [line.split("│") for line in table if line.startswith("│")]
     assert [int(row[1]) for row in cells] == list(shown)
     assert {row[2].strip() for row in cells} == {"60,000"}
