@@ -45,6 +45,10 @@ class Connection(ABC):
         """Send, as far as there is room; the rest with the next call."""
 
     @abstractmethod
+    def unplug(self) -> None:
+        """Fall silent for good; to be closed all the same."""
+
+    @abstractmethod
     def close(self, *, reset: bool = False) -> None:
         """Hang up, or break the connection."""
 
@@ -76,6 +80,9 @@ class TcpConnection(Connection):
         """See :meth:`Connection.send`."""
         with suppress(OSError):
             self._connection.sendall(data)
+
+    def unplug(self) -> None:
+        """See :meth:`Connection.unplug`; a pulled network cable closes no connection."""
 
     def close(self, *, reset: bool = False) -> None:
         """See :meth:`Connection.close`."""
@@ -118,8 +125,15 @@ class PtyConnection(Connection):
             while self.unsent:
                 del self.unsent[: os.write(self._master, self.unsent)]
 
+    def unplug(self) -> None:
+        """See :meth:`Connection.unplug`; a pulled adapter takes its port along."""
+        os.close(self._master)
+        self._master = -1
+
     def close(self, *, reset: bool = False) -> None:
         """See :meth:`Connection.close`; a pty has nothing to break."""
         del reset
-        os.close(self._master)
+        if self._master >= 0:
+            os.close(self._master)
+        # Last: until then no other pty gets its name, which a host may still be trying.
         os.close(self._slave)

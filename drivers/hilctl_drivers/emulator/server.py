@@ -37,7 +37,7 @@ class EmulatorServer:
         self._wires: list[EmulatedWire] = []
         self._listeners: dict[socket.socket, EmulatedWire] = {}
         self._connections: list[Connection] = []
-        self._unplugged: list[TcpConnection | socket.socket] = []
+        self._unplugged: list[Connection | socket.socket] = []
         self._late: list[tuple[int, int, Connection, EmulatedReply, WireFault | None]] = []
         self._undone: list[tuple[int, int, Connection, bytes]] = []
         self._count = 0
@@ -172,17 +172,12 @@ class EmulatorServer:
                 self._send(connection, connection.wire.encode(refusal.data))
 
     def _unplug(self) -> None:
-        """Fall silent for good, wherever faults happen.
-
-        A pulled network cable closes no connection; a pulled adapter takes its port along.
-        """
+        """Fall silent for good, wherever faults happen."""
         for connection in [each for each in self._connections if each.faulty]:
-            if isinstance(connection, TcpConnection):
-                self._connections.remove(connection)
-                self._selector.unregister(connection)
-                self._unplugged.append(connection)
-            else:
-                self._drop(connection)
+            self._connections.remove(connection)
+            self._selector.unregister(connection)
+            connection.unplug()
+            self._unplugged.append(connection)
         for listener in self._listeners:
             self._selector.unregister(listener)
         self._unplugged += self._listeners

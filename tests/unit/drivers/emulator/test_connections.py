@@ -3,6 +3,7 @@
 import os
 import select
 import socket
+from pathlib import Path
 
 import pytest
 
@@ -74,3 +75,16 @@ def test_what_a_host_does_not_read_waits(pty):
         connection.send(b"")
     assert got == sent
     assert connection.unsent == b""
+
+
+def test_nobody_else_gets_the_name_of_an_unplugged_line():
+    """A host that tries it again must not reach another device."""
+    pulled = PtyConnection(None, faulty=True)
+    pulled.unplug()
+    other = PtyConnection(None, faulty=True)
+    try:
+        assert not Path(pulled.name).exists()
+        assert other.name != pulled.name
+    finally:
+        pulled.close()
+        other.close()
