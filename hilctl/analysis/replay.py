@@ -276,7 +276,7 @@ class _Running:
             self._compensator.begin(samples.reference_um[rest][waveform])
             self._unbegun = False
         # Another model than the recorded one looks ahead by its own preview.
-        return self._compensator.ahead(samples.reference_um[part])
+        return self._compensator.ahead(samples.reference_um[part])[:]
 
     def _skipped_on_ramp(self, samples: Samples, row: int) -> int:
         """Return how many samples of a ramp were skipped just before a row."""

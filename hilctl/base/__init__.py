@@ -1,6 +1,6 @@
 """What all rooms share; it knows none of them.
 
-arrays.py    array types
+arrays.py    array types; values.py  arrays, or what stands for one that is longer than memory
 device.py    the contract of a device and of a clock
 errors.py    every exception that is raised on purpose
 strict.py    base of every pydantic model

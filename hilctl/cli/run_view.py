@@ -156,7 +156,7 @@ def print_forecast(checked: "Checked") -> None:
         "command": f"{forecast.command_min:.4g} to {forecast.command_max:.4g} {unit} "
         f"(limits {low:g} to {high:g})",
         "slew": f"{forecast.slew_per_s:.4g} {unit}/s (limit {limits.slew_per_s:g})",
-        "recording": f"about {forecast.recording_mb:.3g} MB",
+        "recording": _recording(forecast.recording_mb),
     }
     if forecast.begins:
         rows["begins"] = forecast.begins
@@ -173,3 +173,7 @@ def print_forecast(checked: "Checked") -> None:
     for warning in checked.warnings:
         terminal.print(f"warning: {warning}", style="yellow")
     terminal.print("may start", style="green")
+
+
+def _recording(megabytes: float) -> str:
+    return f"about {megabytes:.3g} MB" if megabytes < 1000.0 else f"about {megabytes / 1e3:.3g} GB"

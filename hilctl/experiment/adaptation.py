@@ -8,11 +8,13 @@ import numpy as np
 from hilctl.base.arrays import F64
 from hilctl.base.errors import Problem
 from hilctl.base.segments import Segment
+from hilctl.base.values import Values
 from hilctl.experiment.feedback import LOOP_DELAY, delays
 from hilctl.experiment.file import Experiment
 from hilctl.experiment.load import LoadedExperiment
 from hilctl.loop.adaptation import Adaptation, AdaptationBounds, DisplacementOperator
 from hilctl.loop.compensator import Compensator
+from hilctl.waveforms.build import Reference
 
 _OFFSET_SHARE = 0.1  # of the stroke's limits, where no bound is given
 _SLOWER = 5.0
@@ -39,21 +41,29 @@ def adaptation_bounds(config: Experiment) -> AdaptationBounds:
     return AdaptationBounds(offset_um, shape * wanted.gain, shape * wanted.weight)
 
 
+def adapted_operator(config: Experiment, reference: Reference) -> DisplacementOperator | None:
+    """Return what a run adapts, for its reference; None where nothing is adapted."""
+    bounds = adaptation_bounds(config)
+    if not bounds.array.any():
+        return None
+    return DisplacementOperator.over(reference.values, bounds, reference.telling)
+
+
 def make_adaptation(
-    config: Experiment, reference_um: F64, compensator: Compensator
+    config: Experiment, operator: DisplacementOperator | None, compensator: Compensator
 ) -> Adaptation | None:
     """Return the adaptation of a run, or None where nothing is adapted.
 
     Args:
         config: The experiment.
-        reference_um: float64[n].
-        compensator: What it adapts.
+        operator: What it adapts, see :func:`adapted_operator`.
+        compensator: What stands behind it.
     """
-    wanted, bounds = config.adaptation, adaptation_bounds(config)
-    if wanted is None or not bounds.array.any():
+    wanted = config.adaptation
+    if wanted is None or operator is None:
         return None
     return Adaptation(
-        DisplacementOperator(reference_um, bounds),
+        operator,
         wanted.time_constant_s,
         config.sample_rate_hz,
         *delays(wanted.sensor_delay_s, config.sample_rate_hz, compensator.preview),
@@ -126,28 +136,54 @@ def _shortest_s(loaded: LoadedExperiment, preview: int) -> float:
     return _SLOWER * np.count_nonzero(adaptation_bounds(config).array) * delay_s
 
 
-def worst_inputs(config: Experiment, reference_um: F64, input_um: F64) -> Iterator[F64]:
+def worst_inputs(
+    config: Experiment, operator: DisplacementOperator | None, input_um: Values
+) -> Iterator["WorstInput"]:
     """Give the compensator's input with the adaptation at its bounds, where they make it largest.
 
     Args:
         config: The experiment.
-        reference_um: float64[n].
+        operator: What it adapts; None where nothing is adapted.
         input_um: float64[n], the input without adaptation.
     """
-    bounds = adaptation_bounds(config)
-    if not bounds.array.any():
+    if operator is None:
         return
-    operator = DisplacementOperator(reference_um, bounds)
     # As far as they go in a run: over its lead-in, and no faster.
     led = min(config.lead_in_samples, input_um.size)
-    for sign in (1.0, -1.0) if bounds.offset_um else (1.0,):
+    for sign in (1.0, -1.0) if operator.bounds[0] else (1.0,):
         worst = operator.form(
             -operator.bounds * np.array([sign, *[1.0] * (operator.bounds.size - 1)])
         )
-        out, memory = np.array(input_um), operator.at_rest(float(input_um[0]))
-        operator.invert(out[:led], led, np.zeros_like(worst), worst, memory)
-        operator.invert(out[led:], out.size, worst, worst, memory)
-        yield out
+        yield WorstInput(operator, input_um, worst, led)
+
+
+class WorstInput:
+    """The compensator's input with adapted parameters, one part after the other.
+
+    Args:
+        operator: What is adapted.
+        input_um: float64[n], the input without adaptation.
+        worst: float64[m], o, g and w_i that they come to.
+        led: Samples on the way there, at most n.
+    """
+
+    def __init__(
+        self, operator: DisplacementOperator, input_um: Values, worst: F64, led: int
+    ) -> None:
+        self._operator, self._input_um, self._worst, self._led = operator, input_um, worst, led
+        self._memory = operator.at_rest(float(input_um[0:1][0]))
+
+    def __call__(self, start: int, stop: int) -> F64:
+        """Return its next part, float64[stop - start]."""
+        out, worst = np.array(self._input_um[start:stop]), self._worst
+        on_the_way = max(min(stop, self._led) - start, 0)
+        if on_the_way:
+            begins, ends = (at / self._led * worst for at in (start, start + on_the_way))
+            part = out[:on_the_way]
+            self._operator.invert(part, on_the_way, begins, ends, self._memory)
+        there = out[on_the_way:]
+        self._operator.invert(there, there.size, worst, worst, self._memory)
+        return out
 
 
 def at_worst(problem: Problem) -> Problem:

@@ -13,9 +13,11 @@ import numpy as np
 
 from hilctl.base.arrays import F64
 from hilctl.base.errors import ConfigError, DataError, InputError, ModelError, Problem
+from hilctl.base.values import Values
 from hilctl.experiment.adaptation import (
     adaptation_problems,
     adaptation_warnings,
+    adapted_operator,
     at_worst,
     worst_inputs,
 )
@@ -35,6 +37,7 @@ from hilctl.experiment.initial_state import (
 from hilctl.experiment.interlocks import interlock_problems
 from hilctl.experiment.load import LoadedExperiment
 from hilctl.experiment.model_range import RangeFindings, range_findings
+from hilctl.loop.adaptation import DisplacementOperator
 from hilctl.loop.compensator import Compensator
 from hilctl.loop.conditioning import Conditioning
 from hilctl.waveforms.build import Reference, build
@@ -54,6 +57,7 @@ class Checked:
         begun: What the compensator is given, and what it begins with.
         warnings: What keeps it from doing as well as its model promises.
         heat_a2: Heat of the coil before it, the running mean square of its current in A^2.
+        operator: What its adaptation adapts; None where nothing is adapted.
     """
 
     loaded: LoadedExperiment
@@ -62,6 +66,7 @@ class Checked:
     begun: Begun
     warnings: tuple[str, ...]
     heat_a2: float
+    operator: DisplacementOperator | None = None
 
     @property
     def state_size(self) -> int:
@@ -107,8 +112,7 @@ def check(
     except InputError as error:
         problems.append(_problem(loaded, "waveform", str(error)))
         raise ConfigError(problems) from None
-    low, high = float(reference.values.min()), float(reference.values.max())
-    problems += reference_problems(loaded, reference.unit, low, high)
+    problems += reference_problems(loaded, reference.unit, *reference.span)
     findings = _findings(loaded, reference)
     problems += [_problem(loaded, "waveform", text, hint=_REPEAT) for text in findings.refused]
     values = _corrected(loaded, reference, problems)
@@ -130,19 +134,24 @@ def check(
         problems.append(_problem(loaded, "compensator.model", str(error)))
         raise ConfigError(problems) from None
     problems += _start_problems(loaded, begun, forecast) or command_problems(loaded, forecast)
-    problems = problems or _adapted_problems(loaded, reference, begun, conditioned)
+    operator = None if problems else adapted_operator(config, reference)
+    problems += _adapted_problems(loaded, reference, begun, conditioned, operator)
     if problems:
         raise ConfigError(problems)
     warnings = findings.warnings + adaptation_warnings(config, reference.segments)
-    return Checked(loaded, reference, forecast, begun, warnings, heat_a2)
+    return Checked(loaded, reference, forecast, begun, warnings, heat_a2, operator)
 
 
 def _adapted_problems(
-    loaded: LoadedExperiment, reference: Reference, begun: Begun, conditioned: F64
+    loaded: LoadedExperiment,
+    reference: Reference,
+    begun: Begun,
+    conditioned: F64,
+    operator: DisplacementOperator | None,
 ) -> list[Problem]:
     """Return which limits the run would leave with its adaptation at the bounds."""
-    for input_um in worst_inputs(loaded.config, reference.values, begun.input_um):
-        worst = forecast_of(loaded, reference, replace(begun, input_um=input_um), conditioned)
+    for input_um in worst_inputs(loaded.config, operator, begun.input_um):
+        worst = forecast_of(loaded, reference, begun, conditioned, input_um=input_um)
         if found := command_problems(loaded, worst):
             return [at_worst(each) for each in found]
     return []
@@ -153,16 +162,16 @@ def _findings(loaded: LoadedExperiment, reference: Reference) -> RangeFindings:
     known = loaded.model.provenance.identified_range if loaded.model else None
     if known is None or reference.unit != "um":
         return RangeFindings()
-    return range_findings(known, reference.values, reference.segments, loaded.config.sample_rate_hz)
+    return range_findings(known, reference)
 
 
-def _corrected(loaded: LoadedExperiment, reference: Reference, problems: list[Problem]) -> F64:
+def _corrected(loaded: LoadedExperiment, reference: Reference, problems: list[Problem]) -> Values:
     """Return the reference with what has been learned: float64[n]; itself where nothing has."""
     correction = loaded.correction
     if correction is None:
         return reference.values
     try:
-        return reference.values + correction.samples(reference, loaded.model)
+        return correction.added(reference, loaded.model)
     except InputError as error:
         hint = "learn again with 'hilctl learn', or take it out"
         problems.append(_problem(loaded, "compensator.correction", str(error), hint=hint))
@@ -284,7 +293,7 @@ def _start_problems(loaded: LoadedExperiment, begun: Begun, forecast: Forecast) 
     if begun.state is not None:
         compensator.restore(begun.state)
     first = np.empty(1)
-    compensator.process(np.ascontiguousarray(begun.input_um[:1]), first)
+    compensator.process(np.array(begun.input_um[:1]), first)
     safe, unit = config.safe.value, config.limits.unit
     step = abs(float(first[0]) - safe) * rate_hz
     if not config.limits.slew_per_s < step or not forecast.slew_per_s <= step * (1.0 + 1e-9):
@@ -296,7 +305,7 @@ def _start_problems(loaded: LoadedExperiment, begun: Begun, forecast: Forecast) 
         f"its first command would step to {float(first[0]):.4g} {unit} at once: begin there, by "
         "waveform.offset and without a soft start, which begins at 0 µm"
     )
-    return [_problem(loaded, "waveform", rule, f"{float(begun.input_um[0]):.4g} µm", hint)]
+    return [_problem(loaded, "waveform", rule, f"{float(begun.input_um[:1][0]):.4g} µm", hint)]
 
 
 def reference_problems(

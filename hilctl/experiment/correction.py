@@ -14,11 +14,12 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field, model_validator
 
-from hilctl.base.arrays import F64
+from hilctl.base.arrays import F64, I64
 from hilctl.base.errors import InputError
 from hilctl.base.files import TextFiles, write_text
 from hilctl.base.segments import Segment
 from hilctl.base.strict import Strict
+from hilctl.base.values import Added, Values, held
 from hilctl.base.yaml.document import load_document
 from hilctl.base.yaml.plain import dump
 from hilctl.models.base import HysteresisModel
@@ -111,10 +112,10 @@ class Correction(Strict):
     cycles: Annotated[tuple[LearnedCycle, ...], Field(min_length=1)]
     provenance: Mapping[str, str] = Field(default_factory=dict)
 
-    def samples(self, reference: Reference, model: HysteresisModel | None) -> F64:
-        """Return the correction of every sample of a run: float64[n], in um.
+    def added(self, reference: Reference, model: HysteresisModel | None) -> Values:
+        """Return a run's reference with the correction of every sample: float64[n], in um.
 
-        It grows and shrinks with the waveform's soft start and end; where there is no soft start,
+        That grows and shrinks with the waveform's soft start and end; where there is no soft start,
         it grows over the first period.
 
         Raises:
@@ -126,19 +127,26 @@ class Correction(Strict):
         if not _alike(reference.sample_rate_hz, self.sample_rate_hz):
             was, now = self.sample_rate_hz, reference.sample_rate_hz
             raise InputError(f"was learned at {was:g} samples a second, not at {now:g}")
-        out = np.zeros_like(reference.values)
-        found = False
-        for segment in reference.segments:
-            for cycle in self.cycles:
-                if fits(cycle, reference.values, segment):
-                    index = np.arange(segment.stop - segment.start)
-                    faded = cycle.at(index) * envelope(segment)
-                    out[segment.start : segment.stop] = faded
-                    found = True
+        found = [
+            (segment, cycle)
+            for segment in reference.segments
+            for cycle in self.cycles
+            if fits(cycle, reference.values, segment)
+        ]
         if not found:
             known = "; ".join(cycle.label for cycle in self.cycles)
             raise InputError(f"was learned for another waveform: {known}")
-        return out
+
+        def correction(start: int, stop: int) -> F64:
+            out = np.zeros(stop - start)
+            for segment, cycle in found:
+                first, last = max(start, segment.start), min(stop, segment.stop)
+                if first < last:
+                    index = np.arange(first, last) - segment.start
+                    out[first - start : last - start] = cycle.at(index) * envelope(segment, index)
+            return out
+
+        return held(Added(reference.values, correction, reference.values.size))
 
 
 class CorrectionFile(Strict):
@@ -155,7 +163,7 @@ def evaluate(coefficients: C128, points: int) -> F64:
     return np.fft.irfft(spectrum * points, points)
 
 
-def signature(values: F64, segment: Segment) -> F64 | None:
+def signature(values: Values, segment: Segment) -> F64 | None:
     """Return one steady period of a reference at 64 even phases, in its unit.
 
     Args:
@@ -172,11 +180,13 @@ def signature(values: F64, segment: Segment) -> F64 | None:
     place = first + np.arange(PHASES) / PHASES * segment.period
     if place[-1] + 1.0 > segment.steady_stop:
         return None
-    cycle: F64 = np.interp(place, np.arange(values.size), values)
+    # The samples around it alone: of a long run, they are few.
+    low, high = int(place[0]), min(int(place[-1]) + 2, values.size)
+    cycle: F64 = np.interp(place - low, np.arange(high - low), values[low:high])
     return cycle
 
 
-def fits(cycle: LearnedCycle, values: F64, segment: Segment) -> bool:
+def fits(cycle: LearnedCycle, values: Values, segment: Segment) -> bool:
     """Return whether a cycle was learned for a segment: same period, same wanted displacement."""
     wanted = signature(values, segment)
     if wanted is None or not _alike(cycle.period_samples, segment.period):
@@ -185,14 +195,19 @@ def fits(cycle: LearnedCycle, values: F64, segment: Segment) -> bool:
     return bool(np.abs(wanted - learned).max() <= _TOLERANCE * np.ptp(learned))
 
 
-def envelope(segment: Segment) -> F64:
-    """Return how much of a correction is added at each sample of a segment, from 0 to 1."""
+def envelope(segment: Segment, index: I64) -> F64:
+    """Return how much of a correction is added at samples of a segment, from 0 to 1.
+
+    Args:
+        segment: The segment.
+        index: int64[n], its samples, from 0 on.
+    """
     n = segment.stop - segment.start
-    out = np.ones(n)
     rise = segment.steady_start - segment.start or min(n, int(segment.period))
     fall = segment.stop - segment.steady_stop
-    out[:rise] *= 0.5 - 0.5 * np.cos(np.pi * np.arange(rise) / max(rise, 1))
-    out[n - fall :] *= 0.5 + 0.5 * np.cos(np.pi * (np.arange(fall) + 1) / max(fall, 1))
+    grown = 0.5 - 0.5 * np.cos(np.pi * np.minimum(index, rise) / max(rise, 1))
+    ended = np.maximum(index - (n - fall) + 1, 0)
+    out: F64 = grown * (0.5 + 0.5 * np.cos(np.pi * ended / max(fall, 1)))
     return out
 
 

@@ -1,6 +1,7 @@
 """What a run will do, worked out by the same compensator that will run."""
 
 import math
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -12,11 +13,11 @@ from hilctl.experiment.heat import CoilHeat, RunHeat
 from hilctl.experiment.initial_state import Begun
 from hilctl.experiment.load import LoadedExperiment
 from hilctl.experiment.straight import LineEnds
+from hilctl.experiment.whole_run import WholeRun
 from hilctl.loop.compensator import Compensator
 from hilctl.loop.host import StraightLine
 from hilctl.waveforms.build import Reference
 
-_CHUNK = 1_000_000
 _BYTES_A_SAMPLE = 45.0
 _BYTES_OF_INPUT = 8.0
 
@@ -81,6 +82,7 @@ def forecast_of(
     begun: Begun,
     conditioned: F64,
     heat_a2: float = 0.0,
+    input_um: Callable[[int, int], F64] | None = None,
 ) -> Forecast:
     """Run the compensator on its input, and note what comes of it.
 
@@ -90,6 +92,7 @@ def forecast_of(
         begun: The compensator's input, and its memory at the start.
         conditioned: float64[m], commands that come before the waveform's.
         heat_a2: Running mean square of the coil current before all of them, in A^2.
+        input_um: Gives another input from a start to a stop, one part after the other.
 
     Raises:
         ModelError: The model has no inverse.
@@ -98,45 +101,73 @@ def forecast_of(
     compensator = Compensator(loaded.model, config.sample_rate_hz)
     if begun.state is not None:
         compensator.restore(begun.state)
-    input_um = begun.input_um
     heat_a2 = max(heat_a2, config.safe.value**2)
-    limits, rate_hz = config.limits, config.sample_rate_hz
-    figures = CommandFigures(config, config.safe.value, heat_a2)
-    heat = RunHeat()
+    figures = _RunFigures(config, heat_a2)
     if conditioned.size:
-        figures.add(conditioned)
-        heat = heat.then(conditioned, limits, rate_hz)
+        figures.add_before(conditioned)
     values = reference.values
-    ends = LineEnds()
-    wanted = np.empty(min(_CHUNK, input_um.size))
-    for start in range(0, input_um.size, _CHUNK):
-        part = input_um[start : start + _CHUNK]
-        out = wanted[: part.size]
-        compensator.process(part, out)
-        figures.add(out)
-        ends.add(values[start : start + _CHUNK], out)
-        heat = heat.then(out, limits, rate_hz)
-    byte_count = _BYTES_A_SAMPLE + (0.0 if input_um is reference.values else _BYTES_OF_INPUT)
+    run = WholeRun(
+        compensator,
+        input_um or (lambda start, stop: begun.input_um[start:stop]),
+        lambda start, stop: values[start:stop],
+        values.size,
+        figures,
+    )
+    run.go_through(reference.repeats)
+    byte_count = _BYTES_A_SAMPLE + (0.0 if begun.input_um is values else _BYTES_OF_INPUT)
+    low, high = reference.span
+    command, heat = figures.command, figures.command.heat
     return Forecast(
         samples=values.size,
         duration_s=values.size / config.sample_rate_hz,
         before_s=conditioned.size / config.sample_rate_hz,
         begins=begun.begins,
-        reference_min=float(values.min()),
-        reference_max=float(values.max()),
+        reference_min=low,
+        reference_max=high,
         command_unit=loaded.device.info.command_unit,
-        command_min=figures.low,
-        command_max=figures.high,
-        slew_per_s=figures.slew_per_s,
-        heat=heat,
-        begins_rms_a=None if figures.heat.rms_a is None else math.sqrt(heat_a2),
-        heating_rms_a=figures.heat.rms_a,
-        budget_used_s=figures.heat.used_s,
+        command_min=command.low,
+        command_max=command.high,
+        slew_per_s=command.slew_per_s,
+        heat=figures.heat,
+        begins_rms_a=None if heat.rms_a is None else math.sqrt(heat_a2),
+        heating_rms_a=heat.rms_a,
+        budget_used_s=heat.used_s,
         recording_mb=(values.size + conditioned.size) * byte_count / 1e6,
         highest_rate_hz=loaded.device.info.max_rate_hz,
         rate_note=loaded.device.info.rate_note,
-        line=None if loaded.model is None else ends.line(),
+        line=None if loaded.model is None else figures.ends.line(),
     )
+
+
+class _RunFigures:
+    """What is gathered from the commands of a whole run; see :class:`whole_run.Figures`."""
+
+    def __init__(self, config: Experiment, heat_a2: float) -> None:
+        self.command = CommandFigures(config, config.safe.value, heat_a2)
+        self.heat = RunHeat()
+        self.ends = LineEnds()
+        self._limits, self._rate_hz = config.limits, config.sample_rate_hz
+        self._marked = 0.0, 0.0
+
+    def add_before(self, command: F64) -> None:
+        """Take commands that come before the waveform: float64[n], n > 0."""
+        self.command.add(command)
+        self.heat = self.heat.then(command, self._limits, self._rate_hz)
+
+    def add(self, reference: F64, command: F64) -> None:
+        """Take the next ones: float64[n] each, n > 0."""
+        self.add_before(command)
+        self.ends.add(reference, command)
+
+    def mark(self) -> None:
+        """Note that a cycle begins."""
+        self._marked = self.command.heat.heat_a2, self.heat.alone_a2
+
+    def pass_over(self, samples: int, times: int) -> None:
+        """Take the cycle since the mark, of so many samples, that many times more."""
+        before_a2, alone_a2 = self._marked
+        self.command.heat.pass_over(before_a2, samples, times)
+        self.heat = self.heat.pass_over(alone_a2, samples, times, self._limits, self._rate_hz)
 
 
 class CommandFigures:

@@ -78,16 +78,26 @@ class CoilHeat:
         """Go on with a cycle (float64[n], in A) again and again."""
         if self._tau_s is None or times < 1:
             return
-        before = self.heat_a2
+        before_a2 = self.heat_a2
         self.add(cycle)
-        # A cycle maps the heat before it to kept * heat + a constant: the rest is a geometric row.
-        kept = math.exp(-cycle.size / (self._tau_s * self._rate_hz))
-        final = before + (self.heat_a2 - before) / (1.0 - kept)
-        self.heat_a2 = final + (before - final) * kept ** (times - 1)
-        self._samples += (times - 2) * cycle.size
-        self.add(
-            cycle
-        )  # from cycle to cycle it rises or falls: the highest is in the first or last
+        self.pass_over(before_a2, cycle.size, times - 2)
+        # From cycle to cycle it rises or falls: the highest is in the first or last.
+        self.add(cycle)
+
+    def pass_over(self, before_a2: float, samples: int, times: int) -> None:
+        """Take a cycle that was added for added that many times more, but for the highest in it.
+
+        Args:
+            before_a2: Heat before it, in A^2.
+            samples: How many it has.
+            times: How often; -1 takes it out again.
+        """
+        if self._tau_s is None:
+            return
+        self.heat_a2 = _repeated(
+            before_a2, self.heat_a2, samples / self._rate_hz, self._tau_s, times
+        )
+        self._samples += times * samples
 
     def expect(self, heat_a2: float) -> None:
         """Take a heat that was not worked out command by command for what is to come."""
@@ -130,6 +140,30 @@ class RunHeat:
         budget_a2 = _ROOM * (limits.rms_current_a or math.inf) ** 2
         hottest = float(np.min((budget_a2 - alone) / left))
         return RunHeat(seconds, last, min(self.hottest_a2, hottest))
+
+    def pass_over(
+        self, alone_a2: float, samples: int, times: int, limits: Limits, sample_rate_hz: float
+    ) -> "RunHeat":
+        """Return it with a cycle that it has already, that many times more, and one to come.
+
+        The hottest before them is decided by the first cycle or by the last, which is still to be
+        added: from one to the next, the room that is left grows or shrinks.
+
+        Args:
+            alone_a2: :attr:`alone_a2` before that cycle.
+            samples: How many it has.
+            times: How often.
+            limits: The budget.
+            sample_rate_hz: Samples a second.
+        """
+        seconds, tau_s = (
+            self.seconds + times * samples / sample_rate_hz,
+            limits.thermal_time_constant_s,
+        )
+        if tau_s is None:
+            return RunHeat(seconds)
+        last = _repeated(alone_a2, self.alone_a2, samples / sample_rate_hz, tau_s, times)
+        return RunHeat(seconds, last, self.hottest_a2)
 
 
 class CoolingCoil:
@@ -174,6 +208,14 @@ class CoolingCoil:
             return 0.0
         allowed_a2 = max(hottest_a2 - self._rest**2, _LEAST_DIFFERENCE * over_a2)
         return max(0.0, self._tau_s * math.log(over_a2 / allowed_a2))
+
+
+def _repeated(before_a2: float, after_a2: float, seconds: float, tau_s: float, times: int) -> float:
+    """Return the heat after a cycle that took it from one to another has come that often more."""
+    # A cycle maps the heat before it to kept * heat + a constant: the rest is a geometric row.
+    kept = math.exp(-seconds / tau_s)
+    final_a2 = before_a2 + (after_a2 - before_a2) / (1.0 - kept)
+    return final_a2 + (before_a2 - final_a2) * kept ** (times + 1)
 
 
 def cooled(heat_a2: float, held_a: float, tau_s: float | None, seconds: float) -> float:

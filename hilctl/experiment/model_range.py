@@ -7,7 +7,10 @@ import numpy as np
 
 from hilctl.base.arrays import F64
 from hilctl.base.segments import Segment
+from hilctl.base.values import Values, chunks, in_memory
 from hilctl.models.base import IdentifiedRange
+from hilctl.waveforms.build import Reference
+from hilctl.waveforms.shapes import telling_samples
 
 WINDOW_S = 0.2
 FEWEST_SAMPLES = 256  # of a window
@@ -49,21 +52,25 @@ class RangeFindings:
     warnings: tuple[str, ...] = ()
 
 
-def spectrum(values: F64, sample_rate_hz: float, least_move: float = 0.0) -> Spectrum:
+def spectrum(
+    values: Values,
+    sample_rate_hz: float,
+    least_move: float = 0.0,
+    told: tuple[slice, ...] | None = None,
+) -> Spectrum:
     """Return the frequencies of a signal, window after window.
 
     Args:
         values: float64[n].
         sample_rate_hz: Samples a second.
         least_move: Peak-to-peak value below which a window is left out.
+        told: Parts that show all there is to see; all of it where None.
     """
     size = min(max(round(WINDOW_S * sample_rate_hz), FEWEST_SAMPLES), values.size)
     step_hz = sample_rate_hz / size
-    windows = np.lib.stride_tricks.sliding_window_view(values, size)[:: max(size // 2, 1)]
     main = highest = 0
-    for first in range(0, len(windows), BATCH):
-        batch = windows[first : first + BATCH]
-        batch = batch[np.ptp(batch, axis=1) > least_move]
+    for windows in _windows(values, size, told or (slice(0, values.size),)):
+        batch = windows[np.ptp(windows, axis=1) > least_move]
         if not len(batch):
             continue
         tapered = (batch - _lines(batch)) * np.hanning(size)
@@ -71,6 +78,15 @@ def spectrum(values: F64, sample_rate_hz: float, least_move: float = 0.0) -> Spe
         main = max(main, int((power < MOST * power[:, -1:]).sum(axis=1).max()))
         highest = max(highest, int((power < ALL * power[:, -1:]).sum(axis=1).max()))
     return Spectrum(main * step_hz, highest * step_hz, step_hz)
+
+
+def _windows(values: Values, size: int, parts: tuple[slice, ...]) -> Iterator[F64]:
+    """Give windows that overlap by half, of each part, some at a time: float64[k, size]."""
+    hop = max(size // 2, 1)
+    for part in parts:
+        for start in range(part.start, part.stop - size + 1, hop * BATCH):
+            piece = values[start : min(start + hop * (BATCH - 1) + size, part.stop)]
+            yield np.lib.stride_tricks.sliding_window_view(piece, size)[::hop]
 
 
 def _lines(batch: F64) -> F64:
@@ -84,21 +100,15 @@ def _lines(batch: F64) -> F64:
     return lines
 
 
-def range_findings(
-    known: IdentifiedRange,
-    values_um: F64,
-    segments: tuple[Segment, ...],
-    sample_rate_hz: float,
-) -> RangeFindings:
-    """Hold a reference against what a model was identified on.
+def range_findings(known: IdentifiedRange, reference: Reference) -> RangeFindings:
+    """Hold a reference in um against what a model was identified on.
 
     Args:
         known: The motions that the model was identified on.
-        values_um: float64[n], the reference.
-        segments: Its segments.
-        sample_rate_hz: Samples a second.
+        reference: The reference.
     """
-    found = spectrum(values_um, sample_rate_hz, STILL * known.peak_to_peak_um[1])
+    rate_hz, told = reference.sample_rate_hz, reference.telling
+    found = spectrum(reference.values, rate_hz, STILL * known.peak_to_peak_um[1], told)
     low_hz, high_hz = known.frequency_hz
     beyond = 2.0 * found.resolution_hz  # what a window adds to any frequency
     if found.main_hz > FAR * high_hz + beyond:
@@ -107,7 +117,7 @@ def range_findings(
             f"on {_span(low_hz, high_hz)} Hz"
         )
         return RangeFindings(refused=(text,))
-    warnings = list(_motion_warnings(known, values_um, segments, sample_rate_hz))
+    warnings = list(_motion_warnings(known, reference))
     if found.highest_hz > MARGIN * high_hz + beyond:
         warnings.append(
             f"the reference has frequencies up to about {found.highest_hz:.3g} Hz; the model was "
@@ -116,11 +126,10 @@ def range_findings(
     return RangeFindings(warnings=tuple(warnings))
 
 
-def _motion_warnings(
-    known: IdentifiedRange, values_um: F64, segments: tuple[Segment, ...], sample_rate_hz: float
-) -> Iterator[str]:
-    steady = [(each, values_um[each.steady_start : each.steady_stop]) for each in segments]
-    moves = [float(np.ptp(part)) for _, part in steady if part.size and np.ptp(part) > 0.0]
+def _motion_warnings(known: IdentifiedRange, reference: Reference) -> Iterator[str]:
+    values, segments = reference.values, reference.segments
+    sample_rate_hz = reference.sample_rate_hz
+    moves = [move for each in segments if (move := _move_um(values, each)) > 0.0]
     smallest_um = known.peak_to_peak_um[0]
     if moves and min(moves) < SMALL * smallest_um:
         yield (
@@ -133,12 +142,31 @@ def _motion_warnings(
             f"the reference repeats at {min(turns_hz):.3g} Hz; the slowest motion that the model "
             f"was identified on is at {known.frequency_hz[0]:.3g} Hz"
         )
-    speed = float(np.max(np.abs(np.diff(values_um)), initial=0.0)) * sample_rate_hz
+    speed = _largest_step(reference) * sample_rate_hz
     if speed > FAST * known.speed_um_per_s:
         yield (
             f"the reference moves at up to {speed:.3g} µm/s; the model was identified at up to "
             f"{known.speed_um_per_s:.3g} µm/s"
         )
+
+
+def _move_um(values: Values, segment: Segment) -> float:
+    """Return the steady peak-to-peak motion of a segment, by its first periods where it repeats."""
+    start, stop = segment.steady_start, segment.steady_stop
+    if segment.period > 0.0 and not in_memory(values):
+        stop = min(stop, start + telling_samples(segment.period))
+    spans = [(each.min(), each.max()) for each in chunks(values, (slice(start, stop),))]
+    return float(np.max(spans) - np.min(spans)) if spans else 0.0
+
+
+def _largest_step(reference: Reference) -> float:
+    largest = 0.0
+    for part in reference.telling:
+        before = np.empty(0)
+        for each in chunks(reference.values, (part,)):
+            steps = np.abs(np.diff(np.concatenate((before, each))))
+            largest, before = max(largest, float(steps.max(initial=0.0))), each[-1:]
+    return largest
 
 
 def _span(low: float, high: float) -> str:

@@ -18,9 +18,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hilctl.base.arrays import F64, I64
+from hilctl.base.arrays import F64
 from hilctl.base.errors import ConfigError
 from hilctl.base.segments import Segment
+from hilctl.base.values import Values, in_memory
 from hilctl.experiment.check import Checked, command_problems, reference_problems
 from hilctl.experiment.forecast import CommandFigures, Forecast
 from hilctl.loop.compensator import Compensator
@@ -29,6 +30,7 @@ from hilctl.loop.tuning import Factors, Tuner, tune
 
 _CHUNK = 4096
 _PEAK_BLOCK = 65536
+_FAR = 4_000_000
 _MOST_PERIODS = 32
 _SAME = 1e-3
 """Two cycles are the same where they differ by less than this part of their span."""
@@ -73,29 +75,43 @@ class TunedForecast:
 class InputPeaks:
     """Where the compensator's input is highest, lowest and fastest, from any sample on.
 
+    Where it does not fit in memory, over the next samples alone.
+
     Args:
         input_um: float64[n].
     """
 
-    def __init__(self, input_um: F64) -> None:
+    def __init__(self, input_um: Values) -> None:
         self._input_um = input_um
-        starts = range(0, input_um.size, _PEAK_BLOCK)
-        found = [_peaks(input_um[start : start + _PEAK_BLOCK + 1]) for start in starts]
-        self._places: I64 = np.array(found) + np.array(starts)[:, None]
+        self._places = self._values = np.empty((0, 3))
+        self._begins = 0
+        if in_memory(input_um):
+            self._look_from(0)
 
     def after(self, sample: int) -> list[int]:
         """Return the three places at or after ``sample``, to within a block of samples."""
-        first = min(sample // _PEAK_BLOCK, len(self._places) - 1)
-        high, low, fast = self._places[first:].T
+        if not in_memory(self._input_um):
+            self._look_from(sample)
+        first = min((sample - self._begins) // _PEAK_BLOCK, len(self._places) - 1)
+        chosen = self._values[first:].argmax(axis=0)
+        return [max(sample, int(place)) for place in self._places[first:][chosen, range(3)]]
+
+    def _look_from(self, sample: int) -> None:
         values = self._input_um
-        steps = np.abs(values[np.minimum(fast + 1, values.size - 1)] - values[fast])
-        chosen = (high[values[high].argmax()], low[values[low].argmin()], fast[steps.argmax()])
-        return [max(sample, int(place)) for place in chosen]
+        self._begins = sample
+        stop = values.size if in_memory(values) else min(sample + _FAR, values.size)
+        starts = range(sample, stop, _PEAK_BLOCK)
+        found = [_peaks(values[start : start + _PEAK_BLOCK + 1]) for start in starts]
+        self._places = np.array([places for places, _ in found]) + np.array(starts)[:, None]
+        self._values = np.array([heights for _, heights in found])
 
 
-def _peaks(values: F64) -> tuple[int, int, int]:
-    steps = np.abs(np.diff(values))
-    return int(values.argmax()), int(values.argmin()), int(steps.argmax()) if steps.size else 0
+def _peaks(values: F64) -> tuple[tuple[int, int, int], tuple[float, float, float]]:
+    """Return where values are highest, lowest and fastest, and how high, deep and fast."""
+    steps = np.abs(np.diff(values, append=values[-1]))
+    places = int(values.argmax()), int(values.argmin()), int(steps.argmax())
+    high, low, fast = places
+    return places, (float(values[high]), -float(values[low]), float(steps[fast]))
 
 
 def tuned_forecast(
@@ -125,14 +141,22 @@ def tuned_forecast(
         walk.try_around([*ends, *peaks.after(known)])
     problems = command_problems(checked.loaded, walk.forecast())
     # What the run had before the change has been approved: the new gain and offset alone count.
-    values = checked.reference.values[position.sample :]
-    ends_um = [float(end) * tuning.gain + tuning.offset for end in (values.min(), values.max())]
+    ends_um = [end * tuning.gain + tuning.offset for end in _span_after(checked, position.sample)]
     low, high = sorted(ends_um)
     problems += reference_problems(checked.loaded, checked.reference.unit, low, high)
     if problems:
         raise ConfigError(problems)
     seconds = (known - position.sample) / checked.loaded.config.sample_rate_hz
     return TunedForecast(tuning, seconds, to_the_end, walk.figures.heat.highest_a2)
+
+
+def _span_after(checked: Checked, sample: int) -> tuple[float, float]:
+    """Return lowest and highest reference after a sample; of all, where that fits no memory."""
+    reference = checked.reference
+    if not in_memory(reference.values):
+        return reference.span
+    values = reference.values[sample:]
+    return float(values.min()), float(values.max())
 
 
 def _follow(walk: "_Walk", in_time: Callable[[], bool]) -> bool:

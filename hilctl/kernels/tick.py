@@ -35,6 +35,7 @@ from hilctl.kernels.jit import kernel
     MEASURED_ROW,
     INPUT_ROW,
     REFERENCE,
+    REFERENCE_SIZE,
     INPUT,
     MEMORY,
     EXCHANGE,
@@ -50,7 +51,7 @@ from hilctl.kernels.jit import kernel
     INTERLOCK_MEMORY_SIZE,
     STAGES,
     FIRST_STAGE,
-) = range(28)
+) = range(29)
 STAGE_NUMBERS = 5
 """Numbers of each stage, from ``FIRST_STAGE`` on: kernel, parameters and size, memory and size."""
 
@@ -214,9 +215,9 @@ def begin_block(table: I64, slot: int, start: int) -> None:
         slot: The block's.
         start: Its first sample in the waveform; all of the block lies in that.
     """
-    n = table[BLOCK]
-    _copy(_numbers(table[REFERENCE] + 8 * start, n), _row(table, slot, table[REFERENCE_ROW]))
-    _copy(_numbers(table[INPUT] + 8 * start, n), _row(table, slot, table[INPUT_ROW]))
+    n, at = table[BLOCK], start % table[REFERENCE_SIZE]
+    _copy(_numbers(table[REFERENCE] + 8 * at, n), _row(table, slot, table[REFERENCE_ROW]))
+    _copy(_numbers(table[INPUT] + 8 * at, n), _row(table, slot, table[INPUT_ROW]))
 
 
 @kernel("int64(int64[::1], int64)")

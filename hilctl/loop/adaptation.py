@@ -16,12 +16,14 @@ limited.
 
 import math
 from dataclasses import dataclass
+from typing import Any, Self
 
 import numpy as np
 
 from hilctl.base.arrays import F64
 from hilctl.base.errors import InputError
 from hilctl.base.events import ADAPTED, Event, adapted_text
+from hilctl.base.values import Values, chunks
 from hilctl.kernels import adaptation as kernel
 from hilctl.kernels.jit import load
 from hilctl.loop.block import Block
@@ -34,7 +36,6 @@ _DEAD = 3.0  # standard deviations of the noise's part of the gradient
 _ALIKE = 1e-4  # of a mean square: regressors that differ by less are the same
 _RIDGE = 0.02  # of the mean squares, so that regressors that hardly differ are told apart slowly
 _LEAST_SLOPE = 0.3
-_CHUNK = 100_000
 _EVENT_S = 1.0
 _WORTH_SAYING = 0.1  # of a bound
 
@@ -67,30 +68,55 @@ class DisplacementOperator:
     """What the actuator does beside its model, over a reference.
 
     Args:
-        reference_um: float64[n], n > 0: the plays and the centre are those of its span.
-        bounds: How far the parameters may go.
-
-    Raises:
-        InputError: With parameters within these bounds the operator might have no inverse.
+        bounds: float64[m], how far the parameters may go.
+        settings: float64[SETTINGS], see :mod:`hilctl.kernels.adaptation`.
+        table: float64[3, m], see there.
+        shape: float64[m, m], see there.
     """
 
-    def __init__(self, reference_um: F64, bounds: AdaptationBounds) -> None:
-        low, high = float(reference_um.min()), float(reference_um.max())
-        still = not high > low
-        self.bounds = bounds.array
-        if still:  # nothing but the offset shows in what stands still
-            self.bounds[kernel.GAIN :] = 0.0
-        m = self.bounds.size
+    def __init__(self, bounds: F64, settings: F64, table: F64, shape: F64) -> None:
+        self.bounds, self.settings, self.table, self.shape = bounds, settings, table, shape
         self.thresholds = np.array(THRESHOLDS)
-        self.settings = np.zeros(kernel.SETTINGS)
-        self.settings[kernel.MIDDLE_UM] = 0.5 * (low + high)
-        self.settings[kernel.HALF_UM] = 1.0 if still else 0.5 * (high - low)
-        self.table = np.stack([self.bounds, np.zeros(m), np.full(m, math.inf)])
-        self.shape = np.eye(m)
-        self._take_apart(reference_um)
-        least = self._least_slope()
+
+    @classmethod
+    def over(
+        cls, reference_um: Values, bounds: AdaptationBounds, told: tuple[slice, ...] | None = None
+    ) -> Self:
+        """Return that of a reference: the plays and the centre are those of its span.
+
+        Args:
+            reference_um: float64[n], n > 0.
+            bounds: How far the parameters may go.
+            told: Parts of the reference that show all there is to see; all of it where None.
+
+        Raises:
+            InputError: With parameters within these bounds the operator might have no inverse.
+        """
+        spans = [(each.min(), each.max()) for each in chunks(reference_um, told)]
+        low, high = float(np.min(spans)), float(np.max(spans))
+        still = not high > low
+        most = bounds.array
+        if still:  # nothing but the offset shows in what stands still
+            most[kernel.GAIN :] = 0.0
+        settings = np.zeros(kernel.SETTINGS)
+        settings[kernel.MIDDLE_UM] = 0.5 * (low + high)
+        settings[kernel.HALF_UM] = 1.0 if still else 0.5 * (high - low)
+        table = np.stack([most, np.zeros(most.size), np.full(most.size, math.inf)])
+        made = cls(most, settings, table, np.eye(most.size))
+        made._take_apart(reference_um, told)
+        least = made._least_slope()
         if not least >= _LEAST_SLOPE:
             raise InputError(f"the slope must stay above {_LEAST_SLOPE} with all bounds: {least:g}")
+        return made
+
+    def to_lists(self) -> list[Any]:
+        """Return what :meth:`from_lists` makes it of again, to the last bit."""
+        return [each.tolist() for each in (self.bounds, self.settings, self.table, self.shape)]
+
+    @classmethod
+    def from_lists(cls, lists: list[Any]) -> Self:
+        """Undo :meth:`to_lists`."""
+        return cls(*map(np.array, lists))
 
     def at_rest(self, input_um: float) -> F64:
         """Return the plays' memory where the input has come to rest: float64[m - 1]."""
@@ -114,15 +140,15 @@ class DisplacementOperator:
         offset_um, shares = self.bounds[kernel.OFFSET], self.bounds[kernel.GAIN :].sum()
         return float(offset_um + 2.0 * shares * self.settings[kernel.HALF_UM])
 
-    def _take_apart(self, reference_um: F64) -> None:
+    def _take_apart(self, reference_um: Values, told: tuple[slice, ...] | None) -> None:
         """Have each regressor without what those before it have: Gram and Schmidt's way."""
-        m, n = self.bounds.size, reference_um.size
+        m, n = self.bounds.size, 0
         sums, products, found = np.zeros(m), np.zeros((m, m)), np.zeros(m)
-        memory = self.at_rest(float(reference_um[0]))
-        for start in range(0, n, _CHUNK):
+        memory = self.at_rest(float(reference_um[0:1][0]))
+        for part in chunks(reference_um, told):
+            n += part.size
             kernel.regressor_sums(
-                # A copy: compiled code refuses read-only arrays, and references may be long.
-                np.array(reference_um[start : start + _CHUNK]),
+                np.array(part),  # a copy: compiled code refuses read-only arrays
                 self.settings,
                 self.table,
                 self.shape,

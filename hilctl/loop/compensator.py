@@ -4,6 +4,7 @@ import numpy as np
 
 from hilctl.base.arrays import F64
 from hilctl.base.errors import ModelError
+from hilctl.base.values import Ahead, Values, held
 from hilctl.models.base import HysteresisModel, Operator, Stage
 
 
@@ -20,17 +21,14 @@ class Compensator:
         self.preview = self._operator.preview if self._operator else 0
         """Samples by which its input must run ahead of the commands."""
 
-    def ahead(self, reference: F64) -> F64:
+    def ahead(self, reference: Values) -> Values:
         """Return what to feed for a reference (float64[n]): itself, ``preview`` samples ahead.
 
         The last value stands for those that come after it.
         """
-        if not self.preview:
-            return reference
-        after = np.full(min(self.preview, reference.size), reference[-1])
-        return np.concatenate((reference[self.preview :], after))
+        return held(Ahead(reference, self.preview)) if self.preview else reference
 
-    def begin(self, reference: F64) -> None:
+    def begin(self, reference: Values) -> None:
         """Run through what comes before the first command: ``preview`` samples of the reference.
 
         So the first command belongs to a reference that has stood at its first value until then.

@@ -67,6 +67,7 @@ class Composed:
             table[place] = row
         table[tick.BLOCK], table[tick.WIDTH] = plan.block, len(COLUMNS)
         table[tick.REFERENCE] = _where(plan.reference)
+        table[tick.REFERENCE_SIZE] = plan.reference.size
         table[tick.INPUT] = _where(plan.input_um)
         table[tick.EXCHANGE] = _where(self._exchange)
         table[tick.LIMIT], table[tick.LIMITS] = address(limit_block), _where(limiter.numbers)

@@ -86,7 +86,7 @@ class Loop:
         self._next_sample = 0
         self._ended_at = 0
         self._before = Beginning(None, 0)
-        self._end = plan.reference.size
+        self._end = plan.samples
         self._on_ramp = False
         self._missing = 0
         self._dropped = 0
@@ -114,7 +114,7 @@ class Loop:
         block, conditioning = self._plan.block, self._plan.conditioning
         ramp_samples = -(-self._limiter.ramp_samples // block) * block
         self._before = before = Beginning(conditioning, ramp_samples)
-        self._end = before.waveform_at + self._plan.reference.size
+        self._end = before.waveform_at + self._plan.samples
         if ramp_samples:
             self._phase = _Phase.STARTING
             self._pacer.policy = self._plan.ramp_policy
@@ -178,6 +178,9 @@ class Loop:
         if usual is None or not follows or self._end - first_sample < self._plan.block:
             return False
         start = first_sample - self._before.waveform_at
+        window = self._plan.window
+        if window is not None and not window.has(start + self._plan.block):
+            return False
         invalid = usual.begin(self._pacer, first_sample, start, self._start_ns)
         if invalid == ASKED:
             return False
@@ -220,8 +223,9 @@ class Loop:
         start = self._next_sample
         self._next_sample += skipped
         if skipped and self._phase is _Phase.FOLLOWING:
-            at = self._before.waveform_at
-            pass_over(self._plan, self._before, self._tuner, start - at, self._next_sample - at)
+            at, stop = self._before.waveform_at, min(self._next_sample, self._end)
+            if self._ready(stop):
+                pass_over(self._plan, self._before, self._tuner, start - at, stop - at)
         return skipped
 
     def _claim(self, skipped: int, *, due: bool = True) -> Block:
@@ -247,10 +251,18 @@ class Loop:
             return
         if late := self._pacer.too_late():
             self._leave("fault", "late", late)
+        elif not self._ready(min(self._next_sample + self._plan.block, self._end)):
+            text = "the reference was not worked out in time"
+            self._leave("fault", "reference_late", f"{text} at sample {self._next_sample}")
         elif stop:
             self._leave("stopped", "stopped", stop)
         elif self._phase is _Phase.FOLLOWING and (tuning := self._host.tuning()):
             self._tune(tuning)
+
+    def _ready(self, stop: int) -> bool:
+        """Return whether the reference is there up to a sample of the run."""
+        window = self._plan.window
+        return window is None or window.has(stop - self._before.waveform_at)
 
     def _begin(self, phase: _Phase) -> None:
         """Go on to a phase, unless skipped ticks have left the output elsewhere."""

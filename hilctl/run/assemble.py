@@ -10,10 +10,12 @@ from hilctl.experiment.feedback import make_feedback
 from hilctl.experiment.file import Experiment
 from hilctl.experiment.interlocks import interlock_context
 from hilctl.experiment.load import LoadedExperiment
+from hilctl.loop.adaptation import DisplacementOperator
 from hilctl.loop.compensator import Compensator
 from hilctl.loop.conditioning import Conditioning
 from hilctl.loop.pacer import LatePolicy, LateRules
 from hilctl.loop.plan import Plan
+from hilctl.loop.window import Window
 
 _ALWAYS_LATE_S = 2.0
 _MISSED_WINDOW_S = 10.0
@@ -26,6 +28,8 @@ def assemble(
     state: F64 | None,
     conditioning: Conditioning | None = None,
     *,
+    operator: DisplacementOperator | None = None,
+    window: Window | None = None,
     paced: bool = True,
     heat_a2: float = 0.0,
 ) -> Plan:
@@ -33,10 +37,12 @@ def assemble(
 
     Args:
         loaded: The experiment.
-        reference: float64[n], in the waveform's unit.
-        input_um: float64[n], the compensator's input.
+        reference: float64[n], in the waveform's unit; a window of it where there is one.
+        input_um: float64[n], the compensator's input; the same.
         state: The compensator's memory before the first sample; at rest where None.
         conditioning: What comes before the waveform; None for nothing.
+        operator: What its adaptation adapts; None where nothing is adapted.
+        window: How far windows are filled; None where reference and input are there as a whole.
         paced: Whether the run keeps real time; else no tick is late.
         heat_a2: Heat of the coil before it, in A^2.
     """
@@ -60,11 +66,14 @@ def assemble(
         late_policy=policy,
         # By time, not by ticks: a device that takes its time for each would be at it for long.
         ramp_policy=policy if not paced or info.buffered or info.latency_blocks else "skip",
-        late_rules=_late_rules(config, reference.size) if paced else LateRules(),
+        late_rules=_late_rules(config, window.samples if window else reference.size)
+        if paced
+        else LateRules(),
         feedback=make_feedback(config, compensator, info.latency_blocks),
-        adaptation=make_adaptation(config, reference, compensator),
+        adaptation=make_adaptation(config, operator, compensator),
         conditioning=conditioning,
         keep_all=config.recording.on_failure == "stop",
+        window=window,
     )
 
 

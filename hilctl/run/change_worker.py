@@ -33,7 +33,7 @@ _BUDGET_S = 0.3
 _LONGEST_S = 20.0
 _STILL_S = 10.0
 _PAUSE_S = 0.002
-_SUPERVISORS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, STOP_SIGNAL)
+SUPERVISORS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, STOP_SIGNAL)
 """Signals that may be sent to all of a run's processes, and are the supervisor's to follow."""
 
 
@@ -80,7 +80,7 @@ class ChangeWorker:
             target=_work, args=(theirs, self._connection, checked), daemon=True
         )
         # Held back until it ignores them: one that comes in between would end it.
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, _SUPERVISORS)
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, SUPERVISORS)
         try:
             self._process.start()
         finally:
@@ -140,9 +140,9 @@ _GONE = "can't be worked out any more: the process that did so is gone"
 def _work(connection: Connection, supervisors: Connection, checked: Checked) -> None:
     """Work changes out until the supervisor is gone."""
     supervisors.close()  # else the end of its side would never show
-    for number in _SUPERVISORS:
+    for number in SUPERVISORS:
         signal.signal(number, signal.SIG_IGN)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, _SUPERVISORS)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, SUPERVISORS)
     with suppress(OSError):
         os.nice(_NICE)
     peaks = InputPeaks(checked.begun.input_um)

@@ -24,7 +24,7 @@ from hilctl.machine.memory import ProcessMemory
 from hilctl.machine.realtime import be_ordinary, prepare, refusals, require, step_facts
 from hilctl.machine.usage import ProcessUsage
 from hilctl.run.assemble import assemble
-from hilctl.run.host import RingHost
+from hilctl.run.host import RingHost, SharedWindow
 from hilctl.run.job import Job
 from hilctl.run.ring import SampleRing
 from hilctl.run.shared_page import Field, PageText, Phase, SharedPage
@@ -82,7 +82,17 @@ def run_job(job: Job, ring: SampleRing, loaded: LoadedExperiment) -> Outcome:
     config, device, page = loaded.config, loaded.device, ring.page
     host = RingHost(ring, SystemClock(), job.supervisor, job.silence_s)
     conditioning = conditioning_of(loaded, job.stands_um)
-    plan = assemble(loaded, *job.arrays(), job.memory, conditioning, heat_a2=job.heat_a2)
+    reference, input_um = job.arrays()
+    plan = assemble(
+        loaded,
+        reference,
+        input_um,
+        job.memory,
+        conditioning,
+        operator=job.adapted,
+        window=SharedWindow(page, job.samples) if job.samples > reference.size else None,
+        heat_a2=job.heat_a2,
+    )
     loop = Loop(plan, device, host)
     # After the warm-up, so that all it has mapped gets locked; before the device is opened, so that
     # a refusal moves nothing.

@@ -98,6 +98,7 @@ class Field(IntEnum):
     MINOR_FAULTS = 66
     MAJOR_FAULTS = 67
     INVOLUNTARY_SWITCHES = 68
+    REFERENCE_READY = 72
 
 
 class Phase(IntEnum):

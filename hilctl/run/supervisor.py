@@ -24,6 +24,7 @@ from hilctl.run.control_socket import ControlServer
 from hilctl.run.guardian_process import guardian_of
 from hilctl.run.progress import ProgressThread
 from hilctl.run.recorder import Recorder
+from hilctl.run.reference_window import ReferenceProcess
 from hilctl.run.requests import Requests
 from hilctl.run.result import Progress, RunResult
 from hilctl.run.ring import SampleRing
@@ -81,6 +82,7 @@ class Supervisor:
         with ExitStack() as stack:
             # Before anything is held or started: a fork has all that its maker has.
             worker = stack.enter_context(ChangeWorker(self._checked))
+            filling = stack.enter_context(ReferenceProcess(self._checked))
             # Before there is a loop: a signal must stop it, not just end this process. And to the
             # last: whoever finds the run's folder may send one.
             stack.enter_context(self._signals())
@@ -99,7 +101,8 @@ class Supervisor:
             except BaseException:
                 recorder.give_back()
                 raise
-            safety = self._start(stack, folder, ring, child, recording, locks + own)
+            run = folder, ring, child, recording
+            safety = self._start(stack, *run, locks + own, filling)
             started = StartedRun(self._checked, ring, child, safety, recording)
             self._attend(started, server, requests)
             safety.close()
@@ -113,6 +116,7 @@ class Supervisor:
         child: LoopChild,
         recording: RingRecorder,
         locks: list[int],
+        filling: ReferenceProcess,
     ) -> Safety:
         """Wait for loop and guardian to be ready, and give the start signal."""
         page, checked = ring.page, self._checked
@@ -122,6 +126,7 @@ class Supervisor:
             guardian = None if simulated else guardian_of(checked, folder, page, child.pid, locks)
             safety = Safety(checked, page, child, guardian, recording.record_event)
             child.await_ready(lambda: self._stop_signal != 0)
+            filling.begin(folder, page)
             # It is started after the loop, to watch its process, and ready long before it.
             while not safety.ready():
                 time.sleep(0.005)

@@ -9,7 +9,9 @@ import numpy as np
 from hilctl.base.arrays import F64
 from hilctl.base.errors import InputError
 from hilctl.base.segments import Segment
+from hilctl.base.values import IN_MEMORY, Values, chunks, fit, in_memory
 from hilctl.waveforms import shapes, spec
+from hilctl.waveforms.parts import Joined, Repeat, Softened, telling
 from hilctl.waveforms.table import read_samples
 
 
@@ -18,20 +20,51 @@ class Reference:
     """The samples of a run's waveform.
 
     Attributes:
-        values: float64[n], read-only, in ``unit``.
+        values: float64[n], read-only, in ``unit``: an array where they fit in memory.
         unit: ``um``, ``A`` or ``V``.
         sample_rate_hz: Samples a second.
         segments: Which samples belong to which waveform, and which of them are steady.
+        span: Lowest and highest value.
+        repeats: What repeats in one that does not fit in memory.
     """
 
-    values: F64
+    values: Values
     unit: spec.WaveformUnit
     sample_rate_hz: float
     segments: tuple[Segment, ...]
+    span: tuple[float, float]
+    repeats: tuple[Repeat, ...] = ()
+
+    @property
+    def telling(self) -> tuple[slice, ...]:
+        """Parts that show all there is to see: all of it, but for what repeats again and again."""
+        return telling(self.values.size, self.repeats)
+
+    def array(self) -> F64:
+        """Return all of its values, where they fit in memory: float64[n].
+
+        Raises:
+            InputError: They do not.
+        """
+        if not in_memory(self.values):
+            raise InputError(
+                f"has {self.values.size} samples, more than the {IN_MEMORY} that fit in memory "
+                "here: shorten it"
+            )
+        return self.values
+
+
+@dataclass(frozen=True, slots=True)
+class _Part:
+    """One waveform of a reference, and whether its steady part is known to repeat."""
+
+    values: Values
+    segment: Segment
+    repeats: bool
 
 
 def build(waveform: spec.AnyWaveform, sample_rate_hz: float, folder: Path) -> Reference:
-    """Work out every sample of a waveform.
+    """Work out every sample of a waveform, or what works them out where they do not fit in memory.
 
     Args:
         waveform: What the experiment asks for; its unit must be given.
@@ -45,38 +78,59 @@ def build(waveform: spec.AnyWaveform, sample_rate_hz: float, folder: Path) -> Re
     if waveform.unit is None:
         raise InputError("unit is required: um, A or V")
     with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is refused below
-        built = _parts(waveform, waveform.unit, sample_rate_hz, folder)
-    segments: list[Segment] = []
-    start = 0
-    for values, segment in built:
-        segments.append(segment.shifted(start))
-        start += values.size
-    values = np.concatenate([values for values, _ in built])
-    if not np.isfinite(values).all():
+        parts, repeat = _parts(waveform, waveform.unit, sample_rate_hz, folder)
+        values: Values = Joined([part.values for part in parts], repeat)
+        repeats: tuple[Repeat, ...] = ()
+        if not fit(values.size):
+            repeats = _repeats(parts, repeat)
+        else:
+            # A part that is whole and alone may be an array of its own, and a file's.
+            values = np.array(values[0 : values.size])
+            values.flags.writeable = False
+        told = telling(values.size, repeats)
+        spans = [(each.min(), each.max()) for each in chunks(values, told)]
+    span = float(np.min(spans)), float(np.max(spans))  # keeps a NaN, where min() would not
+    if not np.isfinite(span).all():
         raise InputError("amplitude, offset or scale is too large: a value is not finite")
-    values.flags.writeable = False
-    return Reference(values, waveform.unit, sample_rate_hz, tuple(segments))
+    segments, start = [], 0
+    for part in [*parts] * repeat:
+        segments.append(part.segment.shifted(start))
+        start += part.values.size
+    return Reference(values, waveform.unit, sample_rate_hz, tuple(segments), span, repeats)
+
+
+def _repeats(parts: list[_Part], repeat: int) -> tuple[Repeat, ...]:
+    """Return what repeats in a long reference: all of it, or the steady parts of its waveforms."""
+    once = sum(part.values.size for part in parts)
+    if repeat > 1:
+        return (Repeat(0, repeat * once, float(once)),)
+    found, start = [], 0
+    for part in parts:
+        if part.repeats:
+            segment = part.segment.shifted(start)
+            found.append(Repeat(segment.steady_start, segment.steady_stop, segment.period))
+        start += part.values.size
+    return tuple(found)
 
 
 def _parts(
     waveform: spec.AnyWaveform, unit: str, sample_rate_hz: float, folder: Path
-) -> list[tuple[F64, Segment]]:
+) -> tuple[list[_Part], int]:
+    """Return a waveform's parts, and how often they come."""
     if waveform.kind != "sequence":
-        return [_part(waveform, waveform.kind, unit, sample_rate_hz, folder)]
+        return [_part(waveform, waveform.kind, unit, sample_rate_hz, folder)], 1
     built = []
     samples = 0
-    for i, part in enumerate(waveform.parts):
-        name = f"parts.{i} ({part.kind})"
-        values, segment = _part(part, name, unit, sample_rate_hz, folder)
-        samples += values.size
+    for i, each in enumerate(waveform.parts):
+        part = _part(each, f"parts.{i} ({each.kind})", unit, sample_rate_hz, folder)
+        samples += part.values.size
         shapes.check_length(samples * waveform.repeat)
-        built.append((values, segment))
-    return built * waveform.repeat
+        built.append(part)
+    return built, waveform.repeat
 
 
-def _part(
-    w: spec.SinglePart, name: str, unit: str, sample_rate_hz: float, folder: Path
-) -> tuple[F64, Segment]:
+def _part(w: spec.SinglePart, name: str, unit: str, sample_rate_hz: float, folder: Path) -> _Part:
+    values: Values
     if w.kind == "file":
         values, period = read_samples(w, sample_rate_hz, folder)
         label = f"file {Path(w.path).name}"
@@ -88,15 +142,17 @@ def _part(
                 f"{sample_rate_hz / 2.0:.10g} Hz: {highest_hz:.10g} Hz"
             )
         values, period = shapes.sampled(w, sample_rate_hz), period_s * sample_rate_hz
-    soft_start, soft_end = _soften(w, name, values, sample_rate_hz)
     n = values.size
+    soft_start, soft_end = _soft_samples(w, name, n, sample_rate_hz)
     period = period if math.isfinite(period) else 0.0
-    return values, Segment(label, 0, n, soft_start, n - soft_end, period)
+    segment = Segment(label, 0, n, soft_start, n - soft_end, period)
+    softened = Softened(values, w.rest, soft_start, soft_end)
+    # What a file says of its period is its author's word.
+    return _Part(softened, segment, period > 0.0 and w.kind != "file")
 
 
-def _soften(w: spec.SinglePart, name: str, values: F64, sample_rate_hz: float) -> tuple[int, int]:
-    """Bend start and end of ``values`` to rest; return how many samples of each are bent."""
-    n = values.size
+def _soft_samples(w: spec.SinglePart, name: str, n: int, sample_rate_hz: float) -> tuple[int, int]:
+    """Return how many samples of start and end of ``n`` are bent to rest."""
     soft_s = w.soft_start_s + w.soft_end_s
     if soft_s * sample_rate_hz > n + 0.5:
         raise InputError(
@@ -104,14 +160,4 @@ def _soften(w: spec.SinglePart, name: str, values: F64, sample_rate_hz: float) -
             f"{n / sample_rate_hz:.10g} s"
         )
     # whole samples, and one that rounding kept from being whole: never more than n together
-    soft_start = int(w.soft_start_s * sample_rate_hz + 1e-6)
-    soft_end = int(w.soft_end_s * sample_rate_hz + 1e-6)
-    start, end = values[:soft_start], values[n - soft_end :]
-    start[:] = w.rest + _soft(soft_start) * (start - w.rest)
-    end[:] = w.rest + _soft(soft_end)[::-1] * (end - w.rest)
-    return soft_start, soft_end
-
-
-def _soft(n: int) -> F64:
-    """Return a raised cosine from 0 to 1: float64[n]."""
-    return 0.5 - 0.5 * np.cos(np.pi * np.arange(n) / max(n, 1))
+    return int(w.soft_start_s * sample_rate_hz + 1e-6), int(w.soft_end_s * sample_rate_hz + 1e-6)

@@ -1,38 +1,56 @@
 """One waveform and a sample rate to samples: what each kind is, as pure functions of time."""
 
 import math
+from dataclasses import dataclass
 from fractions import Fraction
 
 import numpy as np
 
 from hilctl.base.arrays import F64
 from hilctl.base.errors import InputError
+from hilctl.base.values import CHUNK, Values, chunks, fit
 from hilctl.waveforms import spec
 
-MAX_SAMPLES = 100_000_000
-"""Longest reference that is held in memory: 0.8 GB, and a few times that while it is built."""
+MAX_WHOLE = 100_000_000
+"""Most samples of what is made as a whole, a file's or random sines: 0.8 GB, and a few times that
+while it is made."""
+
+MAX_SAMPLES = 10**12
+"""Most samples of a waveform: half a year at 50 kHz."""
+
+_TELLING_CYCLES = 8
 
 
 def sample_count(duration_s: float, sample_rate_hz: float) -> int:
     """Return how many samples a duration has, at least one.
 
     Raises:
-        InputError: They do not fit in memory.
+        InputError: They are more than :data:`MAX_SAMPLES`.
     """
     check_length(duration_s * sample_rate_hz)
     return max(1, round(duration_s * sample_rate_hz))
 
 
 def check_length(samples: float) -> None:
-    """Refuse what does not fit in memory.
+    """Refuse what nobody can mean.
 
     Raises:
         InputError: There are more than :data:`MAX_SAMPLES`.
     """
     if samples > MAX_SAMPLES:
+        raise InputError(f"has {samples:.10g} samples, more than {MAX_SAMPLES}: shorten it")
+
+
+def check_whole(samples: float) -> None:
+    """Refuse what is made as a whole, and does not fit in memory.
+
+    Raises:
+        InputError: There are more than :data:`MAX_WHOLE`.
+    """
+    if samples > MAX_WHOLE:
         raise InputError(
-            f"has {samples:.10g} samples, more than the {MAX_SAMPLES} that fit in memory: "
-            "shorten it or lower sample_rate_hz"
+            f"has {samples:.10g} samples, more than the {MAX_WHOLE} that fit in memory: "
+            "shorten it and repeat it in a sequence, or lower sample_rate_hz"
         )
 
 
@@ -69,14 +87,36 @@ def outline(w: spec.Shape, unit: str) -> tuple[str, float, float]:
             return w.kind, 0.0, 0.0
 
 
-def sampled(w: spec.Shape, sample_rate_hz: float) -> F64:
+def sampled(w: spec.Shape, sample_rate_hz: float) -> Values:
     """Return every sample of a waveform, offset included and not yet softened: float64[n].
 
     Raises:
-        InputError: They do not fit in memory.
+        InputError: They are too many, or do not fit in memory where they are made as a whole.
     """
-    t = np.arange(sample_count(_duration_s(w), sample_rate_hz)) / sample_rate_hz
-    return w.offset + _shape(w, t)
+    size = sample_count(_duration_s(w), sample_rate_hz)
+    match w:
+        case spec.RandomSines():
+            check_whole(size)
+            return w.offset + _random(w, size)
+        case spec.Multisine():
+            return _Shaped(w, sample_rate_hz, size, _multisine_scale(w, sample_rate_hz, size))
+        case _:
+            return _Shaped(w, sample_rate_hz, size)
+
+
+@dataclass(frozen=True, slots=True)
+class _Shaped:
+    """A waveform's samples, worked out where they are asked for."""
+
+    shape: spec.ShapeOfTime
+    sample_rate_hz: float
+    size: int
+    scale: float = 1.0
+
+    def __getitem__(self, part: slice, /) -> F64:
+        start, stop, _ = part.indices(self.size)
+        t = np.arange(start, stop) / self.sample_rate_hz
+        return self.shape.offset + _shape(self.shape, t, self.scale)
 
 
 def _duration_s(w: spec.Shape) -> float:
@@ -89,7 +129,7 @@ def _duration_s(w: spec.Shape) -> float:
             return w.duration_s
 
 
-def _shape(w: spec.Shape, t: F64) -> F64:
+def _shape(w: spec.ShapeOfTime, t: F64, scale: float) -> F64:
     match w:
         case spec.Sine():
             return w.amplitude * np.sin(_angle(w.frequency_hz, w.phase_deg, t))
@@ -108,9 +148,7 @@ def _shape(w: spec.Shape, t: F64) -> F64:
         case spec.Chirp():
             return _chirp(w, t)
         case spec.Multisine():
-            return _multisine(w, t)
-        case spec.RandomSines():
-            return _random(w, t)
+            return scale * _multisine(w, t)
         case spec.Step() | spec.Hold() | spec.LevelPath():
             return _levelled(w, t)
 
@@ -151,7 +189,7 @@ def _step(w: spec.Step, t: F64) -> F64:
 
 
 def _multisine(w: spec.Multisine, t: F64) -> F64:
-    """Return evenly spaced sines with Schroeder phases, peak ``amplitude``: float64[n].
+    """Return evenly spaced sines with Schroeder phases, of whatever peak: float64[n].
 
     Source: M. R. Schroeder, IEEE Trans. Information Theory 16 (1970) 85: phases of a low crest
     factor, ``phi_m = -pi m (m - 1) / M``.
@@ -161,20 +199,41 @@ def _multisine(w: spec.Multisine, t: F64) -> F64:
     for m in range(count):
         frequency_hz = w.first_hz + m * w.step_hz
         total += np.sin(2.0 * np.pi * frequency_hz * t - np.pi * m * (m + 1) / count)
-    peak = float(np.max(np.abs(total)))
-    return total if peak == 0.0 else w.amplitude / peak * total
+    return total
 
 
-def _random(w: spec.RandomSines, t: F64) -> F64:
+def _multisine_scale(w: spec.Multisine, sample_rate_hz: float, size: int) -> float:
+    """Return what gives a multisine its amplitude, by its peak over the samples that tell it."""
+    told = size
+    if not fit(size):
+        period = outline(w, "")[2] * sample_rate_hz
+        told = min(size, telling_samples(period) if math.isfinite(period) else MAX_WHOLE)
+    plain = _Shaped(w.model_copy(update={"offset": 0.0}), sample_rate_hz, told)
+    peak = max(float(np.max(np.abs(each))) for each in chunks(plain))
+    return 1.0 if peak == 0.0 else w.amplitude / peak
+
+
+def telling_samples(period: float) -> int:
+    """Return how many samples of what repeats stand for all of them.
+
+    Args:
+        period: Samples in a period, > 0 and finite.
+    """
+    # Where a period is no whole number of samples, each cycle has others: several are looked at.
+    cycles = 1 if period.is_integer() else _TELLING_CYCLES
+    return CHUNK + math.ceil(cycles * period)
+
+
+def _random(w: spec.RandomSines, size: int) -> F64:
     """Return sines of random phases at all multiples of 1 / duration within the band: float64[n].
 
     Summed in the spectrum: there are more of them the longer it is.
     """
     first, last = math.ceil(w.first_hz * w.duration_s), math.floor(w.last_hz * w.duration_s)
     phases = np.random.default_rng(w.seed).random(last - first + 1)
-    spectrum = np.zeros(t.size // 2 + 1, dtype=np.complex128)
+    spectrum = np.zeros(size // 2 + 1, dtype=np.complex128)
     spectrum[first : last + 1] = np.exp(2j * np.pi * phases)[: spectrum.size - first]
-    total = np.fft.irfft(spectrum, t.size)
+    total = np.fft.irfft(spectrum, size)
     return w.amplitude / float(np.max(np.abs(total))) * total
 
 

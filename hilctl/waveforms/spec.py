@@ -249,7 +249,7 @@ class FileWaveform(_Shape):
         return last_row
 
 
-Shape: TypeAlias = (
+ShapeOfTime: TypeAlias = (
     Sine
     | Triangle
     | ComplexHarmonic
@@ -258,9 +258,9 @@ Shape: TypeAlias = (
     | Step
     | Hold
     | Multisine
-    | RandomSines
     | LevelPath
 )
+Shape: TypeAlias = ShapeOfTime | RandomSines
 _Single: TypeAlias = Shape | FileWaveform
 SinglePart: TypeAlias = Annotated[_Single, Field(discriminator="kind")]
 

@@ -206,7 +206,7 @@ def cost_us(block: int) -> float:
     """Return processor time that adaptation adds to a tick, in us, the best of some."""
     time_s = np.arange(round(RATE_HZ)) / RATE_HZ
     reference_um = 10.0 + 20.0 * np.sin(44.0 * time_s)
-    operator = DisplacementOperator(reference_um, AdaptationBounds(6.0, 0.1, 0.02))
+    operator = DisplacementOperator.over(reference_um, AdaptationBounds(6.0, 0.1, 0.02))
     adaptation = Adaptation(operator, 0.3, RATE_HZ, 1, 3, NOISE_UM)
     made = made_block(block)
     made.reference[:] = made.input_um[:] = reference_um[:block]

@@ -27,7 +27,7 @@ BOUNDS = st.builds(AdaptationBounds, st.floats(0.0, 20.0), st.floats(0.0, 0.3), 
 
 
 def adapting(bounds, reference=REFERENCE, time_constant_s=0.05):
-    operator = DisplacementOperator(reference, bounds)
+    operator = DisplacementOperator.over(reference, bounds)
     return Adaptation(operator, time_constant_s, RATE_HZ, 1, 1, 0.01), operator
 
 

@@ -5,9 +5,15 @@ import pytest
 
 from hilctl.base.errors import ConfigError
 from hilctl.base.yaml.document import Document
-from hilctl.experiment.adaptation import adaptation_bounds, make_adaptation, worst_inputs
+from hilctl.experiment.adaptation import (
+    adaptation_bounds,
+    adapted_operator,
+    make_adaptation,
+    worst_inputs,
+)
 from hilctl.experiment.check import check
 from hilctl.experiment.load import resolve
+from hilctl.loop.adaptation import DisplacementOperator
 from hilctl.loop.compensator import Compensator
 from tests.unit.experiment.test_feedback import EXPERIMENT, MODEL
 
@@ -35,7 +41,7 @@ def test_a_good_one_is_taken(load):
     assert checked.records_input
     np.testing.assert_array_equal(checked.begun.input_um, checked.reference.values)
     compensator = Compensator(checked.loaded.model, 5000.0)
-    made = make_adaptation(checked.loaded.config, checked.reference.values, compensator)
+    made = make_adaptation(checked.loaded.config, checked.operator, compensator)
     assert made is not None
     assert made.parameters["offset_um"] == 0.0
 
@@ -79,9 +85,8 @@ def test_bounds_follow_from_what_else_acts(load):
         update={"compensator": config.compensator.model_copy(update={"correction": "learned.yaml"})}
     )
     assert adaptation_bounds(learned).array.tolist() == [13.5, 0.0, 0.0, 0.0, 0.0]
-    compensator = Compensator(None, 5000.0)
     both = learned.model_copy(update={"feedback": load(INTEGRAL).config.feedback})
-    assert make_adaptation(both, np.ones(3), compensator) is None
+    assert adapted_operator(both, check(load(NOISE)).reference) is None
 
 
 def test_what_adaptation_can_not_do_is_said(load):
@@ -108,8 +113,12 @@ def test_worst_inputs_reach_further_than_any_adaptation(load):
     """Both ways, coming in over the lead-in."""
     config = load("adaptation={noise_um: 0.03, offset_um: 5.0}").config
     reference = 10.0 * np.sin(np.arange(5000) / 100.0)
-    high, low = worst_inputs(config, reference, reference)
+    operator = DisplacementOperator.over(reference, adaptation_bounds(config))
+    high, low = (worst(0, 5000) for worst in worst_inputs(config, operator, reference))
     assert high[0] == pytest.approx(0.0, abs=0.05)
     assert high[2000:].max() > 5.0 + 10.0 / 0.9
     assert low[2000:].min() < -5.0 - 10.0 / 0.9
-    assert not [*worst_inputs(load().config, reference, reference)]
+    (parts, _) = worst_inputs(config, operator, reference)
+    divided = np.concatenate([parts(start, start + 625) for start in range(0, 5000, 625)])
+    np.testing.assert_allclose(divided, high, rtol=0.0, atol=1e-12)
+    assert not [*worst_inputs(load().config, None, reference)]

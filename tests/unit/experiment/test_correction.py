@@ -42,6 +42,11 @@ def correction_for(made: Reference, segment: Segment, model=None) -> Correction:
     )
 
 
+def correction_of(correction: Correction, made: Reference, model=None):
+    """Return what is added to a reference."""
+    return correction.added(made, model)[:] - made.values[:]
+
+
 def test_a_file_gives_back_the_same_correction(tmp_path):
     """Written and read again, every coefficient has the same bits."""
     made = reference(sine(), tmp_path)
@@ -57,7 +62,7 @@ def test_the_correction_follows_the_phase_where_a_period_is_no_whole_number(tmp_
     """In the steady part it is the Fourier sum at each sample's own phase."""
     made = reference(sine(), tmp_path)
     segment = made.segments[0]
-    added = correction_for(made, segment).samples(made, None)
+    added = correction_of(correction_for(made, segment), made)
     steady = np.arange(segment.steady_start, segment.steady_stop)
     turns = 2.0 * np.pi * steady / segment.period
     expected = 0.5 + 0.4 * np.cos(turns) + 0.2 * np.sin(turns) - 0.1 * np.sin(3.0 * turns)
@@ -69,7 +74,7 @@ def test_the_correction_fades_with_the_waveform(tmp_path):
     """It starts and ends at 0 and changes no faster than the fade and the cycle themselves."""
     made = reference(sine(), tmp_path)
     segment = made.segments[0]
-    added = correction_for(made, segment).samples(made, None)
+    added = correction_of(correction_for(made, segment), made)
     assert added[0] == 0.0
     assert abs(added[-1]) < 1e-4
     steady = added[segment.steady_start : segment.steady_stop]
@@ -78,7 +83,7 @@ def test_the_correction_fades_with_the_waveform(tmp_path):
 
 def test_without_a_soft_start_it_fades_in_over_one_period():
     """Where the waveform starts at once, the correction still does not jump."""
-    fade = envelope(Segment("x", 0, 1000, 0, 1000, 100.0))
+    fade = envelope(Segment("x", 0, 1000, 0, 1000, 100.0), np.arange(1000))
     assert fade[0] == 0.0
     assert fade[50] == pytest.approx(0.5)
     assert (fade[100:] == 1.0).all()
@@ -88,7 +93,7 @@ def test_only_the_waveform_that_was_learned_is_corrected(tmp_path):
     """In a sequence, the other parts stay as they are; a repeated one is corrected each time."""
     parts = (sine(100.0), sine(150.0), sine(150.0, amplitude=9.0))
     made = reference(Sequence(kind="sequence", unit="um", parts=parts, repeat=2), tmp_path)
-    added = correction_for(made, made.segments[1]).samples(made, None)
+    added = correction_of(correction_for(made, made.segments[1]), made)
     corrected = [bool(added[s.start : s.stop].any()) for s in made.segments]
     assert corrected == [False, True, False] * 2
 
@@ -101,7 +106,7 @@ def test_another_waveform_is_refused(other, tmp_path):
     made = reference(sine(), tmp_path)
     correction = correction_for(made, made.segments[0])
     with pytest.raises(InputError, match=r"another waveform: sine 10 um 150 Hz"):
-        correction.samples(reference(other, tmp_path), None)
+        correction.added(reference(other, tmp_path), None)
 
 
 def test_another_length_or_fade_is_the_same_waveform(tmp_path):
@@ -109,7 +114,7 @@ def test_another_length_or_fade_is_the_same_waveform(tmp_path):
     made = reference(sine(), tmp_path)
     correction = correction_for(made, made.segments[0])
     longer = sine(soft_s=0.2).model_copy(update={"duration_s": 3.0})
-    assert np.abs(correction.samples(reference(longer, tmp_path), None)).max() > 0.5
+    assert np.abs(correction_of(correction, reference(longer, tmp_path))).max() > 0.5
 
 
 def test_another_rate_or_model_is_refused(tmp_path):
@@ -117,10 +122,10 @@ def test_another_rate_or_model_is_refused(tmp_path):
     made = reference(sine(), tmp_path)
     correction = correction_for(made, made.segments[0], terfenol_rdpi())
     with pytest.raises(InputError, match="another model"):
-        correction.samples(made, None)
+        correction.added(made, None)
     faster = build(sine(), 2.0 * RATE_HZ, tmp_path)
     with pytest.raises(InputError, match=r"10000 samples a second, not at 20000"):
-        correction.samples(faster, terfenol_rdpi())
+        correction.added(faster, terfenol_rdpi())
 
 
 def test_a_file_with_unequal_coefficients_is_refused(tmp_path):

@@ -151,7 +151,7 @@ class TestForecast:
         """However the reference is cut, the forecast is the same, bit for bit."""
         model = terfenol_rdpi()
         whole = checked(DISPLACEMENT, model=model).forecast
-        monkeypatch.setattr("hilctl.experiment.forecast._CHUNK", chunk)
+        monkeypatch.setattr("hilctl.experiment.whole_run.CHUNK", chunk)
         assert checked(DISPLACEMENT, model=model).forecast == whole
 
     def test_longer_than_a_chunk(self, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -159,7 +159,7 @@ class TestForecast:
         settings = ("waveform.duration_s=120.0", "waveform.frequency_hz=0.37")
         forecast = checked(DISPLACEMENT, *settings, model=terfenol_rdpi()).forecast
         assert forecast.samples == 1_200_000
-        monkeypatch.setattr("hilctl.experiment.forecast._CHUNK", 2_000_000)
+        monkeypatch.setattr("hilctl.experiment.whole_run.CHUNK", 2_000_000)
         assert checked(DISPLACEMENT, *settings, model=terfenol_rdpi()).forecast == forecast
 
     def test_what_is_fed_ahead_is_what_is_forecast(self) -> None:

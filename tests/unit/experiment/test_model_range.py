@@ -6,6 +6,7 @@ import pytest
 from hilctl.base.segments import Segment
 from hilctl.experiment.model_range import range_findings, spectrum
 from hilctl.models.base import IdentifiedRange
+from hilctl.waveforms.build import Reference
 
 RATE_HZ = 10_000.0
 KNOWN = IdentifiedRange(
@@ -16,7 +17,8 @@ KNOWN = IdentifiedRange(
 def findings(values_um, frequency_hz=0.0):
     period = RATE_HZ / frequency_hz if frequency_hz else 0.0
     segment = Segment("s", 0, values_um.size, 0, values_um.size, period)
-    return range_findings(KNOWN, values_um, (segment,), RATE_HZ)
+    span = float(values_um.min()), float(values_um.max())
+    return range_findings(KNOWN, Reference(values_um, "um", RATE_HZ, (segment,), span))
 
 
 def sine(frequency_hz, amplitude=40.0, seconds=1.0):

@@ -26,7 +26,7 @@ TRUE = np.array([3.0, 0.05, 0.01, -0.01, 0.008])
 
 
 def adaptation(due_after=0, shown_after=0, noise_um=0.0, bounds=BOUNDS, reference=REFERENCE):
-    operator = DisplacementOperator(reference, bounds)
+    operator = DisplacementOperator.over(reference, bounds)
     return Adaptation(operator, 0.2, RATE_HZ, due_after, shown_after, noise_um), operator
 
 
@@ -205,9 +205,9 @@ def test_bad_bounds_and_time():
     with pytest.raises(InputError, match="must be >= 0"):
         AdaptationBounds(-1.0, 0.1, 0.0)
     with pytest.raises(InputError, match="slope"):
-        DisplacementOperator(REFERENCE, AdaptationBounds(1.0, 0.5, 0.3))
+        DisplacementOperator.over(REFERENCE, AdaptationBounds(1.0, 0.5, 0.3))
     with pytest.raises(InputError, match="time_constant_s"):
-        Adaptation(DisplacementOperator(REFERENCE, BOUNDS), 0.0, RATE_HZ, 0, 0, 0.0)
+        Adaptation(DisplacementOperator.over(REFERENCE, BOUNDS), 0.0, RATE_HZ, 0, 0, 0.0)
 
 
 class TestLoop:

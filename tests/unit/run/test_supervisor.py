@@ -22,9 +22,20 @@ from hilctl.run.stopping import STOP_SIGNAL
 from hilctl.run.supervisor import Supervisor
 
 MS = 1_000_000
-STARTED = ["ordinary", "worker", "devices", "claimed", "folder", "server", "child", "guardian"]
-READY = [*STARTED, "await ready", "begin", "favoured", "recording"]
-UNDONE = ["ordinary again", "server closed", "folder removed", "devices let go", "worker closed"]
+STARTED = [
+    "ordinary",
+    "worker",
+    "filling",
+    "devices",
+    "claimed",
+    "folder",
+    "server",
+    "child",
+    "guardian",
+]
+READY = [*STARTED, "await ready", "filled", "begin", "favoured", "recording"]
+_UNDONE = ["ordinary again", "server closed", "folder removed", "devices let go"]
+UNDONE = [*_UNDONE, "filling ended", "worker closed"]
 
 
 class Time:
@@ -73,6 +84,7 @@ class Neighbours:
             "be_ordinary": lambda: self.note("ordinary"),
             "favoured": lambda loop: self.around("favoured", "ordinary again", loop),
             "ChangeWorker": lambda checked: self.around("worker", "worker closed", None),
+            "ReferenceProcess": lambda checked: self.around("filling", "filling ended", self),
             "held_devices": lambda holds: self.around("devices", "devices let go", [*holds]),
             "Recorder": lambda *a, overwrite: self.note("claimed", self.recorder),
             "run_folder": self.run_folder,
@@ -141,7 +153,12 @@ class Neighbours:
             assert stopped()
         self.note("await ready")
 
-    def begin(self, start_unix_ns, set_up, waveform_at):
+    def begin(self, *args):
+        if args[0] is self.folder:
+            return self.note("filled")
+        return self.begin_recording(*args)
+
+    def begin_recording(self, start_unix_ns, set_up, waveform_at):
         assert (set_up, waveform_at) == ({"rt.fifo": "done: 50"}, 40)
         self.begun.append((start_unix_ns, self.time.now_ns))
         self.time.now_ns += self.begin_takes_ns.pop(0) if self.begin_takes_ns else 0
@@ -237,7 +254,9 @@ def test_whatever_fails_before_the_start_signal_leaves_nothing(stage, number):
         expected.append("safety closed")
     if number > READY.index("claimed"):
         expected.append("given back")
-    undo = dict(zip(("favoured", "server", "folder", "devices", "worker"), UNDONE, strict=True))
+    undo = dict(
+        zip(("favoured", "server", "folder", "devices", "filling", "worker"), UNDONE, strict=True)
+    )
     expected += [undone for begun, undone in undo.items() if READY.index(begun) < number]
     assert stage.log[number + 1 :] == expected
     if stage.ring is not None:
@@ -287,7 +306,7 @@ def test_what_breaks_afterwards_costs_neither_coil_nor_recording(stage):
     assert stage.log[len(READY) :][:4] == [
         "requests", "serve", "broken off: a bug", "progress ended",
     ]  # fmt: skip
-    assert stage.log[-6:] == ["safety closed", *UNDONE]
+    assert stage.log[-7:] == ["safety closed", *UNDONE]
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, STOP_SIGNAL])
@@ -378,4 +397,4 @@ def test_memory_that_is_not_to_be_had_is_told(stage, monkeypatch):
     monkeypatch.setattr(SampleRing, "create", create)
     with pytest.raises(RunError, match="ring: no memory: No space left on device; less recording"):
         stage.run()
-    assert stage.log[-4:] == ["given back", *UNDONE[2:]]
+    assert stage.log[-5:] == ["given back", *UNDONE[2:]]
