@@ -17,7 +17,7 @@ number is the one it expects.
 import math
 import mmap
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Self
 
@@ -38,6 +38,8 @@ _SEQUENCE, _FIRST_SAMPLE = int(Head.SEQUENCE), int(Head.FIRST_SAMPLE)
 _HEAD_NUMBERS = len(Head)
 _MAGIC = 0x48494C43_52494E48
 _LOOKS = 10
+_BATCH_SAMPLES = 8192
+"""About how many samples are taken out together: what becomes of them is ten times their memory."""
 _TYPES = (np.int64, np.float64, np.float64, np.uint32)
 
 
@@ -181,16 +183,28 @@ class SampleRing:
         self._numbers[_HEAD] = block.number + 1
         return True
 
-    def pop(self) -> Batch | None:
-        """Take out all blocks there are, up to the end of the ring; None where there are none.
+    def batches(self) -> Iterator[Batch]:
+        """Take out the blocks that are there now, some at a time; see :meth:`pop`."""
+        # As many as there are now: on a busy machine there always is another one by then.
+        waiting = min(max(self.page.get(Field.HEAD) - self._tail, 0), self.slots)
+        until = self._tail + waiting
+        while (left := until - self._tail) > 0 and (batch := self.pop(left)) is not None:
+            yield batch
+
+    def pop(self, most: int | None = None) -> Batch | None:
+        """Take out blocks, up to the end of the ring and not too many; None where there are none.
 
         They keep their room until :meth:`release`.
+
+        Args:
+            most: How many at most.
         """
         there = min(max(self.page.get(Field.HEAD) - self._tail, 0), self.slots)
         if there == 0:
             return None
         first = self._tail % self.slots
-        count = min(there, self.slots - first)
+        few = max(1, _BATCH_SAMPLES // self._area.columns.shape[2])
+        count = min(there, self.slots - first, few, there if most is None else most)
         batch = self._area.rows(slice(first, first + count))
         # HEAD may be seen before the block that it counts: the sequence numbers decide.
         wrong = np.flatnonzero(~_whole(batch.heads, self._tail))

@@ -112,11 +112,7 @@ class RingRecorder:
         took = False
         # Before the samples: whatever an event refers to stands in the ring by the time it is seen.
         self._of_loop.extend(page.pop_events())
-        # Twice, as a batch ends where the ring does. Not until there is none: on a busy machine
-        # there always is another block by then, and nothing would ever be flushed.
-        for _ in range(2):
-            if (batch := self._ring.pop()) is None:
-                break
+        for batch in self._ring.batches():
             self.newest = batch.rows(slice(-1, None))
             recorder.batch(batch)
             took = True

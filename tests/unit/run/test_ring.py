@@ -6,6 +6,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from hilctl.base.samples import LAST_SAMPLE, LONGEST_NS, Flag, Head
+from hilctl.run import ring as module
 from hilctl.run.ring import SampleRing
 from hilctl.run.shared_page import Field, PageText
 
@@ -58,6 +59,36 @@ def test_full_ring_refuses_and_keeps_what_it_has(tmp_path):
     assert not push(ring, 9)
     other.release()
     assert push(ring, 9)
+
+
+def test_many_come_out_some_at_a_time(tmp_path, monkeypatch):
+    """In order, round the end of the ring, and no more than there were when it was asked."""
+    monkeypatch.setattr(module, "_BATCH_SAMPLES", 2 * BLOCK)
+    ring = make(tmp_path, slots=7)
+    other = SampleRing(ring.path)
+    for number in range(3):
+        push(ring, number)
+    assert [batch.heads.shape[0] for batch in other.batches()] == [2, 1]
+    other.release()
+    for number in range(3, 9):
+        push(ring, number)
+    sizes, taken = [], []
+    for batch in other.batches():
+        sizes.append(batch.heads.shape[0])
+        taken += (batch.heads[:, Head.FIRST_SAMPLE] // BLOCK).tolist()
+        if len(sizes) == 1:
+            push(ring, 9)
+    assert (sizes, taken) == ([2, 2, 2], [*range(3, 9)])
+    assert [batch.heads.shape[0] for batch in other.batches()] == [1]
+    assert not [*other.batches()]
+
+
+def test_a_block_comes_out_however_large_it_is(tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "_BATCH_SAMPLES", 1)
+    ring = make(tmp_path)
+    push(ring, 0)
+    push(ring, 1)
+    assert ring.pop().heads.shape[0] == 1
 
 
 @settings(max_examples=50)

@@ -120,16 +120,16 @@ def test_events_of_both_sides_come_after_the_samples(ring, recording):
 
 def test_an_event_of_the_loop_never_comes_before_its_samples(ring, recording, monkeypatch):
     """A block and its event that come while the samples are taken wait for the next time."""
-    pop, recorder = ring.pop, recording.recorder
+    batches, recorder, went_on = ring.batches, recording.recorder, []
 
-    def pop_and_go_on():
-        batch = pop()
-        if not recorder.events and batch is None:
+    def batches_and_go_on():
+        yield from batches()
+        if not went_on:
+            went_on.append(True)
             exchange(ring, 1)
             ring.page.push_event(Event(0, "error", "stroke", ""))
-        return batch
 
-    monkeypatch.setattr(ring, "pop", pop_and_go_on)
+    monkeypatch.setattr(ring, "batches", batches_and_go_on)
     recording._drain()
     assert (recorder.firsts, recorder.events) == ([], [])
     recording._drain()
