@@ -25,6 +25,9 @@ _NOT_IN_A_TICK = (
 _RESERVED_BYTES = 8 << 20  # stacks of threads and BLAS' buffers are reserved, and never filled
 _LOCK_ON_FAULT = 7  # MCL_CURRENT | MCL_FUTURE | MCL_ONFAULT
 _DONTNEED = 4
+_TRIM_THRESHOLD = -1
+_MMAP_THRESHOLD = -3
+_KEPT_BYTES = 1 << 19
 _SMAPS = Path("/proc/self/smaps")
 
 
@@ -111,9 +114,19 @@ class ProcessMemory:
         Only those that are as in their file: what the loader has put there is nowhere else. Where
         that is refused, they stay.
         """
+        if hasattr(self._libc, "malloc_trim"):  # glibc's: what was freed goes back, too
+            self._libc.malloc_trim(0)
         for each in _own_mappings():
             if not each.in_a_tick and each.of_file and each.resident and not each.changed:
                 self._libc.madvise(*map(ctypes.c_size_t, (each.start, each.size, _DONTNEED)))
+
+    def stay_small(self) -> None:
+        """Give back what no tick needs, and from now on what is freed: each batch needs some MB."""
+        self.release()
+        if hasattr(self._libc, "mallopt"):
+            # Unless they are set, glibc keeps twice the largest array that was ever freed.
+            self._libc.mallopt(_TRIM_THRESHOLD, _KEPT_BYTES)
+            self._libc.mallopt(_MMAP_THRESHOLD, _KEPT_BYTES)
 
     def lock(self) -> None:
         """Keep in RAM what a tick may need, all of it, now; and whatever else is ever touched.

@@ -130,7 +130,7 @@ class Supervisor:
             # It is started after the loop, to watch its process, and ready long before it.
             while not safety.ready():
                 time.sleep(0.005)
-            ProcessMemory().release()  # all is compiled
+            ProcessMemory().stay_small()  # all is compiled
             start_ns = self._begin(recording.recorder, page)
             # Before there are threads: all that share the interpreter with this one come along.
             stack.enter_context(favoured(child.pid))

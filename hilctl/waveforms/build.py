@@ -9,7 +9,7 @@ import numpy as np
 from hilctl.base.arrays import F64
 from hilctl.base.errors import InputError
 from hilctl.base.segments import Segment
-from hilctl.base.values import IN_MEMORY, Values, chunks, fit, in_memory
+from hilctl.base.values import Values, chunks, fit
 from hilctl.waveforms import shapes, spec
 from hilctl.waveforms.parts import Joined, Repeat, Softened, telling
 from hilctl.waveforms.table import read_samples
@@ -41,17 +41,13 @@ class Reference:
         return telling(self.values.size, self.repeats)
 
     def array(self) -> F64:
-        """Return all of its values, where they fit in memory: float64[n].
+        """Return all of its values, where they fit in memory at all: float64[n].
 
         Raises:
             InputError: They do not.
         """
-        if not in_memory(self.values):
-            raise InputError(
-                f"has {self.values.size} samples, more than the {IN_MEMORY} that fit in memory "
-                "here: shorten it"
-            )
-        return self.values
+        shapes.check_whole(self.values.size)
+        return self.values[:]
 
 
 @dataclass(frozen=True, slots=True)

@@ -116,8 +116,14 @@ def test_telling_parts() -> None:
     assert telling(n, (Repeat(0, chunk, 500.0),)) == (slice(0, n),)
 
 
-def test_where_an_array_is_needed_a_long_one_is_refused(made: Made, small: None) -> None:
-    with pytest.raises(InputError, match=r"4000 samples, more than the .* that fit in memory here"):
+def test_where_an_array_is_needed_a_long_one_is_made_or_refused(
+    made: Made, small: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert made(1000.0, **WAVES[4]).array().size == 4000
+    monkeypatch.setattr(shapes, "MAX_WHOLE", 3999)
+    with pytest.raises(
+        InputError, match="4000 samples, more than the 3999 that fit in memory: shorten it"
+    ):
         made(1000.0, **WAVES[4]).array()
     assert made(1000.0, **WAVES[4] | {"duration_s": 1.0}).array().size == 1000
 
