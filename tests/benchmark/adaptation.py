@@ -157,8 +157,15 @@ def loaded_run(model: Path, *settings: str) -> LoadedExperiment:
 def peak_um(loaded: LoadedExperiment, device: UsedRig) -> tuple[float, float]:
     """Return the largest error and the reference's span of the last second of a run, in um."""
     checked = check(loaded)
-    arrays = (checked.reference.values, checked.begun.input_um)
-    plan = assemble(loaded, *arrays, checked.begun.state, checked.conditioning(), paced=False)
+    arrays = (checked.reference.values[:], checked.begun.input_um[:])
+    plan = assemble(
+        loaded,
+        *arrays,
+        checked.begun.state,
+        checked.conditioning(),
+        operator=checked.operator,
+        paced=False,
+    )
     outcome, samples = run_in_memory(plan, device)
     if outcome.code != "completed":
         raise SystemExit(outcome.reason)

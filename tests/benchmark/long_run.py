@@ -4,8 +4,8 @@
 
 The run is that of ``configs/terfenol_sine_6a.yaml`` at 50 kHz, in a process of its own, whose
 memory is looked at every second. Eight hours of it are 41 GB in the folder, removed at the end.
-Exit code 1 where it is slower than real time, loses a sample, or takes more memory in its last
-tenth than in its second one.
+Exit code 1 where it is slower than real time, loses a sample, or takes more memory in its second
+half than in its first.
 """
 
 import argparse
@@ -15,7 +15,6 @@ import sys
 import tempfile
 import time
 from pathlib import Path
-from statistics import median
 from typing import Any
 
 from hilctl.run.start import checked_experiment
@@ -23,7 +22,7 @@ from hilctl.run.unpaced import run_unpaced
 from tests.benchmark.soak import rss_kib
 
 EXPERIMENT = Path(__file__).parents[2] / "configs" / "terfenol_sine_6a.yaml"
-FLAT = 1.02
+FLAT = 1.05
 
 
 def run(settings: list[str], path: Path) -> dict[str, Any]:
@@ -75,16 +74,16 @@ def main() -> int:
         words = ["--inside", str(Path(folder) / "run.mcap"), "--seconds", str(given.seconds)]
         words += [word for each in given.settings for word in ("--set", each)]
         found, seen = watched(words)
-    tenth = max(len(seen) // 10, 1)
-    early, late = median(seen[tenth : 2 * tenth] or seen), median(seen[-tenth:])
+    begun = seen[len(seen) // 10 :]  # it grows to what a batch needs
+    early, late = max(begun[: len(begun) // 2]), max(begun[len(begun) // 2 :])
     times = given.seconds / found["run_s"]
     print(f"check     {found['check_s']:.2f} s")
     print(f"run       {found['run_s']:.1f} s, {times:.1f} times real time")
     print(f"samples   {found['samples']}, {found['missing']} missing, {found['code']}")
     print(f"recording {found['bytes'] / 1e9:.2f} GB, CPU {found['cpu_s']:.0f} s")
     print(
-        f"memory    {early / 1024:.0f} MiB in the second tenth, {late / 1024:.0f} MiB in the last:"
-        f" {late / early:.3f}; highest {max(seen) / 1024:.0f}"
+        f"memory    {early / 1024:.0f} MiB at most in the first half, {late / 1024:.0f} in the"
+        f" second: {late / early:.3f}"
     )
     well = found["code"] == "completed" and found["missing"] == 0
     return 0 if well and times > 1.0 and late <= FLAT * early else 1

@@ -55,6 +55,7 @@ class Refinement:
             "reasons": list(self.reasons),
             "ratio": self.choice.ratio,
             "strength": self.choice.strength,
+            "anchor": self.choice.anchor,
             "own_drift": self.choice.own,
             "before": self.choice.before.to_mapping(),
             "after": self.choice.after.to_mapping(),

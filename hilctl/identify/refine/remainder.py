@@ -44,6 +44,10 @@ class Moments:
     def __add__(self, other: "Moments") -> "Moments":
         return Moments(self.normal + other.normal, self.right + other.right)
 
+    def scaled(self, factor: float) -> "Moments":
+        """Return them with as many times their weight."""
+        return Moments(factor * self.normal, factor * self.right)
+
     def __sub__(self, other: "Moments") -> "Moments":
         return Moments(self.normal - other.normal, self.right - other.right)
 
@@ -108,8 +112,7 @@ class Remainder:
             rows = np.unique(np.linspace(0, x.size - 1, ROWS).astype(np.int64))
             columns, was = self._columns(x, rows, rate_hz), self._was(x, rate_hz)[rows]
             total += _sums(columns, was, self._weight(x, rows))
-        scale = ANCHOR * len(self._runs)
-        return Moments(scale * total.normal, scale * total.right)
+        return total.scaled(ANCHOR * len(self._runs))
 
     def _motions(self) -> Iterator[F64]:
         """Give motions of the whole range: growing sines, slow and fast, and small in large."""

@@ -18,6 +18,9 @@ from hilctl.models.base import HysteresisModel
 from hilctl.models.refined import RefinedModel
 
 STRENGTHS = (0.003, 0.01, 0.02, 0.05, 0.1, 0.3, 1.0)
+ANCHORS = (100.0, 10.0)
+"""Times the least weight of the old model on motions that runs may say nothing of."""
+AS_GOOD = 1.02  # times the least error on runs held out
 WORTH = 0.98  # of the old error: what is not less is no better
 LOSS = 0.5  # of what is gained in the mean: more must not be lost on any one run
 
@@ -36,12 +39,14 @@ class Choice:
 
     Attributes:
         strength: How firmly the old model is held to.
+        anchor: Times the least weight that it has on motions of its whole range.
         own: Whether runs have constants, creep and drift of their own.
         before: Errors of the old model on what was held out.
         after: Errors of the refined ones, each fitted without the run that it is judged on.
     """
 
     strength: float
+    anchor: float
     own: bool
     before: HeldOut
     after: HeldOut
@@ -137,20 +142,35 @@ class Strength:
         ways = [(strength, own) for own in (False, True) for strength in STRENGTHS]
         for i, (strength, own) in enumerate(ways):
             progress(i / len(ways), f"strength {strength:g}")
-            models = {s: self._refined(s.fitted, strength, own=own) for s in self._splits}
-            after = self._held_out(models)
-            bare = self._held_out(models, own=True) if own else after
-            choice = Choice(strength, own, self._before[own], bare)
-            whole = self._refined(self._whole, strength, own=own)
-            found.append((choice, whole, after.judgement.rms_percent))
+            found.append(self._tried(strength, 1.0, own=own))
         # Small loops stand where hysteresis has left them, so a constant of a run's own would take
         # what is to be learned; it is one only where runs held out do better for it as they are.
         own = min(found, key=lambda each: each[2])[0].own
         left = [(choice, whole) for choice, whole, _ in found if choice.own == own]
-        return min(left, key=lambda each: (not each[0].better, each[0].ratio))
+        best = min(left, key=lambda each: (not each[0].better, each[0].ratio))
+        # Runs say nothing of what is faster or larger than they are: where holding to the old model
+        # there costs them next to nothing, it is held to.
+        for anchor in ANCHORS if best[0].better else ():
+            choice, whole, _ = self._tried(best[0].strength, anchor, own=own)
+            if choice.better and choice.ratio <= AS_GOOD * best[0].ratio:
+                return choice, whole
+        return best
 
-    def _refined(self, fitted: Sequence[int], strength: float, *, own: bool) -> RefinedModel:
-        sums = self._anchor
+    def _tried(
+        self, strength: float, anchor: float, *, own: bool
+    ) -> tuple[Choice, RefinedModel, float]:
+        """Return a way to refine, what it makes of all runs, and its error on those held out."""
+        models = {s: self._refined(s.fitted, strength, anchor, own=own) for s in self._splits}
+        after = self._held_out(models)
+        bare = self._held_out(models, own=True) if own else after
+        choice = Choice(strength, anchor, own, self._before[own], bare)
+        whole = self._refined(self._whole, strength, anchor, own=own)
+        return choice, whole, after.judgement.rms_percent
+
+    def _refined(
+        self, fitted: Sequence[int], strength: float, anchor: float, *, own: bool
+    ) -> RefinedModel:
+        sums = self._anchor.scaled(anchor)
         for i in fitted:
             sums += self._moments[own][i]
         return self._remainder.model(self._solved(sums, strength))

@@ -9,7 +9,7 @@ from hilctl.base.errors import DataError
 from hilctl.identify.fit_data import FitData
 from hilctl.identify.held_out import HeldOut
 from hilctl.identify.judge import judgement_of
-from hilctl.identify.refine.strength import Choice, Split, parts_of
+from hilctl.identify.refine.strength import STRENGTHS, Choice, Split, Strength, parts_of
 from tests.unit.identify.refine.conftest import OLD, history
 
 
@@ -30,8 +30,39 @@ def held_out(factors):
 ])  # fmt: skip
 def test_better_in_the_mean_and_nowhere_much_worse(before, after, better):
     """What one run loses is held against what all gain."""
-    choice = Choice(0.1, False, held_out(before), held_out(after))
+    choice = Choice(0.1, 1.0, False, held_out(before), held_out(after))
     assert choice.better == better
+
+
+class Tried(Strength):
+    """Ways whose errors on runs held out are told, by strength and anchor."""
+
+    def __init__(self, errors):
+        self.errors, self.asked = errors, []
+
+    def _tried(self, strength, anchor, *, own):
+        self.asked.append((strength, anchor))
+        error = self.errors.get((strength, anchor), 0.02)
+        choice = Choice(strength, anchor, own, held_out((0.02, 0.02)), held_out((error, error)))
+        return choice, (strength, anchor), 100.0 * error
+
+
+@pytest.mark.parametrize(
+    ("errors", "taken"),
+    [
+        ({}, (0.1, 1.0)),
+        ({(0.1, 10.0): 0.0101}, (0.1, 10.0)),
+        ({(0.1, 10.0): 0.0101, (0.1, 100.0): 0.0101}, (0.1, 100.0)),
+        ({(0.1, 10.0): 0.01, (0.1, 100.0): 0.0103}, (0.1, 10.0)),
+        ({(0.1, 10.0): 0.0103, (0.1, 100.0): 0.02}, (0.1, 1.0)),
+        ({(0.1, 1.0): 0.02, (0.3, 10.0): 0.01}, (STRENGTHS[0], 1.0)),
+    ],
+)
+def test_the_old_model_is_held_to_where_that_costs_nothing(errors, taken):
+    """As much as runs held out allow: they say nothing of what is faster than they are."""
+    tried = Tried({(0.1, 1.0): 0.01} | errors)
+    choice, whole = tried.best(lambda *_: None)
+    assert whole == taken == (choice.strength, choice.anchor)
 
 
 def test_each_of_several_runs_is_judged_by_what_the_others_say():
