@@ -4,6 +4,7 @@ Feedforward needs no answer from the actuator, so every command of the run is wo
 by the same compensator that will run, and held against the limits.
 """
 
+import logging
 import math
 import time
 from dataclasses import dataclass, replace
@@ -42,6 +43,9 @@ from hilctl.loop.compensator import Compensator
 from hilctl.loop.conditioning import Conditioning
 from hilctl.waveforms.build import Reference, build
 
+_log = logging.getLogger(__name__)
+
+_MANY = 50_000_000  # samples, which take some seconds
 STILL_S = 0.1  # after which the stages of any actuator rest
 _REPEAT = "identify the model on such motions too, or keep the waveform to what it was found on"
 
@@ -112,6 +116,7 @@ def check(
     except InputError as error:
         problems.append(_problem(loaded, "waveform", str(error)))
         raise ConfigError(problems) from None
+    _tell_of_long_work(reference)
     problems += reference_problems(loaded, reference.unit, *reference.span)
     findings = _findings(loaded, reference)
     problems += [_problem(loaded, "waveform", text, hint=_REPEAT) for text in findings.refused]
@@ -140,6 +145,15 @@ def check(
         raise ConfigError(problems)
     warnings = findings.warnings + adaptation_warnings(config, reference.segments)
     return Checked(loaded, reference, forecast, begun, warnings, heat_a2, operator)
+
+
+def _tell_of_long_work(reference: Reference) -> None:
+    samples = sum(part.stop - part.start for part in reference.telling)
+    if samples > _MANY:
+        _log.warning(
+            "the waveform does not repeat: %.3g million samples are worked out before it starts",
+            samples * 1e-6,
+        )
 
 
 def _adapted_problems(

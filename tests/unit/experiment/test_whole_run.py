@@ -9,12 +9,14 @@ import pytest
 
 from hilctl.base import values
 from hilctl.base.arrays import F64
+from hilctl.experiment import check as check_module
 from hilctl.experiment import whole_run
 from hilctl.experiment.forecast import Forecast
 from hilctl.experiment.whole_run import WholeRun, whole_cycle
 from hilctl.loop.compensator import Compensator
 from hilctl.models.base import HysteresisModel
 from hilctl.models.files import load_model
+from hilctl.waveforms import parts, shapes
 from hilctl.waveforms.parts import Repeat
 from tests.published import terfenol_rdpi
 from tests.unit.experiment.test_forecast import DISPLACEMENT, MODEL, checked
@@ -23,6 +25,8 @@ BUDGET = ("limits.rms_current_a=4.0", "limits.thermal_time_constant_s=7.0")
 SEQUENCE = "waveform={kind: sequence, unit: A, repeat: 40, parts: [{kind: sine, \
 amplitude: 9.0, frequency_hz: 7.0, duration_s: 1.0, soft_start_s: 0.2, soft_end_s: 0.2}, \
 {kind: chirp, amplitude: 5.0, start_hz: 2.0, stop_hz: 60.0, duration_s: 0.5}]}"
+CHIRP = "waveform={kind: chirp, unit: A, amplitude: 5.0, start_hz: 2.0, stop_hz: 60.0, \
+duration_s: 40.0}"
 LONG = {
     "sine": ("waveform.duration_s=40.0", "waveform.soft_end_s=0.3"),
     "no whole period": ("waveform.duration_s=40.0", "waveform.frequency_hz=30.0"),
@@ -106,6 +110,24 @@ def test_what_drifts_is_worked_out(drift: float) -> None:
 def test_what_is_not_finite_is_worked_out() -> None:
     counted = gone_through(500.0, 1_000_000, lambda t: np.where(t > 10, np.nan, t))
     assert (counted.samples, counted.passed) == (1_000_000, 0)
+
+
+@pytest.mark.parametrize(("repeats", "told"), [(True, []), (False, ["0.4 million samples"])])
+def test_long_work_is_told(
+    repeats: bool,
+    told: list[str],
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """Where much of it has to be worked out, and not where it repeats."""
+    for module in (values, shapes, parts):
+        monkeypatch.setattr(module, "CHUNK", 1000)
+    monkeypatch.setattr(check_module, "_MANY", 100_000)
+    monkeypatch.setattr(values, "IN_MEMORY", 100_000)
+    waveform = "waveform.duration_s=40.0" if repeats else CHIRP
+    checked(DISPLACEMENT, waveform, model=terfenol_rdpi())
+    texts = [each.getMessage().partition(": ")[2] for each in caplog.records]
+    assert [text.partition(" are")[0] for text in texts] == told
 
 
 @pytest.mark.parametrize(
