@@ -22,6 +22,8 @@ ANCHORS = (100.0, 10.0)
 """Times the least weight of the old model on motions that runs may say nothing of."""
 AS_GOOD = 1.02  # times the least error on runs held out
 WORTH = 0.98  # of the old error: what is not less is no better
+STRETCHES = 10  # of a run, each of them judged by itself
+MOST = 1.12  # times the old error of any one: shorter than a run, they are known less well
 LOSS = 0.5  # of what is gained in the mean: more must not be lost on any one run
 
 
@@ -63,6 +65,27 @@ class Choice:
         return tuple(now.label for now, was in pairs if now.rms_percent > most * was.rms_percent)
 
     @property
+    def even(self) -> bool:
+        """Whether no stretch of a run is worse by more than such a short one tells.
+
+        Small motions are stretches of larger runs: what they lose does not show in all of it.
+        """
+        worst = 1.0
+        sides = zip(
+            self.before.judgement.modelled_um, self.after.judgement.modelled_um, strict=True
+        )
+        for run, modelled in zip(self.after.records, sides, strict=True):
+            assert isinstance(run, History)
+            seen_um = run.displacement_um[run.ignore :]
+            was, now = (
+                [float(np.mean(part**2)) for part in np.array_split(side - seen_um, STRETCHES)]
+                for side in modelled
+            )
+            ratios = [b / a for a, b in zip(was, now, strict=True) if a > 0.0]
+            worst = max(worst, *ratios)
+        return worst <= MOST**2
+
+    @property
     def ratio(self) -> float:
         """Error after over error before: root mean square over runs, each of its own motion."""
         after, before = (
@@ -75,6 +98,11 @@ class Choice:
     def better(self) -> bool:
         """Whether it is better than the old model, and on no run worse."""
         return self.ratio <= WORTH and not self.worse
+
+    def as_good(self, other: "Choice") -> bool:
+        """Return whether it is as good as another way, or next to."""
+        fair = self.better >= other.better and self.even >= other.even
+        return fair and self.ratio <= AS_GOOD * other.ratio
 
 
 def parts_of(
@@ -147,12 +175,12 @@ class Strength:
         # what is to be learned; it is one only where runs held out do better for it as they are.
         own = min(found, key=lambda each: each[2])[0].own
         left = [(choice, whole) for choice, whole, _ in found if choice.own == own]
-        best = min(left, key=lambda each: (not each[0].better, each[0].ratio))
+        best = min(left, key=lambda way: (not way[0].better, not way[0].even, way[0].ratio))
         # Runs say nothing of what is faster or larger than they are: where holding to the old model
         # there costs them next to nothing, it is held to.
         for anchor in ANCHORS if best[0].better else ():
             choice, whole, _ = self._tried(best[0].strength, anchor, own=own)
-            if choice.better and choice.ratio <= AS_GOOD * best[0].ratio:
+            if choice.as_good(best[0]):
                 return choice, whole
         return best
 

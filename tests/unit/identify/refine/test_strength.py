@@ -34,6 +34,19 @@ def test_better_in_the_mean_and_nowhere_much_worse(before, after, better):
     assert choice.better == better
 
 
+@pytest.mark.parametrize(("factor", "even"), [(1.0, True), (1.1, True), (1.15, False), (0.1, True)])
+def test_one_stretch_that_gets_worse_is_seen(factor, even):
+    """In the last tenth of one run, where all the rest of both gets better by half."""
+    before, after = held_out((0.02, 0.02)), held_out((0.01, 0.01))
+    modelled = after.judgement.modelled_um[1]
+    measured = after.records[1].displacement_um
+    last = -(modelled.size // 10)
+    modelled[last:] = (1.0 + factor * 0.02) * measured[last:]
+    choice = Choice(0.1, 1.0, False, before, after)
+    assert choice.better
+    assert choice.even == even
+
+
 class Tried(Strength):
     """Ways whose errors on runs held out are told, by strength and anchor."""
 
