@@ -36,7 +36,7 @@ from hilctl.identify.workers import one_by_one
 from hilctl.learning.session import Session
 from hilctl.loop.compensator import Compensator
 from hilctl.models.base import HysteresisModel
-from hilctl.models.files import dump_model
+from hilctl.models.files import dump_model, load_model
 from hilctl.run.step import unpaced
 from hilctl.waveforms.build import build
 from hilctl_drivers.simulated.rigs import PHYSICS, Physics, TerfenolOptions
@@ -46,6 +46,7 @@ from tests.benchmark.learning import CYCLES, EXPERIMENT, SOFT_S
 from tests.benchmark.references import RATE_HZ, Row, Stroke, random, references
 
 CAMPAIGN = Path(__file__).parents[2] / "configs" / "identify_any.yaml"
+OMEGA = CAMPAIGN.parent / "models" / "terfenol_omega.yaml"
 MARGIN = 0.06  # of the range that a model was identified on, at either end
 MOST_A = 8.0
 LEARNED_HZ = (10.0, 100.0, 250.0)
@@ -301,13 +302,15 @@ def show(rig: Rig, options: argparse.Namespace) -> tuple[dict[str, Any], bool]:
     low_um, high_um = fit.model.output_range_um or (-50.0, 35.0)
     margin = MARGIN * (high_um - low_um)
     inside = Stroke(low_um + margin, high_um - margin)
-    cost = cost_us(fit.model, inside.row("", (1.0, None), 0.6 * random(9)).reference_um)
+    timed_um = inside.row("", (1.0, None), 0.6 * random(9)).reference_um
+    cost, omega = cost_us(fit.model, timed_um), cost_us(load_model(OMEGA), timed_um)
     rows = [row for row in references(inside.low_um, inside.high_um) if wanted(row, options.rows)]
     also = [name for name in ("conditioned", "floor") if getattr(options, name)]
     names = ["from rest", *also]
     say = partial(print, file=sys.stderr if options.json else sys.stdout, flush=True)
     say(f"\n{' '.join([rig.physics, *options.options])}, {options.model}, {taken}: "
-        f"{took_s:.1f} s of processor time, inverse {cost:.2f} us a sample")  # fmt: skip
+        f"{took_s:.1f} s of processor time, inverse {cost:.2f} us a sample, "
+        f"Omega {omega:.2f}")  # fmt: skip
     say(f"{'reference':20} {'peak %':>7} {'no mean':>8} {'rms %':>6} {'noise':>6}"
         + "".join(f" | {name:>13}" for name in names) + " | goal")  # fmt: skip
     ways = drives(rig, fit.model, also)
@@ -324,6 +327,7 @@ def show(rig: Rig, options: argparse.Namespace) -> tuple[dict[str, Any], bool]:
         "model": taken,
         "fit_s": took_s,
         "inverse_us": cost,
+        "omega_us": omega,
         "rows": [result.to_mapping() for result in results],
     }
     return table, good
