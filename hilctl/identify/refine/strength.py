@@ -24,6 +24,7 @@ AS_GOOD = 1.02  # times the least error on runs held out
 WORTH = 0.98  # of the old error: what is not less is no better
 STRETCHES = 10  # of a run, each of them judged by itself
 MOST = 1.12  # times the old error of any one: shorter than a run, they are known less well
+FOREGONE = 0.5  # of what could be gained: no more is left for the sake of such a stretch
 LOSS = 0.5  # of what is gained in the mean: more must not be lost on any one run
 
 
@@ -175,7 +176,11 @@ class Strength:
         # what is to be learned; it is one only where runs held out do better for it as they are.
         own = min(found, key=lambda each: each[2])[0].own
         left = [(choice, whole) for choice, whole, _ in found if choice.own == own]
-        best = min(left, key=lambda way: (not way[0].better, not way[0].even, way[0].ratio))
+        best = min(left, key=lambda way: (not way[0].better, way[0].ratio))
+        least = FOREGONE * (1.0 - best[0].ratio)
+        even = [way for way in left if way[0].even and way[0].better]
+        even = [way for way in even if 1.0 - way[0].ratio >= least]
+        best = min(even, key=lambda way: way[0].ratio, default=best)
         # Runs say nothing of what is faster or larger than they are: where holding to the old model
         # there costs them next to nothing, it is held to.
         for anchor in ANCHORS if best[0].better else ():

@@ -51,13 +51,28 @@ class Tried(Strength):
     """Ways whose errors on runs held out are told, by strength and anchor."""
 
     def __init__(self, errors):
-        self.errors, self.asked = errors, []
+        self.errors, self.kinds = errors, {}
 
     def _tried(self, strength, anchor, *, own):
-        self.asked.append((strength, anchor))
         error = self.errors.get((strength, anchor), 0.02)
-        choice = Choice(strength, anchor, own, held_out((0.02, 0.02)), held_out((error, error)))
+        kind = self.kinds.get(strength, Choice)
+        choice = kind(strength, anchor, own, held_out((0.02, 0.02)), held_out((error, error)))
         return choice, (strength, anchor), 100.0 * error
+
+
+class Uneven(Choice):
+    """A way that makes a stretch worse."""
+
+    @property
+    def even(self):
+        return False
+
+
+@pytest.mark.parametrize(("error", "taken"), [(0.0149, 0.3), (0.0151, 0.1)])
+def test_no_more_than_half_is_left_for_the_sake_of_a_stretch(error, taken):
+    tried = Tried({(0.1, 1.0): 0.01, (0.3, 1.0): error})
+    tried.kinds[0.1] = Uneven
+    assert tried.best(lambda *_: None)[0].strength == taken
 
 
 @pytest.mark.parametrize(
