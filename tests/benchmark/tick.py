@@ -107,10 +107,10 @@ def ticks_us(options: argparse.Namespace, model: Path) -> tuple[np.ndarray, np.n
         work = job(folder, checked)
         threading.Thread(target=start, args=(ring.page,), daemon=True).start()
         outcome = loop_process.run_job(work, ring, work.load())
-        batch = ring.pop()
-    if outcome.code != "completed" or batch is None:
+        heads = [batch.heads for batch in ring.batches()]
+    if outcome.code != "completed" or not heads:
         sys.exit(f"the run ended as {outcome.code}: {outcome.reason}")
-    exchange_ns = batch.heads[:, Head.EXCHANGE_NS]
+    exchange_ns = np.concatenate(heads)[:, Head.EXCHANGE_NS]
     slept, woke = np.array([NotingClock.slept, NotingClock.woke])
     busy_ns = slept[1:] - woke[:-1] - exchange_ns[: slept.size - 1]
     return busy_ns[: options.ticks] * 1e-3, exchange_ns[: options.ticks] * 1e-3
