@@ -7,8 +7,9 @@ spi.py         a PPI compensated by stop operators (SPI)
 deadband.py    memoryless function of deadband operators and its inverse
 integrated.py  the integrated model: RDPI, then deadbands, and its inverse
 butterfly.py   plays, then an even function: rods without bias, inverted on one side
-staged.py      field lag, hysteresis, structure, delay, and their inverse; chain.py joins them, and
-               undoes the structure
+staged.py      field lag, hysteresis, structure, delay, creep, and their inverse; chain.py joins
+               them, and undoes the structure
+creep.py       creep of a displacement, and its exact inverse
 generalised.py generalised PI model: plays between envelopes, and its inverse
 numeric_inverse.py  models whose inverse is found root by root: preisach.py, kp.py
                (Krasnosel'skii-Pokrovskii), bouc_wen.py, duhem.py

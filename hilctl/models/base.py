@@ -165,6 +165,9 @@ class Operator:
         memory[:] = self._memory
         self._memory = memory
 
+    def stand(self, seconds: float) -> None:
+        """Let time pass with the input as it was last: what that changes is creep alone."""
+
     def reset(self, first_input: float | None = None) -> None:
         """Start from rest; where ``first_input`` is given, as if the signal had begun there."""
         self._memory[:] = self._rest

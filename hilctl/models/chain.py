@@ -48,6 +48,11 @@ class Chain(Operator):
             stage.keep_in(memory[start:stop])
             start = stop
 
+    def stand(self, seconds: float) -> None:
+        """Let time pass with the input as it was last."""
+        for stage in self._stages:
+            stage.stand(seconds)
+
     def _own_stages(self) -> list[Stage] | None:
         """Return those of all its operators, in order."""
         stages: list[Stage] = []

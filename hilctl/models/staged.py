@@ -1,9 +1,10 @@
-"""Hysteresis between the stages that carry it: field lag, structure, transport delay.
+"""Hysteresis between the stages that carry it: field lag, structure, transport delay, creep.
 
-Command -> field lag -> hysteresis -> structure -> transport delay -> displacement. A displacement
-is sampled when a command is put out and can't yet show it, as :mod:`hilctl.base.device` has it. So
-the forward operator answers one sample later than its input, whatever its stages; ``delay_s`` is
-what comes on top of that.
+Command -> field lag -> hysteresis -> structure -> transport delay -> creep -> displacement. What is
+linear may stand in any order; creep, as the last, is undone first. A displacement is sampled when a
+command is put out and can't yet show it, as :mod:`hilctl.base.device` has it. So the forward
+operator answers one sample later than its input, whatever its stages; ``delay_s`` is what comes on
+top of that.
 
 The inverse goes the other way round, and its input must run ahead of its output by
 :attr:`~hilctl.models.base.Operator.preview` samples: one for the loop, then the delay, then what
@@ -29,6 +30,7 @@ from hilctl.kernels.dynamics import (
 )
 from hilctl.models.base import HysteresisModel, Operator, Provenance, refuse
 from hilctl.models.chain import Chain, between, delayed, smoothing_weights
+from hilctl.models.creep import Creep
 from hilctl.models.field import FieldModel
 from hilctl.models.generalised_duhem import GeneralisedDuhemModel
 from hilctl.models.integrated import IntegratedModel
@@ -126,6 +128,7 @@ class StagedModel(HysteresisModel):
         smoothing_s: Standard deviation of the smoothing in the inverse, in s, not less than 1 / w
             where there is a structure. Corners of a reference are rounded within about twice that;
             a lead makes steps of the command out of corners that are not.
+        creep: What the displacement goes on by where it stays; None where there is none.
     """
 
     kind: Literal["staged"] = "staged"
@@ -134,6 +137,7 @@ class StagedModel(HysteresisModel):
     structure: Structure | None = None
     delay_s: float = Field(default=0.0, ge=0.0, le=1.0)
     smoothing_s: float = Field(default=0.0, ge=0.0, le=0.1)
+    creep: Creep | None = None
 
     @classmethod
     def around(
@@ -144,6 +148,7 @@ class StagedModel(HysteresisModel):
         structure: Structure | None = None,
         delay_s: float = 0.0,
         smoothing_s: float = 0.0,
+        creep: Creep | None = None,
     ) -> Self:
         """Put stages around a model, whose unit, ranges and provenance become theirs."""
         shared = {name: getattr(hysteresis, name) for name in _SHARED}
@@ -155,6 +160,7 @@ class StagedModel(HysteresisModel):
             structure=structure,
             delay_s=delay_s,
             smoothing_s=smoothing_s,
+            creep=creep,
             **shared,
         )
 
@@ -187,6 +193,8 @@ class StagedModel(HysteresisModel):
             stages.append(delayed(whole))
         if part:
             stages.append(between(1.0 - part))
+        if self.creep is not None:
+            stages.append(self.creep.forward(sample_rate_hz, self.hysteresis.output_offset_um))
         return Chain(stages, output_offset=self.output_offset_um)
 
     def inverse(self, sample_rate_hz: float) -> Chain:
@@ -197,7 +205,11 @@ class StagedModel(HysteresisModel):
         """
         whole, part = self._delay(sample_rate_hz)
         preview = 1 + whole + (1 if part else 0)
-        stages = [between(part)] if part else []
+        stages: list[Operator] = []
+        if self.creep is not None:
+            stages.append(self.creep.inverse(sample_rate_hz, self.hysteresis.output_offset_um))
+        if part:
+            stages.append(between(part))
         if self.structure is not None or self.smoothing_s > 0.0:
             stages.append(self._unstructure(sample_rate_hz))
             preview += stages[-1].preview

@@ -7,6 +7,7 @@ from pydantic import ValidationError
 from hilctl.base.errors import ModelError
 from hilctl.models.base import Provenance
 from hilctl.models.chain import smoothing_weights
+from hilctl.models.creep import Creep
 from hilctl.models.files import dump_model, parse_model
 from hilctl.models.published import exponential_integrated
 from hilctl.models.staged import FieldLag, StagedModel, Structure
@@ -19,6 +20,7 @@ OMEGA = exponential_integrated(
     alpha=0.3, gamma_s=0.0, a_0=1.0, alpha_0=0.2, beta_0=0.3, g_0=6.0, alpha_1=0.3, beta_1=0.1,
     d_p=0.8, alpha_2=0.4, beta_2=0.1, d_n=0.8, plays=6, deadbands_a_side=2,
 )  # fmt: skip
+CREEP = Creep(time_constants_s=(0.02, 0.3), shares=(0.03, 0.02))
 STAGES = {
     "bare": {},
     "lag": {"lag": LAG},
@@ -27,10 +29,11 @@ STAGES = {
     "part of a sample": {"delay_s": 2.35 / RATE_HZ},
     "structure": {"structure": STRUCTURE},
     "smoothing": {"lag": LAG, "smoothing_s": 1.0 / (2.0 * np.pi * 2200.0)},
-    "all": {"lag": LAG, "structure": STRUCTURE, "delay_s": 2.7e-5},
+    "creep": {"lag": LAG, "creep": CREEP},
+    "all": {"lag": LAG, "structure": STRUCTURE, "delay_s": 2.7e-5, "creep": CREEP},
 }
 PREVIEW = {"bare": 1, "lag": 1, "linear lag": 1, "delay": 4, "part of a sample": 4, "structure": 12,
-           "all": 14, "smoothing": 12}  # fmt: skip
+           "creep": 1, "all": 14, "smoothing": 12}  # fmt: skip
 
 
 def sine(frequency_hz, n=12_000):
@@ -95,7 +98,7 @@ def test_inverse_undoes_the_model(name, frequency_hz):
     came = model.forward(RATE_HZ).process(command)
     error = (came - reference)[2 * inverse.preview :]  # before it, the model stands where it began
     assert np.abs(error).max() < 2e-4 * np.ptp(reference)
-    if name not in {"structure", "smoothing", "all", "part of a sample"}:
+    if name not in {"structure", "smoothing", "all", "part of a sample", "creep"}:
         np.testing.assert_allclose(error, 0.0, atol=1e-11)
 
 
@@ -103,7 +106,8 @@ def test_model_answers_later_than_its_input():
     """No command shows in the displacement sampled when it is put out, nor before the delay."""
     step = np.zeros(40)
     step[10:] = 2.0
-    for name, first in (("bare", 11), ("lag", 11), ("structure", 11), ("delay", 14)):
+    stages = ("bare", 11), ("lag", 11), ("structure", 11), ("delay", 14), ("creep", 11)
+    for name, first in stages:
         came = StagedModel.around(OMEGA, **STAGES[name]).forward(RATE_HZ).process(step)
         assert np.flatnonzero(came != came[0])[0] == first, name
 
