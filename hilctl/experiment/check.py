@@ -124,7 +124,8 @@ def check(
     try:
         conditioning = conditioning_of(loaded)
         conditioned = np.empty(0) if conditioning is None else conditioning.command
-        before, begins = _state_before(loaded, folder, conditioned, problems)
+        now_s = time.time() if now_s is None else now_s
+        before, begins = _state_before(loaded, folder, conditioned, now_s, problems)
         if before is not None:
             values = before.lead_in(values, config.lead_in_samples)
         begun = begin(loaded.model, config.sample_rate_hz, values, before, begins)
@@ -132,7 +133,6 @@ def check(
             begun = replace(begun, stands_um=None)
         problems += feedback_problems(loaded, begun.preview)
         problems += adaptation_problems(loaded, begun.preview)
-        now_s = time.time() if now_s is None else now_s
         heat_a2 = max(heat_a2, heat_before(loaded, folder, now_s))
         forecast = forecast_of(loaded, reference, begun, conditioned, heat_a2)
     except ModelError as error:
@@ -193,7 +193,11 @@ def _corrected(loaded: LoadedExperiment, reference: Reference, problems: list[Pr
 
 
 def _state_before(
-    loaded: LoadedExperiment, folder: Path | None, conditioned: F64, problems: list[Problem]
+    loaded: LoadedExperiment,
+    folder: Path | None,
+    conditioned: F64,
+    now_s: float,
+    problems: list[Problem],
 ) -> tuple[InitialState | None, str]:
     """Return where the actuator stands before the waveform, None at rest; and why, in words.
 
@@ -202,6 +206,7 @@ def _state_before(
         folder: See :func:`check`.
         conditioned: float64[m], commands that come before the waveform: a cycle that makes all
             before it forgotten, and a rest; or the rest alone; or none.
+        now_s: Unix time in s.
         problems: Added to where that can't be said.
 
     Raises:
@@ -215,11 +220,11 @@ def _state_before(
     if config.condition is not None:
         begins = "where its condition leaves the actuator"
     elif named == "last":
-        before, begins = left_by_last_run(loaded, folder)
+        before, begins = left_by_last_run(loaded, now_s, folder)
     elif named != "rest":
         begins = f"where {named} left the actuator"
         try:
-            before = initial_state_after(loaded.folder / named, model, rate_hz)
+            before = initial_state_after(loaded.folder / named, model, rate_hz, now_s)
         except DataError as error:
             problems.append(_problem(loaded, "compensator.initial_state", str(error)))
     if before is None and conditioned.size:

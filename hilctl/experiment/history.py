@@ -23,12 +23,13 @@ _LARGEST_BYTES = 256 << 20  # some minutes at 50 kHz: more would keep the start 
 
 
 def left_by_last_run(
-    loaded: LoadedExperiment, folder: Path | None = None
+    loaded: LoadedExperiment, now_s: float, folder: Path | None = None
 ) -> tuple[InitialState | None, str]:
     """Return where the last run left the actuator, or None for rest; and which, or why, in words.
 
     Args:
         loaded: The experiment; it has a compensator.
+        now_s: Unix time in s.
         folder: Folder that this run is written to, where that is not ``recording.folder``.
 
     Raises:
@@ -45,7 +46,7 @@ def left_by_last_run(
     try:
         left, why = None, f"{path}: is larger than {_LARGEST_BYTES >> 20} MB"
         if path.stat().st_size <= _LARGEST_BYTES:
-            left = initial_state_after(path, model, config.sample_rate_hz)
+            left = initial_state_after(path, model, config.sample_rate_hz, now_s)
     except (DataError, OSError) as error:
         left, why = None, str(error)
     if left is None:

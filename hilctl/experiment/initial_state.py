@@ -1,8 +1,10 @@
 """What a compensator begins with: the memory that a run before left in the actuator, or rest."""
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -111,56 +113,74 @@ def begin(
     )
 
 
-def initial_state_after(path: Path, model: HysteresisModel, sample_rate_hz: float) -> InitialState:
+def initial_state_after(
+    path: Path, model: HysteresisModel, sample_rate_hz: float, now_s: float
+) -> InitialState:
     """Return what a recorded run, taken to have begun at rest, left behind.
 
     All of its commands, the ramp out too, go through the model; what comes of it, through the
-    inverse. So any run will do, with or without a compensator, by this model or another.
+    inverse. So any run will do, with or without a compensator, by this model or another. What has
+    crept goes back from its end to now, and for a second at least.
 
     Args:
         path: The run's recording.
         model: The model that the compensator inverts.
         sample_rate_hz: Samples a second; the recording's must be the same.
+        now_s: Unix time in s.
 
     Raises:
         DataError: The recording can't be read, or is not of a whole run of such commands.
         ModelError: The model has no inverse.
     """
     followed = _Followed(path, model, sample_rate_hz)
-    left = left_by(followed.commands(), model, sample_rate_hz)
+    left = left_by(followed.commands(), model, sample_rate_hz, lambda: now_s - followed.ended_s)
     if not math.isfinite(left.stands_um):
         raise DataError(f"{path}: has commands that the model has no displacement for")
     return replace(left, run_id=followed.run_id)
 
 
-def left_by(commands: Iterable[F64], model: HysteresisModel, sample_rate_hz: float) -> InitialState:
-    """Return where commands from rest leave the model, once it has stood still for a second.
+def left_by(
+    commands: Iterable[F64],
+    model: HysteresisModel,
+    sample_rate_hz: float,
+    stood_s: Callable[[], float] | None = None,
+) -> InitialState:
+    """Return where commands from rest leave the model.
 
     Args:
-        commands: float64[n] each, one after the other.
+        commands: float64[n] each, one after the other; the last of them a rest, where nothing more
+            is said of it.
         model: The model.
         sample_rate_hz: Samples a second.
+        stood_s: Gives, after the commands, the time since then in s; a second at least is taken.
     """
     forward, inverse = model.forward(sample_rate_hz), model.inverse(sample_rate_hz)
     rest = inverse.state()
-    ahead, stands_um = inverse.preview, 0.0
-    for command in _and_still(commands, round(_STILL_S * sample_rate_hz)):
+    ahead, stands_um, last = inverse.preview, 0.0, 0.0
+    still = [] if stood_s is None else [round(_STILL_S * sample_rate_hz)]
+    for command in _and_still(commands, still):
         came = forward.process(command)
         if not np.isfinite(came).all():
             return InitialState(rest, math.nan, "")
         if came.size > ahead:
             inverse.process(came[ahead:])
-        ahead, stands_um = max(ahead - came.size, 0), float(came[-1])
+        ahead, stands_um, last = max(ahead - came.size, 0), float(came[-1]), float(command[-1])
+    if stood_s is not None and (more_s := stood_s() - _STILL_S) > 0.0:
+        forward.stand(more_s)
+        inverse.stand(more_s)
+        stands_um = float(forward.process(np.array([last]))[0])
     return InitialState(inverse.state(), stands_um, "")
 
 
-def _and_still(commands: Iterable[F64], samples: int) -> Iterator[F64]:
+def _and_still(commands: Iterable[F64], still: Sequence[int]) -> Iterator[F64]:
+    """Give commands, and then the last of them for so many samples."""
     last = 0.0
     for command in commands:
         if command.size:
             yield command
             last = float(command[-1])
-    yield np.full(samples, last)
+    for samples in still:
+        yield np.full(samples, last)
 
 
 class _Followed:
@@ -169,6 +189,8 @@ class _Followed:
     def __init__(self, path: Path, model: HysteresisModel, sample_rate_hz: float) -> None:
         self._path, self._unit, self._rate_hz = path, model.input_unit, sample_rate_hz
         self.run_id = ""
+        self.ended_s = math.inf
+        """When it ended, Unix time in s, once its commands have been gone through."""
 
     def commands(self) -> Iterator[F64]:
         """Yield them, from the first sample to the last."""
@@ -191,6 +213,8 @@ class _Followed:
             lost = "lost its device, or did not confirm its safe value"
             raise DataError(f"{self._path}: {lost}: where it left the actuator is not known")
         self.run_id = piece.run.get("run_id", "")
+        with suppress(ValueError):  # of an older hilctl, or a foreign one: a second, then
+            self.ended_s = datetime.fromisoformat(piece.end.get("ended", "")).timestamp()
 
     def _check(self, recording: "Recording") -> None:
         path = self._path

@@ -1,5 +1,6 @@
 """Replay: the recorded reference, through the code that ran, gives the recorded bits again."""
 
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -127,7 +128,7 @@ def test_another_model_is_fed_by_its_own_preview(ahead, recording):
 
 def test_run_that_goes_on_after_another_is_identical(ahead, tmp_path):
     """Begun with what a run before left, a run records that memory, and replays from it."""
-    memory = initial_state_after(ahead.path, STAGED, ahead.sample_rate_hz)
+    memory = initial_state_after(ahead.path, STAGED, ahead.sample_rate_hz, time.time())
     after = record(tmp_path, STAGED, 0.1, ahead.path)
     begun = Compensator(STAGED, ahead.sample_rate_hz)
     begun.restore(memory.state)

@@ -555,7 +555,7 @@ def test_the_first_command_is_that_of_the_state_it_begins_with(
 ) -> None:
     """A run that goes on from another one makes no step from rest."""
     there = InitialState(np.array([-3.0, 0.0]), 0.0, "before")
-    monkeypatch.setattr(module, "left_by_last_run", lambda loaded, folder: (there, "as left"))
+    monkeypatch.setattr(module, "left_by_last_run", lambda *_: (there, "as left"))
     made = loaded(DISPLACEMENT, *FAST, model=Offset())
     compensator = CompensatorConfig(model="model.yaml", initial_state="last")
     config = made.config.model_copy(update={"compensator": compensator})
@@ -589,7 +589,7 @@ def test_the_coil_is_cold_unless_something_says_otherwise(monkeypatch: pytest.Mo
 
 
 def test_a_run_before_that_says_nothing_is_a_problem(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(path: Path, model: HysteresisModel, rate_hz: float) -> InitialState:
+    def refuse(path: Path, *_: object) -> InitialState:
         raise DataError(f"{path}: nothing there")
 
     monkeypatch.setattr(module, "initial_state_after", refuse)

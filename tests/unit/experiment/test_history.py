@@ -31,6 +31,8 @@ limits: {peak_current_a: 6.0, slew_a_per_s: 20000.0, stroke_um: [-75.0, 60.0]}
 recording: {folder: runs}
 """
 
+NOW_S = 2e9
+
 
 class Folder:
     """An experiment, and the folder that its runs are written to."""
@@ -68,7 +70,7 @@ def test_the_newest_of_this_device_is_taken(folder):
     (folder.runs / "text.mcap").write_text("no recording")
     path = folder.record("b")
     folder.record("a")
-    left, words = left_by_last_run(folder.loaded())
+    left, words = left_by_last_run(folder.loaded(), NOW_S)
     assert left is not None
     assert left.run_id == "b"
     assert abs(left.stands_um) > 0.5
@@ -87,7 +89,7 @@ def test_no_older_one_stands_in_for_the_newest(folder, made, why):
     """What came after it is not known: rest, and the reason."""
     folder.record("new", **made)
     folder.record("old")
-    left, words = left_by_last_run(folder.loaded())
+    left, words = left_by_last_run(folder.loaded(), NOW_S)
     assert left is None
     assert words.startswith("at rest, what the last run left is not known")
     assert why in words
@@ -97,9 +99,12 @@ def test_no_older_one_stands_in_for_the_newest(folder, made, why):
 def test_another_rate_or_a_large_file(folder, monkeypatch):
     """A recording that does not fit is named with what does not."""
     path = folder.record("new")
-    assert "was recorded at 10000 Hz" in left_by_last_run(folder.loaded("sample_rate_hz=5000"))[1]
+    assert (
+        "was recorded at 10000 Hz"
+        in left_by_last_run(folder.loaded("sample_rate_hz=5000"), NOW_S)[1]
+    )
     monkeypatch.setattr("hilctl.experiment.history._LARGEST_BYTES", 1 << 10)
-    left, words = left_by_last_run(folder.loaded())
+    left, words = left_by_last_run(folder.loaded(), NOW_S)
     assert (left, f"{path}: is larger than 0 MB" in words) == (None, True)
 
 
@@ -109,17 +114,22 @@ def test_where_this_run_goes_the_last_one_may_be(folder):
     folder.record("older")
     newer = folder.path / "other" / "newer.mcap"
     shutil.copy(folder.runs / "older.mcap", newer)
-    assert left_by_last_run(folder.loaded(), newer.parent)[1] == f"where {newer} left the actuator"
-    assert "older.mcap" in left_by_last_run(folder.loaded())[1]
+    assert (
+        left_by_last_run(folder.loaded(), NOW_S, newer.parent)[1]
+        == f"where {newer} left the actuator"
+    )
+    assert "older.mcap" in left_by_last_run(folder.loaded(), NOW_S)[1]
 
 
 def test_nothing_there(folder):
     """No recording, no folder; and no device that could have a past."""
-    words = left_by_last_run(folder.loaded())[1]
+    words = left_by_last_run(folder.loaded(), NOW_S)[1]
     assert words == f"at rest: no recording of this device in {folder.runs}"
-    assert left_by_last_run(folder.loaded(f"recording.folder={folder.path}/absent"))[0] is None
+    assert (
+        left_by_last_run(folder.loaded(f"recording.folder={folder.path}/absent"), NOW_S)[0] is None
+    )
     folder.record("new", holds=())
-    assert left_by_last_run(folder.loaded(holds=())) == (None, "at rest")
+    assert left_by_last_run(folder.loaded(holds=()), NOW_S) == (None, "at rest")
 
 
 class TestCheck:
@@ -129,7 +139,7 @@ class TestCheck:
         """The compensator begins there, is led in from there, and says so."""
         folder.record("new")
         begun = check(folder.loaded()).begun
-        left, words = left_by_last_run(folder.loaded())
+        left, words = left_by_last_run(folder.loaded(), NOW_S)
         np.testing.assert_array_equal(begun.state, left.state)
         assert (begun.run_id, begun.begins) == ("new", words)
         assert begun.input_um[0] == pytest.approx(left.stands_um)

@@ -1,5 +1,6 @@
 """What a run before left behind: the compensator that begins with it meets its model exactly."""
 
+from datetime import datetime
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 from hilctl.base.errors import DataError
 from hilctl.base.samples import COLUMNS, Batch, Flag, Head
 from hilctl.experiment.initial_state import InitialState, initial_state_after, left_by
+from hilctl.models.creep import Creep
 from hilctl.models.published import exponential_integrated
 from hilctl.models.staged import FieldLag, StagedModel
 from hilctl.recording.messages import RecordingLayout
@@ -23,6 +25,10 @@ OMEGA = exponential_integrated(
 STAGED = StagedModel.around(
     OMEGA, lag=FieldLag(tau_s=2e-4, growth_per_unit=0.2), delay_s=2.0 / RATE_HZ
 )
+CREEPING = STAGED.model_copy(
+    update={"creep": Creep(time_constants_s=(0.3, 20.0), shares=(0.03, 0.05))}
+)
+NOW_S = datetime.fromisoformat("2026-01-01T00:01:00+00:00").timestamp()
 COMMAND = 4.0 * np.sin(np.pi * np.arange(1000) / 999.0)
 
 
@@ -56,7 +62,7 @@ def record(path: Path, command, *, first=0, whole=True, flags=0, facts=None, end
 @pytest.mark.parametrize("model", [OMEGA, STAGED], ids=["integrated", "staged"])
 def test_compensator_goes_on_where_the_actuator_was_left(tmp_path, model):
     """An actuator that is the model, left away from rest, then follows the reference exactly."""
-    memory = initial_state_after(record(tmp_path / "run.mcap", COMMAND), model, RATE_HZ)
+    memory = initial_state_after(record(tmp_path / "run.mcap", COMMAND), model, RATE_HZ, NOW_S)
     plant, inverse = model.forward(RATE_HZ), model.inverse(RATE_HZ)
     plant.process(np.concatenate((COMMAND, np.full(20_000, COMMAND[-1]))))
     assert abs(memory.stands_um) > 0.5
@@ -73,7 +79,7 @@ def test_compensator_goes_on_where_the_actuator_was_left(tmp_path, model):
     np.testing.assert_allclose(came[110:], reference[110:], atol=1e-9)
 
 
-@pytest.mark.parametrize("model", [OMEGA, STAGED], ids=["integrated", "staged"])
+@pytest.mark.parametrize("model", [OMEGA, STAGED, CREEPING], ids=["integrated", "staged", "creep"])
 def test_a_run_in_pieces_leaves_what_the_whole_leaves(model):
     """To the bit, where a piece is shorter than what the inverse looks ahead, and where empty."""
     whole = left_by([COMMAND], model, RATE_HZ)
@@ -81,6 +87,23 @@ def test_a_run_in_pieces_leaves_what_the_whole_leaves(model):
     left = left_by(pieces, model, RATE_HZ)
     assert left.stands_um == whole.stands_um
     np.testing.assert_array_equal(left.state, whole.state)
+
+
+@pytest.mark.parametrize(("ended", "still_s"), [
+    ("2026-01-01T00:00:56.500+00:00", 3.5),
+    ("2026-01-01T00:01:09.000+00:00", 1.0),
+    ("yesterday", 1.0),
+])  # fmt: skip
+def test_what_has_crept_goes_back_until_the_next_run(tmp_path, ended, still_s):
+    """As if all the time since the end had been gone through; a clock set back is a second."""
+    path = record(tmp_path / "run.mcap", COMMAND, end={"ended": ended})
+    left = initial_state_after(path, CREEPING, RATE_HZ, NOW_S)
+    still = np.full(round(still_s * RATE_HZ), COMMAND[-1])
+    wanted = left_by([COMMAND, still], CREEPING, RATE_HZ)
+    gone = left_by([COMMAND], CREEPING, RATE_HZ)
+    assert abs(gone.stands_um - wanted.stands_um) > 0.02
+    assert left.stands_um == pytest.approx(wanted.stands_um, abs=1e-6)
+    np.testing.assert_allclose(left.state, wanted.state, rtol=0.0, atol=1e-6)
 
 
 def test_from_rest_the_same_reference_is_missed(tmp_path):
@@ -114,6 +137,6 @@ def test_recordings_that_don_t_tell_are_refused(tmp_path, model, rate_hz, made, 
     """Another rate, another unit, lost samples, no end: refused with the reason."""
     path = record(tmp_path / "run.mcap", COMMAND, **made)
     with pytest.raises(DataError, match=message):
-        initial_state_after(path, model, rate_hz)
+        initial_state_after(path, model, rate_hz, NOW_S)
     with pytest.raises(DataError, match="no such file"):
-        initial_state_after(tmp_path / "absent.mcap", model, rate_hz)
+        initial_state_after(tmp_path / "absent.mcap", model, rate_hz, NOW_S)
