@@ -11,9 +11,10 @@ import hilctl
 from hilctl.base.device import CommandUnit
 from hilctl.identify.catalogue import CATALOGUE
 from hilctl.identify.data.records import Record, Records, SteadyLoop
-from hilctl.identify.fit_data import FitData, search_data
+from hilctl.identify.fit_data import FitData
+from hilctl.identify.fit_kind import fit_kind
 from hilctl.identify.found_range import identified_range
-from hilctl.identify.job import FitJob, OnProgress, StartOutcome, ignore_progress
+from hilctl.identify.job import OnProgress, StartOutcome, ignore_progress
 from hilctl.identify.judge import Judgement, judge
 from hilctl.identify.settings import FitSettings
 from hilctl.identify.workers import Map, one_by_one
@@ -93,8 +94,8 @@ def fit_model(
         DataError: The data can't be used as asked, or there are none.
     """
     begin = clock()
-    data, few = FitData(records, unit), search_data(records, settings.kind, unit)
-    found = CATALOGUE[settings.kind].fit(FitJob(few, settings, run, progress, start))
+    data = FitData(records, unit)
+    found = fit_kind(records, settings, unit, run=run, progress=progress, start=start)
     judged = judge(found.model, data, creep=settings.creep)
     provenance = Provenance(
         source=tuple(source),

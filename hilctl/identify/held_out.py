@@ -9,10 +9,10 @@ import numpy as np
 from hilctl.base.arrays import F64
 from hilctl.base.device import CommandUnit
 from hilctl.base.errors import DataError
-from hilctl.identify.catalogue import CATALOGUE
 from hilctl.identify.data.records import History, Record, SteadyLoop
-from hilctl.identify.fit_data import FitData, search_data
-from hilctl.identify.job import FitJob, OnProgress
+from hilctl.identify.fit_data import FitData
+from hilctl.identify.fit_kind import fit_kind
+from hilctl.identify.job import OnProgress
 from hilctl.identify.judge import Judgement, judge, judgement_of
 from hilctl.identify.settings import FitSettings
 from hilctl.identify.workers import Map
@@ -129,12 +129,12 @@ def held_out_error(
 
 def _tried(trial: _Trial) -> tuple[F64, object | None] | None:
     """Return what a model gives of the data that it did not see, and where its search ended."""
-    data = search_data(trial.fold.fitted, trial.settings.kind, trial.unit)
+    fitted, settings = trial.fold.fitted, trial.settings
     try:
-        found = CATALOGUE[trial.settings.kind].fit(FitJob(data, trial.settings, start=trial.start))
+        found = fit_kind(fitted, settings, trial.unit, start=trial.start)
     except DataError:  # what is left is too little for this kind of fit; all of it need not be
         return None
-    judged = judge(found.model, trial.fold.held_out, creep=trial.settings.creep)
+    judged = judge(found.model, trial.fold.held_out, creep=settings.creep)
     return np.concatenate(judged.modelled_um), found.end
 
 

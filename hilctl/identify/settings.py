@@ -132,6 +132,13 @@ class FitSettings(Strict):
         default=False,
         description="A zero and creep, c + d ln(1 + t / 0.1 s), of each record's own.",
     )
+    creep_stage: bool = _of(
+        "staged",
+        "field",
+        "generalised_duhem",
+        default=True,
+        description="Whether creep is looked for, where histories rest for 0.5 s and more.",
+    )
     hysteresis: Literal["integrated", "preisach"] = _of(
         "staged",
         default="integrated",

@@ -117,7 +117,7 @@ def identified(physics: Physics, path: Path) -> None:
     if path.exists():
         return
     waveform = build(load_experiment(CAMPAIGN).config.waveform, RATE_HZ, CAMPAIGN.parent)
-    command = np.array(waveform.values)
+    command = waveform.array().copy()
     noise_um = np.random.default_rng(3).normal(0.0, NOISE_UM, command.size)
     displacement_um = driven(rig(physics, 0.0), command) + noise_um
     history = History("campaign", command, displacement_um, RATE_HZ)

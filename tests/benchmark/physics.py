@@ -133,7 +133,7 @@ def identified(rig: Rig, kind: str, seed: int) -> tuple[FittedModel, float]:
     """Return a model of the campaign on one rig, and the processor time it took."""
     experiment = load_experiment(CAMPAIGN)
     waveform = build(experiment.config.waveform, RATE_HZ, CAMPAIGN.parent)
-    command = np.array(waveform.values)
+    command = waveform.array().copy()
     measured = driven(rig.at_rest(noise=True, seed=seed), command)
     records = [History("campaign", command, measured, RATE_HZ)]
     start = time.process_time()
@@ -184,8 +184,13 @@ def drives(rig: Rig, model: HysteresisModel, also: Sequence[str]) -> dict[str, D
         loaded, left, stands = conditioned(rig, model)
 
         def after(row: Row) -> tuple[F64, TerfenolActuator]:
-            led = left.lead_in(row.reference_um, loaded.config.lead_in_samples)
-            return compensated(model, led, left), copy.deepcopy(stands)
+            # References are shorter than the way from where the actuator stands: that comes first.
+            way = loaded.config.lead_in_samples
+            rested_um = np.concatenate((np.full(way, row.reference_um[0]), row.reference_um))
+            command = compensated(model, left.lead_in(rested_um, way)[:], left)
+            rig_then = copy.deepcopy(stands)
+            driven(rig_then, command[:way])
+            return command[way:], rig_then
 
         found["conditioned"] = after
     if "floor" in also:

@@ -73,7 +73,7 @@ def drive(loaded: LoadedExperiment, model: HysteresisModel, reference: Reference
     config, device = loaded.config, loaded.device
     compensator = Compensator(model, config.sample_rate_hz)
     limiter = Limiter(config.command_limits(), 1.0 / config.sample_rate_hz)
-    values = reference.values
+    values = reference.array()
     wanted, command, flags = np.empty(values.size), np.empty(values.size), _flags(values.size)
     displacement_um, measured = np.empty(values.size), np.empty(values.size)
     compensator.process(compensator.ahead(values), wanted)
