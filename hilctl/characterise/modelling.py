@@ -23,7 +23,7 @@ Mask: TypeAlias = npt.NDArray[np.bool_]
 
 _SLACK = 0.01
 
-FITTED = ("slow-loops", "fast-loops", "small-motions", "training")
+FITTED = ("slow-loops", "fast-loops", "creep", "small-motions", "training")
 """Steps whose recordings a model is identified from: each begins with a motion of full size, so
 that what was before it does not matter."""
 

@@ -1,7 +1,8 @@
-"""Noise and drift of a sensor at rest, and the first reaction to a small sine: pure functions."""
+"""Noise, drift and creep at rest, and the first reaction to a small sine: pure functions."""
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -14,6 +15,8 @@ from hilctl.recording.data import Recording
 _CLEAR = 6.0  # standard errors that a reaction must stand out by
 _EVEN = 2.0
 _FEWEST_CYCLES = 4
+_MEAN_S = 0.1
+_LONG = 10  # times that: a rest that tells creep
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +66,30 @@ def rest_noise(recording: Recording) -> RestNoise:
         line_hz=strongest * recording.sample_rate_hz / left.size,
         line_um=float(lines[strongest]),
     )
+
+
+def crept_percent(recording: Recording) -> list[float]:
+    """Return how far the displacement moves on in each long rest, in percent of where it stands.
+
+    Each from a tenth of a second after the motion before it, and from the displacement at the
+    beginning; rests where the command began are left out.
+    """
+    segment = recording.segments[-1]
+    samples = recording.samples.part(segment.start, segment.stop)
+    command, part = samples.command, round(_MEAN_S * recording.sample_rate_hz)
+    began = float(recording.samples.command[0])
+    began_um = float(np.nanmean(recording.samples.displacement_um[:part]))
+    turns = np.flatnonzero(np.diff(command))
+    edges = np.concatenate(([0], turns + 1, [command.size]))
+    crept = []
+    for start, stop in pairwise(edges.tolist()):
+        if stop - start < _LONG * part or abs(command[start] - began) < 1e-9 * np.ptp(command):
+            continue
+        moving_um = samples.displacement_um[start:stop]
+        first_um = float(np.nanmean(moving_um[part : 2 * part]))
+        last_um = float(np.nanmean(moving_um[-part:]))
+        crept.append(100.0 * (last_um - first_um) / (first_um - began_um))
+    return crept
 
 
 @dataclass(frozen=True, slots=True)

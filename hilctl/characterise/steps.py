@@ -15,7 +15,7 @@ from hilctl.characterise.loops import (
     repeatability,
     reversal_curves,
 )
-from hilctl.characterise.noise import rest_noise, sine_reaction
+from hilctl.characterise.noise import crept_percent, rest_noise, sine_reaction
 from hilctl.characterise.problem import RigProblemError
 from hilctl.characterise.response import small_signal
 from hilctl.characterise.results import Measured
@@ -274,6 +274,18 @@ def _take_biased(
     return measured.also(biased=found), text
 
 
+def _rests(limits: CampaignLimits, measured: Measured) -> Keys:
+    return waveforms.rests(limits, full_amplitude(limits, measured))
+
+
+def _take_rests(
+    recording: Recording, limits: CampaignLimits, measured: Measured
+) -> tuple[Measured, str]:
+    del limits
+    crept = " and ".join(f"{percent:+.2g}" for percent in crept_percent(recording))
+    return measured, f"moves on by {crept} % in {waveforms.CREEP_S:g} s"
+
+
 def _small(limits: CampaignLimits, measured: Measured) -> Keys:
     return waveforms.small_motions(limits, full_amplitude(limits, measured))
 
@@ -336,6 +348,7 @@ STEPS: tuple[CampaignStep, ...] = (
     CampaignStep("fast-loops", "loops at several frequencies", _fast, _take_fast),
     CampaignStep("reversal-curves", "first-order reversal curves", _reversal, _take_reversal),
     CampaignStep("biased-loops", "small loops all over the range", _biased, _take_biased),
+    CampaignStep("creep", "creep in rests on either side", _rests, _take_rests),
     CampaignStep("small-motions", "small random motions", _small, _taken("for the fit")),
     CampaignStep(
         "training",

@@ -18,6 +18,7 @@ from hilctl.waveforms.spec import AnyWaveform
 Keys: TypeAlias = dict[str, Any]
 
 REST_S = 2.0
+CREEP_S = 8.0
 RANDOM_S = 3.0
 HELD_OUT_SEED = 7
 TRAINING_SEED = 100
@@ -33,6 +34,7 @@ _REVERSALS = 9
 _BIASES = (0.7, 0.35, 0.0, -0.35, -0.7)
 _TRIES = 5
 _OF_BIAS = 0.15
+_OF_REST = 0.8
 _SMALL = ((0.6, 0.35), (-0.6, 0.35), (0.0, 0.35), (0.87, 0.11), (-0.87, 0.11), (0.0, 0.11))
 _RANDOM_BAND = (5.0, 0.5)  # of the lowest and of the highest frequency of loops
 
@@ -209,6 +211,23 @@ def random_reference(limits: CampaignLimits, amplitude: float, seed: int) -> Key
     """Return a reference that never repeats, after a conditioning cycle."""
     part = _random_part(limits, amplitude, seed, RANDOM_S, limits.centre)
     return _sequence(limits, [conditioning(limits, amplitude), part])
+
+
+def rests(limits: CampaignLimits, amplitude: float) -> Keys:
+    """Return rests on either side and at rest, after a conditioning cycle: they tell creep."""
+    level = _OF_REST * amplitude
+    rate_per_s = min(8.0 * amplitude * limits.lowest_hz, limits.slew_per_s)
+    rise_s = min(2.0 * level / rate_per_s, 0.5 * CREEP_S)
+    steps = {
+        "kind": "step",
+        "levels": [level, -level, limits.rest - limits.centre],
+        "dwell_s": CREEP_S,
+        "rise_s": rise_s,
+        "offset": limits.centre,
+        "rest": limits.rest,
+        "soft_start_s": rise_s,
+    }
+    return _sequence(limits, [conditioning(limits, amplitude), steps])
 
 
 def _random_part(

@@ -22,6 +22,7 @@ FOLDS = 3
 SEED = 1
 HEAD = 0.7  # part of a history that is fitted, where the rest is held out
 SAME = 0.02  # of a span: what counts as within it
+MOVES = 0.1  # of a history's peak-to-peak: what its last part must move by, or it says nothing
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,7 +151,8 @@ def _halved(record: Record) -> tuple[Record, Record | None]:
         tail = History(label, command, displacement_um, rate_hz, cut)
     except DataError:
         return record, None
-    return (head, tail) if _within(record, [head]) else (record, None)
+    moves = np.ptp(displacement_um[cut:]) > MOVES * np.ptp(displacement_um)
+    return (head, tail) if moves and _within(record, [head]) else (record, None)
 
 
 def _within(record: Record, others: Sequence[Record]) -> bool:

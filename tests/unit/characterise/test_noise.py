@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from hilctl.base.segments import Segment
-from hilctl.characterise.noise import rest_noise, sine_reaction
+from hilctl.characterise.noise import crept_percent, rest_noise, sine_reaction
 from hilctl.characterise.problem import RigProblemError
-from hilctl.characterise.waveforms import at_rest, sine
+from hilctl.characterise.waveforms import at_rest, rests, sine
+from hilctl.models.creep import Creep
 
 RNG = np.random.default_rng(4)
 
@@ -81,3 +82,20 @@ def test_a_segment_says_where_the_sine_is(make_recording):
     segment = Segment("sine", 500, 3000, 500, 3000, 250.0)
     run = make_recording(2.0 * command, command=command, segments=[segment])
     assert sine_reaction(run).gain_um == pytest.approx(2.0)
+
+
+def test_what_creeps_in_a_rest_is_told_of_where_it_stands(limits, played):
+    """Either side, from a displacement that is not 0 at rest; nothing where nothing creeps."""
+    creep = Creep(time_constants_s=(0.02, 3.0), shares=(0.1, 0.05))
+
+    def creeping(command):
+        x_um = 5.0 * command + 12.0
+        return creep.forward(limits.sample_rate_hz, rest_um=x_um[0]).process(x_um)
+
+    keys = rests(limits, limits.reach)
+    found = crept_percent(played(limits, keys, creeping, noise_um=0.01))
+    # The element of 0.02 s is through with it before it is looked at, and what the other one has
+    # gone to on one side it must come back from on the other.
+    assert found == pytest.approx([100.0 * 0.05 / 1.1 * 0.88, 100.0 * 0.05 / 1.1 * 1.58], rel=0.05)
+    still = crept_percent(played(limits, keys, lambda v: 5.0 * v + 12.0, noise_um=0.01))
+    assert still == pytest.approx([0.0, 0.0], abs=0.05)

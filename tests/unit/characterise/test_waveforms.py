@@ -23,6 +23,7 @@ WAVEFORMS = {
     "reversal": lambda x: w.reversal_curves(x, x.reach),
     "biased": lambda x: w.biased_loops(x, x.reach),
     "random": lambda x: w.random_reference(x, x.reach, 1),
+    "rests": lambda x: w.rests(x, x.reach),
     "small": lambda x: w.small_motions(x, x.reach),
 }
 
@@ -61,6 +62,21 @@ def test_reversal_curves_turn_ever_lower(limits):
     assert turns == sorted(turns, reverse=True)
     assert turns[-1] == -2.0
     assert set(path["levels"][:-1:2]) == {2.0}
+
+
+@pytest.mark.parametrize("settings", [(), RESTING_HIGH], ids=["central", "high"])
+def test_rests_are_long_and_lie_on_either_side(limits_with, settings):
+    limits = limits_with(*settings)
+    keys, command = w.within(limits, w.rests(limits, limits.reach))
+    steps = keys["parts"][1]
+    still = round((steps["dwell_s"] - steps["rise_s"]) * limits.sample_rate_hz) - 2
+    dwell = round(steps["dwell_s"] * limits.sample_rate_hz)
+    ends = command.size - dwell * np.arange(2, -1, -1)
+    for end, side in zip(ends, (1.0, -1.0), strict=False):
+        rest = command[end - still : end]
+        assert np.ptp(rest) == 0.0
+        assert rest[0] == pytest.approx(limits.centre + side * 0.8 * limits.reach, rel=0.01)
+    assert command[-1] == pytest.approx(limits.rest)
 
 
 def test_a_loop_keeps_the_amplitude_where_the_limits_allow_it(limits):

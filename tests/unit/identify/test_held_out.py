@@ -51,3 +51,9 @@ def test_of_a_history_the_last_part_of_what_is_judged_is_held_out():
 
 def test_a_history_that_grows_has_no_part_that_says_anything_of_the_rest():
     assert folds_of([history(np.linspace(0.5, 1.0, 1000))]) == []
+
+
+def test_a_history_that_rests_at_its_end_is_fitted_as_a_whole():
+    """Errors in percent of the little that a rest moves by would say nothing."""
+    envelope = np.where(np.arange(1000) < 650, 1.0, 0.02)
+    assert folds_of([history(envelope)]) == []
