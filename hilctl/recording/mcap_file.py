@@ -19,7 +19,6 @@ from mcap.records import (
     Attachment,
     AttachmentIndex,
     Channel,
-    Chunk,
     ChunkIndex,
     DataEnd,
     Footer,
@@ -44,8 +43,12 @@ LEVEL = 1
 _MESSAGE = struct.Struct("<BQHIQQ")
 _MESSAGE_ROW = np.dtype([("opcode", "u1"), ("size", "<u8"), ("channel", "<u2"),
                          ("sequence", "<u4"), ("logged", "<u8"), ("published", "<u8")])  # fmt: skip
-_FIXED = _MESSAGE.size - 9
+_FRAME = 9
+"""Bytes of a record's opcode and size."""
+_FIXED = _MESSAGE.size - _FRAME
 """Bytes of a message record that are neither its opcode and size nor its data."""
+_ZSTD = b"zstd"
+_CHUNK = struct.Struct(f"<BQQQQII{len(_ZSTD)}sQ")
 _INDEX = struct.Struct("<BQHI")
 _INDEX_ROW = struct.Struct("<QQ")
 _FOOTER = struct.Struct("<BQQQ")
@@ -181,25 +184,24 @@ class McapWriter:
         self._chunk = _OpenChunk()
         data = b"".join(closing.parts)
         compressed = self._compressor.compress(data)
-        chunk = Chunk(
-            compression="zstd", data=compressed, message_end_time=closing.last_ns,
-            message_start_time=closing.first_ns, uncompressed_crc=zlib.crc32(data),
-            uncompressed_size=len(data),
+        head = _CHUNK.pack(
+            Opcode.CHUNK, _CHUNK.size - _FRAME + len(compressed), closing.first_ns, closing.last_ns,
+            len(data), zlib.crc32(data), len(_ZSTD), _ZSTD, len(compressed),
         )  # fmt: skip
-        start, written = self._stream.tell(), _bytes(chunk)
+        start, length = self._stream.tell(), len(head) + len(compressed)
         offsets, indexes = {}, bytearray()
         for channel, places in closing.indexes.items():
-            offsets[channel] = start + len(written) + len(indexes)
-            size = _INDEX.size - 9 + len(places)
+            offsets[channel] = start + length + len(indexes)
+            size = _INDEX.size - _FRAME + len(places)
             indexes += _INDEX.pack(Opcode.MESSAGE_INDEX, size, channel, len(places)) + places
         index = ChunkIndex(
-            chunk_length=len(written), chunk_start_offset=start, compression=chunk.compression,
-            compressed_size=len(compressed), message_end_time=chunk.message_end_time,
+            chunk_length=length, chunk_start_offset=start, compression=_ZSTD.decode(),
+            compressed_size=len(compressed), message_end_time=closing.last_ns,
             message_index_length=len(indexes), message_index_offsets=offsets,
-            message_start_time=chunk.message_start_time, uncompressed_size=len(data),
+            message_start_time=closing.first_ns, uncompressed_size=len(data),
         )  # fmt: skip
-        self._stream.write(written)
-        self._stream.write(indexes)
+        for part in (head, compressed, indexes):
+            self._stream.write(part)
         self._chunk_indexes.add(_bytes(index))
         self._statistics.chunk_count += 1
 
