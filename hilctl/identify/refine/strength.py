@@ -21,7 +21,7 @@ STRENGTHS = (0.003, 0.01, 0.02, 0.05, 0.1, 0.3, 1.0)
 ANCHORS = (100.0, 10.0)
 """Times the least weight of the old model on motions that runs may say nothing of."""
 AS_GOOD = 1.02  # times the least error on runs held out
-WORTH = 0.98  # of the old error: what is not less is no better
+WORTH = 0.9  # of the old error: less gain is not worth what runs do not show
 STRETCHES = 10  # of a run, each of them judged by itself
 MOST = 1.12  # times the old error of any one: shorter than a run, they are known less well
 FOREGONE = 0.5  # of what could be gained: no more is left for the sake of such a stretch
