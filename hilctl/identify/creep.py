@@ -11,16 +11,17 @@ import numpy as np
 from scipy.optimize import nnls
 
 from hilctl.base.arrays import F64, I64
-from hilctl.identify.data.records import History, Record
+from hilctl.identify.data.records import FEWEST_POINTS, History, Record
 from hilctl.models.creep import Creep
 
+COARSE_S = 1e-3
 LEAST_REST_S = 0.5
 STILL = 1e-6  # of the command's range, from sample to sample
-SETTLED_S = 0.02  # of a rest: lags and structures are still by then
+SETTLED_S = 0.01  # of a rest: lags and structures are still by then
 SHORTEST_S = 0.03  # time constant
 LONGEST = 10.0  # times the longest rest: slower creep than this goes straight throughout
 APART = 2.0  # of time constants: any law of creep is near a sum of such
-FIRST_S, GROWTH = 0.01, 1.3  # of stretches of a rest, each averaged
+FIRST_S, GROWTH = 0.005, 1.3  # of stretches of a rest, each averaged
 ROUNDS = 4  # what has crept does not creep on: each round leaves a few percent of what it adds
 LEAST_SHARE = 1e-4
 CLEAR = 0.3  # least part of the motion during rests that creep must explain
@@ -53,7 +54,7 @@ def creep_of(records: Sequence[Record]) -> Creep | None:
     Args:
         records: Of which histories tell that rest for half a second and more, twice or more.
     """
-    histories = [record for record in records if isinstance(record, History)]
+    histories = [_coarse(record) for record in records if isinstance(record, History)]
     rests = [rest for i, history in enumerate(histories) for rest in _rests(i, history)]
     if len(rests) < 2:
         return None
@@ -74,6 +75,17 @@ def without_creep(records: Sequence[Record], creep: Creep) -> tuple[Record, ...]
         else record
         for record in records
     )
+
+
+def _coarse(history: History) -> History:
+    """Return means over a millisecond: creep is slower by far, and there are fewer of them."""
+    together = max(1, int(COARSE_S * history.sample_rate_hz))
+    count = history.command.size // together
+    if together == 1 or count < FEWEST_POINTS:
+        return history
+    whole = np.stack((history.command, history.displacement_um))[:, : count * together]
+    command, displacement_um = whole.reshape(2, count, together).mean(axis=2)
+    return History(history.label, command, displacement_um, history.sample_rate_hz / together)
 
 
 def _rests(number: int, history: History) -> Iterator[_Rest]:
