@@ -18,7 +18,7 @@ from hilctl.waveforms.spec import AnyWaveform
 Keys: TypeAlias = dict[str, Any]
 
 REST_S = 2.0
-CREEP_S = 8.0
+CREEP_S = 4.0
 RANDOM_S = 3.0
 HELD_OUT_SEED = 7
 TRAINING_SEED = 100
