@@ -5,10 +5,13 @@ from scipy.fft import rfft, rfftfreq
 
 from hilctl.base.arrays import F64
 from hilctl.experiment.model_range import ALL, spectrum
-from hilctl.identify.data.records import Record, SteadyLoop
+from hilctl.identify.data.records import History, Record, SteadyLoop
+from hilctl.identify.data.thin import turning_points
 from hilctl.identify.fit_data import FitData
 from hilctl.models.base import IdentifiedRange
 
+SMALL, FEWEST_SWINGS = 0.1, 10
+NOT_ZERO_UM = 1e-6
 LEAST = 0.01  # part of a history's power below its lowest frequency
 
 
@@ -21,10 +24,26 @@ def identified_range(data: FitData) -> IdentifiedRange:
     ]
     lowest, highest = zip(*map(frequencies_hz, data.records), strict=True)
     return IdentifiedRange(
-        peak_to_peak_um=(min(moves), max(moves)),
+        peak_to_peak_um=(min(map(smallest_um, data.records)), max(moves)),
         frequency_hz=(min(lowest), max(highest)),
         speed_um_per_s=max(speeds),
     )
+
+
+def smallest_um(record: Record) -> float:
+    """Return the peak-to-peak displacement of a loop, or of a history's smaller swings.
+
+    A history goes from turn to turn of its command. A tenth of its way it goes in smaller swings:
+    noise, or what is left of a decaying cycle, is not much of it.
+    """
+    if isinstance(record, History):
+        at = turning_points(record.command)
+        swings_um = np.sort(np.abs(np.diff(record.displacement_um[at])))
+        if swings_um.size >= FEWEST_SWINGS:
+            way_um = np.cumsum(swings_um)
+            found = float(swings_um[np.searchsorted(way_um, SMALL * way_um[-1])])
+            return max(found, NOT_ZERO_UM)
+    return float(np.ptp(record.displacement_um))
 
 
 def frequencies_hz(record: Record) -> tuple[float, float]:

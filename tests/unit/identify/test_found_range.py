@@ -31,3 +31,20 @@ def test_of_a_history_the_frequencies_of_its_command():
     low, high = identified_range(FitData([History("sweep", command, command, 1e3)])).frequency_hz
     assert low == pytest.approx(2.2, abs=0.5)
     assert high == pytest.approx(20.0, abs=10.0)
+
+
+def test_of_a_history_the_swings_from_turn_to_turn():
+    """Of a large loop and many small ones all over it, these are the smallest motion."""
+    time_s = np.arange(20_000) / 1000.0
+    command = 3.0 * np.sin(2.0 * np.pi * 0.1 * time_s) + 0.5 * np.sin(2.0 * np.pi * 5.0 * time_s)
+    small, large = identified_range(
+        FitData([History("small", command, 5.0 * command, 1e3)])
+    ).peak_to_peak_um
+    assert small == pytest.approx(5.0, rel=0.2)
+    assert large == pytest.approx(35.0, rel=0.02)
+
+
+def test_of_a_history_that_turns_little_all_of_it():
+    command = np.concatenate((np.linspace(0.0, 2.0, 100), np.linspace(2.0, 0.0, 100)))
+    found = identified_range(FitData([History("once", command, 5.0 * command, 1e3)]))
+    assert found.peak_to_peak_um == pytest.approx((10.0, 10.0))
