@@ -50,6 +50,7 @@ class _Phase(Enum):
 
 
 _BEFORE = (_Phase.STARTING, _Phase.CONDITIONING)
+_FOLLOWING = _Phase.FOLLOWING  # looked up once: in Python 3.11 that is a call
 
 
 class Loop:
@@ -174,7 +175,7 @@ class Loop:
     def _usual_tick(self) -> bool:
         """Run a whole tick that nothing special happens in; False, and nothing done, in others."""
         usual, first_sample = self._usual, self._next_sample
-        follows = self._phase is _Phase.FOLLOWING and self._tuner.idle and not self._missing
+        follows = self._phase is _FOLLOWING and self._tuner.idle and not self._missing
         if usual is None or not follows or self._end - first_sample < self._plan.block:
             return False
         start = first_sample - self._before.waveform_at
@@ -214,15 +215,19 @@ class Loop:
     def _wait(self) -> int:
         """Wait for the tick; return the samples that were skipped before it."""
         block_samples, most = self._plan.block, None
-        if self._phase in _BEFORE:  # their last tick is not skipped: what comes next waits
+        if (
+            self._phase is not _FOLLOWING and self._phase in _BEFORE
+        ):  # their last tick is not skipped: what comes next waits
             before = self._before
             ends = before.condition_at if self._phase is _Phase.STARTING else before.waveform_at
             most = (ends - self._next_sample) // block_samples - 1
         skipped = self._pacer.wait(most) * block_samples
+        if not skipped:
+            return 0
         # Before the block is claimed: its number and the state kept with it are those after it.
         start = self._next_sample
         self._next_sample += skipped
-        if skipped and self._phase is _Phase.FOLLOWING:
+        if self._phase is _FOLLOWING:
             at, stop = self._before.waveform_at, min(self._next_sample, self._end)
             if self._ready(stop):
                 pass_over(self._plan, self._before, self._tuner, start - at, stop - at)

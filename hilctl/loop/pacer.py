@@ -124,6 +124,7 @@ class Pacer:
         self._stalls: deque[tuple[int, int]] = deque()
         self._missed = 0
         self._not_kept = ""
+        self._least_counted_ns = 0.0
         self.late_run = 0
         """Late ticks one after the other, up to this one."""
         self.tick = -1
@@ -154,7 +155,9 @@ class Pacer:
         self._clock.sleep_until_ns(self.deadline_ns)
         now_ns = self._clock.now_ns()
         self.late_ns = now_ns - self.deadline_ns
-        self._count()
+        # Nothing to count, as a rule: late means over a limit, and the worst is soon seen.
+        if self.late_ns > self._least_counted_ns or self.late_run:
+            self._count()
         if self.late_ns < self._period_ns or self.policy in {"catch_up", "follow"}:
             return 0
         if self.policy == "slip":
@@ -211,6 +214,7 @@ class Pacer:
         if self.late_ns > counters.worst_ns:
             counters.worst_ns = self.late_ns
             counters.worst_tick = self.tick
+            self._least_counted_ns = min(self.late_ns, self._rules.late_after_ns)
         if self.late_ns > self._rules.late_after_ns:
             counters.late_ticks += 1
             self.late_run += 1

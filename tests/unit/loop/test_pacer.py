@@ -43,6 +43,22 @@ def test_period_need_not_be_whole():
     assert paced.deadline_ns == 1_000_000
 
 
+def test_a_late_tick_counts_whether_or_not_it_is_the_worst():
+    """After a far later one, and after one that was on time; and the worst is known throughout."""
+    paced = pacer(FakeClock(5_000, {1: 700_000, 3: 600_000, 5: 300_000, 6: 900_000}))
+    seen = []
+    for _ in range(8):
+        paced.wait()
+        counters = paced.counters
+        seen.append((counters.late_ticks, counters.worst_ns, counters.worst_tick, paced.late_run))
+    worst = 700_000, 1
+    assert seen == [
+        (0, 0, 0, 0), (1, *worst, 1), (1, *worst, 0), (2, *worst, 1),
+        (2, *worst, 0), (2, *worst, 0),
+        (3, 900_000, 6, 1), (3, 900_000, 6, 0),
+    ]  # fmt: skip
+
+
 @pytest.mark.parametrize(("late_ns", "counted"), [(499_999, 0), (500_000, 0), (500_001, 1)])
 def test_late_is_later_than_the_limit(late_ns, counted):
     """A tick counts as late only beyond the limit."""
