@@ -24,7 +24,8 @@ APART = 2.0  # of time constants: any law of creep is near a sum of such
 FIRST_S, GROWTH = 0.005, 1.3  # of stretches of a rest, each averaged
 ROUNDS = 4  # what has crept does not creep on: each round leaves a few percent of what it adds
 LEAST_SHARE = 1e-4
-CLEAR = 0.3  # least part of the motion during rests that creep must explain
+CLEAR = 0.8  # least part of the motion during rests that creep must explain
+MOST = 0.5  # share of all together: a displacement that wanders asks for more
 LEAST = 3e-4  # of the stroke: motion during rests that is worth an element
 
 
@@ -139,11 +140,12 @@ class _LeastSquares:
         shares, left = nnls(moves, self._measured_um)
         explained = 1.0 - (left / max(float(np.linalg.norm(self._measured_um)), 1e-300)) ** 2
         worth = shares > LEAST_SHARE
-        if explained < CLEAR or not np.abs(moves @ shares).max() > self._least_um:
+        moved_um = float(np.abs(moves @ shares).max())
+        if explained < CLEAR or shares.sum() > MOST or not moved_um > self._least_um:
             return None
         return Creep(
             time_constants_s=tuple(self._times_s[worth].tolist()),
-            shares=tuple(np.minimum(shares[worth], 1.0).tolist()),
+            shares=tuple(shares[worth].tolist()),
         )
 
     def _moved(self, bare_um: Sequence[F64], time_s: float) -> F64:

@@ -34,14 +34,14 @@ def test_of_a_history_the_frequencies_of_its_command():
 
 
 def test_of_a_history_the_swings_from_turn_to_turn():
-    """Of a large loop and many small ones all over it, these are the smallest motion."""
+    """Of large loops and small ones, these are the smallest motion where they are enough of it."""
     time_s = np.arange(20_000) / 1000.0
-    command = 3.0 * np.sin(2.0 * np.pi * 0.1 * time_s) + 0.5 * np.sin(2.0 * np.pi * 5.0 * time_s)
-    small, large = identified_range(
-        FitData([History("small", command, 5.0 * command, 1e3)])
-    ).peak_to_peak_um
-    assert small == pytest.approx(5.0, rel=0.2)
-    assert large == pytest.approx(35.0, rel=0.02)
+    wave = np.sin(2.0 * np.pi * 5.0 * time_s)
+    for part, wanted_um in ((0.3, 5.0), (0.9, 30.0)):
+        command = np.where(np.arange(wave.size) < part * wave.size, 3.0, 0.5) * wave
+        history = History("both", command, 5.0 * command, 1e3)
+        found = identified_range(FitData([history])).peak_to_peak_um
+        assert found == pytest.approx((wanted_um, 30.0), rel=0.01)
 
 
 def test_of_a_history_that_turns_little_all_of_it():
