@@ -68,7 +68,7 @@ def rest_noise(recording: Recording) -> RestNoise:
     )
 
 
-def crept_percent(recording: Recording) -> list[float]:
+def crept_percent(recording: Recording) -> tuple[float, ...]:
     """Return how far the displacement moves on in each long rest, in percent of where it stands.
 
     Each from a tenth of a second after the motion before it, and from the displacement at the
@@ -89,7 +89,7 @@ def crept_percent(recording: Recording) -> list[float]:
         first_um = float(np.nanmean(moving_um[part : 2 * part]))
         last_um = float(np.nanmean(moving_um[-part:]))
         crept.append(100.0 * (last_um - first_um) / (first_um - began_um))
-    return crept
+    return tuple(crept)
 
 
 @dataclass(frozen=True, slots=True)

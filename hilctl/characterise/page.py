@@ -9,6 +9,7 @@ from hilctl.base.printable import printable
 from hilctl.base.quantity import quantity, significant
 from hilctl.characterise import plots
 from hilctl.characterise.results import Characterisation, Measured, UnseenReference
+from hilctl.characterise.waveforms import CREEP_S
 from hilctl.identify.page import loops_figure
 from hilctl.identify.summary import HEADINGS, error_rows, summary
 from hilctl.models.files import dump_model
@@ -62,6 +63,9 @@ def figure_rows(measured: Measured, unit: str) -> Iterator[tuple[str, str]]:
             "return to one point",
             f"{quantity(curves.return_um, 'um', 2)}, {curves.return_percent:.2g} %",
         )
+    if measured.crept_percent:
+        crept = " and ".join(f"{percent:+.2g} %" for percent in measured.crept_percent)
+        yield "moves on in rests", f"{crept} in {CREEP_S:g} s"
     if (repeated := measured.repeated) is not None:
         shift = f"{quantity(repeated.shift_um, 'um', 2)} in place"
         yield "repeats at the end", f"{repeated.shape_percent:.2g} % in shape, {shift}"

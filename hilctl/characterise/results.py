@@ -28,6 +28,7 @@ class Measured:
         fast: Loops at several frequencies.
         reversal: First-order reversal curves.
         biased: Small loops at places all over the range.
+        crept_percent: How far the displacement moves on in each rest, of where it stands.
         repeated: How the last of the growing loops compares with itself at the end.
     """
 
@@ -39,6 +40,7 @@ class Measured:
     fast: tuple[LoopFigures, ...] = ()
     reversal: ReversalCurves | None = None
     biased: tuple[LoopFigures, ...] = ()
+    crept_percent: tuple[float, ...] = ()
     repeated: Repeatability | None = None
 
     def also(self, **found: Any) -> Self:

@@ -282,8 +282,10 @@ def _take_rests(
     recording: Recording, limits: CampaignLimits, measured: Measured
 ) -> tuple[Measured, str]:
     del limits
-    crept = " and ".join(f"{percent:+.2g}" for percent in crept_percent(recording))
-    return measured, f"moves on by {crept} % in {waveforms.CREEP_S:g} s"
+    found = crept_percent(recording)
+    crept = " and ".join(f"{percent:+.2g}" for percent in found)
+    text = f"moves on by {crept} % in {waveforms.CREEP_S:g} s"
+    return measured.also(crept_percent=found), text
 
 
 def _small(limits: CampaignLimits, measured: Measured) -> Keys:

@@ -5,8 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hilctl.characterise.page import characterisation_page, write_characterisation
-from hilctl.characterise.results import StepRow
+from hilctl.characterise.page import (
+    characterisation_page,
+    figure_rows,
+    write_characterisation,
+)
+from hilctl.characterise.results import Measured, StepRow
 from tests.unit.characterise.test_plots import SMALL
 from tests.unit.characterise.test_results import FOUND, LOOP, UNSEEN, identification
 
@@ -54,3 +58,9 @@ def test_a_page_is_written_over(tmp_path):
     for _ in range(2):
         write_characterisation(WHOLE, path)
     assert path.read_text(encoding="utf-8").startswith("<!DOCTYPE html>")
+
+
+def test_creep_is_a_figure_where_it_was_looked_for():
+    rows = dict(figure_rows(Measured(crept_percent=(2.44, -3.1)), "A"))
+    assert rows["moves on in rests"] == "+2.4 % and -3.1 % in 4 s"
+    assert "moves on in rests" not in dict(figure_rows(Measured(), "A"))

@@ -62,6 +62,7 @@ def test_a_sound_actuator_goes_through_all_steps(walked, limits):
     assert measured.repeated.shape_percent < 0.5
     assert len(measured.fast) > 8
     assert measured.reversal.return_percent < 0.5
+    assert measured.crept_percent == pytest.approx((0.0, 0.0), abs=0.01)
 
 
 def test_the_stroke_holds_amplitudes_down(walked, limits_with):
