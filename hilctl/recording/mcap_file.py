@@ -33,6 +33,7 @@ from mcap.records import (
 from mcap.writer import MCAP0_MAGIC
 
 from hilctl.base.arrays import I64
+from hilctl.recording.records import FRAME
 from hilctl.recording.rows import MessageRows
 
 CHUNK_BYTES = 8 << 20
@@ -43,9 +44,7 @@ LEVEL = 1
 _MESSAGE = struct.Struct("<BQHIQQ")
 _MESSAGE_ROW = np.dtype([("opcode", "u1"), ("size", "<u8"), ("channel", "<u2"),
                          ("sequence", "<u4"), ("logged", "<u8"), ("published", "<u8")])  # fmt: skip
-_FRAME = 9
-"""Bytes of a record's opcode and size."""
-_FIXED = _MESSAGE.size - _FRAME
+_FIXED = _MESSAGE.size - FRAME.size
 """Bytes of a message record that are neither its opcode and size nor its data."""
 _ZSTD = b"zstd"
 _CHUNK = struct.Struct(f"<BQQQQII{len(_ZSTD)}sQ")
@@ -185,14 +184,14 @@ class McapWriter:
         data = b"".join(closing.parts)
         compressed = self._compressor.compress(data)
         head = _CHUNK.pack(
-            Opcode.CHUNK, _CHUNK.size - _FRAME + len(compressed), closing.first_ns, closing.last_ns,
-            len(data), zlib.crc32(data), len(_ZSTD), _ZSTD, len(compressed),
+            Opcode.CHUNK, _CHUNK.size - FRAME.size + len(compressed), closing.first_ns,
+            closing.last_ns, len(data), zlib.crc32(data), len(_ZSTD), _ZSTD, len(compressed),
         )  # fmt: skip
         start, length = self._stream.tell(), len(head) + len(compressed)
         offsets, indexes = {}, bytearray()
         for channel, places in closing.indexes.items():
             offsets[channel] = start + length + len(indexes)
-            size = _INDEX.size - _FRAME + len(places)
+            size = _INDEX.size - FRAME.size + len(places)
             indexes += _INDEX.pack(Opcode.MESSAGE_INDEX, size, channel, len(places)) + places
         index = ChunkIndex(
             chunk_length=length, chunk_start_offset=start, compression=_ZSTD.decode(),
