@@ -1,7 +1,7 @@
 """What a compensator begins with: the memory that a run before left in the actuator, or rest."""
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import datetime
@@ -157,7 +157,7 @@ def left_by(
     forward, inverse = model.forward(sample_rate_hz), model.inverse(sample_rate_hz)
     rest = inverse.state()
     ahead, stands_um, last = inverse.preview, 0.0, 0.0
-    still = [] if stood_s is None else [round(_STILL_S * sample_rate_hz)]
+    still = 0 if stood_s is None else round(_STILL_S * sample_rate_hz)
     for command in _and_still(commands, still):
         came = forward.process(command)
         if not np.isfinite(came).all():
@@ -172,14 +172,14 @@ def left_by(
     return InitialState(inverse.state(), stands_um, "")
 
 
-def _and_still(commands: Iterable[F64], still: Sequence[int]) -> Iterator[F64]:
+def _and_still(commands: Iterable[F64], samples: int) -> Iterator[F64]:
     """Give commands, and then the last of them for so many samples."""
     last = 0.0
     for command in commands:
         if command.size:
             yield command
             last = float(command[-1])
-    for samples in still:
+    if samples:
         yield np.full(samples, last)
 
 
