@@ -1,6 +1,7 @@
 /* cyclictest's measurement for machines that allow no SCHED_FIFO, where cyclictest won't start.
  *
- * wakeup INTERVAL_US LOOPS LONGEST_US prints "us count" for each us, then what lies beyond.
+ * wakeup INTERVAL_US LOOPS LONGEST_US [catch_up] prints "us count" for each us, then what lies
+ * beyond. With catch_up it makes up for the wake-ups that a stall has cost, each late.
  */
 #define _GNU_SOURCE
 #include <stdio.h>
@@ -19,7 +20,7 @@ static long long now_ns(void)
 
 int main(int argc, char **argv)
 {
-    if (argc != 4)
+    if (argc != 4 && argc != 5)
         return 2;
     long long interval = atoll(argv[1]) * 1000, loops = atoll(argv[2]), longest = atoll(argv[3]);
     long long *counts = calloc(longest + 1, sizeof *counts);
@@ -37,7 +38,7 @@ int main(int argc, char **argv)
         counts[late_us < longest ? late_us : longest]++;
         do
             due += interval;
-        while (due <= now); /* as cyclictest does: a stall counts once */
+        while (due <= now && argc == 4); /* as cyclictest does: a stall counts once */
     }
     for (long long us = 0; us < longest; us++)
         printf("%06lld %06lld\n", us, counts[us]);

@@ -3,9 +3,10 @@
     python -m tests.benchmark.writing [--seconds 20] [--goal 0.3]
 
 Fifty blocks of 50 samples at a time, as the recorder takes them out of the ring at 50 kHz, with
-noise that does not repeat. Both write zstd with checksums and index into a file, in turns. Exit
-code 1 where a million samples take more than ``--goal`` s, or making and writing messages takes
-longer than the SDK needs to write messages that are made already and hilctl to make them.
+noise that does not repeat. Both write zstd with checksums and index into a file, in turns, in
+chunks as large as the default ``flush_s`` makes them. Exit code 1 where a million samples take
+more than ``--goal`` s, or making and writing messages takes longer than the SDK needs to write
+messages that are made already and hilctl to make them.
 """
 
 import argparse
@@ -21,14 +22,17 @@ import numpy as np
 from foxglove.mcap import MCAPWriteOptions
 
 from hilctl.base.samples import COLUMNS, Batch
+from hilctl.experiment.parts import RecordingConfig
 from hilctl.recording import schema
+from hilctl.recording.mcap_file import LEVEL
 from hilctl.recording.messages import Encoded, MessageMaker, RecordingLayout
 from hilctl.recording.writer import RecordingWriter, RunFacts
 from hilctl.run.start import checked_experiment
 from tests.benchmark import long_recordings as made
 
 BLOCKS = 50
-FLUSH_BATCHES = 2  # every 100 ms
+BATCH_S = 0.05
+FLUSH_BATCHES = round(RecordingConfig().flush_s / BATCH_S)
 ROUNDS = 5
 LAYOUT = RecordingLayout(made.RATE_HZ, "A", False, 1000.0, 1_800_000_000 * 10**9)
 RUN = RunFacts({}, (), "name: writing\n", "", LAYOUT)
@@ -86,7 +90,7 @@ def each_message(run: list[Batch]) -> Iterator[tuple[str, int, bytes]]:
                     yield message.topic, time_ns, data
 
 
-def theirs_s(messages: list[tuple[str, int, bytes]], path: Path) -> float:
+def theirs_s(messages: list[tuple[str, int, bytes]], path: Path, chunk_bytes: int) -> float:
     """Let the SDK write messages; return what that took of the processor, all of its threads."""
     context = foxglove.Context()
     channels = {
@@ -100,7 +104,9 @@ def theirs_s(messages: list[tuple[str, int, bytes]], path: Path) -> float:
         )
         for topic, name in schema.TOPICS.items()
     }
-    options = MCAPWriteOptions(compression_level=1, compression_threads=0)
+    options = MCAPWriteOptions(
+        compression_level=LEVEL, compression_threads=0, chunk_size=chunk_bytes
+    )
     began_s = time.process_time()
     with foxglove.open_mcap(path, context=context, allow_overwrite=True, writer_options=options):
         for topic, time_ns, data in messages:
@@ -117,6 +123,7 @@ def main() -> int:
     run = batches(asked.seconds)
     messages = list(each_message(run))
     millions = sum(batch.flags.size for batch in run) * 1e-6
+    chunk_bytes = FLUSH_BATCHES * sum(len(data) for _, _, data in messages) // len(run)
     took: dict[str, list[float]] = {"ours": [], "making": [], "theirs": []}
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "run.mcap"
@@ -124,7 +131,7 @@ def main() -> int:
             took["ours"].append(ours_s(run, path))
             size = path.stat().st_size
             took["making"].append(making_s(run))
-            took["theirs"].append(theirs_s(messages, path))
+            took["theirs"].append(theirs_s(messages, path, chunk_bytes))
     per_million = {name: statistics.median(times) / millions for name, times in took.items()}
     ours_cpu_s, theirs_cpu_s = per_million["ours"], per_million["making"] + per_million["theirs"]
     print(
