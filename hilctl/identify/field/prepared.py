@@ -1,8 +1,9 @@
 """Records as the fit needs them: thinned in time, the displacement ready to lose its structure."""
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Generic, TypeVar
 
 import numpy as np
 
@@ -19,9 +20,30 @@ COMMAND_OFF = 1e-4  # the same for commands, on which the operators turn
 LONGEST = 0.3  # cycles of the fastest: longest step
 
 
-@dataclass(frozen=True)
+_Found = TypeVar("_Found")
+
+
+class Latest(Generic[_Found]):
+    """What was found last: a search changes one stage at a time, and most depends on few."""
+
+    def __init__(self) -> None:
+        self._known: tuple[object, _Found] | None = None
+
+    def of(self, key: object, work: Callable[[], _Found]) -> _Found:
+        """Return what ``work`` gives for a key; the same again where the key is the same.
+
+        Args:
+            key: All that the result depends on; compared by ``==``.
+            work: Works it out.
+        """
+        if self._known is None or self._known[0] != key:
+            self._known = key, work()
+        return self._known[1]
+
+
+@dataclass(frozen=True, eq=False)
 class Run:
-    """One record.
+    """One record; what its methods return is not to be changed, as it may be returned again.
 
     Attributes:
         rate_hz: Of the record.
@@ -40,6 +62,8 @@ class Run:
     mean: F64
     derivatives: F64
     motion: Motion
+    _late: Latest[tuple[F64, F64]] = field(default_factory=Latest, init=False, repr=False)
+    _bare: Latest[F64] = field(default_factory=Latest, init=False, repr=False)
 
     @property
     def time_s(self) -> F64:
@@ -56,12 +80,19 @@ class Run:
         Args:
             lag_s: Time constant, > 0.
         """
+        return self._late.of(lag_s, lambda: self._late_command(lag_s))
+
+    def _late_command(self, lag_s: float) -> tuple[F64, F64]:
         lags = np.maximum(self.step_s / lag_s, 1e-3)
         late = -1.0 / np.expm1(-lags) - 1.0 / lags
         return late, self.mean + (2.0 * late - 1.0) * (self.command - self.mean)
 
     def bare_um(self, delay_s: float, slope_s: float, bend_s2: float) -> F64:
         """Return the displacement before delay and structure: float64[n]."""
+        key = delay_s, slope_s, bend_s2
+        return self._bare.of(key, lambda: self._bare_um(*key))
+
+    def _bare_um(self, delay_s: float, slope_s: float, bend_s2: float) -> F64:
         out = np.empty(self.kept.size)
         late = delay_s * self.rate_hz
         bare_displacement(self.derivatives, self.kept, late, slope_s, bend_s2, out)

@@ -178,7 +178,7 @@ class DuhemSearch:
         size = logs.size
         slopes = np.empty((errors.size, size + (len(NAMES) if stages else 0)))
         self._errors(x, logs, slopes[:, :size])
-        for k in range(size, slopes.shape[1]):
+        for k in reversed(range(size, slopes.shape[1])):  # the offset first: signals stay the same
             there, stage = x.copy(), k - size
             step = DIFFERENCE * STEPS[stage]
             there[stage] += step if x[stage] + step <= HIGHEST[stage] else -step

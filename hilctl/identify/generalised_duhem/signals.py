@@ -6,7 +6,7 @@ import numpy as np
 
 from hilctl.base.arrays import F64, I64
 from hilctl.identify.field.columns import turning_points
-from hilctl.identify.field.prepared import Prepared
+from hilctl.identify.field.prepared import Latest, Prepared
 from hilctl.identify.field.rows import Motion
 from hilctl.identify.field.stages import (
     HIGH,
@@ -68,6 +68,8 @@ class Signals:
     def __init__(self, data: Prepared) -> None:
         self._data = data
         self._kept: tuple[I64, ...] = ()
+        self._motions: tuple[Motion, ...] = ()
+        self._paths: Latest[list[Path]] = Latest()
         measured = np.concatenate([run.derivatives[0] for run in data.runs])
         self._middle_um = 0.5 * float(measured.max() + measured.min())
         self._half_um = 0.5 * float(np.ptp(measured))
@@ -106,17 +108,20 @@ class Signals:
             count = turning_points(field, way * 2.0 * self._data.reach, out)
             kept.append(out[:count].copy())
         self._kept = tuple(kept)
+        self._motions = tuple(
+            run.motion.at(at) for run, at in zip(self._data.runs, kept, strict=True)
+        )
+        self._paths = Latest()
 
     def paths(self, x: F64) -> list[Path]:
-        """Return what a row leaves of each record."""
+        """Return what a row leaves of each record: not to be changed, nor does the offset do so."""
+        return self._paths.of(x[:-1].tobytes(), lambda: self._left(x))
+
+    def _left(self, x: F64) -> list[Path]:
         return [
-            Path(
-                np.ascontiguousarray(field[kept]),
-                np.ascontiguousarray(y[kept]),
-                run.motion.at(kept),
-            )
-            for (field, y), kept, run in zip(
-                self._whole(x), self._kept, self._data.runs, strict=True
+            Path(np.ascontiguousarray(field[kept]), np.ascontiguousarray(y[kept]), motion)
+            for (field, y), kept, motion in zip(
+                self._whole(x), self._kept, self._motions, strict=True
             )
         ]
 

@@ -1,12 +1,13 @@
 """Records thinned: what is left of a command, a displacement and what is to be judged."""
 
 import math
+from itertools import pairwise
 
 import numpy as np
 import pytest
 
 from hilctl.identify.data.records import History
-from hilctl.identify.field.prepared import LONGEST, OFF, POINTS, Prepared, Run
+from hilctl.identify.field.prepared import LONGEST, OFF, POINTS, Latest, Prepared, Run
 
 RATE_HZ = 10_000.0
 
@@ -125,3 +126,30 @@ def test_structure_and_delay_come_off_a_sine(delay_s: float) -> None:
     bare = run.bare_um(delay_s, 2.0 * damping * radian_s, radian_s**2)
     assert bare[:130] == pytest.approx(np.sin(turn * t)[kept][:130], abs=2e-4)
     assert run.bare_um(1.0, 0.0, 0.0) == pytest.approx(went.imag[-1])
+
+
+def test_only_what_was_found_last_is_known() -> None:
+    latest: Latest[int] = Latest()
+    asked = []
+
+    def work(key: int) -> int:
+        asked.append(key)
+        return 10 * key
+
+    found = [latest.of(key, lambda key=key: work(key)) for key in (1, 1, 2, 2, 1)]  # type: ignore[misc]
+    assert found == [10, 10, 20, 20, 10]
+    assert asked == [1, 2, 1]
+
+
+def test_what_was_found_last_does_not_stand_for_other_arguments() -> None:
+    record, other = history(), Prepared([history()]).runs[0]
+    run = Prepared([record]).runs[0]
+    asked = [(1e-3, 2e-4, 1e-8), (1e-3, 3e-4, 1e-8), (2e-3, 3e-4, 1e-8), (2e-3, 3e-4, 3e-7)]
+    found = [run.bare_um(*each) for each in asked]
+    assert run.bare_um(*asked[-1]) is found[-1]
+    for each, bare_um in zip(reversed(asked), reversed(found), strict=True):
+        np.testing.assert_array_equal(other.bare_um(*each), bare_um)
+    assert all((a != b).any() for a, b in pairwise(found))
+    late = [run.late_command(lag_s) for lag_s in (1e-3, 2e-3)]
+    np.testing.assert_array_equal(other.late_command(2e-3), late[1])
+    np.testing.assert_array_equal(other.late_command(1e-3), late[0])

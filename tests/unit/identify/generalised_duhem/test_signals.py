@@ -80,3 +80,33 @@ def test_paths_keep_the_turns_and_points_no_further_apart_than_was_asked_for() -
     # A turn is where the slopes of the table change from one direction's to the other's.
     assert coarse.field.max() == path.field.max()
     assert coarse.field.min() == path.field.min()
+
+
+@pytest.mark.parametrize("stage", range(len(NAMES)))
+def test_paths_follow_every_stage_but_the_offset(stage: int) -> None:
+    """What was worked out before stands for a row of the same signals, and for no other."""
+    kept, fresh = Signals(data()), Signals(data())
+    for signals in (kept, fresh):
+        signals.choose(FIRST, 0.02)
+    (before,) = kept.paths(FIRST)
+    x = FIRST.copy()
+    x[stage] += STEPS[stage]
+    (after,), (expected,) = kept.paths(x), fresh.paths(x)
+    np.testing.assert_array_equal(after.field, expected.field)
+    np.testing.assert_array_equal(after.displacement_um, expected.displacement_um)
+    if NAMES[stage] == "offset":
+        assert after is before
+    else:
+        assert (after.field != before.field).any() or (
+            after.displacement_um != before.displacement_um
+        ).any()
+
+
+def test_paths_through_other_points_are_other_paths() -> None:
+    signals = Signals(data())
+    signals.choose(FIRST, 0.05)
+    (coarse,) = signals.paths(FIRST)
+    signals.choose(FIRST, 0.01)
+    (fine,) = signals.paths(FIRST)
+    assert fine.field.size > coarse.field.size
+    assert fine.motion.travel.size == fine.field.size
