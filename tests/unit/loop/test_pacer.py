@@ -70,6 +70,16 @@ def test_late_is_later_than_the_limit(late_ns, counted):
     assert paced.counters.worst_tick == 3
 
 
+@pytest.mark.parametrize("late_ns", [1, 400_000, 700_000])
+def test_the_worst_tick_is_the_first_that_was_as_late(late_ns):
+    """However little that is, and whether it counts as late or not."""
+    paced = pacer(FakeClock(5_000, {3: late_ns, 5: late_ns}))
+    for _ in range(8):
+        paced.wait()
+    assert paced.counters.worst_ns == late_ns
+    assert paced.counters.worst_tick == 3
+
+
 def test_skip_leaves_out_ticks_and_keeps_the_phase():
     """After 3.2 periods of stall, three ticks are left out and the next is on the old grid."""
     clock = FakeClock(5_000, {2: 3_200_000})

@@ -7,6 +7,7 @@ import socket
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -16,6 +17,7 @@ from hilctl.base.errors import DeviceError, InputError, RunError
 from hilctl.loop.pacer import Lateness
 from hilctl.loop.plan import Outcome
 from hilctl.machine.realtime import SetUpStep
+from hilctl.machine.usage import ProcessUsage
 from hilctl.run import loop_process
 from hilctl.run.job import Job
 from hilctl.run.ring import SampleRing
@@ -65,6 +67,8 @@ class Prepared:
         self._patch = monkeypatch
         self.steps = ()
         monkeypatch.setattr(loop_process, "prepare", self._prepare)
+        memory = SimpleNamespace(release=lambda: self.device.events.append("small"))
+        monkeypatch.setattr(loop_process, "ProcessMemory", lambda: memory)
 
     def _prepare(self, settings):
         assert settings is self.loaded.config.realtime
@@ -101,7 +105,7 @@ def broken(prepared):
 def test_a_loop_that_breaks_makes_the_output_safe_and_closes(broken):
     """The error is the loop's own."""
     device, error, page = broken(reachable=True)
-    assert device.events == ["prepare", "open", "make_safe", "close"]
+    assert device.events == ["prepare", "open", "small", "make_safe", "close"]
     assert isinstance(error, ZeroDivisionError)
     assert page.get(Field.PHASE) == Phase.RUNNING
 
@@ -151,7 +155,8 @@ def test_the_loop_is_started_at_the_time_that_the_supervisor_says(prepared):
     assert made.run() == OUTCOME
     assert seen == [(12345, Phase.RUNNING)]
     assert made.page.get(Field.PHASE) == Phase.CLOSING
-    assert made.device.events == ["prepare", "open", "close"]
+    # What was compiled for the device, once it is open, is given back too.
+    assert made.device.events == ["prepare", "open", "small", "close"]
     assert made.page.lateness() == Lateness(late_ticks=3, worst_ns=70)
     facts, refused = json.loads(made.page.read_text(PageText.SET_UP))
     assert facts == {"rt.fifo": "failed: not permitted"}
@@ -211,7 +216,35 @@ def test_a_supervisor_that_died_before_the_start_ends_the_run_by_its_ramp(prepar
     before_ns = time.monotonic_ns()
     assert made.run() == OUTCOME
     assert before_ns <= due[0] <= time.monotonic_ns()
-    assert made.device.events == ["prepare", "open", "close"]
+    assert made.device.events == ["prepare", "open", "small", "close"]
+
+
+def test_it_leaves_what_the_run_took_of_the_machine(prepared, monkeypatch):
+    """Of the run alone, and not of what came before it."""
+    made, counts = prepared(), iter(((50, 7, 1, 1, 1), (60, 9, 3, 1, 4)))
+    usage = SimpleNamespace(now=lambda: ProcessUsage(*next(counts)))
+    monkeypatch.setattr(loop_process, "ProcessUsage", usage)
+    made.loop_does(lambda loop, start_ns: OUTCOME)
+    assert made.run() == OUTCOME
+    assert made.page.usage() == ProcessUsage(60, 9, 3, 1, 4).since(ProcessUsage(50, 7, 1, 1, 1))
+
+
+@pytest.mark.parametrize("more", [0, 1])
+def test_a_waveform_that_is_longer_than_what_lies_in_the_folder_has_a_window(
+    prepared, monkeypatch, more
+):
+    made, windows = prepared(), []
+    made.job = replace(made.job, samples=made.job.samples + more)
+    made.loop_does(lambda loop, start_ns: OUTCOME)
+    assemble = loop_process.assemble
+
+    def assembled(*args, window, **options):
+        windows.append(window)
+        return assemble(*args, window=window, **options)
+
+    monkeypatch.setattr(loop_process, "assemble", assembled)
+    assert made.run() == OUTCOME
+    assert (windows != [None]) == bool(more)
 
 
 @pytest.mark.parametrize(
@@ -226,10 +259,11 @@ def test_a_supervisor_that_died_before_the_start_ends_the_run_by_its_ramp(prepar
 )
 def test_all_that_it_has_to_say_is_in_the_page(prepared, monkeypatch, raised, code, phase, text):
     """The supervisor tells by the phase what is there: an outcome, a refusal, or a fault."""
-    made, ignored = prepared(), {}
+    made, ignored, done = prepared(), {}, []
 
     def run_job(job, ring, loaded):
         assert job == made.job
+        assert done == ["ordinary", "loaded"]
         if raised is not None:
             raise raised
         return OUTCOME
@@ -239,7 +273,8 @@ def test_all_that_it_has_to_say_is_in_the_page(prepared, monkeypatch, raised, co
         ours.sendall(b"-" + made.job.to_json().encode())  # without standard error, see waiting_loop
     standard_input = SimpleNamespace(fileno=theirs.detach)
     monkeypatch.setattr(loop_process.sys, "stdin", standard_input)
-    monkeypatch.setattr(loop_process, "be_ordinary", lambda: None)
+    monkeypatch.setattr(loop_process, "be_ordinary", lambda: done.append("ordinary"))
+    monkeypatch.setattr(loop_process, "load", lambda *kernels: done.append("loaded"))
     monkeypatch.setattr(loop_process.signal, "signal", ignored.__setitem__)
     monkeypatch.setattr(loop_process, "run_job", run_job)
     assert loop_process.main() == code
@@ -248,6 +283,15 @@ def test_all_that_it_has_to_say_is_in_the_page(prepared, monkeypatch, raised, co
     assert made.page.outcome() == (OUTCOME if code == 0 else None)
     # A stop comes from the supervisor alone, so that it ends by the ramp.
     assert ignored == dict.fromkeys((signal.SIGINT, signal.SIGTERM, signal.SIGHUP), signal.SIG_IGN)
+
+
+def test_a_process_that_gets_no_job_ends_as_if_it_had_none(monkeypatch):
+    ours, theirs = socket.socketpair()
+    ours.close()
+    monkeypatch.setattr(loop_process.sys, "stdin", SimpleNamespace(fileno=theirs.detach))
+    monkeypatch.setattr(loop_process, "be_ordinary", lambda: None)
+    monkeypatch.setattr(loop_process.signal, "signal", lambda number, handler: None)
+    assert loop_process.main() == 0
 
 
 BULKY = ("scipy.optimize", "scipy.signal", "scipy.sparse", "matplotlib", "pandas")

@@ -33,7 +33,7 @@ STARTED = [
     "child",
     "guardian",
 ]
-READY = [*STARTED, "await ready", "filled", "begin", "favoured", "recording"]
+READY = [*STARTED, "await ready", "filled", "small", "begin", "favoured", "recording"]
 _UNDONE = ["ordinary again", "server closed", "folder removed", "devices let go"]
 UNDONE = [*_UNDONE, "filling ended", "worker closed"]
 
@@ -96,6 +96,7 @@ class Neighbours:
             "RingRecorder": self.ring_recorder,
             "guardian_of": lambda *a: self.note("guardian", a[-1]),
             "Safety": self.safety,
+            "ProcessMemory": lambda: SimpleNamespace(stay_small=lambda: self.note("small")),
             "StartedRun": self.started_run,
             "ProgressThread": lambda *a: SimpleNamespace(
                 start=lambda: self.said.append("shown"), end=lambda: self.note("progress ended")
