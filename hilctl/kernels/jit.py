@@ -15,6 +15,7 @@ from numba.core.runtime.nrt import rtsys
 
 from hilctl.base.private import private_folder, user_folders
 
+_NUMBA: Any = numba.config
 Function = TypeVar("Function", bound=Callable[..., object])
 
 STAGE = "void(float64[::1], float64[::1], float64[::1], float64[::1])"
@@ -39,6 +40,9 @@ def kernel(
     Where neither the package nor the user has a folder that can be written, or the disk is full,
     the result is kept in memory for as long as the machine runs, or not at all.
 
+    Where numba is told not to compile (``NUMBA_DISABLE_JIT=1``: for a debugger, or to see what
+    tests reach), the function is left as it is; runs then work, without a call for a whole tick.
+
     Args:
         signatures: numba signatures, for example ``"void(float64[::1], float64[::1])"``.
         inline: Always merge it into the kernels that call it: for those called once a sample.
@@ -52,6 +56,8 @@ def kernel(
     """
 
     def decorate(function: Function) -> Function:
+        if _NUMBA.DISABLE_JIT:
+            return function
         return cast("Function", _Kernel(function, signatures, inline=inline, nogil=nogil))
 
     return decorate
@@ -64,7 +70,8 @@ def load(*kernels: Callable[..., object]) -> None:
         numba.TypingError: A kernel is not what its signatures say.
     """
     for each in kernels:
-        cast("_Kernel", each).load()
+        if isinstance(each, _Kernel):
+            each.load()
 
 
 def address(each: Callable[..., object]) -> int:

@@ -10,7 +10,7 @@ from hilctl.base.arrays import F64, I64, U32
 from hilctl.base.samples import COLUMNS, Batch, Head
 from hilctl.kernels import tick
 from hilctl.kernels.interlock import interlock_block
-from hilctl.kernels.jit import address, entry, load
+from hilctl.kernels.jit import address, entry, is_kernel, load
 from hilctl.kernels.limit import limit_block
 from hilctl.loop import block as rows
 from hilctl.loop.block import Block
@@ -132,10 +132,10 @@ class Composed:
 
 
 def compose(plan: Plan, limiter: Limiter, interlocks: Interlocks) -> Composed | None:
-    """Return the calls of a run; None where its compensator is more than stages."""
+    """Return the calls of a run; None where its kernels are more than stages, or not compiled."""
     stages = plan.compensator.stages()
     arrays = plan.reference, plan.input_um
-    if stages is None or not all(_plain(each) for each in arrays):
+    if stages is None or not is_kernel(limit_block) or not all(_plain(each) for each in arrays):
         return None
     return Composed(plan, stages, limiter, interlocks)
 

@@ -1,9 +1,12 @@
 """Kernels are compiled, or read from the disk, before the first tick."""
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
+
+import numpy as np
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 STAGED = "compensator.model=" + str(CONFIGS / "models" / "terfenol_staged_preisach.yaml")
@@ -57,3 +60,34 @@ def test_none_is_loaded_while_a_loop_runs(tmp_path):
     found = json.loads(ended.stdout)
     assert found["samples"] > 50_000
     assert found["late"] == []
+
+
+UNCOMPILED = """
+import sys
+from pathlib import Path
+import numpy as np
+from hilctl.recording.reader import read
+from hilctl.run import unpaced
+from hilctl.run.start import checked_experiment
+
+times = {"duration_s": 0.03, "soft_start_s": 0.01, "soft_end_s": 0.01}
+settings = [f"waveform.{name}={value}" for name, value in times.items()]
+path = Path(sys.argv[2])
+unpaced.run_unpaced(checked_experiment(Path(sys.argv[1]), settings), path)
+columns = read(path).samples.columns()
+np.save(path.with_suffix(".npy"), np.array(list(columns.values())))
+"""
+
+
+def test_a_run_is_the_same_where_numba_is_told_not_to_compile(tmp_path):
+    """As for a debugger; bit for bit, though then there is no one call for a whole tick."""
+    found = []
+    for name, told in (("compiled", {}), ("plain", {"NUMBA_DISABLE_JIT": "1"})):
+        path = tmp_path / f"{name}.mcap"
+        command = [sys.executable, "-P", "-c", UNCOMPILED, str(CONFIGS / RUNS[0][0]), str(path)]
+        around = {**os.environ, **told}
+        ended = subprocess.run(command, capture_output=True, text=True, env=around, check=False)
+        assert ended.returncode == 0, ended.stderr
+        found.append(np.load(path.with_suffix(".npy")))
+    assert found[0].shape[1] >= 1000
+    np.testing.assert_array_equal(*found)
