@@ -2,8 +2,8 @@
 
     python -m tests.benchmark.writing [--seconds 20] [--goal 0.3]
 
-Fifty blocks of 50 samples at a time, as the recorder takes them out of the ring at 50 kHz, with
-noise that does not repeat. Both write zstd with checksums and index into a file, in turns, in
+A compensated run of the simulated rig, fifty blocks of 50 samples at a time, as the recorder takes
+them out of the ring at 50 kHz. Both write zstd with checksums and index into a file, in turns, in
 chunks as large as the default ``flush_s`` makes them. Exit code 1 where a million samples take
 more than ``--goal`` s, or making and writing messages takes longer than the SDK needs to write
 messages that are made already and hilctl to make them.
@@ -16,40 +16,42 @@ import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from unittest.mock import patch
 
 import foxglove
-import numpy as np
 from foxglove.mcap import MCAPWriteOptions
 
-from hilctl.base.samples import COLUMNS, Batch
+from hilctl.base.samples import Batch
 from hilctl.experiment.parts import RecordingConfig
 from hilctl.recording import schema
 from hilctl.recording.mcap_file import LEVEL
 from hilctl.recording.messages import Encoded, MessageMaker, RecordingLayout
 from hilctl.recording.writer import RecordingWriter, RunFacts
+from hilctl.run.recorder import Recorder
 from hilctl.run.start import checked_experiment
-from tests.benchmark import long_recordings as made
+from hilctl.run.unpaced import run_unpaced
 
+EXPERIMENT = Path(__file__).parents[2] / "configs" / "terfenol_sine_6a.yaml"
+RATE_HZ = 50_000.0
 BLOCKS = 50
 BATCH_S = 0.05
 FLUSH_BATCHES = round(RecordingConfig().flush_s / BATCH_S)
 ROUNDS = 5
-LAYOUT = RecordingLayout(made.RATE_HZ, "A", False, 1000.0, 1_800_000_000 * 10**9)
+LAYOUT = RecordingLayout(RATE_HZ, "A", False, 1000.0, 1_800_000_000 * 10**9)
 RUN = RunFacts({}, (), "name: writing\n", "", LAYOUT)
 
 
-def batches(seconds: int) -> list[Batch]:
-    """Return a run as the recorder takes it out of the ring."""
-    content = made.Content(checked_experiment(made.EXPERIMENT, []))
-    rng = np.random.default_rng(1)
-    displacement = list(COLUMNS).index("displacement_um")
-    found = []
-    for whole in content.batches(seconds):
-        noise_um = rng.normal(0.0, made.NOISE_UM, whole.flags.shape)
-        step_um = made.SENSOR_STEP_UM
-        whole.columns[:, displacement] += np.round(noise_um / step_um) * step_um
-        blocks = range(0, whole.flags.shape[0], BLOCKS)
-        found += [whole.rows(slice(first, first + BLOCKS)) for first in blocks]
+def batches(seconds: int, folder: Path) -> list[Batch]:
+    """Return a run of the simulated rig as the recorder takes it out of the ring."""
+    checked = checked_experiment(EXPERIMENT, [f"waveform.duration_s={seconds}"])
+    found: list[Batch] = []
+
+    def keep(_recorder: Recorder, batch: Batch) -> None:
+        firsts = range(0, batch.flags.shape[0], BLOCKS)
+        found.extend(batch.rows(slice(first, first + BLOCKS)) for first in firsts)
+
+    with patch.object(Recorder, "batch", keep):
+        run_unpaced(checked, folder / "run.mcap", overwrite=True)
     return found
 
 
@@ -120,13 +122,13 @@ def main() -> int:
     parser.add_argument("--seconds", type=int, default=20)
     parser.add_argument("--goal", type=float, default=0.3)
     asked = parser.parse_args()
-    run = batches(asked.seconds)
-    messages = list(each_message(run))
-    millions = sum(batch.flags.size for batch in run) * 1e-6
-    chunk_bytes = FLUSH_BATCHES * sum(len(data) for _, _, data in messages) // len(run)
     took: dict[str, list[float]] = {"ours": [], "making": [], "theirs": []}
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "run.mcap"
+        run = batches(asked.seconds, path.parent)
+        messages = list(each_message(run))
+        millions = sum(batch.flags.size for batch in run) * 1e-6
+        chunk_bytes = FLUSH_BATCHES * sum(len(data) for _, _, data in messages) // len(run)
         for _ in range(ROUNDS):
             took["ours"].append(ours_s(run, path))
             size = path.stat().st_size

@@ -659,3 +659,39 @@ def test_each_block_keeps_the_memory_and_the_command_before() -> None:
     kept = model.inverse(10_000.0).state().size
     assert checked(DISPLACEMENT, model=model).state_size == kept + 1
     assert checked(CURRENT).state_size == 1
+
+
+def test_work_that_takes_long_is_told(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """By what is worked out of the waveform, not by what repeats."""
+    longer = "waveform.duration_s=300.0"
+    reference = checked(DISPLACEMENT, longer, model=terfenol_rdpi()).reference
+    samples = sum(part.stop - part.start for part in reference.telling)
+    assert any(part.start for part in reference.telling)
+    assert 1000 < samples < reference.values.size
+    monkeypatch.setattr(module, "_MANY", samples)
+    checked(DISPLACEMENT, longer, model=terfenol_rdpi())
+    assert not caplog.records
+    monkeypatch.setattr(module, "_MANY", samples - 1)
+    checked(DISPLACEMENT, longer, model=terfenol_rdpi())
+    assert [record.getMessage() for record in caplog.records] == [
+        f"the waveform does not repeat: {samples * 1e-6:.3g} million samples are worked out before "
+        "it starts"
+    ]
+
+
+def test_a_rest_before_the_waveform_does_not_make_the_last_run_forgotten(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A conditioning cycle does; a rest in which the offset is measured leaves things there."""
+    model = terfenol_rdpi()
+    there = InitialState(model.inverse(10_000.0).state(), 0.0, "before")
+    monkeypatch.setattr(module, "left_by_last_run", lambda *_: (there, "as left"))
+    made = loaded(DISPLACEMENT, model=model)
+    for named, run_id in (("last", "before"), ("rest", "")):
+        compensator = CompensatorConfig(model="model.yaml", initial_state=named, offset="measured")
+        config = made.config.model_copy(update={"compensator": compensator})
+        found = check(replace(made, config=config))
+        assert found.conditioning() is not None
+        assert found.begun.run_id == run_id

@@ -171,3 +171,24 @@ def test_lag_refuses_other_types():
             np.zeros(3, np.float32), 0.2, FieldLag(tau_s=1e-4).growth_per_unit, rest_memory(1),
             np.zeros(3),
         )  # fmt: skip
+
+
+@pytest.mark.parametrize(("stage", "block", "parameters", "size"), [
+    (dynamics.lead_stage, dynamics.lead_block, (0.3, 0.4), 1),
+    (dynamics.between_stage, dynamics.between_block, (0.3,), 0),
+])  # fmt: skip
+def test_a_stage_is_its_block_with_parameters_in_a_row(stage, block, parameters, size):
+    ends = []
+    for kernel, given in ((stage, (np.array(parameters),)), (block, parameters)):
+        memory, out = rest_memory(size), np.empty_like(SIGNAL)
+        kernel(SIGNAL, *given, memory, out)
+        ends.append((out, memory))
+    np.testing.assert_array_equal(ends[0][0], ends[1][0])
+    np.testing.assert_array_equal(ends[0][1], ends[1][1])
+    assert (ends[0][0] != SIGNAL).any()
+
+
+def test_an_offset_is_added():
+    out = np.empty(3)
+    dynamics.offset_stage(np.array([1.0, -2.0, 0.5]), np.array([0.25]), np.empty(0), out)
+    assert out.tolist() == [1.25, -1.75, 0.75]
