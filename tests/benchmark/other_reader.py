@@ -10,6 +10,7 @@ from mcap.reader import make_reader
 
 PEERS = Path(__file__).parents[1] / "peers"
 NOT_INSTALLED = "not installed"
+LONGEST_S = 120.0
 
 
 def verdict(path: Path, samples: int | None) -> str:
@@ -29,7 +30,10 @@ def verdict(path: Path, samples: int | None) -> str:
     if node is None or not (PEERS / "node_modules" / "@mcap" / "core").is_dir():
         return NOT_INSTALLED
     command = [node, str(PEERS / "read_mcap.mjs"), str(path)]
-    ran = subprocess.run(command, capture_output=True, text=True, check=True, timeout=120)
+    try:
+        ran = subprocess.run(command, capture_output=True, text=True, check=True, timeout=LONGEST_S)
+    except subprocess.TimeoutExpired:
+        return f"no answer within {LONGEST_S:g} s"
     found = json.loads(ran.stdout)[str(path)]
     if "error" in found:
         return str(found["error"])
