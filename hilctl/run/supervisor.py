@@ -80,12 +80,13 @@ class Supervisor:
         be_ordinary()
         config = self._config
         with ExitStack() as stack:
+            # Before there is a loop: a signal must stop it, not just end this process. And to the
+            # last: whoever finds the run's folder may send one, and impatience while processes are
+            # ended would cost the result of a run that has ended.
+            stack.enter_context(self._signals())
             # Before anything is held or started: a fork has all that its maker has.
             worker = stack.enter_context(ChangeWorker(self._checked))
             filling = stack.enter_context(ReferenceProcess(self._checked))
-            # Before there is a loop: a signal must stop it, not just end this process. And to the
-            # last: whoever finds the run's folder may send one.
-            stack.enter_context(self._signals())
             # The device before the recording: a run that is refused must not touch a file.
             locks = stack.enter_context(held_devices(self._checked.loaded.device.info.holds))
             recorder = Recorder(self._checked, self._output, overwrite=self._overwrite)

@@ -239,6 +239,22 @@ def test_a_simulated_device_has_no_guardian(stage):
     assert "guardian" not in stage.log
 
 
+def test_signals_are_taken_for_as_long_as_anything_is_begun_or_undone(stage):
+    """One that came while the last process is ended would cost the result of the run."""
+    before, taken = signal.getsignal(signal.SIGINT), {}
+
+    class Log(list):
+        def append(self, what):
+            taken[what] = signal.getsignal(signal.SIGINT) is not before
+            super().append(what)
+
+    stage.log = Log()
+    stage.run()
+    assert {"worker", "filling", "worker closed", "filling ended"} < taken.keys()
+    assert [what for what, held in taken.items() if not held] == ["ordinary"]
+    assert signal.getsignal(signal.SIGINT) is before
+
+
 @pytest.mark.parametrize("number", range(len(READY)))
 def test_whatever_fails_before_the_start_signal_leaves_nothing(stage, number):
     """No lock, no folder, no file and no loop: and the loop is never told to go."""
