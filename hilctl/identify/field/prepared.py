@@ -36,9 +36,10 @@ class Latest(Generic[_Found]):
             key: All that the result depends on; compared by ``==``.
             work: Works it out.
         """
-        if self._known is None or self._known[0] != key:
-            self._known = key, work()
-        return self._known[1]
+        known = self._known
+        if known is None or known[0] != key:
+            self._known = known = key, work()
+        return known[1]
 
 
 @dataclass(frozen=True, eq=False)
