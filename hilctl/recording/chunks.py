@@ -5,6 +5,7 @@ but the first of a run, they can be had as a table, without an object each.
 """
 
 import struct
+import threading
 import zlib
 from collections.abc import Collection
 from dataclasses import dataclass
@@ -78,15 +79,22 @@ def _at_once(data: bytes, size: int) -> bytes | None:
     try:
         if size > LARGEST_CHUNK_BYTES or zstandard.frame_content_size(data) != size:
             return None
-        return _decompressor().decompress(data, allow_extra_data=False)
+        return _of_thread.decompressor.decompress(data, allow_extra_data=False)
     except zstandard.ZstdError:
         return None
 
 
-@cache
-def _decompressor() -> zstandard.ZstdDecompressor:
-    """Return one for all chunks: to make one takes as long as a chunk of 100 ms."""
-    return zstandard.ZstdDecompressor()
+class _OfThread(threading.local):
+    """A decompressor of each thread for all chunks: to make one takes as long as one of 100 ms.
+
+    Two threads that share one get each other's bytes.
+    """
+
+    def __init__(self) -> None:
+        self.decompressor = zstandard.ZstdDecompressor()
+
+
+_of_thread = _OfThread()
 
 
 @dataclass(frozen=True, slots=True)
