@@ -15,6 +15,7 @@ from hilctl.characterise.results import UnseenReference
 from hilctl.identify.command import Identification, identify_records, settings_from
 from hilctl.identify.data.records import History
 from hilctl.identify.job import OnProgress, ignore_progress
+from hilctl.identify.workers import beside_each_other, workers
 from hilctl.models.base import HysteresisModel
 from hilctl.recording.data import Recording
 from hilctl.recording.reader import read
@@ -50,12 +51,15 @@ def identified(
     Raises:
         InputError: No model can be identified from them.
     """
-    fitted = [read(path) for name, path in recordings.items() if name in FITTED]
+    fitted = beside_each_other(read, [p for name, p in recordings.items() if name in FITTED])
     source = [recording.path.name for recording in fitted]
     histories = [_history(recording) for recording in fitted]
     unit = fitted[0].command_unit
     settings = settings_from("auto", [])
-    return identify_records(histories, settings, unit, source=source, progress=progress)
+    with workers("threads") as run:
+        return identify_records(
+            histories, settings, unit, source=source, run=run, progress=progress
+        )
 
 
 def _history(recording: Recording) -> History:

@@ -12,6 +12,7 @@ from hilctl.identify.data.records import Record, Records, SteadyLoop
 from hilctl.identify.fit_data import PERIODS, FitData
 from hilctl.identify.staged.fit_data import StagedFitData
 from hilctl.identify.staged.model import response_um
+from hilctl.identify.workers import beside_each_other
 from hilctl.models.base import HysteresisModel
 from hilctl.models.plays import PlayModel
 from hilctl.models.staged import StagedModel
@@ -110,20 +111,22 @@ def _modelled_um(model: HysteresisModel, data: FitData) -> F64:
     """Return a model's displacement of all judged samples: float64[N]."""
     if isinstance(model, PlayModel):
         return data.response_um(model)
-    parts: list[F64] = []
-    for record, speed in zip(data.records, data.speeds, strict=True):
-        if not isinstance(record, SteadyLoop):
-            command, _, ignored = record.run()
-            parts.append(model.forward(record.sample_rate_hz).process(command)[ignored:])
-        elif record.sample_rate_hz > 0.0 and isinstance(model, StagedModel):
-            parts.append(_sampled_cycle_um(model, record))
-        elif isinstance(model, StagedModel):
-            parts.append(response_um(model, StagedFitData([record], [speed])))
-        else:
-            points, rate_hz = record.command.size, record.command.size * record.frequency_hz
-            periods = np.tile(record.command, PERIODS)
-            parts.append(model.forward(rate_hz).process(periods)[-points:])
-    return np.concatenate(parts)
+    pairs = zip(data.records, data.speeds, strict=True)
+    return np.concatenate(beside_each_other(lambda pair: _record_um(model, *pair), pairs))
+
+
+def _record_um(model: HysteresisModel, record: Record, speed: F64) -> F64:
+    """Return a model's displacement of a record's judged samples: float64[n]."""
+    if not isinstance(record, SteadyLoop):
+        command, _, ignored = record.run()
+        return model.forward(record.sample_rate_hz).process(command)[ignored:]
+    if record.sample_rate_hz > 0.0 and isinstance(model, StagedModel):
+        return _sampled_cycle_um(model, record)
+    if isinstance(model, StagedModel):
+        return response_um(model, StagedFitData([record], [speed]))
+    points, rate_hz = record.command.size, record.command.size * record.frequency_hz
+    periods = np.tile(record.command, PERIODS)
+    return model.forward(rate_hz).process(periods)[-points:]
 
 
 def _sampled_cycle_um(model: HysteresisModel, loop: SteadyLoop) -> F64:

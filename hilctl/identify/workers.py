@@ -1,8 +1,10 @@
 """Independent fits at the same time: here, over threads or processes, or on a Dask cluster."""
 
-from collections.abc import Callable, Iterator, Sequence
+import os
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import contextmanager
+from functools import cache
 from multiprocessing import get_context
 from typing import Any, Protocol, TypeVar
 
@@ -36,6 +38,20 @@ class Stream(Protocol):
 def one_by_one(function: Callable[[Task], Result], tasks: Sequence[Task], /) -> list[Result]:
     """Run tasks one after the other."""
     return [function(task) for task in tasks]
+
+
+def beside_each_other(function: Callable[[Task], Result], tasks: Iterable[Task], /) -> list[Result]:
+    """Return ``[function(task) for task in tasks]``, worked out on all cores; the order is kept.
+
+    For the short parts of one fit, most of whose time goes to kernels that leave the interpreter to
+    others (``nogil``) and to BLAS; a part must not come here itself.
+    """
+    return list(_threads().map(function, tasks))
+
+
+@cache
+def _threads() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(len(os.sched_getaffinity(0)), "hilctl-fit")
 
 
 @contextmanager

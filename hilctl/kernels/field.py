@@ -273,7 +273,10 @@ def lost_field(e: float, losses: Losses) -> tuple[float, float]:
     return e * (1.0 + more + excess / root), slope
 
 
-@kernel(f"void(float64[::1], float64[::1], float64[::1], float64[::1], {_LOSSES}, float64[::1])")
+@kernel(
+    f"void(float64[::1], float64[::1], float64[::1], float64[::1], {_LOSSES}, float64[::1])",
+    nogil=True,
+)
 def field_left(v: F64, late: F64, step_s: F64, m: F64, losses: Losses, w: F64) -> None:
     """Work out the field that the losses leave of a command, for outputs that are known.
 
@@ -393,7 +396,7 @@ def _advance(
     return m if what == _COMMAND else command
 
 
-@kernel(_RUN)
+@kernel(_RUN, nogil=True)
 def field_forward(
     v: F64,
     span: Span,

@@ -126,7 +126,10 @@ def _share_out(
     by_node[node + stride + 1] += gain * a * b * slopes[way, i + 1, j + 1]
 
 
-@kernel(f"void(float64[::1], float64, float64, {_BAND}, int64[::1], float64[::1], float64[:, ::1])")
+@kernel(
+    f"void(float64[::1], float64, float64, {_BAND}, int64[::1], float64[::1], float64[:, ::1])",
+    nogil=True,
+)
 def duhem_columns(
     y: F64, start_y: float, start_w: float, band: Band, rows: I64, w: F64, out: F64
 ) -> None:
@@ -231,7 +234,7 @@ def _root(command: float, memory: F64, band: Band, losses: Losses) -> float:
     return y
 
 
-@kernel(f"void(float64[::1], {_BAND}, {_LOSSES}, float64[::1], float64[::1])")
+@kernel(f"void(float64[::1], {_BAND}, {_LOSSES}, float64[::1], float64[::1])", nogil=True)
 def duhem_forward(v: F64, band: Band, losses: Losses, memory: F64, out: F64) -> None:
     """Run the model.
 

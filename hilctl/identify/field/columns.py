@@ -8,7 +8,7 @@ from hilctl.base.arrays import F64, I64
 from hilctl.kernels.jit import kernel
 
 
-@kernel("int64(float64[::1], float64[::1], float64, float64, int64, int64, int64[::1])")
+@kernel("int64(float64[::1], float64[::1], float64, float64, int64, int64, int64[::1])", nogil=True)
 def corners(x: F64, y: F64, off_x: float, off_y: float, thin: int, furthest: int, out: I64) -> int:
     """Find the samples between which straight lines are near enough to two signals.
 
@@ -48,7 +48,7 @@ def corners(x: F64, y: F64, off_x: float, off_y: float, thin: int, furthest: int
     return count
 
 
-@kernel("void(float64[:, ::1], int64[::1], float64, float64, float64, float64[::1])")
+@kernel("void(float64[:, ::1], int64[::1], float64, float64, float64, float64[::1])", nogil=True)
 def bare_displacement(
     derivatives: F64, kept: I64, late: float, slope_gain: float, bend_gain: float, out: F64
 ) -> None:
@@ -128,7 +128,7 @@ def swings(y: F64, turn: float, out: F64) -> None:
     out[first:] = abs(y[last] - y[first])
 
 
-@kernel("int64(float64[::1], int64[::1], int64[::1], int64[::1])")
+@kernel("int64(float64[::1], int64[::1], int64[::1], int64[::1])", nogil=True)
 def needed_points(u: F64, rows: I64, points: I64, places: I64) -> int:
     """Find the rows of a path and all samples at which it turns: operators need no others.
 
@@ -196,7 +196,10 @@ def _risen(u: float, lowest: float, width: float, s: F64, edges: F64) -> tuple[f
     return edges[j] + width * (value + 0.5 * s[j + 2] * third + slope * beyond), slope
 
 
-@kernel("void(float64[::1], int64[::1], float64[::1], float64, float64, int64, float64[:, ::1])")
+@kernel(
+    "void(float64[::1], int64[::1], float64[::1], float64, float64, int64, float64[:, ::1])",
+    nogil=True,
+)
 def play_columns(
     u: F64, rows: I64, thresholds: F64, lowest: float, width: float, splines: int, out: F64
 ) -> None:
@@ -229,7 +232,8 @@ def play_columns(
 
 @kernel(
     "void(float64[::1], int64[::1], float64[::1], float64, float64, float64[:, ::1],"
-    " float64[::1], float64[:, ::1])"
+    " float64[::1], float64[:, ::1])",
+    nogil=True,
 )
 def plays_given(
     u: F64,

@@ -12,6 +12,7 @@ from hilctl.identify.data.records import History
 from hilctl.identify.field.columns import bare_displacement, corners
 from hilctl.identify.field.rows import Motion
 from hilctl.identify.field.smoothing import smoothed
+from hilctl.identify.workers import beside_each_other
 
 POINTS = 90  # samples that are left of the fastest cycle
 SMOOTHED = 0.09  # of a radian of the fastest cycle: how far the displacement is smoothed at least
@@ -123,7 +124,7 @@ class Prepared:
         self.reach = max(0.5 * float(np.ptp(record.command)) for record in records)
         self.stroke_um = max(float(np.ptp(record.displacement_um)) for record in records)
         self.top_hz = max(_speed(record) for record in records) / (2.0 * math.pi * self.reach)
-        self.runs: Sequence[Run] = tuple(self._run(record) for record in records)
+        self.runs: Sequence[Run] = beside_each_other(self._run, records)
 
     def _run(self, record: History) -> Run:
         rate_hz, command = record.sample_rate_hz, record.command

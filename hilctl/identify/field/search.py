@@ -20,6 +20,7 @@ from hilctl.identify.field.stages import (
 )
 from hilctl.identify.field.weights import Curve, Grid, Weights, solve, table
 from hilctl.identify.job import OnProgress
+from hilctl.identify.workers import beside_each_other
 
 MARGIN = 0.1  # of the span: room of the tables beyond what the data reach
 LENGTHS = (0.05, 0.4)  # of half the span: shortest and longest drag
@@ -172,7 +173,8 @@ class FieldSearch:
     def _signals(self, x: F64) -> tuple[list[F64], list[F64]]:
         known = physical(stages_in(x), self._data)
         span = self._grid.width * self._grid.cells if self._grid else 2.0 * self._data.reach
-        both = [signals(run, known, self._curve, span) for run in self._data.runs]
+        curve, runs = self._curve, self._data.runs
+        both = beside_each_other(lambda run: signals(run, known, curve, span), runs)
         return [u for u, _ in both], [y for _, y in both]
 
     def _scale(self, y: F64, rows: Rows) -> F64:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
-from hilctl.base.arrays import F64
+from hilctl.base.arrays import F64, I64
 from hilctl.identify.field.prepared import Prepared
 from hilctl.identify.field.rows import chosen
 from hilctl.identify.field.stages import Physical
@@ -26,6 +26,7 @@ from hilctl.identify.generalised_duhem.signals import (
 )
 from hilctl.identify.generalised_duhem.tables import STEEPEST, Layout, laid_over, prior
 from hilctl.identify.job import OnProgress
+from hilctl.identify.workers import beside_each_other
 from hilctl.kernels.generalised_duhem import duhem_columns
 
 COARSE_WAY, FINE_WAY = 0.03, 0.02  # of the span: furthest way between two points of a path
@@ -200,24 +201,30 @@ class DuhemSearch:
             logs: float64[2, k, l].
             slopes: float64[N, 2 k l], filled with what the errors grow by with these.
         """
-        layout, first = self._layout, 0
+        layout = self._layout
         start_um = self._signals.offset_um(x, self._first_um)
         flux = np.arange(layout.centre.size, dtype=np.float64)  # of which nothing here depends
         band = layout.band(logs, flux)
         to_percent = 100.0 / self._stroke_um / np.sqrt(self._rows.scale.size)
         middles = layout.nodes_um[:-1] + 0.5 * layout.cell_um
-        parts = []
-        for path, rows in zip(self._signals.paths(x), self._rows.samples, strict=True):
+        errors = np.empty(self._rows.scale.size)
+
+        def fill(path: Path, rows: I64, first: int) -> None:
             columns = np.empty((rows.size, 0 if slopes is None else logs.size))
             w = np.empty_like(path.field)
             duhem_columns(path.displacement_um, start_um, 0.0, band, rows, w, columns)
             slope = np.interp(path.displacement_um[rows], middles, layout.slopes)
-            scale = to_percent * slope * self._rows.scale[first : first + rows.size]
-            parts.append(scale * (w[rows] - path.field[rows]))
+            here = slice(first, first + rows.size)
+            scale = to_percent * slope * self._rows.scale[here]
+            errors[here] = scale * (w[rows] - path.field[rows])
             if slopes is not None:
-                slopes[first : first + rows.size] = columns * scale[:, None]
-            first += rows.size
-        return np.concatenate(parts)
+                np.multiply(columns, scale[:, None], out=slopes[here])
+
+        samples = self._rows.samples
+        firsts = np.cumsum([0, *(rows.size for rows in samples[:-1])]).tolist()
+        parts = zip(self._signals.paths(x), samples, firsts, strict=True)
+        beside_each_other(lambda part: fill(*part), parts)
+        return errors
 
 
 def _bounded_step(normal: F64, down: F64, damping: float, table: int, x: F64) -> F64:

@@ -19,6 +19,7 @@ from hilctl.identify.field.stages import (
     stages_of,
 )
 from hilctl.identify.field.weights import Curve
+from hilctl.identify.workers import beside_each_other
 
 STAGES = ("field", "output", "decay", "growth", "bend", "excess", "radian", "damping", "delay")
 POWERS = np.arange(1.0, 5.0)
@@ -127,4 +128,5 @@ class Signals:
 
     def _whole(self, x: F64) -> list[tuple[F64, F64]]:
         known, flux = self.known(x), self.flux(x)
-        return [signals(run, known, flux, 2.0 * self._data.reach) for run in self._data.runs]
+        span = 2.0 * self._data.reach
+        return beside_each_other(lambda run: signals(run, known, flux, span), self._data.runs)

@@ -1,6 +1,8 @@
 """Work shared out over processes or a cluster finds the same."""
 
 import importlib.util
+import os
+import threading
 from collections.abc import Callable
 
 import pytest
@@ -9,7 +11,7 @@ from hilctl.base.errors import InputError
 from hilctl.identify.data.records import SteadyLoop
 from hilctl.identify.fit_model import fit_model
 from hilctl.identify.settings import FitSettings
-from hilctl.identify.workers import workers
+from hilctl.identify.workers import beside_each_other, workers
 from hilctl.models.published import exponential_integrated
 
 Loops = Callable[..., list[SteadyLoop]]
@@ -23,6 +25,20 @@ def loops(loops_of: Loops) -> list[SteadyLoop]:
         beta_1=0.15, d_p=8.0, alpha_2=0.1, beta_2=0.4, d_n=8.0, plays=6, deadbands_a_side=4,
     )  # fmt: skip
     return loops_of(omega, GRID)
+
+
+def test_short_parts_run_beside_each_other_and_keep_their_order():
+    """All that a machine's cores take are under way at once; the first error is raised."""
+    cores = len(os.sched_getaffinity(0))
+    together = threading.Barrier(cores)
+
+    def met(part: int) -> int:
+        together.wait(timeout=60.0)
+        return 2 * part
+
+    assert beside_each_other(met, range(cores)) == [2 * part for part in range(cores)]
+    with pytest.raises(ZeroDivisionError):
+        beside_each_other(lambda part: 1 // part, [1, 0])
 
 
 @pytest.mark.parametrize("scheduler", ["threads", "processes"])
