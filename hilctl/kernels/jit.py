@@ -5,6 +5,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
+from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
@@ -135,7 +136,7 @@ class _Kernel(CPUDispatcher):
     def load(self) -> None:
         with global_compiler_lock:
             if not self._loaded:
-                with _without_blas():
+                with _without_blas(), _in_some_folder():
                     self._compile_declared()
                 self.disable_compile()
                 self._loaded = True
@@ -199,6 +200,26 @@ def _without_blas() -> Iterator[None]:
         yield
     finally:
         del sys.modules[name]
+
+
+@contextmanager
+def _in_some_folder() -> Iterator[None]:
+    """Stand in the root folder meanwhile where the working folder has been deleted.
+
+    numba gives places in the source by their way from the working folder.
+    """
+    try:
+        Path.cwd()
+    except FileNotFoundError:
+        gone = os.open(".", os.O_PATH)
+        os.chdir("/")
+        try:
+            yield
+        finally:
+            os.fchdir(gone)
+            os.close(gone)
+    else:
+        yield
 
 
 @cache

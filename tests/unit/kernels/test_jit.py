@@ -190,6 +190,21 @@ def test_full_disk_keeps_no_kernel_from_being_compiled(tmp_path, in_memory, monk
     assert list(in_memory.rglob("*.nbc"))
 
 
+def item(values: np.ndarray, at: int) -> float:
+    return values[at]
+
+
+def test_compiled_where_the_working_folder_has_been_deleted(tmp_path, monkeypatch, in_memory):
+    """What is named from the root can be run from there; names from the folder stay unknown."""
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    monkeypatch.chdir(gone)
+    gone.rmdir()
+    assert jit.kernel("float64(float64[::1], int64)")(item)(np.array([0.5, 1.5]), 1) == 1.5
+    with pytest.raises(FileNotFoundError):
+        Path.cwd()
+
+
 def test_mistake_in_a_kernel_is_said(in_memory):
     """What has nothing to do with the cache is not passed over."""
     wrong = jit.kernel("float64(unicode_type)")(double)
