@@ -6,7 +6,7 @@ from fractions import Fraction
 
 import numpy as np
 
-from hilctl.base.arrays import F64
+from hilctl.base.arrays import F64, I64
 from hilctl.base.errors import InputError
 from hilctl.base.values import CHUNK, Values, chunks, fit
 from hilctl.waveforms import spec
@@ -19,6 +19,7 @@ MAX_SAMPLES = 10**12
 """Most samples of a waveform: half a year at 50 kHz."""
 
 _TELLING_CYCLES = 8
+_LONGEST_PERIOD = 2**31  # samples; so that their products are no more than an integer holds
 
 
 def sample_count(duration_s: float, sample_rate_hz: float) -> int:
@@ -115,8 +116,39 @@ class _Shaped:
 
     def __getitem__(self, part: slice, /) -> F64:
         start, stop, _ = part.indices(self.size)
-        t = np.arange(start, stop) / self.sample_rate_hz
-        return self.shape.offset + _shape(self.shape, t, self.scale)
+        at = _Instants(np.arange(start, stop), self.sample_rate_hz)
+        return self.shape.offset + _shape(self.shape, at, self.scale)
+
+
+@dataclass(frozen=True, slots=True)
+class _Instants:
+    """When samples are taken.
+
+    Attributes:
+        sample: int64[n], their numbers.
+        rate_hz: Samples a second.
+    """
+
+    sample: I64
+    rate_hz: float
+
+    @property
+    def t(self) -> F64:
+        """Time in s: float64[n]."""
+        return self.sample / self.rate_hz
+
+    def cycles(self, frequency_hz: float) -> F64:
+        """Return how far into its cycle a frequency is, in cycles: float64[n], 0 to 1.
+
+        The same bits in each period that is a whole number of samples, for frequencies and rates
+        that are taken as the decimal numbers they were written as: rounded times would make each
+        cycle another, and what comes of it in a recording cannot be told from noise.
+        """
+        turn = _decimal(frequency_hz) / _decimal(self.rate_hz) % 1
+        if turn.denominator > _LONGEST_PERIOD:
+            return np.mod(frequency_hz * self.t, 1.0)
+        inside = self.sample % turn.denominator * turn.numerator % turn.denominator
+        return inside / turn.denominator
 
 
 def _duration_s(w: spec.Shape) -> float:
@@ -129,28 +161,29 @@ def _duration_s(w: spec.Shape) -> float:
             return w.duration_s
 
 
-def _shape(w: spec.ShapeOfTime, t: F64, scale: float) -> F64:
+def _shape(w: spec.ShapeOfTime, at: _Instants, scale: float) -> F64:
     match w:
         case spec.Sine():
-            return w.amplitude * np.sin(_angle(w.frequency_hz, w.phase_deg, t))
+            return w.amplitude * _sine(w.frequency_hz, math.radians(w.phase_deg), at)
         case spec.Triangle():  # starts at 0 and rises
-            phase = np.mod(w.frequency_hz * t + 0.25, 1.0)
+            phase = np.mod(at.cycles(w.frequency_hz) + 0.25, 1.0)
             return w.amplitude * (1.0 - 4.0 * np.abs(phase - 0.5))
         case spec.ComplexHarmonic():
-            total = np.zeros_like(t)
+            total = np.zeros(at.sample.size)
             for part in w.components:
-                total += part.amplitude * np.sin(_angle(part.frequency_hz, part.phase_deg, t))
+                angle = math.radians(part.phase_deg)
+                total += part.amplitude * _sine(part.frequency_hz, angle, at)
             return total
         case spec.GrowingOrDecaying():
-            elapsed = t / w.duration_s
+            elapsed = at.t / w.duration_s
             envelope = elapsed if w.kind == "growing" else 1.0 - elapsed
-            return w.amplitude * envelope * np.sin(_angle(w.frequency_hz, 0.0, t))
+            return w.amplitude * envelope * _sine(w.frequency_hz, 0.0, at)
         case spec.Chirp():
-            return _chirp(w, t)
+            return _chirp(w, at.t)
         case spec.Multisine():
-            return scale * _multisine(w, t)
+            return scale * _multisine(w, at)
         case spec.Step() | spec.Hold() | spec.LevelPath():
-            return _levelled(w, t)
+            return _levelled(w, at.t)
 
 
 def _levelled(w: spec.Step | spec.Hold | spec.LevelPath, t: F64) -> F64:
@@ -163,8 +196,8 @@ def _levelled(w: spec.Step | spec.Hold | spec.LevelPath, t: F64) -> F64:
             return np.interp(t, _arrivals_s(w), _levels(w))
 
 
-def _angle(frequency_hz: float, phase_deg: float, t: F64) -> F64:
-    return 2.0 * np.pi * frequency_hz * t + math.radians(phase_deg)
+def _sine(frequency_hz: float, angle: float, at: _Instants) -> F64:
+    return np.sin(2.0 * np.pi * at.cycles(frequency_hz) + angle)
 
 
 def _chirp(w: spec.Chirp, t: F64) -> F64:
@@ -188,17 +221,17 @@ def _step(w: spec.Step, t: F64) -> F64:
     return values
 
 
-def _multisine(w: spec.Multisine, t: F64) -> F64:
+def _multisine(w: spec.Multisine, at: _Instants) -> F64:
     """Return evenly spaced sines with Schroeder phases, of whatever peak: float64[n].
 
     Source: M. R. Schroeder, IEEE Trans. Information Theory 16 (1970) 85: phases of a low crest
     factor, ``phi_m = -pi m (m - 1) / M``.
     """
     count = _multisine_count(w)
-    total = np.zeros_like(t)
+    first_hz, step_hz = _decimal(w.first_hz), _decimal(w.step_hz)
+    total = np.zeros(at.sample.size)
     for m in range(count):
-        frequency_hz = w.first_hz + m * w.step_hz
-        total += np.sin(2.0 * np.pi * frequency_hz * t - np.pi * m * (m + 1) / count)
+        total += _sine(float(first_hz + m * step_hz), -math.pi * m * (m + 1) / count, at)
     return total
 
 
@@ -253,13 +286,18 @@ def _multisine_count(w: spec.Multisine) -> int:
     return int((w.last_hz - w.first_hz) / w.step_hz + 1e-9) + 1
 
 
+def _decimal(value: float) -> Fraction:
+    """Return the decimal number that a value was written as."""
+    return Fraction(repr(float(value)))
+
+
 def common_period_s(frequencies_hz: list[float]) -> float:
     """Return the shortest period that all frequencies share, in s.
 
     Frequencies are taken as the decimal numbers they were written as, so 0.1 and 0.3 Hz share
     10 s. Infinite where it is too long for a float.
     """
-    fractions = [Fraction(repr(f)) for f in frequencies_hz]
+    fractions = [_decimal(f) for f in frequencies_hz]
     common = fractions[0]
     for fraction in fractions[1:]:
         common = Fraction(

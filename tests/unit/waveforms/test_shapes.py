@@ -2,12 +2,14 @@
 
 import math
 from collections.abc import Callable
+from fractions import Fraction
 from typing import Any, ClassVar
 
 import numpy as np
 import pytest
 
 from hilctl.base.arrays import F64
+from hilctl.waveforms import shapes, spec
 from hilctl.waveforms.build import Reference
 from hilctl.waveforms.shapes import common_period_s, sample_count
 
@@ -383,3 +385,40 @@ def test_values_are_read_only(made: Made) -> None:
     values = made(RATE_HZ, **CASES[0][0]).values
     with pytest.raises(ValueError, match="read-only"):
         values[0] = 1.0
+
+
+@pytest.mark.parametrize(
+    ("frequency_hz", "rate_hz", "period"),
+    [(100.0, 50_000.0, 500), (0.1, 50_000.0, 500_000), (33.3, 1000.0, 10_000), (7.0, 48_000.1, 0)],
+)
+@pytest.mark.parametrize("kind", ["sine", "triangle", "multisine"])
+def test_cycles_are_the_same_bit_for_bit(kind, frequency_hz, rate_hz, period):
+    """And right, however long it goes on: a month later no phase is lost to rounding."""
+    common = {"amplitude": 3.0, "duration_s": 5e6, "unit": "um", "offset": 1.0}
+    shape: spec.Sine | spec.Triangle | spec.Multisine
+    if kind == "multisine":
+        band = {"first_hz": frequency_hz, "last_hz": 2.5 * frequency_hz, "step_hz": frequency_hz}
+        shape = spec.Multisine(kind=kind, **band, **common)
+    else:
+        shape = {"sine": spec.Sine, "triangle": spec.Triangle}[kind](
+            kind=kind, frequency_hz=frequency_hz, **common
+        )
+    values = shapes.sampled(shape, rate_hz)
+    turn = Fraction(repr(frequency_hz)) / Fraction(repr(rate_hz))
+    if period:
+        assert (turn * period).denominator == 1
+        for later in (1, 12_345):
+            far = later * period
+            np.testing.assert_array_equal(values[far : far + 700], values[:700])
+    if kind == "sine":
+        at = 4_000_000_000
+        right = [1.0 + 3.0 * math.sin(2.0 * math.pi * (turn * k % 1)) for k in range(at, at + 50)]
+        np.testing.assert_allclose(values[at : at + 50], right, rtol=0.0, atol=2e-14)
+
+
+def test_periods_longer_than_numbers_hold_are_rounded():
+    """What is no short decimal repeats after more samples than anybody has."""
+    sine = spec.Sine(kind="sine", amplitude=1.0, frequency_hz=1.0 / 3.0, duration_s=10.0, unit="um")
+    values = shapes.sampled(sine, 10_000.0 / 7.0)[:]
+    t = np.arange(values.size) / (10_000.0 / 7.0)
+    np.testing.assert_allclose(values, np.sin(2.0 * np.pi / 3.0 * t), rtol=0.0, atol=1e-14)
