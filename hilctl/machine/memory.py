@@ -17,6 +17,10 @@ _NOT_IN_A_TICK = (
     "openblas",
     "libgfortran",
     "libquadmath",
+    "libstdc++",
+    "/numpy/random/",
+    "/numpy/linalg/",
+    "/numpy/fft/",
     "/scipy/",
     "libcrypto",
     "_pydantic_core",
@@ -114,15 +118,21 @@ class ProcessMemory:
         Only those that are as in their file: what the loader has put there is nowhere else. Where
         that is refused, they stay.
         """
+        self._give_back([each for each in _own_mappings() if not each.in_a_tick])
+
+    def _give_back(self, given: Iterable[Mapping]) -> None:
         if hasattr(self._libc, "malloc_trim"):  # glibc's: what was freed goes back, too
             self._libc.malloc_trim(0)
-        for each in _own_mappings():
-            if not each.in_a_tick and each.of_file and each.resident and not each.changed:
+        for each in given:
+            if each.of_file and each.resident and not each.changed:
                 self._libc.madvise(*map(ctypes.c_size_t, (each.start, each.size, _DONTNEED)))
 
     def stay_small(self) -> None:
-        """Give back what no tick needs, and from now on what is freed: each batch needs some MB."""
-        self.release()
+        """Give back what can be read again, and from now on what is freed: for who has no ticks.
+
+        Half of what a process reads of its libraries it reads at its start only.
+        """
+        self._give_back(_own_mappings())
         if hasattr(self._libc, "mallopt"):
             # Unless they are set, glibc keeps twice the largest array that was ever freed.
             self._libc.mallopt(_TRIM_THRESHOLD, _KEPT_BYTES)
