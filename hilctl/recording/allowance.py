@@ -7,7 +7,7 @@ within one another, messages without content. What hilctl writes stays far below
 from hilctl.base.errors import DataError
 
 LARGEST_CHUNK_BYTES = 32 * 2**20
-"""Largest chunk, uncompressed; hilctl closes one behind 8 MiB."""
+"""Largest chunk, uncompressed; hilctl closes one behind 3 MiB, and did so behind 8."""
 MOST_IN_CHUNK = 2**18
 """Most records in a chunk; 8 MiB of messages as short as hilctl's are a third of that."""
 

@@ -18,7 +18,7 @@ from hilctl.recording.mcap_file import McapWriter
 from hilctl.recording.rows import SCOPE_T_REL, MessageRows, scope_rows
 from hilctl.recording.wire import BlockArrays, block_bytes
 
-_MAX_BLOCK = 500
+_MAX_BLOCK = 2500
 _NONE = np.empty(0)
 _YEAR_NS = 366 * 86_400 * 10**9
 

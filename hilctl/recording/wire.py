@@ -121,15 +121,18 @@ def block_bytes(block: BlockArrays, t_rel: F64) -> bytes:
     """
     lists = {T_REL: t_rel, STATE: block.state, PREVIOUS: block.previous_command}
     lists |= {NUMBER_OF[name]: values for name, values in block.columns.items()}
-    packed = {number: values.tobytes() for number, values in lists.items()}
-    packed[FLAGS] = _packed(block.flags)
     numbers = {TICK0: block.tick0, N: block.n, _DROPPED: block.dropped}
-    heads = [_number(field << 3) + _number(value) for field, value in numbers.items() if value]
-    return b"".join(heads) + b"".join(
-        _list_head(field, len(packed[field])) + packed[field]
-        for field in sorted(packed)
-        if packed[field]
-    )
+    # Of blocks of one sample, a column is one number in so many of the ring's.
+    packed = {field: np.ascontiguousarray(of).data for field, of in lists.items()}
+    packed[FLAGS] = memoryview(_packed(block.flags))
+    parts: list[bytes | memoryview] = []
+    for field, value in numbers.items():
+        if value:
+            parts += _number(field << 3), _number(value)
+    for field in sorted(packed):
+        if size := packed[field].nbytes:
+            parts += _list_head(field, size), packed[field]
+    return b"".join(parts)
 
 
 @lru_cache(maxsize=1024)  # one block after the other has lists of the same lengths

@@ -24,7 +24,6 @@ from foxglove.mcap import MCAPWriteOptions
 from hilctl.base.samples import Batch
 from hilctl.experiment.parts import RecordingConfig
 from hilctl.recording import schema
-from hilctl.recording.mcap_file import LEVEL
 from hilctl.recording.messages import Encoded, MessageMaker, RecordingLayout
 from hilctl.recording.writer import RecordingWriter, RunFacts
 from hilctl.run.recorder import Recorder
@@ -33,6 +32,7 @@ from hilctl.run.unpaced import run_unpaced
 
 EXPERIMENT = Path(__file__).parents[2] / "configs" / "terfenol_sine_6a.yaml"
 RATE_HZ = 50_000.0
+LEVEL = 1  # of the SDK: of its levels the nearest to what hilctl does
 BLOCKS = 50
 BATCH_S = 0.05
 FLUSH_BATCHES = round(RecordingConfig().flush_s / BATCH_S)

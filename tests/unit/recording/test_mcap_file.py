@@ -8,11 +8,11 @@ import pytest
 from mcap.reader import make_reader
 
 from hilctl.recording import mcap_file
-from hilctl.recording.mcap_file import McapWriter
+from hilctl.recording.mcap_file import Compression, McapWriter
 from hilctl.recording.rows import scope_rows
 from tests.fakes import PackageMcapWriter
 
-LEVEL = 3  # as that package has it
+AS_THERE = Compression(compression_level=3)  # as that package has it
 CHUNK = 600
 
 
@@ -71,7 +71,7 @@ def test_it_is_what_the_package_writes(write, monkeypatch):
     monkeypatch.setattr(mcap_file, "_PACKED_BYTES", 500)  # a few chunks' indexes
     ours, theirs = io.BytesIO(), io.BytesIO()
     for stream, writer in (
-        (ours, McapWriter(ours, chunk_bytes=CHUNK, level=LEVEL)),
+        (ours, McapWriter(ours, chunk_bytes=CHUNK, compression=AS_THERE)),
         (theirs, PackageMcapWriter(theirs, chunk_size=CHUNK)),
     ):
         write(writer)

@@ -8,7 +8,8 @@ from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
 from hilctl.base.events import Event
-from hilctl.base.samples import COLUMNS
+from hilctl.base.samples import COLUMNS, Batch, Head
+from hilctl.recording.messages import MessageMaker, RecordingLayout
 from hilctl.recording.reader import read
 
 
@@ -31,6 +32,20 @@ def recorded(tmp_path, make):
     with path.open("wb") as stream:
         make.write(stream, batches)
     return path, batches
+
+
+def test_blocks_of_one_sample_are_the_same_message(make):
+    """In the ring their columns are not one number after the other."""
+    whole = make.batch(0, 1)
+    size = whole.flags.shape[1]
+    heads = np.repeat(whole.heads, size, axis=0)
+    heads[:, Head.FIRST_SAMPLE], heads[:, Head.SAMPLES] = np.arange(size), 1
+    columns = np.ascontiguousarray(whole.columns[0].T[:, :, np.newaxis])
+    ones = Batch(heads, np.repeat(whole.states, size, axis=0), columns, whole.flags.T.copy())
+    layout = RecordingLayout(50_000.0, "A", True, 1000.0, 1_800_000_000 * 10**9, True)
+    block, other = (next(iter(MessageMaker(layout).batch(each))) for each in (whole, ones))
+    assert block.topic == "/samples"
+    assert block == other
 
 
 @pytest.mark.parametrize("unit", ["A", "V"])

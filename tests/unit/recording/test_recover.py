@@ -132,16 +132,19 @@ def test_cut_at_every_kind_of_boundary(sound, tmp_path):
 
 @pytest.mark.slow
 def test_random_cuts_garbage_and_zeros(sound, tmp_path):
-    """At 200 random places, with nothing, zeros or garbage behind the cut."""
+    """At 200 random places, with nothing, zeros or garbage behind the cut: what is saved is right.
+
+    Garbage may save more than nothing: it fills up a block that begins right.
+    """
     rng = np.random.default_rng(7)
     path = tmp_path / "run.mcap"
     first = next(end for code, _, end in sound.records if code == METADATA)
     for number, cut in enumerate(rng.integers(first, len(sound.data), 200).tolist()):
         path.write_bytes(sound.data[:cut])
-        count = check(path, sound, cut)
+        check(path, sound, cut)
         behind = int(rng.integers(1, 9000))
         path.write_bytes(sound.data[:cut] + (bytes(behind) if number % 2 else rng.bytes(behind)))
-        assert check(path, sound, cut) <= count
+        check(path, sound, cut)
 
 
 def test_messages_of_a_torn_chunk_are_saved(sound, tmp_path):
@@ -166,7 +169,7 @@ def test_other_compressions(sound, make, tmp_path, kind, monkeypatch):
     stream = io.BytesIO()
     other = partial(PackageMcapWriter, compression=kind)
     monkeypatch.setattr(module, "McapWriter", other)
-    make.write(stream, [make.batch(0, 4), make.batch(200, 60, seed=1)])
+    make.write(stream, [make.batch(0, 4), make.batch(200, 240, seed=1)])
     data = stream.getvalue()
     every = messages(io.BytesIO(data))
     _, start, end = [record for record in framed(data) if record[0] == CHUNK][1]

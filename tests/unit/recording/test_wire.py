@@ -94,7 +94,7 @@ def test_what_is_written_another_way_is_left_to_the_library():
 def test_all_that_is_recorded_is_plain(make):
     """Or reading takes ten times as long."""
     stream = io.BytesIO()
-    make.write(stream, [make.batch(0, 40), make.batch(2000, 40, seed=1)])
+    make.write(stream, [make.batch(2000 * k, 40, seed=k) for k in range(3)])
     kinds = {1: wire.sample_block, 2: wire.tick_block}
     found = [
         kinds[record.channel_id](record.data)
