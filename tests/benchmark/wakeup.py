@@ -162,7 +162,11 @@ def print_histograms(name: str, ours: np.ndarray, theirs: np.ndarray) -> None:
 
 
 def compare(options: argparse.Namespace, folder: Path) -> float:
-    """Run all pairs and print them; return the median ratio."""
+    """Run all pairs and print them; return the ratio of p99.9 over all of them.
+
+    A stall of the machine, which hits one side of a pair, is most of that pair's tail: ratios of
+    single pairs go from 0.1 to 20 where those of all wake-ups agree.
+    """
     first = measure(options.rate, options.seconds / 10, Realtime(priority=options.priority))
     for step in first.steps:
         print(f"{step.name:>13}  {step.outcome}: {step.detail}")
@@ -179,23 +183,26 @@ def compare(options: argparse.Namespace, folder: Path) -> float:
               f"ratio of p99.9 {ratios[-1]:.2f}")  # fmt: skip
         for name, watch in zip(("hilctl", options.name), watches, strict=True):
             print(f"{name:>13}  {watch.text()}", flush=True)
-    print_histograms(options.name, *map(np.concatenate, late_us))
-    return float(np.median(ratios))
+    all_us = [np.concatenate(each) for each in late_us]
+    print_histograms(options.name, *all_us)
+    print(f"\nmedian of the pairs' ratios of p99.9: {np.median(ratios):.2f}")
+    p999_us = [float(np.percentile(each, QUANTILE)) for each in all_us]
+    print(f"p99.9 of all pairs: hilctl {p999_us[0]:.0f}, {options.name} {p999_us[1]:.0f} us")
+    return p999_us[0] / p999_us[1]
 
 
 def main() -> int:
-    """Run the benchmark; the exit code is 1 where the median ratio is above ``--max-ratio``."""
+    """Run the benchmark; the exit code is 1 where the ratio is above ``--max-ratio``."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
-    parser.add_argument("--pairs", type=int, default=5)
-    parser.add_argument("--seconds", type=float, default=30.0, help="length of each run")
+    parser.add_argument("--pairs", type=int, default=25)
+    parser.add_argument("--seconds", type=float, default=6.0, help="length of each run")
     parser.add_argument("--rate", type=float, default=1000.0, help="ticks a second")
     parser.add_argument("--priority", type=int, default=80)
     parser.add_argument("--max-ratio", type=float, default=1.2)
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         ratio = compare(options, Path(name))
-    print(f"\nmedian ratio of p99.9 over {options.pairs} pairs: {ratio:.2f} "
-          f"(at most {options.max_ratio:g})")  # fmt: skip
+    print(f"ratio of these: {ratio:.2f}, at most {options.max_ratio:g}")
     return int(ratio > options.max_ratio)
 
 
