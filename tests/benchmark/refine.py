@@ -96,16 +96,17 @@ def sines(items: Sequence[tuple[float, float, float]], dwell_s: float = 0.16) ->
     return np.concatenate(parts)
 
 
-def training(low_um: float, high_um: float) -> Iterator[F64]:
+def training(low_um: float, high_um: float, seed: int) -> Iterator[F64]:
     """Give ten references: random ones, multisines, small and biased sines."""
+    first = 101 + 10 * seed
     time_s = np.arange(round(1.5 * RATE_HZ)) / RATE_HZ
     slow = 0.86 * np.sin(2.0 * np.pi * 3.0 * time_s)
     waves = (
-        random(101, 2.0, 150.0, 2.0),
-        random(102, 5.0, 250.0, 2.0),
-        0.5 * random(103, 3.0, 220.0, 1.5),
-        0.5 + 0.45 * random(104, 3.0, 220.0, 1.5),
-        -0.5 + 0.45 * random(105, 3.0, 220.0, 1.5),
+        random(first + 0, 2.0, 150.0, 2.0),
+        random(first + 1, 5.0, 250.0, 2.0),
+        0.5 * random(first + 2, 3.0, 220.0, 1.5),
+        0.5 + 0.45 * random(first + 3, 3.0, 220.0, 1.5),
+        -0.5 + 0.45 * random(first + 4, 3.0, 220.0, 1.5),
         sines([(0.85, 0.12, 80), (0.6, 0.3, 180), (0.3, 0.15, 120), (0.8, 0.2, 60), (0.1, 0.2, 240),
                (-0.4, 0.15, 90), (-0.85, 0.12, 110), (-0.5, 0.3, 200)]),
         sines([(-0.8, 0.1, 130), (-0.6, 0.35, 70), (-0.3, 0.1, 230), (-0.75, 0.2, 160),
@@ -113,19 +114,21 @@ def training(low_um: float, high_um: float) -> Iterator[F64]:
         np.sin(2.0 * np.pi * 30.0 * time_s[: round(0.6 * RATE_HZ)]),
         sines([(0, 0.1, 60), (0, 0.25, 140), (0, 0.12, 220), (0, 0.4, 180), (0, 0.08, 80),
                (0, 0.6, 240), (0, 0.2, 110)]),
-        slow + 0.12 * random(106, 40.0, 240.0, 1.5),
+        slow + 0.12 * random(first + 5, 40.0, 240.0, 1.5),
     )  # fmt: skip
     middle, half = 0.5 * (low_um + high_um), 0.5 * (high_um - low_um)
     for wave in waves:
         yield swelling(np.arange(wave.size) / RATE_HZ, 0.1) * (middle + half * wave)
 
 
-def refined(rig: Rig, model: HysteresisModel, low_um: float, high_um: float) -> Refinement:
+def refined(
+    rig: Rig, model: HysteresisModel, low_um: float, high_um: float, seed: int
+) -> Refinement:
     """Return a model refined from ten runs that it has compensated."""
     runs = []
-    for i, reference_um in enumerate(training(low_um, high_um)):
+    for i, reference_um in enumerate(training(low_um, high_um, seed)):
         command = command_of(model, reference_um)
-        answer_um = rig.driven(command, 500 + i, noise=True)
+        answer_um = rig.driven(command, 500 + 20 * seed + i, noise=True)
         runs.append(History(f"run {i}", command, answer_um, RATE_HZ))
     return refine_runs(model, runs)
 
@@ -165,14 +168,14 @@ STARTS: dict[str, tuple[Callable[[Physics], HysteresisModel], dict[str, Any]]] =
 """Where the model comes from, and what the rig is by then."""
 
 
-def show(physics: Physics, start: str, model: HysteresisModel) -> bool:
+def show(physics: Physics, start: str, model: HysteresisModel, seed: int) -> bool:
     """Print the table of one physics and start; return whether every goal is met."""
     rig = Rig(physics, STARTS[start][1])
     low_um, high_um = model.output_range_um or (-50.0, 35.0)
     margin = 0.06 * (high_um - low_um)
     low_um, high_um = low_um + margin, high_um - margin
     begin = time.process_time()
-    found = refined(rig, model, low_um, high_um)
+    found = refined(rig, model, low_um, high_um, seed)
     print(f"\n{physics}, {start}: {time.process_time() - begin:.1f} s of processor time; {found}")
     print(f"{'reference':22} {'rms %':>7} {'after':>7} {'ratio':>6} {'peak %':>7} {'after':>7} "
           f"{'noise':>6}")  # fmt: skip
@@ -201,6 +204,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
     parser.add_argument("--physics", nargs="*", default=list(PHYSICS), choices=list(PHYSICS))
     parser.add_argument("--start", nargs="*", default=list(STARTS), choices=list(STARTS))
+    parser.add_argument("--seed", type=int, default=0, help="of the runs' references and noise")
     options = parser.parse_args()
     met = []
     for physics in options.physics:
@@ -208,7 +212,7 @@ def main() -> int:
         for start in options.start:
             source = STARTS[start][0]
             model = models.setdefault(source, models.get(source) or source(physics))
-            met.append(show(physics, start, model))
+            met.append(show(physics, start, model, options.seed))
     return int(not all(met))
 
 

@@ -17,8 +17,8 @@ from hilctl.identify.refine.remainder import Moments, Remainder
 from hilctl.models.base import HysteresisModel
 from hilctl.models.refined import RefinedModel
 
-STRENGTHS = (0.003, 0.01, 0.02, 0.05, 0.1, 0.3, 1.0)
-ANCHORS = (100.0, 10.0)
+STRENGTHS = (0.003, 0.01, 0.02, 0.03, 0.05, 0.1, 0.3, 1.0)
+ANCHORS = (100.0, 10.0, 3.0)
 """Times the least weight of the old model on motions that runs may say nothing of."""
 AS_GOOD = 1.02  # times the least error on runs held out
 WORTH = 0.9  # of the old error: less gain is not worth what runs do not show
@@ -177,17 +177,18 @@ class Strength:
         own = min(found, key=lambda each: each[2])[0].own
         left = [(choice, whole) for choice, whole, _ in found if choice.own == own]
         best = min(left, key=lambda way: (not way[0].better, way[0].ratio))
-        least = FOREGONE * (1.0 - best[0].ratio)
+        least_gain = FOREGONE * (1.0 - best[0].ratio)
         even = [way for way in left if way[0].even and way[0].better]
-        even = [way for way in even if 1.0 - way[0].ratio >= least]
+        even = [way for way in even if 1.0 - way[0].ratio >= least_gain]
         best = min(even, key=lambda way: way[0].ratio, default=best)
         # Runs say nothing of what is faster or larger than they are: where holding to the old model
         # there costs them next to nothing, it is held to.
-        for anchor in ANCHORS if best[0].better else ():
-            choice, whole, _ = self._tried(best[0].strength, anchor, own=own)
-            if choice.as_good(best[0]):
-                return choice, whole
-        return best
+        if not best[0].better:
+            return best
+        held = [self._tried(best[0].strength, anchor, own=own)[:2] for anchor in ANCHORS]
+        least = min([best, *held], key=lambda way: (not way[0].better, way[0].ratio))
+        good = (way for way in held if way[0].as_good(best[0]) and way[0].as_good(least[0]))
+        return next(good, best)
 
     def _tried(
         self, strength: float, anchor: float, *, own: bool
