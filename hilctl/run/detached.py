@@ -49,7 +49,7 @@ def start_detached(
     checked = checked_experiment(experiment, settings)
     output = output_of(checked, output)
     log = free_log(output)
-    command = [sys.executable, "-P", "-m", "hilctl.cli", "run", str(experiment), *flags]
+    command = [sys.executable, "-P", "-m", "hilctl", "run", str(experiment), *flags]
     command += ["--output", str(output)]
     command += [word for setting in settings for word in ("--set", setting)]
     try:

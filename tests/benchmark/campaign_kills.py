@@ -70,7 +70,7 @@ class KilledCampaign:
         file = folder / "killed.yaml"
         file.write_text(CAMPAIGN.format(steps=steps), encoding="utf-8")
         self._folder = folder
-        self._command = [sys.executable, "-m", "hilctl.cli", "campaign", str(file)]
+        self._command = [sys.executable, "-m", "hilctl", "campaign", str(file)]
         self._command += ["--folder", str(self.runs), *words]
         self._environment = {**os.environ, "HILCTL_RUNS": str(folder / "memory")}
         self._known: dict[Path, str] = {}

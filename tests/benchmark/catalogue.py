@@ -78,7 +78,7 @@ def timed(words: Sequence[str], cache: Path) -> tuple[float, float, str]:
     """Return wall time and processor time of a command in s, and what it printed last."""
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     began = time.perf_counter()
-    command = [sys.executable, "-P", "-m", "hilctl.cli", "list", *words]
+    command = [sys.executable, "-P", "-m", "hilctl", "list", *words]
     env = {**os.environ, "XDG_CACHE_HOME": str(cache)}
     done = subprocess.run(command, env=env, check=True, capture_output=True, text=True)
     wall_s = time.perf_counter() - began

@@ -104,7 +104,7 @@ class AttackedRuns:
     def _hilctl(
         self, words: list[str], environment: dict[str, str] | None = None, **options: Any
     ) -> subprocess.Popen[Any]:
-        command = [sys.executable, "-m", "hilctl.cli", *words]
+        command = [sys.executable, "-m", "hilctl", *words]
         given = {**self._environment, **(environment or {})}
         return subprocess.Popen(command, env=given, **options)
 

@@ -37,7 +37,7 @@ class LiveRun:
             words = [str(EXPERIMENT), "--json", *words, "--output", str(self.output)]
             words += ["--overwrite", "--live"] if live else ["--overwrite"]
             self.process = subprocess.Popen(
-                [sys.executable, "-m", "hilctl.cli", "run", *words],
+                [sys.executable, "-m", "hilctl", "run", *words],
                 stdout=subprocess.PIPE,
                 stderr=log,
             )
@@ -89,7 +89,7 @@ def rss_mb(process):
 async def page_server(name):
     """``hilctl live`` for a run, in a process of its own; yield its number and its address."""
     process = subprocess.Popen(
-        [sys.executable, "-m", "hilctl.cli", "live", name], stdout=subprocess.PIPE
+        [sys.executable, "-m", "hilctl", "live", name], stdout=subprocess.PIPE
     )
     try:
         line = await asyncio.to_thread(process.stdout.readline)

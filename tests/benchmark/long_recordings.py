@@ -133,7 +133,7 @@ def make(path: Path, seconds: int) -> int:
 def measured(*command: str) -> tuple[float, float, int]:
     """Run a command of hilctl; return its wall and processor time in s, and its peak in bytes."""
     began = time.monotonic()
-    child = subprocess.Popen([sys.executable, "-m", "hilctl.cli", *command], stdout=sys.stderr)
+    child = subprocess.Popen([sys.executable, "-m", "hilctl", *command], stdout=sys.stderr)
     _, status, usage = os.wait4(child.pid, 0)
     child.returncode = os.waitstatus_to_exitcode(status)
     if child.returncode:

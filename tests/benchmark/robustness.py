@@ -138,7 +138,7 @@ def identified(options: argparse.Namespace, rig: tuple[str, ...], folder: Path) 
 
 
 def _hilctl(*words: str) -> None:
-    command = [sys.executable, "-m", "hilctl.cli", *words, "--json"]
+    command = [sys.executable, "-m", "hilctl", *words, "--json"]
     done = subprocess.run(command, capture_output=True, text=True)
     if done.returncode:
         said = json.loads(done.stdout).get("reason", "") if done.stdout.startswith("{") else ""

@@ -64,7 +64,7 @@ def main() -> int:
         path = options.keep or Path(folder) / "soak.mcap"
         words = ["run", str(EXPERIMENT), "--output", str(path), "--overwrite", "--json"]
         words += ["--set", f"waveform.duration_s={60.0 * options.minutes}"]
-        command = [sys.executable, "-m", "hilctl.cli", *words]
+        command = [sys.executable, "-m", "hilctl", *words]
         with subprocess.Popen(command, stdout=subprocess.PIPE) as run:
             seen = watch(run, path)
             print()

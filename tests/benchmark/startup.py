@@ -21,7 +21,7 @@ CONFIG = Path(__file__).parents[2] / "configs" / "terfenol_sine_6a.yaml"
 def first_sample_s(experiment: Path, folder: Path, environment: dict[str, str]) -> float:
     """Run an experiment for a moment; return the time from its command to its first sample."""
     output = folder / "run.mcap"
-    words = [sys.executable, "-m", "hilctl.cli", "run", str(experiment), "--overwrite", "--quiet"]
+    words = [sys.executable, "-m", "hilctl", "run", str(experiment), "--overwrite", "--quiet"]
     words += ["--output", str(output), "--set", "waveform.duration_s=1.0"]
     began_s = time.time()
     ran = subprocess.run(words, capture_output=True, text=True, env={**os.environ, **environment})

@@ -93,7 +93,7 @@ WIRES = (
 
 def hilctl(*words: object) -> list[str]:
     """Return the command line of a hilctl command."""
-    return [sys.executable, "-m", "hilctl.cli", *map(str, words)]
+    return [sys.executable, "-m", "hilctl", *map(str, words)]
 
 
 def write_profiles(folder: Path) -> None:

@@ -374,7 +374,7 @@ def test_process(tmp_path: Path, text: str, arguments: tuple[str, ...], message:
     (tmp_path / "x.yaml").write_text(text)
     before = contents(tmp_path)
     ended = subprocess.run(
-        [sys.executable, "-m", "hilctl.cli", "run", "x.yaml", *arguments],
+        [sys.executable, "-m", "hilctl", "run", "x.yaml", *arguments],
         cwd=tmp_path,
         capture_output=True,
         text=True,

@@ -55,7 +55,7 @@ def installed(tmp_path) -> dict[str, str]:
 
 def hilctl(environment: dict[str, str], *words: object) -> subprocess.CompletedProcess[str]:
     """Run a command of hilctl to its end."""
-    command = [sys.executable, "-m", "hilctl.cli", *map(str, words)]
+    command = [sys.executable, "-m", "hilctl", *map(str, words)]
     return subprocess.run(command, capture_output=True, text=True, env=environment)
 
 

@@ -102,7 +102,7 @@ class Run:
         experiment = {**EXPERIMENT, "device": device, **changes}
         path.write_text(yaml.safe_dump(experiment), encoding="utf-8")
         self.output = folder / f"{name}.mcap"
-        command = [sys.executable, "-m", "hilctl.cli", "run", str(path)]
+        command = [sys.executable, "-m", "hilctl", "run", str(path)]
         command += ["--output", str(self.output), "--json"]
         self.process = subprocess.Popen(
             command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
@@ -171,7 +171,7 @@ class Emulated:
 
     def __init__(self, folder: Path, *words: str, lines: int = 1) -> None:
         self.log = Log(folder / "writes.jsonl")
-        command = [sys.executable, "-m", "hilctl.cli", "emulate", *words]
+        command = [sys.executable, "-m", "hilctl", "emulate", *words]
         command += ["--log", str(self.log.path)]
         self.process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
         assert self.process.stdout is not None

@@ -41,7 +41,7 @@ EXPERIMENT = {
 
 def hilctl(*words, code=0):
     """Run a command; return what it printed as JSON, or its error text where it must fail."""
-    command = [sys.executable, "-m", "hilctl.cli", *map(str, words)]
+    command = [sys.executable, "-m", "hilctl", *map(str, words)]
     if code == 0:
         command.append("--json")
     done = subprocess.run(command, capture_output=True, text=True, timeout=120)

@@ -78,11 +78,11 @@ datetime.datetime = Stepped
 
 
 def start(folder: Path, *, code: str = "", preexec=None, environment=None, **recording):
-    """Start a run in a process of its own; ``code`` stands for ``python -m hilctl.cli``."""
+    """Start a run in a process of its own; ``code`` stands for ``python -m hilctl``."""
     path = folder / "experiment.yaml"
     section = {"flush_s": 0.1, "ring_s": 1.0, **recording}
     path.write_text(yaml.safe_dump({**EXPERIMENT, "recording": section}), encoding="utf-8")
-    program = ["-c", code] if code else ["-m", "hilctl.cli"]
+    program = ["-c", code] if code else ["-m", "hilctl"]
     words = ["run", str(path), "--output", str(folder / "run.mcap"), "--json"]
     return subprocess.Popen(
         [sys.executable, *program, *words],

@@ -70,7 +70,7 @@ def test_working_folder_that_is_gone_before_the_start(tmp_path, experiment, outp
     shutil.copy(ROOT / "configs" / "demo.yaml", tmp_path)
     shutil.copytree(ROOT / "configs" / "models", tmp_path / "models")
     names = [f"{tmp_path}{each}" if each[0] == "/" else each for each in (experiment, output)]
-    command = [sys.executable, "-P", "-m", "hilctl.cli", "run", names[0], "--output", names[1]]
+    command = [sys.executable, "-P", "-m", "hilctl", "run", names[0], "--output", names[1]]
     command += ["--set", "waveform.duration_s=0.5"]
     ended = subprocess.run(
         ["sh", "-c", GONE, "sh", *command],
@@ -88,7 +88,7 @@ def test_folder_that_is_deleted_while_a_run_starts(tmp_path, device, inside):
     (tmp_path / "e.yaml").write_text(yaml.safe_dump({**EXPERIMENT, "device": device.section}))
     lab = tmp_path / "lab"
     lab.mkdir()
-    command = [sys.executable, "-P", "-m", "hilctl.cli", "run", str(tmp_path / "e.yaml")]
+    command = [sys.executable, "-P", "-m", "hilctl", "run", str(tmp_path / "e.yaml")]
     command += ["--output", "run.mcap" if inside else str(lab / "run.mcap")]
     with subprocess.Popen(
         command, cwd=lab if inside else tmp_path, stderr=subprocess.PIPE, text=True

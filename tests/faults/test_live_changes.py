@@ -57,7 +57,7 @@ def test_a_run_is_switched_marked_watched_and_stopped(recording):
     assert np.nanmax(np.abs(frames[-1].high["error"])) > 3.0
     run.set(inverse="in", over_s=0.3)
     with subprocess.Popen(
-        [sys.executable, "-m", "hilctl.cli", "watch"], stdout=subprocess.PIPE, text=True
+        [sys.executable, "-m", "hilctl", "watch"], stdout=subprocess.PIPE, text=True
     ) as watching:
         assert "s  mark: tapped the stage" in "".join(itertools.islice(watching.stdout, 4))
         run.stop()

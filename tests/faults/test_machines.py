@@ -27,7 +27,7 @@ def hilctl(tmp_path):
     def run(shell='"$@"', output="run.mcap", folder=tmp_path, changes=None, **environment):
         text = yaml.safe_dump({**EXPERIMENT, **(changes or {})})
         (tmp_path / "e.yaml").write_text(text, encoding="utf-8")
-        command = ["sh", "-c", shell, "sh", sys.executable, "-P", "-m", "hilctl.cli", "run"]
+        command = ["sh", "-c", shell, "sh", sys.executable, "-P", "-m", "hilctl", "run"]
         command += [str(tmp_path / "e.yaml"), "--output", str(output), "--overwrite"]
         ended = subprocess.run(
             command, cwd=folder, capture_output=True, text=True, timeout=240,
@@ -176,7 +176,7 @@ def test_a_name_full_of_markup_and_escapes_is_shown_as_it_is(hilctl, tmp_path):
 
 def test_errors_of_programs_name_it_too(tmp_path):
     """With --json the message is JSON, and as plain."""
-    command = [sys.executable, "-P", "-m", "hilctl.cli", "report", "\x1b[2J[/x].mcap", "--json"]
+    command = [sys.executable, "-P", "-m", "hilctl", "report", "\x1b[2J[/x].mcap", "--json"]
     ended = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120)
     assert ended.returncode == 2
     assert json.loads(ended.stdout)["error"].startswith("\x1b[2J[/x].mcap: ")

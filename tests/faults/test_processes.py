@@ -50,7 +50,7 @@ class Run:
         path.write_text(yaml.safe_dump({**EXPERIMENT, **changes}), encoding="utf-8")
         words = ["run", str(path), "--output", str(self.output), "--json"]
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "hilctl.cli", *words],
+            [sys.executable, "-m", "hilctl", *words],
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,

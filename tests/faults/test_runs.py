@@ -60,7 +60,7 @@ class Run:
 
     def __init__(self, folder: Path, *, preexec=None, **changes) -> None:
         self.output = folder / "run.mcap"
-        command = [sys.executable, "-m", "hilctl.cli", "run", str(experiment(folder, **changes))]
+        command = [sys.executable, "-m", "hilctl", "run", str(experiment(folder, **changes))]
         command += ["--output", str(self.output), "--json"]
         self.process = subprocess.Popen(
             command,

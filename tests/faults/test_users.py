@@ -29,7 +29,7 @@ class Neighbour:
         (folder / "theirs.yaml").write_text(text, encoding="utf-8")
 
     def start(self):
-        command = [sys.executable, "-P", "-m", "hilctl.cli", "run", "theirs.yaml", "--json"]
+        command = [sys.executable, "-P", "-m", "hilctl", "run", "theirs.yaml", "--json"]
         self.process = subprocess.Popen(
             [*self._words, *command, "--output", "theirs.mcap"],
             cwd=self.folder,

@@ -266,7 +266,7 @@ def test_killed_in_real_time_it_loses_one_run_and_goes_on(tmp_path):
     (tmp_path / "rig.yaml").write_text(RIG)
     (tmp_path / "few.yaml").write_text(FEW)
     runs = tmp_path / "runs"
-    words = [sys.executable, "-m", "hilctl.cli", "campaign", str(tmp_path / "few.yaml"),
+    words = [sys.executable, "-m", "hilctl", "campaign", str(tmp_path / "few.yaml"),
              "--folder", str(runs)]  # fmt: skip
     process = subprocess.Popen(words, env=os.environ, stdout=subprocess.DEVNULL)
     second = runs / "few-0002.mcap"

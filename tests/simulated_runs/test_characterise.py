@@ -90,7 +90,7 @@ def test_what_is_wrong_with_a_rig_is_named(tmp_path, setting, code):
 def test_a_campaign_that_is_killed_loses_one_step(tmp_path):
     """SIGKILL in real time; the same command then goes on, and Ctrl-C ends it by the safe ramp."""
     words = [
-        sys.executable, "-m", "hilctl.cli", "characterise", str(RIG), "--output",
+        sys.executable, "-m", "hilctl", "characterise", str(RIG), "--output",
         str(tmp_path / "model.yaml"), "--folder", str(tmp_path / "runs"),
         "--set", "sample_rate_hz=5000", "--set", "block=50", "--set", "recording.flush_s=0.1",
     ]  # fmt: skip
@@ -125,7 +125,7 @@ def test_a_campaign_that_is_killed_loses_one_step(tmp_path):
 def test_programs_are_told_the_plan(tmp_path):
     words = ["characterise", str(RIG), "--output", str(tmp_path / "m.yaml"), "--dry-run", "--json"]
     done = subprocess.run(
-        [sys.executable, "-m", "hilctl.cli", *words], capture_output=True, text=True, check=True
+        [sys.executable, "-m", "hilctl", *words], capture_output=True, text=True, check=True
     )
     assert json.loads(done.stdout)["rig_time_s"] < 80.0
     assert list(tmp_path.iterdir()) == []

@@ -15,7 +15,7 @@ CONFIGS = Path(__file__).parents[2] / "configs"
 
 def hilctl(*arguments, code=0):
     ended = subprocess.run(
-        [sys.executable, "-m", "hilctl.cli", *map(str, arguments)],
+        [sys.executable, "-m", "hilctl", *map(str, arguments)],
         capture_output=True,
         text=True,
         timeout=280,

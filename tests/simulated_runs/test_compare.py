@@ -33,7 +33,7 @@ def models(folder):
         [
             sys.executable,
             "-m",
-            "hilctl.cli",
+            "hilctl",
             "compare",
             loops,
             "--html",

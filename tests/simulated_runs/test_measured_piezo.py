@@ -27,7 +27,7 @@ pytestmark = [
 
 def hilctl(*arguments):
     ended = subprocess.run(
-        [sys.executable, "-m", "hilctl.cli", *map(str, arguments)],
+        [sys.executable, "-m", "hilctl", *map(str, arguments)],
         capture_output=True,
         text=True,
         timeout=120,

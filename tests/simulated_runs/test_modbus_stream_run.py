@@ -16,7 +16,7 @@ CONFIG = Path(__file__).parents[2] / "configs" / "modbus_labjack_t7_stream.yaml"
 
 
 def start(*words):
-    command = [sys.executable, "-m", "hilctl.cli", *map(str, words)]
+    command = [sys.executable, "-m", "hilctl", *map(str, words)]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 

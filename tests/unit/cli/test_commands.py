@@ -84,7 +84,7 @@ HEAVY = ("numba", "numpy", "scipy", "matplotlib", "mcap", "pydantic", "yaml", "p
 
 def hilctl(*arguments):
     return subprocess.run(
-        [sys.executable, "-m", "hilctl.cli", *map(str, arguments)],
+        [sys.executable, "-m", "hilctl", *map(str, arguments)],
         capture_output=True,
         text=True,
         timeout=120,

@@ -244,7 +244,7 @@ def test_the_command(torn):
 
     def hilctl(*arguments):
         return subprocess.run(
-            [sys.executable, "-m", "hilctl.cli", *map(str, arguments)],
+            [sys.executable, "-m", "hilctl", *map(str, arguments)],
             capture_output=True,
             text=True,
             timeout=120,

@@ -1,4 +1,4 @@
-"""``python -m hilctl.cli``."""
+"""``python -m hilctl``."""
 
 from hilctl.cli import main
 
