@@ -100,24 +100,28 @@ def sampled(w: spec.Shape, sample_rate_hz: float) -> Values:
             check_whole(size)
             return w.offset + _random(w, size)
         case spec.Multisine():
-            return _Shaped(w, sample_rate_hz, size, _multisine_scale(w, sample_rate_hz, size))
+            scale = _multisine_scale(w, sample_rate_hz, size)
+            return _Shaped(w, sample_rate_hz, size, _period(w, sample_rate_hz), scale)
         case _:
-            return _Shaped(w, sample_rate_hz, size)
+            return _Shaped(w, sample_rate_hz, size, _period(w, sample_rate_hz))
 
 
 @dataclass(frozen=True, slots=True)
 class _Shaped:
-    """A waveform's samples, worked out where they are asked for."""
+    """A waveform's samples, worked out where they are asked for; of what repeats, one period."""
 
     shape: spec.ShapeOfTime
     sample_rate_hz: float
     size: int
+    period: int
     scale: float = 1.0
 
     def __getitem__(self, part: slice, /) -> F64:
         start, stop, _ = part.indices(self.size)
-        at = _Instants(np.arange(start, stop), self.sample_rate_hz)
-        return self.shape.offset + _shape(self.shape, at, self.scale)
+        count = max(stop - start, 0)
+        worked_out = min(count, self.period or count)
+        at = _Instants(np.arange(start, start + worked_out), self.sample_rate_hz)
+        return np.resize(self.shape.offset + _shape(self.shape, at, self.scale), count)
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,6 +153,22 @@ class _Instants:
             return np.mod(frequency_hz * self.t, 1.0)
         inside = self.sample % turn.denominator * turn.numerator % turn.denominator
         return inside / turn.denominator
+
+
+def _period(w: spec.ShapeOfTime, sample_rate_hz: float) -> int:
+    """Return after how many samples the same bits come again; 0 where that is never or too late."""
+    match w:
+        case spec.Sine() | spec.Triangle():
+            common = [w.frequency_hz]
+        case spec.ComplexHarmonic():
+            common = [part.frequency_hz for part in w.components]
+        case spec.Multisine():
+            common = [w.first_hz, w.step_hz]
+        case _:
+            return 0
+    rate = _decimal(sample_rate_hz)
+    period = math.lcm(*((_decimal(each) / rate).denominator for each in common))
+    return period if period <= _LONGEST_PERIOD else 0
 
 
 def _duration_s(w: spec.Shape) -> float:
@@ -241,7 +261,8 @@ def _multisine_scale(w: spec.Multisine, sample_rate_hz: float, size: int) -> flo
     if not fit(size):
         period = outline(w, "")[2] * sample_rate_hz
         told = min(size, telling_samples(period) if math.isfinite(period) else MAX_WHOLE)
-    plain = _Shaped(w.model_copy(update={"offset": 0.0}), sample_rate_hz, told)
+    without = w.model_copy(update={"offset": 0.0})
+    plain = _Shaped(without, sample_rate_hz, told, _period(w, sample_rate_hz))
     peak = max(float(np.max(np.abs(each))) for each in chunks(plain))
     return 1.0 if peak == 0.0 else w.amplitude / peak
 

@@ -410,6 +410,11 @@ def test_cycles_are_the_same_bit_for_bit(kind, frequency_hz, rate_hz, period):
         for later in (1, 12_345):
             far = later * period
             np.testing.assert_array_equal(values[far : far + 700], values[:700])
+        # One period stands for all: piece by piece, nothing is repeated.
+        first = period - 3
+        whole = values[first : first + period + 500]
+        pieces = [values[at : at + 100] for at in range(first, first + period + 500, 100)]
+        np.testing.assert_array_equal(whole, np.concatenate(pieces)[: whole.size])
     if kind == "sine":
         at = 4_000_000_000
         right = [1.0 + 3.0 * math.sin(2.0 * math.pi * (turn * k % 1)) for k in range(at, at + 50)]
