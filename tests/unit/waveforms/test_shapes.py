@@ -427,3 +427,20 @@ def test_periods_longer_than_numbers_hold_are_rounded():
     values = shapes.sampled(sine, 10_000.0 / 7.0)[:]
     t = np.arange(values.size) / (10_000.0 / 7.0)
     np.testing.assert_allclose(values, np.sin(2.0 * np.pi / 3.0 * t), rtol=0.0, atol=1e-14)
+
+
+def test_one_period_is_worked_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    """And repeated, where more is asked for; where less is, no more than that."""
+    sizes = []
+    shape_of = shapes._shape
+
+    def counted(w: spec.ShapeOfTime, at: shapes._Instants, scale: float) -> F64:
+        sizes.append(at.sample.size)
+        return shape_of(w, at, scale)
+
+    monkeypatch.setattr(shapes, "_shape", counted)
+    sine = spec.Sine(kind="sine", amplitude=1.0, frequency_hz=40.0, duration_s=10.0, unit="um")
+    values = shapes.sampled(sine, 1000.0)
+    asked = [(0, 5000), (7, 32), (7, 33), (5, 5), (9, 2), (9990, 10_100)]
+    assert [values[a:b].size for a, b in asked] == [5000, 25, 26, 0, 0, 10]
+    assert sizes == [25, 25, 25, 0, 0, 10]
