@@ -104,3 +104,33 @@ def test_a_process_with_kernels_stays_small():
     assert compiler < 8 << 20
     assert resident < 100 << 20
     assert not blas
+
+
+SUPERVISOR = """
+import json, sys
+import numpy as np
+from hilctl.machine.memory import ProcessMemory, _own_mappings
+
+
+def of_files():
+    return sum(e.resident - e.changed for e in _own_mappings() if e.of_file)
+
+
+before = of_files()
+ProcessMemory().stay_small()
+after = of_files()
+resident = []
+for _ in range(4):
+    np.ones(2_000_000)
+    resident.append(sum(each.resident for each in _own_mappings()))
+json.dump([before, after, resident[-1] - resident[0]], sys.stdout)
+"""
+
+
+def test_who_has_no_ticks_gives_back_its_libraries_and_what_it_frees():
+    """It reads again what it needs of them, and its arrays leave nothing behind."""
+    command = [sys.executable, "-c", SUPERVISOR]
+    ran = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
+    before, after, grown = json.loads(ran.stdout)
+    assert after < 0.7 * before
+    assert grown < 4 << 20
