@@ -5,8 +5,9 @@
 Runs of the simulated rig, recorded, at 20 kHz sample by sample and at 50 kHz in blocks of 5 and of
 50; after each, ``wakeup.c`` wakes as often at the same priority, and does nothing. It prints the
 share of ticks that woke late (by more than half a period, on either side, each tick that a stall
-has made late), how much of a core the processes take, what of it the simulated rig takes, and their
-memory. Exit code 1 where a goal is missed, or a run ends early or loses a sample.
+has made late; at 20 kHz of a C program that never sleeps, too), how much of a core the processes
+take, what of it the simulated rig takes, and their memory. Exit code 1 where a goal is missed, or a
+run ends early or loses a sample.
 """
 
 import argparse
@@ -61,12 +62,17 @@ def ours(case: Case, seconds: float, folder: Path) -> dict[str, Any]:
     return found
 
 
-def sleeper(case: Case, seconds: float, program: Path) -> tuple[float, float]:
-    """Let the C program wake as often; return the percentage that is late, and cores."""
+def sleeper(
+    case: Case, seconds: float, program: Path, way: str = "catch_up"
+) -> tuple[float, float]:
+    """Let the C program wake as often; return the percentage that is late, and cores.
+
+    One that spins has no real-time priority: the kernel takes that 5 % of the time.
+    """
     interval_us = round(1e6 * case.block / case.rate_hz)
     loops = round(seconds * case.rate_hz / case.block)
-    command = [str(program), str(interval_us), str(loops), "1000", "catch_up"]
-    fifo = "chrt", "--fifo", str(PRIORITY)
+    command = [str(program), str(interval_us), str(loops), "1000", way]
+    fifo = () if way == "spin" else ("chrt", "--fifo", str(PRIORITY))
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     ran = subprocess.run([*fifo, *command], capture_output=True, text=True, check=True)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -80,6 +86,7 @@ def sleeper(case: Case, seconds: float, program: Path) -> tuple[float, float]:
 def measured(case: Case, pairs: int, seconds: float, folder: Path) -> bool:
     """Measure and print a case; return whether its goals are met."""
     late, cores, rig_cores, resident_mb, late_c, cores_c = [], [], [], [], [], []
+    spinning = []
     whole = True
     for _ in range(pairs):
         run = ours(case, seconds, folder)
@@ -94,11 +101,14 @@ def measured(case: Case, pairs: int, seconds: float, folder: Path) -> bool:
         alone = sleeper(case, seconds, folder / "wakeup")
         late_c.append(alone[0])
         cores_c.append(alone[1])
+        if case.late_percent is not None:
+            spinning.append(sleeper(case, seconds, folder / "wakeup", "spin")[0])
     loop_cores, supervisor_cores = map(statistics.median, zip(*cores, strict=True))
     memory_mb = [statistics.median(each) for each in zip(*resident_mb, strict=True)]
     print(
         f"{case.rate_hz} Hz, blocks of {case.block}: "
-        f"late {text(late)} %, C that only sleeps {text(late_c)} %; "
+        f"late {text(late)} %, C that only sleeps {text(late_c)} %"
+        f"{f', that only spins {text(spinning)} %' if spinning else ''}; "
         f"cores {loop_cores:.2f} (rig {statistics.median(rig_cores):.2f}) "
         f"and {supervisor_cores:.2f}, C {statistics.median(cores_c):.2f}; "
         f"resident {memory_mb[0]:.0f} and {memory_mb[1]:.0f} MB"
