@@ -1,6 +1,7 @@
 """Independent fits at the same time: here, over threads or processes, or on a Dask cluster."""
 
 import os
+import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import contextmanager
@@ -46,7 +47,23 @@ def beside_each_other(function: Callable[[Task], Result], tasks: Iterable[Task],
     For the short parts of one fit, most of whose time goes to kernels that leave the interpreter to
     others (``nogil``) and to BLAS; a part must not come here itself.
     """
+    if _worker.unwanted.is_set():
+        raise _UnwantedError
     return list(_threads().map(function, tasks))
+
+
+class _UnwantedError(Exception):
+    """Ends a fit whose result nobody waits for any more."""
+
+
+class _Worker(threading.local):
+    """Whether what a thread of :func:`streams` works out is still wanted."""
+
+    def __init__(self) -> None:
+        self.unwanted = threading.Event()
+
+
+_worker = _Worker()
 
 
 @cache
@@ -94,10 +111,23 @@ def streams(scheduler: str = "none") -> Iterator[Stream]:
                          f"{scheduler!r}")  # fmt: skip
 
 
-def _local(scheduler: str) -> Executor:
-    if scheduler == "threads":
-        return ThreadPoolExecutor()
-    return ProcessPoolExecutor(mp_context=get_context("spawn"))  # fork would copy BLAS's threads
+@contextmanager
+def _local(scheduler: str) -> Iterator[Executor]:
+    if scheduler == "processes":  # spawned: a fork would copy BLAS's threads
+        with ProcessPoolExecutor(mp_context=get_context("spawn")) as processes:
+            yield processes
+        return
+    unwanted = threading.Event()
+
+    def begin() -> None:
+        _worker.unwanted = unwanted
+
+    with ThreadPoolExecutor(initializer=begin) as threads:
+        try:
+            yield threads
+        except BaseException:
+            unwanted.set()  # a Ctrl-C is not to wait seconds for fits to end
+            raise
 
 
 @contextmanager

@@ -41,6 +41,31 @@ def test_short_parts_run_beside_each_other_and_keep_their_order():
         beside_each_other(lambda part: 1 // part, [1, 0])
 
 
+def test_fits_that_nobody_waits_for_end():
+    """A Ctrl-C, or the error of one of them, need not wait until all others are done."""
+    begun, ended = threading.Event(), []
+
+    def fit(number: int) -> None:
+        if number:
+            assert begun.wait(timeout=60.0)
+            raise KeyboardInterrupt
+        begun.set()
+        try:
+            while True:  # the test's time limit ends it where nothing else does
+                beside_each_other(abs, [number])
+        finally:
+            ended.append(number)
+
+    def run() -> None:
+        with workers("threads") as each:
+            each(fit, [1, 0])
+
+    with pytest.raises(KeyboardInterrupt):
+        run()
+    assert ended == [0]
+    assert beside_each_other(abs, [-2, 3]) == [2, 3]
+
+
 @pytest.mark.parametrize("scheduler", ["threads", "processes"])
 @pytest.mark.slow
 def test_workers_find_the_same(loops: list[SteadyLoop], scheduler: str) -> None:
