@@ -1,5 +1,6 @@
 """Doubles that tests of several rooms share: clocks, devices, hosts and links."""
 
+import json
 import math
 import os
 import select
@@ -451,6 +452,12 @@ def emulated(
         emulator.server.stop()
         thread.join()
         emulator.log.close()
+
+
+def logged(path: Path) -> list[dict]:
+    """Return what an emulated device says it put out, from a log that it may be writing still."""
+    *lines, _half = path.read_text(encoding="utf-8").split("\n")
+    return [json.loads(line) for line in lines]
 
 
 def loop_of(supervisor: int) -> int:

@@ -20,7 +20,7 @@ import yaml
 
 from hilctl.analysis.replay import replay
 from hilctl.recording.reader import read
-from tests.fakes import loop_of
+from tests.fakes import logged, loop_of
 
 PROFILES = Path(__file__).parents[1] / "data"
 
@@ -68,9 +68,7 @@ class Log:
         self.path = path
 
     def events(self, output: str) -> list[dict]:
-        # The device is writing it still: what follows the last line feed is half a line.
-        *lines, _ = self.path.read_text(encoding="utf-8").split("\n")
-        return [each for each in map(json.loads, lines) if each.get("output") == output]
+        return [each for each in logged(self.path) if each.get("output") == output]
 
     def writes(self, output: str) -> list[dict]:
         return [each for each in self.events(output) if each["event"] == "write"]

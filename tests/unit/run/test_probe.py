@@ -1,6 +1,5 @@
 """Probing a device: it is only read, nobody else may use it, and what it says is judged."""
 
-import json
 import math
 import re
 from contextlib import ExitStack
@@ -17,7 +16,7 @@ from hilctl.run.probe import judge, probe
 from hilctl.run.run_folder import held_devices
 from hilctl_drivers.emulator.options import EmulatorOptions
 from hilctl_drivers.profile import shipped_profiles
-from tests.fakes import ManualClock, emulated
+from tests.fakes import ManualClock, emulated, logged
 
 CONFIGS = Path(__file__).parents[3] / "configs"
 INFO = DeviceInfo(
@@ -111,7 +110,7 @@ def test_a_trip_stays_and_no_stale_command_takes_effect(rig, profile):
     probed.clock.pass_s(1.0)
     found = probe(probed.experiment, [])
     assert probed.emulator.device.tripped
-    events = [json.loads(line) for line in probed.log.read_text().splitlines()]
+    events = logged(probed.log)
     current_a = [each["current_a"] for each in events if "current_a" in each]
     assert current_a[-2:] == [pytest.approx(3.0, abs=1e-2), 0.0]
     assert events[-1]["event"] == "watchdog"

@@ -1,6 +1,5 @@
 """``serial_dac`` through a board's FIFO, against an emulated board with a clock of its own."""
 
-import json
 import time
 from dataclasses import replace
 
@@ -22,7 +21,7 @@ from hilctl_drivers.serial.device import SerialDac
 from hilctl_drivers.serial.last_write import SerialLastWrite
 from hilctl_drivers.serial.setup import SerialOptions
 from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
-from tests.fakes import FakeHost, ShiftedClock, SteppingClock, emulated
+from tests.fakes import FakeHost, ShiftedClock, SteppingClock, emulated, logged
 
 pytestmark = pytest.mark.slow  # the board's FIFO runs empty in real time
 
@@ -60,7 +59,7 @@ class Board:
         return [self.exchange(np.full(BLOCK, float(command))) for _ in range(blocks)]
 
     def events(self):
-        return [json.loads(line) for line in self._log.read_text().splitlines()]
+        return logged(self._log)
 
 
 @pytest.fixture

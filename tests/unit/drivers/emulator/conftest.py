@@ -1,6 +1,5 @@
 """Emulators that all tests here share."""
 
-import json
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 
@@ -8,7 +7,7 @@ import pytest
 
 from hilctl_drivers.emulator.options import EmulatorOptions
 from hilctl_drivers.emulator.setup import build
-from tests.fakes import emulated
+from tests.fakes import emulated, logged
 
 MS = 1_000_000
 START_NS = 10_000_000_000
@@ -36,7 +35,7 @@ class Emulated:
         return answer.make(self.now_ns)
 
     def writes(self):
-        return [json.loads(line) for line in self.log.read_text().splitlines()]
+        return logged(self.log)
 
     def close(self):
         self.emulator.server.close()

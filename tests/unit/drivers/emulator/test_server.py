@@ -19,6 +19,7 @@ from hilctl_drivers.modbus.pdu import (
     write_pdu,
 )
 from hilctl_drivers.modbus.registers import RegisterFormat
+from tests.fakes import logged
 
 FLOAT32 = RegisterFormat("float32")
 MS = 1_000_000
@@ -173,7 +174,7 @@ def test_late_request_is_carried_out_after_its_host_has_gone(served, tmp_path):
             if value == 2.0:
                 assert link.recv(100)
     for _ in range(500):
-        written = [json.loads(line)["value"] for line in path.read_text().splitlines()]
+        written = [event["value"] for event in logged(path)]
         if len(written) == 2:
             break
         threading.Event().wait(0.01)

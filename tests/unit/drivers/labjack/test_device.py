@@ -1,6 +1,5 @@
 """``modbus_stream`` against an emulated LabJack in this process, in a time that tests make pass."""
 
-import json
 import struct
 from dataclasses import replace
 from types import SimpleNamespace
@@ -14,7 +13,7 @@ from hilctl_drivers.labjack.device import ModbusStream
 from hilctl_drivers.labjack.setup import ModbusStreamOptions
 from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
 from hilctl_drivers.wire.links import NoAnswerError
-from tests.fakes import FaultyLink, InProcess, InProcessLink
+from tests.fakes import FaultyLink, InProcess, InProcessLink, logged
 
 RATE_HZ = 10_000.0
 BLOCK = 100
@@ -73,7 +72,7 @@ class DrivenStream:
         self.time.sleep(seconds)
 
     def events(self):
-        return [json.loads(line) for line in self._log.read_text().splitlines()]
+        return logged(self._log)
 
     @property
     def clock(self):

@@ -1,6 +1,5 @@
 """Devices on emulated ones: a pair that is served at one rig, and one in this process."""
 
-import json
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -15,7 +14,7 @@ from hilctl_drivers.modbus import last_write
 from hilctl_drivers.modbus.device import ModbusDac
 from hilctl_drivers.modbus.setup import ModbusOptions
 from hilctl_drivers.profile import shipped_profiles
-from tests.fakes import FaultyLink, InProcess, ManualClock, VirtualTime
+from tests.fakes import FaultyLink, InProcess, ManualClock, VirtualTime, logged
 
 MESSAGE_S = 0.001
 TIMEOUT_S = 0.1
@@ -60,7 +59,7 @@ class ServedPair:
         return ModbusDac(ModbusOptions.model_validate(options), sleep=time.sleep, clock=time)
 
     def events(self) -> list[dict]:
-        return [json.loads(line) for line in self.log.read_text().splitlines()]
+        return logged(self.log)
 
 
 @pytest.fixture
@@ -130,7 +129,7 @@ class DrivenModbus:
         return self.emulated.rig.current_a
 
     def writes(self):
-        return [json.loads(line) for line in self._log.read_text().splitlines()]
+        return logged(self._log)
 
 
 @pytest.fixture

@@ -1,6 +1,5 @@
 """modbus_dac on loopback: what it checks before it opens, how it exchanges, and its watchdog."""
 
-import json
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -18,7 +17,7 @@ from hilctl_drivers.modbus import last_write
 from hilctl_drivers.modbus.device import ModbusDac
 from hilctl_drivers.modbus.setup import ModbusOptions
 from hilctl_drivers.profile import load_profile, shipped_profiles
-from tests.fakes import ManualClock, VirtualTime
+from tests.fakes import ManualClock, VirtualTime, logged
 
 T7 = {
     "profile": "labjack_t7",
@@ -85,7 +84,7 @@ class Served:
         return ModbusDac(ModbusOptions.model_validate(given), sleep=time.sleep, clock=time)
 
     def events(self) -> list[dict]:
-        return [json.loads(line) for line in self.log.read_text().splitlines()]
+        return logged(self.log)
 
 
 @pytest.fixture

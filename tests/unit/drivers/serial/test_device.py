@@ -1,6 +1,5 @@
 """``serial_dac`` on lines of text and on single frames, against emulated devices on a pty."""
 
-import json
 import os
 import time
 from pathlib import Path
@@ -16,7 +15,7 @@ from hilctl_drivers.serial import last_write
 from hilctl_drivers.serial.device import SerialDac
 from hilctl_drivers.serial.last_write import SerialLastWrite
 from hilctl_drivers.serial.setup import SerialOptions
-from tests.fakes import ShiftedClock, SteppingClock, emulated
+from tests.fakes import ShiftedClock, SteppingClock, emulated, logged
 
 DCON = (Path(__file__).parents[3] / "data" / "dcon_module.yaml").read_text()
 KINDS = ["dcon", "scpi", "cobs", "length"]
@@ -65,7 +64,7 @@ class Rig:
         return displacement_um[0]
 
     def events(self):
-        return [json.loads(line) for line in self.log.read_text().splitlines()]
+        return logged(self.log)
 
     def current_a(self):
         """What the coil carries by the emulator's log."""
