@@ -5,10 +5,11 @@ command leaves. It forgets, as the loops do, so that an error of one place does 
 all the rest; and its fields depend on the table by the same equation, with the same forgetting.
 """
 
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 from hilctl.base.arrays import F64, I64
 from hilctl.identify.field.prepared import Prepared
@@ -149,11 +150,12 @@ class DuhemSearch:
             first = damping
             for _ in range(TRIALS):
                 step = _bounded_step(normal, down, damping, logs.size, x)
-                to_x, to_logs = self._stepped(x, logs, step)
-                to_errors = self._errors(to_x, to_logs)
-                to_cost = self._cost(to_x, to_logs, to_errors)
-                if to_cost < cost:
-                    break
+                if step is not None:
+                    to_x, to_logs = self._stepped(x, logs, step)
+                    to_errors = self._errors(to_x, to_logs)
+                    to_cost = self._cost(to_x, to_logs, to_errors)
+                    if to_cost < cost:
+                        break
                 damping = max(10.0 * damping, REFUSED_DAMPING)
             else:
                 break
@@ -227,10 +229,20 @@ class DuhemSearch:
         return errors
 
 
-def _bounded_step(normal: F64, down: F64, damping: float, table: int, x: F64) -> F64:
-    """Return the step of damped normal equations, with stages that it would take too far held."""
+def _bounded_step(normal: F64, down: F64, damping: float, table: int, x: F64) -> F64 | None:
+    """Return the step of damped normal equations, with stages that it would take too far held.
+
+    None where the damping is too little for one: far from any solution, errors are so large that
+    rounding hides what holds the table.
+    """
     damped = normal.copy()
     damped[np.diag_indices_from(damped)] += damping
+    with suppress(LinAlgError):
+        return _step_within(damped, down, table, x)
+    return None
+
+
+def _step_within(damped: F64, down: F64, table: int, x: F64) -> F64:
     step = np.asarray(cho_solve(cho_factor(damped), down))
     if step.size == table:
         return step

@@ -52,6 +52,31 @@ def test_stages_stay_within_their_bounds_and_the_others_make_up_for_it() -> None
     assert (normal @ step - down)[free] == pytest.approx(0.0, abs=1e-6)
 
 
+def test_errors_beyond_what_holds_the_table_ask_for_more_damping() -> None:
+    """As they do on a rig of two low modes, where no step could be worked out."""
+    root = 1e4 * np.random.default_rng(3).standard_normal((2, 5))
+    normal, down = root.T @ root, np.ones(5)
+    assert _bounded_step(normal - 1e-3 * np.eye(5), down, 1e-9, 5, FIRST) is None
+    step = _bounded_step(normal - 1e-3 * np.eye(5), down, 1.0, 5, FIRST)
+    assert step is not None
+    assert np.isfinite(step).all()
+
+
+def test_a_descent_goes_on_where_the_first_damping_is_too_little(monkeypatch) -> None:
+    job, logs = ready()
+    dampings: list[float] = []
+
+    def refusing(normal: F64, down: F64, damping: float, table: int, x: F64) -> F64 | None:
+        dampings.append(damping)
+        return None if len(dampings) == 1 else _bounded_step(normal, down, damping, table, x)
+
+    monkeypatch.setattr("hilctl.identify.generalised_duhem.search._bounded_step", refusing)
+    x, better = job._descend(FIRST, logs, 2, 0.0)
+    first, last = (job._errors(*at) for at in ((FIRST, logs), (x, better)))
+    assert dampings[1] > dampings[0]
+    assert last @ last < first @ first
+
+
 def test_units_make_no_difference() -> None:
     def ends(unit: float, um: float) -> tuple[F64, F64]:
         job = DuhemSearch(data(unit, um), 8, 6, 0.05 * um / unit)
