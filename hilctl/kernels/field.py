@@ -16,8 +16,9 @@ The command is ahead of the field by what the losses take, in the mean over a sa
     h(e) = e (1 + b |e| + c e^2 + x / sqrt(|e| + e_0))
 
 Memory, float64[p + d c + 3 d + 6]: the plays' outputs, each drag's in each of c cells less those at
-rest, three sums over each drag, then u, m, z, w, the last du / dm, and the previous input; NaN
-means that there is none yet. It is updated in place, so any cut into blocks gives the same bits.
+rest, three sums over each drag, then u, m, z, w, what u last went by for each unit of v, of m in
+the inverse, and the previous input; NaN means that there is none yet. It is updated in place, so
+any cut into blocks gives the same bits.
 
 Sources: I. D. Mayergoyz, "Mathematical Models of Hysteresis", Springer 1991 (plays as Preisach's
 triangle); E. Della Torre, "Magnetic Hysteresis", IEEE Press 1999 (the moving model); D. C. Jiles,
@@ -335,12 +336,15 @@ def _root(
 ) -> tuple[float, float]:
     """Return the u that gives ``target``, or the end of the span that comes nearest; and m there.
 
-    Newton's steps from the last u on, within the bounds that the signs so far have set, or halfway
-    between these where a step leaves them or gains too little.
+    Newton's steps from where u would be if it went on as it last did, within the bounds that the
+    signs so far have set, or halfway between these where a step leaves them or gains too little.
     """
     low, high, tolerance = span
     ends = memory.size - 6
     u, m, gap = max(low, min(high, memory[ends])), 0.0, 0.0
+    if what == _COMMAND:
+        guess = u + (target - memory[ends + 5]) * memory[ends + 4]
+        u = guess if low < guess < high else u
     if what == _OUTPUT and memory[ends + 4] > 0.0 and low < u < high:
         # What u gives is known, and the next step goes about as the last one did.
         short = target - memory[ends + 1]
@@ -390,8 +394,10 @@ def _advance(
     memory[k + 2] = losses[2] * memory[k + 2] + (1.0 - losses[2]) * lost
     before = memory[k]
     _settle(u, memory, bank)
-    if m != memory[k + 1]:
+    if what == _OUTPUT and m != memory[k + 1]:
         memory[k + 4] = (u - before) / (m - memory[k + 1])
+    if what == _COMMAND and target != memory[k + 5]:
+        memory[k + 4] = (u - before) / (target - memory[k + 5]) if not fresh else 0.0
     memory[k + 1], memory[k + 3], memory[k + 5] = m, w, target
     return m if what == _COMMAND else command
 
