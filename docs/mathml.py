@@ -7,13 +7,22 @@ from docutils.utils.math.latex2mathml import tex2mathml
 from sphinx.application import Sphinx
 
 
+def _mathml(text: str, *, as_block: bool) -> str:
+    """Return an equation; a dot that is no accent stands above its letter, whatever the font.
+
+    Some fonts have accents so low that browsers draw them into the letter.
+    """
+    found: str = tex2mathml(text, as_block=as_block)
+    return found.replace('<mover accent="true">', "<mover>")
+
+
 def _inline(writer: Any, node: nodes.math) -> None:
-    writer.body.append(tex2mathml(node.astext()))
+    writer.body.append(_mathml(node.astext(), as_block=False))
     raise nodes.SkipNode
 
 
 def _displayed(writer: Any, node: nodes.math_block) -> None:
-    writer.body.append(f'<div class="equation">{tex2mathml(node.astext(), as_block=True)}</div>')
+    writer.body.append(f'<div class="equation">{_mathml(node.astext(), as_block=True)}</div>')
     raise nodes.SkipNode
 
 
