@@ -34,7 +34,8 @@ be characterised; 128 + n a run stopped by signal n.
 import gc
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from importlib import import_module
 from typing import Any, NoReturn
 
@@ -67,7 +68,7 @@ def main() -> None:
     # What is imported comes by the hundred thousand objects, with no garbage among them: to search
     # it again and again takes a tenth of the time.
     gc.set_threshold(50_000)
-    with plain_streams(), heard_as_asked(as_json="--json" in sys.argv):
+    with plain_streams(), _memory_said_once(), heard_as_asked(as_json="--json" in sys.argv):
         try:
             _command()
         except HilctlError as error:
@@ -78,6 +79,26 @@ def main() -> None:
         except (OSError, MemoryError, ImportError, SystemError) as error:
             print_origin()
             _refuse(RunError(_machine_refused(error)))
+
+
+@contextmanager
+def _memory_said_once() -> Iterator[None]:
+    """Withhold what Python remarks of errors that nobody can catch where memory has run out.
+
+    It is said once, in words, as the error that ends the command: an import that runs out of memory
+    may leave such remarks beside it.
+    """
+    before = sys.unraisablehook
+
+    def said(what: "sys.UnraisableHookArgs") -> None:
+        if not isinstance(what.exc_value, MemoryError):
+            before(what)
+
+    sys.unraisablehook = said
+    try:
+        yield
+    finally:
+        sys.unraisablehook = before
 
 
 def _command() -> None:

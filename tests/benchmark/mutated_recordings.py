@@ -49,7 +49,8 @@ from hilctl.models.generalised import Envelope, GeneralisedModel
 from hilctl.models.kp import KrasnoselskiiPokrovskiiModel
 from hilctl.models.plays import PpiModel
 from hilctl.models.preisach import PreisachModel
-from hilctl.models.staged import FieldLag, StagedModel, Structure
+from hilctl.models.staged import FieldLag, StagedModel
+from hilctl.models.structure import Mode, Structure
 from hilctl.recording import reader, schema
 from hilctl.recording.data import Recording
 from hilctl.recording.reader import read
@@ -72,6 +73,9 @@ PREISACH = PreisachModel(
     thresholds=(0.0, 0.5), lowest=-5.0, cell=2.5, slopes=((2.0, 3.0, 2.0), (0.5, 0.1, 0.0)),
     command_span=SPAN,
 )  # fmt: skip
+MODE = Mode(
+    natural_hz=600.0, damping_ratio=0.03, antiresonance_hz=630.0, antiresonance_damping_ratio=0.03
+)
 MODELS: tuple[HysteresisModel, ...] = (
     terfenol_rdpi(),
     PREISACH,
@@ -85,7 +89,7 @@ MODELS: tuple[HysteresisModel, ...] = (
     ),
     StagedModel.around(
         PREISACH, lag=FieldLag(tau_s=1e-4, growth_per_unit=0.3),
-        structure=Structure(natural_hz=2200.0, damping_ratio=0.12), delay_s=3e-5,
+        structure=Structure(natural_hz=2200.0, damping_ratio=0.12), modes=(MODE,), delay_s=3e-5,
     ),
 )  # fmt: skip
 

@@ -72,6 +72,34 @@ def test_a_slip_of_the_finger_is_answered_with_the_nearest_command():
     assert "No such command 'stauts'. Did you mean 'status'?" in ended.stderr
 
 
+class Unraised:
+    """Breaks where nobody can be told: Python only remarks it."""
+
+    def __init__(self, error):
+        self._error = error
+
+    def __del__(self):
+        raise self._error
+
+
+@pytest.mark.parametrize(("error", "remarks"), [(MemoryError, 0), (ValueError, 1)])
+def test_memory_that_has_run_out_is_said_once(in_here, monkeypatch, error, remarks):
+    """By the command's own message, not by what Python remarks beside it as well."""
+    heard = []
+    monkeypatch.setattr(sys, "unraisablehook", heard.append)
+
+    def broken():
+        lost = Unraised(error())
+        del lost
+        raise MemoryError
+
+    monkeypatch.setattr(cli, "_command", broken)
+    code, _, said = in_here("check")
+    assert (code, said) == (3, "hilctl: not enough memory\n")
+    assert len(heard) == remarks
+    assert sys.unraisablehook == heard.append
+
+
 def test_a_group_of_commands_runs_its_own(in_here):
     """``devices`` is one, with ``probe`` in it."""
     code, _, stderr = in_here("devices", "probe", "absent.yaml")
