@@ -98,6 +98,20 @@ def is_kernel(value: object) -> bool:
     return isinstance(value, _Kernel)
 
 
+def compile_by(other: Callable[[str, str], None] | None) -> None:
+    """Have what is not on the disk compiled by somebody else from now on; None for here again.
+
+    Args:
+        other: Compiles and keeps a kernel, by its module and its name there. Where that can't be
+            had, the kernel is compiled here all the same.
+    """
+    _Elsewhere.compile = other
+
+
+class _Elsewhere:
+    compile: Callable[[str, str], None] | None = None
+
+
 class _Kept(FunctionCache):
     """Where the compiled forms of a function are kept."""
 
@@ -114,7 +128,11 @@ class _Kept(FunctionCache):
             return super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
         rtsys.initialize(target_context)
         with guarded():
-            return load_kept(sig, target_context)  # type: ignore[no-untyped-call]
+            kept = load_kept(sig, target_context)  # type: ignore[no-untyped-call]
+            if kept is None and _Elsewhere.compile is not None:
+                _Elsewhere.compile(self._py_func.__module__, self._py_func.__qualname__)
+                kept = load_kept(sig, target_context)  # type: ignore[no-untyped-call]
+            return kept
 
 
 class _Kernel(CPUDispatcher):

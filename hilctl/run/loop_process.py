@@ -9,11 +9,14 @@ import json
 import signal
 import sys
 import time
+from collections.abc import Callable
+from contextlib import ExitStack
 
 from hilctl.base.errors import DeviceError, HilctlError, InputError, RunError
 from hilctl.experiment.condition import conditioning_of
 from hilctl.experiment.load import LoadedExperiment
 from hilctl.kernels import tick
+from hilctl.kernels.elsewhere import compiled_elsewhere
 from hilctl.kernels.interlock import interlock_block
 from hilctl.kernels.jit import load
 from hilctl.kernels.limit import limit_block
@@ -47,15 +50,21 @@ def main() -> int:
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)  # the supervisor decides, and the loop ramps down
     be_ordinary()  # as its maker is by the time that it has a job
-    load(*_EVERY_RUN)  # while the supervisor checks
-    text = received_job(sys.stdin.fileno())
-    if not text:
-        return 0  # there is no run for this one
+    with ExitStack() as compiling:
+        compiling.enter_context(compiled_elsewhere())
+        load(*_EVERY_RUN)  # while the supervisor checks
+        text = received_job(sys.stdin.fileno())
+        # Without text there is no run for this one.
+        return _carried_out(text, compiling.close) if text else 0
+
+
+def _carried_out(text: str, all_compiled: Callable[[], None]) -> int:
+    """Carry out a job, and leave what came of it in the ring's page; return the exit code."""
     job = Job.from_json(text)
     ring = SampleRing(job.ring_path)
     page = ring.page
     try:
-        outcome = run_job(job, ring, job.load())
+        outcome = run_job(job, ring, job.load(), all_compiled)
     except InputError as error:  # before anything has moved
         return _failed(page, str(error), Phase.REFUSED)
     except HilctlError as error:
@@ -73,8 +82,19 @@ def _failed(page: SharedPage, text: str, phase: Phase = Phase.FAILED) -> int:
     return 1
 
 
-def run_job(job: Job, ring: SampleRing, loaded: LoadedExperiment) -> Outcome:
+def run_job(
+    job: Job,
+    ring: SampleRing,
+    loaded: LoadedExperiment,
+    all_compiled: Callable[[], None] = lambda: None,
+) -> Outcome:
     """Run a job whose experiment is loaded, from set-up to the closed device.
+
+    Args:
+        job: What to run, and for whom.
+        ring: Where samples go.
+        loaded: The experiment.
+        all_compiled: Called before the first tick, when no more kernel is needed.
 
     Raises:
         HilctlError: It could not start, or broke; the output was put at its safe value.
@@ -107,6 +127,7 @@ def run_job(job: Job, ring: SampleRing, loaded: LoadedExperiment) -> Outcome:
         raise
     try:
         # A device may load kernels of its own when it is opened.
+        all_compiled()
         ProcessMemory().release()
         page.put(Field.WAVEFORM_AT, waveform_at)
         page.write_text(PageText.SET_UP, json.dumps([step_facts(steps), refusals(steps)]))

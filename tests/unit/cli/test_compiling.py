@@ -7,6 +7,7 @@ import pytest
 
 from hilctl.cli.compiling import compiling_shown
 from hilctl.cli.volume import Volume
+from hilctl.kernels import jit
 
 
 class Terminal(io.StringIO):
@@ -49,6 +50,14 @@ def test_each_kernel_is_named(at_terminal):
     assert lines[1:] == ["  inner", "  inner"]
     compile_something()
     assert len(terminal.getvalue().splitlines()) == 3
+
+
+def test_what_another_process_compiles_is_named_too(at_terminal):
+    terminal = at_terminal()
+    with compiling_shown():
+        assert jit._Elsewhere.compile is not None
+        jit._Elsewhere.compile("hilctl.kernels.limit", "limit_block")
+    assert terminal.getvalue().splitlines()[1:] == ["  limit_block"]
 
 
 def test_no_program_reads_it(capsys):

@@ -14,6 +14,7 @@ from types import SimpleNamespace
 import pytest
 
 from hilctl.base.errors import DeviceError, InputError, RunError
+from hilctl.kernels import jit
 from hilctl.loop.pacer import Lateness
 from hilctl.loop.plan import Outcome
 from hilctl.machine.realtime import SetUpStep
@@ -126,6 +127,17 @@ def test_a_start_that_is_refused_moves_nothing(broken, output):
     assert isinstance(error, InputError)
     assert str(error).endswith("nothing has moved")
     assert page.get(Field.PHASE) == Phase.STARTING
+
+
+def test_nothing_is_compiled_any_more_when_the_device_is_open(prepared):
+    """What compiles has ended before the memory is given back, and long before the first tick."""
+    made = prepared()
+    made.loop_does(lambda self, start_ns: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        loop_process.run_job(
+            made.job, made.ring, made.loaded, lambda: made.device.events.append("compiled")
+        )
+    assert made.device.events[:4] == ["prepare", "open", "compiled", "small"]
 
 
 @pytest.mark.parametrize(("output", "ramps"), [(0.0, False), (5.0, True)])
@@ -261,9 +273,12 @@ def test_all_that_it_has_to_say_is_in_the_page(prepared, monkeypatch, raised, co
     """The supervisor tells by the phase what is there: an outcome, a refusal, or a fault."""
     made, ignored, done = prepared(), {}, []
 
-    def run_job(job, ring, loaded):
+    def run_job(job, ring, loaded, all_compiled):
         assert job == made.job
         assert done == ["ordinary", "loaded"]
+        assert jit._Elsewhere.compile is not None
+        all_compiled()
+        assert jit._Elsewhere.compile is None
         if raised is not None:
             raise raised
         return OUTCOME
