@@ -18,6 +18,9 @@ class Realtime(Strict):
         priority: Its SCHED_FIFO priority.
         cpu: CPU that it runs on; ``none`` takes the first isolated one, or else leaves it open.
         require: Whether a run without SCHED_FIFO and locked memory is refused.
+        wait: How it waits for a tick: ``sleep``, or ``spin``, which looks at the clock all the time
+            for the last 0.2 ms. No timer wakes it late then, but it takes a CPU for itself, and
+            another one has to be left for all the rest.
     """
 
     priority: Annotated[int, Field(ge=1, le=98)] = 80
@@ -29,3 +32,4 @@ class Realtime(Strict):
         ),
     ] = None
     require: bool = False
+    wait: Literal["sleep", "spin"] = "sleep"

@@ -6,6 +6,7 @@ nothing and writes no file: all it has to say goes into the ring's page.
 """
 
 import json
+import os
 import signal
 import sys
 import time
@@ -21,10 +22,17 @@ from hilctl.kernels.interlock import interlock_block
 from hilctl.kernels.jit import load
 from hilctl.kernels.limit import limit_block
 from hilctl.loop.loop import Loop
-from hilctl.loop.pacer import SystemClock
+from hilctl.loop.pacer import SpinningClock, SystemClock
 from hilctl.loop.plan import Outcome
 from hilctl.machine.memory import ProcessMemory
-from hilctl.machine.realtime import be_ordinary, prepare, refusals, require, step_facts
+from hilctl.machine.realtime import (
+    be_ordinary,
+    prepare,
+    refusals,
+    require,
+    require_another_cpu,
+    step_facts,
+)
 from hilctl.machine.usage import ProcessUsage
 from hilctl.run.assemble import assemble
 from hilctl.run.host import RingHost, SharedWindow
@@ -100,7 +108,8 @@ def run_job(
         HilctlError: It could not start, or broke; the output was put at its safe value.
     """
     config, device, page = loaded.config, loaded.device, ring.page
-    host = RingHost(ring, SystemClock(), job.supervisor, job.silence_s)
+    clock = SpinningClock() if config.realtime.wait == "spin" else SystemClock()
+    host = RingHost(ring, clock, job.supervisor, job.silence_s)
     conditioning = conditioning_of(loaded, job.stands_um)
     reference, input_um = job.arrays()
     plan = assemble(
@@ -114,6 +123,7 @@ def run_job(
         heat_a2=job.heat_a2,
     )
     loop = Loop(plan, device, host)
+    require_another_cpu(config.realtime, len(os.sched_getaffinity(0)))
     # After the warm-up, so that all it has mapped gets locked; before the device is opened, so that
     # a refusal moves nothing.
     steps = prepare(config.realtime)

@@ -2,12 +2,12 @@
 
     python -m tests.benchmark.rates [--seconds 10] [--pairs 3]
 
-Runs of the simulated rig, recorded, at 20 kHz sample by sample and at 50 kHz in blocks of 5 and of
-50; after each, ``wakeup.c`` wakes as often at the same priority, and does nothing. It prints the
-share of ticks that woke late (by more than half a period, on either side, each tick that a stall
-has made late; at 20 kHz of a C program that never sleeps, too), how much of a core the processes
-take, what of it the simulated rig takes, and their memory. Exit code 1 where a goal is missed, or a
-run ends early or loses a sample.
+Runs of the simulated rig, recorded, at 20 kHz sample by sample, asleep between ticks and spinning
+(``realtime.wait``), and at 50 kHz in blocks of 5 and of 50; after each, ``wakeup.c`` wakes as often
+at the same priority, and does nothing. It prints the share of ticks that woke late (by more than
+half a period, on either side, each tick that a stall has made late; beside a run that spins of a C
+program that never sleeps, too), how much of a core the processes take, what of it the simulated rig
+takes, and their memory. Exit code 1 where a goal is missed, or a run ends early or loses a sample.
 """
 
 import argparse
@@ -36,13 +36,15 @@ class Case:
 
     rate_hz: int
     block: int
+    wait: str = "sleep"
     late_percent: float | None = None
     cores: float | None = None
     resident_mb: float | None = None
 
 
 CASES = (
-    Case(20_000, 1, late_percent=LATE_PERCENT),
+    Case(20_000, 1),
+    Case(20_000, 1, wait="spin", late_percent=LATE_PERCENT),
     Case(50_000, 5, cores=CORES),
     Case(50_000, 50, resident_mb=RESIDENT_MB),
 )
@@ -52,6 +54,7 @@ def ours(case: Case, seconds: float, folder: Path) -> dict[str, Any]:
     """Run hilctl; return what it says of the run."""
     settings = {"sample_rate_hz": case.rate_hz, "block": case.block}
     settings |= {"waveform.duration_s": seconds, "timing.late_after": LATE_AFTER}
+    settings |= {"realtime.wait": case.wait}
     given = [f"--set={key}={value}" for key, value in settings.items()]
     command = ["hilctl", "run", str(EXPERIMENT), *given, "--json", "--overwrite"]
     command += ["--output", str(folder / "run.mcap")]
@@ -106,7 +109,7 @@ def measured(case: Case, pairs: int, seconds: float, folder: Path) -> bool:
     loop_cores, supervisor_cores = map(statistics.median, zip(*cores, strict=True))
     memory_mb = [statistics.median(each) for each in zip(*resident_mb, strict=True)]
     print(
-        f"{case.rate_hz} Hz, blocks of {case.block}: "
+        f"{case.rate_hz} Hz, blocks of {case.block}, {case.wait}: "
         f"late {text(late)} %, C that only sleeps {text(late_c)} %"
         f"{f', that only spins {text(spinning)} %' if spinning else ''}; "
         f"cores {loop_cores:.2f} (rig {statistics.median(rig_cores):.2f}) "

@@ -1,10 +1,19 @@
 """Pacing on absolute deadlines, with a clock that the test turns."""
 
 import errno
+from itertools import count
 
 import pytest
 
-from hilctl.loop.pacer import Lateness, LateRules, Pacer, SystemClock, deadline_misses
+from hilctl.loop.pacer import (
+    SPIN_NS,
+    Lateness,
+    LateRules,
+    Pacer,
+    SpinningClock,
+    SystemClock,
+    deadline_misses,
+)
 from tests.fakes import FakeClock
 
 PERIOD_NS = 1_000_000
@@ -230,6 +239,21 @@ def test_sleep_that_a_signal_interrupts_goes_on():
     with pytest.raises(OSError, match="Invalid argument") as caught:
         clock.sleep_until_ns(0)
     assert caught.value.errno == errno.EINVAL
+
+
+@pytest.mark.parametrize("ahead_ns", [SPIN_NS + 1, SPIN_NS, 0, -5])
+def test_a_clock_that_spins_sleeps_until_shortly_before_a_time_and_then_looks(
+    monkeypatch, ahead_ns
+):
+    """At a time that comes with each look, so that no sleep of the machine's is in it."""
+    clock, looks, slept_until = SpinningClock(), count(1_000_000, 50), []
+    now = next(looks)
+    monkeypatch.setattr(clock, "now_ns", lambda: next(looks))
+    monkeypatch.setattr(SystemClock, "sleep_until_ns", lambda _, to_ns: slept_until.append(to_ns))
+    deadline_ns = now + 50 + ahead_ns  # after the first look
+    clock.sleep_until_ns(deadline_ns)
+    assert slept_until == ([deadline_ns - SPIN_NS] if ahead_ns > SPIN_NS else [])
+    assert deadline_ns <= next(looks) - 50 <= max(deadline_ns, now + 100) + 50
 
 
 class TestTooLate:

@@ -15,7 +15,7 @@ import pytest
 
 from hilctl.base.errors import DeviceError, InputError, RunError
 from hilctl.kernels import jit
-from hilctl.loop.pacer import Lateness
+from hilctl.loop.pacer import Lateness, SpinningClock, SystemClock
 from hilctl.loop.plan import Outcome
 from hilctl.machine.realtime import SetUpStep
 from hilctl.machine.usage import ProcessUsage
@@ -138,6 +138,28 @@ def test_nothing_is_compiled_any_more_when_the_device_is_open(prepared):
             made.job, made.ring, made.loaded, lambda: made.device.events.append("compiled")
         )
     assert made.device.events[:4] == ["prepare", "open", "compiled", "small"]
+
+
+@pytest.mark.parametrize("wait", ["sleep", "spin"])
+def test_the_loop_waits_as_it_is_asked_to(prepared, monkeypatch, wait):
+    made, clocks = prepared(), []
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1})
+    realtime = made.loaded.config.realtime.model_copy(update={"wait": wait})
+    object.__setattr__(made.loaded.config, "realtime", realtime)
+    made.loop_does(lambda self, start_ns: clocks.append(type(self._host.clock)) or 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        made.run()
+    assert clocks == [SpinningClock if wait == "spin" else SystemClock]
+
+
+def test_spinning_on_the_only_cpu_is_refused_before_anything_is_touched(prepared, monkeypatch):
+    made = prepared()
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {3})
+    realtime = made.loaded.config.realtime.model_copy(update={"wait": "spin"})
+    object.__setattr__(made.loaded.config, "realtime", realtime)
+    with pytest.raises(InputError, match="only one"):
+        made.run()
+    assert made.device.events == []
 
 
 @pytest.mark.parametrize(("output", "ramps"), [(0.0, False), (5.0, True)])
