@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from hilctl.base.arrays import F64
+from hilctl.base.exponential import exponential
 from hilctl_drivers.simulated.extras import Creep, SecondMode, Thermal, VoltageLimit
 from hilctl_drivers.simulated.pinned_cells import PinnedCellsParameters
 from hilctl_drivers.simulated.plant import CHUNK, Plant
@@ -73,22 +74,6 @@ class TerfenolParameters:
     amplifier: VoltageLimit | None = None
 
 
-def _exponential(matrix: F64) -> F64:
-    """Return exp(matrix): float64[m, m], the Taylor series of a small part of it, squared.
-
-    SciPy's to 13 digits, but a run would wait longer for SciPy than for all of its device.
-    """
-    halvings = max(0, math.frexp(np.abs(matrix).sum(axis=1).max())[1] + 3)
-    part = matrix * 0.5**halvings  # its norm is at most 1/8: the twelfth term is below 1e-19
-    term = total = np.eye(matrix.shape[0])
-    for k in range(1, 13):
-        term = term @ part / k
-        total = total + term
-    for _ in range(halvings):
-        total = total @ total
-    return total
-
-
 def _motion(parameters: TerfenolParameters, load_kg: float, step_s: float) -> F64:
     """Return float64[m - 2, m], the exact step of structure and sensor for ``respond``.
 
@@ -113,7 +98,7 @@ def _motion(parameters: TerfenolParameters, load_kg: float, step_s: float) -> F6
         rates[-3, 2 * k] = sensor
     rates[-3, -3] = -sensor
     rates[-2, -1] = 1.0 / step_s
-    motion: F64 = np.ascontiguousarray(_exponential(rates * step_s)[:-2])
+    motion: F64 = np.ascontiguousarray(exponential(rates * step_s)[:-2])
     motion[:, -2] -= motion[:, -1]
     return motion
 
