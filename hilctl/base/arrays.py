@@ -11,6 +11,9 @@ F64: TypeAlias = npt.NDArray[np.float64]
 U32: TypeAlias = npt.NDArray[np.uint32]
 """A uint32 array, used for sample flags."""
 
+C128: TypeAlias = npt.NDArray[np.complex128]
+"""A complex128 array, used for frequency responses."""
+
 I64: TypeAlias = npt.NDArray[np.int64]
 """An int64 array, used for indices and nanoseconds."""
 

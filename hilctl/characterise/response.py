@@ -10,11 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import OptimizeResult, least_squares
 
-from hilctl.base.arrays import F64
+from hilctl.base.arrays import C128, F64
 from hilctl.base.errors import DataError
 from hilctl.characterise.gaps import without_gaps
 from hilctl.characterise.problem import RigProblemError
-from hilctl.experiment.correction import C128
 from hilctl.recording.data import Recording
 
 _FEWEST_LINES = 8

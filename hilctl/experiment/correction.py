@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field, model_validator
 
-from hilctl.base.arrays import F64, I64
+from hilctl.base.arrays import C128, F64, I64
 from hilctl.base.errors import InputError
 from hilctl.base.files import TextFiles, write_text
 from hilctl.base.segments import Segment
@@ -32,8 +32,6 @@ PHASES = 64
 _GRID = 1 << 16  # the highest harmonic of 2048 loses 0.5 % of its amplitude between points
 _TOLERANCE = 1e-3
 _SAME_PERIOD = 1e-6
-
-C128 = npt.NDArray[np.complex128]
 
 
 class LearnedCycle(Strict):

@@ -2,10 +2,11 @@
 
 import numpy as np
 
+from hilctl.base.arrays import C128
 from hilctl.base.errors import ConfigError, Problem
 from hilctl.base.segments import Segment
 from hilctl.experiment.check import Checked
-from hilctl.experiment.correction import C128, LearnedCycle, fits, signature
+from hilctl.experiment.correction import LearnedCycle, fits, signature
 from hilctl.learning.cycle import harmonic_count
 from hilctl.learning.update import Learning, begin
 

@@ -13,8 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import least_squares
 
-from hilctl.base.arrays import F64
-from hilctl.experiment.correction import C128
+from hilctl.base.arrays import C128, F64
 
 _COUPLING = 0.15
 """Part of a harmonic's change that hysteresis scatters over its neighbours."""

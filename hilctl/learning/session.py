@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import TypeAlias
 
 from hilctl import __version__
+from hilctl.base.arrays import C128
 from hilctl.base.errors import ConfigError, HilctlError, InputError, RunError
 from hilctl.base.segments import Segment
 from hilctl.experiment.correction import (
-    C128,
     Correction,
     LearnedCycle,
     model_sha256,

@@ -11,8 +11,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from hilctl.base.arrays import F64
-from hilctl.experiment.correction import C128
+from hilctl.base.arrays import C128, F64
 from hilctl.learning.cycle import CycleError
 from hilctl.learning.response import Change, Response, fit
 

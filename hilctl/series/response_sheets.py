@@ -8,9 +8,8 @@ from matplotlib.axes import Axes
 
 from hilctl.analysis.canvas import QUIET
 from hilctl.analysis.sheet import Panel, Sheet
-from hilctl.base.arrays import F64
+from hilctl.base.arrays import C128, F64
 from hilctl.base.quantity import quantity, significant
-from hilctl.experiment.correction import C128
 from hilctl.series.collect import RunSeries, SeriesRun
 from hilctl.series.dimension import Dimension
 from hilctl.series.look import line_of, looks, spread

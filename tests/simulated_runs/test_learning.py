@@ -15,7 +15,8 @@ from hilctl.experiment.correction import load_correction
 from hilctl.experiment.load import load_experiment
 from hilctl.learning.session import Session
 from hilctl.models.files import dump_model, load_model
-from hilctl.models.staged import FieldLag, StagedModel, Structure
+from hilctl.models.staged import FieldLag, StagedModel
+from hilctl.models.structure import Structure
 from hilctl.recording.reader import read
 from hilctl.run.start import checked_experiment, start_run
 from hilctl.run.step import paced, unpaced
