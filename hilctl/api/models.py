@@ -22,7 +22,7 @@ def identify(
     model: str = "auto",
     settings: Settings = (),
     validate: Paths = (),
-    scheduler: str = "none",
+    scheduler: str | None = None,
     overwrite: bool = False,
     on_progress: Callable[[float, str], None] = lambda done, text: None,
 ) -> "Identification":
@@ -34,7 +34,9 @@ def identify(
         model: Its kind, or ``auto``: what is best on data that no fit saw.
         settings: Of the fit, see ``hilctl identify --settings``.
         validate: Files to judge the model on; parts of the others where there are none.
-        scheduler: Where independent fits run: ``none``, ``processes``, or a Dask address.
+        scheduler: Where independent fits run: ``none``, ``threads``, ``processes``, or a Dask
+            address. Left out, the candidates of ``auto`` over threads, as their kernels leave the
+            interpreter to each other, and others one after the other.
         overwrite: Whether a model file of that name may be replaced.
         on_progress: Called with how much is done, from 0 to 1, and what is being done.
 
@@ -51,7 +53,7 @@ def identify(
         settings_from(model, texts_of(settings)),
         path_or_none(output),
         paths_of(validate),
-        scheduler,
+        scheduler or ("threads" if model == "auto" else "none"),
         overwrite=overwrite,
         progress=on_progress,
     )

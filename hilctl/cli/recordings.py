@@ -32,7 +32,10 @@ Validate = Annotated[
     typer.Option(metavar="FILE", help="File to judge the model on; may be repeated."),
 ]
 Scheduler = Annotated[
-    str, typer.Option(help="none, threads, processes, or a Dask scheduler's address.")
+    str | None,
+    typer.Option(
+        help="none, threads, processes, or a Dask scheduler's address; threads where it is auto."
+    ),
 ]
 FitTexts = Annotated[
     list[str] | None,
@@ -150,7 +153,7 @@ def identify(
     whole: Whole = False,
     leave_out: LeaveOut = None,
     validate: Validate = None,
-    scheduler: Scheduler = "none",
+    scheduler: Scheduler = None,
     html: Annotated[Path | None, typer.Option(help="Page of model against data to write.")] = None,
     overwrite: Overwrite = False,
     as_json: AsJson = False,

@@ -53,3 +53,17 @@ def test_what_is_given_is_passed_on(monkeypatch, tmp_path):
     request = seen["all"][0]
     assert [str(path) for path in request.recordings] == ["a.mcap"]
     assert (request.models, request.settings, request.points) == (["ppi"], ["block=5"], 300)
+
+
+@pytest.mark.parametrize(
+    ("model", "asked", "where"),
+    [
+        ("auto", None, "threads"),
+        ("ppi", None, "none"),
+        ("auto", "none", "none"),
+        ("ppi", "processes", "processes"),
+    ],
+)
+def test_candidates_are_fitted_beside_each_other(monkeypatch, model, asked, where):
+    monkeypatch.setattr("hilctl.identify.command.identify_files", lambda *given, **named: given[4])
+    assert api.identify("a.mcap", model=model, scheduler=asked) == where
