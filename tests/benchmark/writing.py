@@ -36,7 +36,7 @@ LEVEL = 1  # of the SDK: of its levels the nearest to what hilctl does
 BLOCKS = 50
 BATCH_S = 0.05
 FLUSH_BATCHES = round(RecordingConfig().flush_s / BATCH_S)
-ROUNDS = 5
+ROUNDS = 11
 LAYOUT = RecordingLayout(RATE_HZ, "A", False, 1000.0, 1_800_000_000 * 10**9)
 RUN = RunFacts({}, (), "name: writing\n", "", LAYOUT)
 
@@ -135,14 +135,17 @@ def main() -> int:
             took["making"].append(making_s(run))
             took["theirs"].append(theirs_s(messages, path, chunk_bytes))
     per_million = {name: statistics.median(times) / millions for name, times in took.items()}
-    ours_cpu_s, theirs_cpu_s = per_million["ours"], per_million["making"] + per_million["theirs"]
+    # Of each round, so that a slow moment of the machine hits both.
+    rounds = zip(took["ours"], took["making"], took["theirs"], strict=True)
+    ratio = statistics.median(ours / (making + theirs) for ours, making, theirs in rounds)
     print(
-        f"hilctl: {ours_cpu_s:.3f} CPU-s a million samples, {size / millions * 1e-6:.1f} bytes each"
+        f"hilctl: {per_million['ours']:.3f} CPU-s a million samples, "
+        f"{size / millions * 1e-6:.1f} bytes each"
     )
     print(f"  of it messages: {per_million['making']:.3f}")
     print(f"foxglove SDK, the same messages ready-made: {per_million['theirs']:.3f}")
-    print(f"hilctl / (messages + SDK): {ours_cpu_s / theirs_cpu_s:.2f}")
-    return int(ours_cpu_s > asked.goal or ours_cpu_s > theirs_cpu_s)
+    print(f"hilctl / (messages + SDK), median of {ROUNDS} rounds: {ratio:.3f}")
+    return int(per_million["ours"] > asked.goal or ratio > 1.0)
 
 
 if __name__ == "__main__":
