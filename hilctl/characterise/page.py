@@ -13,6 +13,7 @@ from hilctl.characterise.waveforms import CREEP_S
 from hilctl.identify.page import loops_figure
 from hilctl.identify.summary import HEADINGS, error_rows, summary
 from hilctl.models.files import dump_model
+from hilctl.models.staged import StagedModel
 
 _FITTED_SHOWN = 12
 HELD_OUT_HEADINGS = ("not fitted", "peak %", "rms %", "mean %", "noise floor %")
@@ -28,8 +29,17 @@ def _percents(each: UnseenReference) -> Iterator[str]:
         yield f"{value:.3g}"
 
 
-def figure_rows(measured: Measured, unit: str) -> Iterator[tuple[str, str]]:
+def figure_rows(found: Characterisation) -> Iterator[tuple[str, str]]:
     """Give what was measured, as name and text."""
+    yield from _measured_rows(found.measured, found.unit)
+    model = None if found.identification is None else found.identification.fit.model
+    for mode in model.modes if isinstance(model, StagedModel) else ():
+        own = f"{quantity(mode.natural_hz, 'Hz', 4)}, damping ratio {mode.damping_ratio:.2g}"
+        against = f"antiresonance {quantity(mode.antiresonance_hz, 'Hz', 4)}"
+        yield "further mode, in the model", f"{own}; {against}"
+
+
+def _measured_rows(measured: Measured, unit: str) -> Iterator[tuple[str, str]]:
     per = f"um/{unit}"
     if (rest := measured.rest) is not None:
         yield "noise at rest", f"{quantity(rest.noise_um, 'um')} rms"
@@ -87,7 +97,7 @@ def characterisation_page(found: Characterisation) -> str:
     if found.problem:
         body.append(f'<p class="note">{_text(found.problem)}</p>')
     body += [*_held_out(found), "<h2>Measured</h2>"]
-    body.append(grid(("figure", "value"), figure_rows(found.measured, found.unit)))
+    body.append(grid(("figure", "value"), figure_rows(found)))
     body += [*_drawn(found), *_model(found), "<h2>Steps</h2>"]
     rows = [
         (each.name, each.purpose, f"{each.seconds:.1f}", each.text, Path(each.recording).name)

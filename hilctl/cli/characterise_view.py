@@ -67,7 +67,7 @@ def print_characterisation(found: Characterisation, model: Path | None, page: Pa
         terminal.print(f"verdict: {found.verdict}", soft_wrap=True)
         for note in found.verdict.notes if found.verdict else ():
             terminal.print(note, soft_wrap=True)
-    figures = list(figure_rows(found.measured, found.unit))
+    figures = list(figure_rows(found))
     if figures:
         terminal.print(_table(Text("measured"), ("figure", "value"), figures))
     if model is not None:

@@ -10,8 +10,9 @@ from hilctl.base.errors import DataError
 from hilctl.identify.data.records import History, Record
 from hilctl.identify.held_out import HeldOut, held_out_error
 from hilctl.identify.job import OnProgress, ignore_progress
-from hilctl.identify.settings import IdentifySettings
+from hilctl.identify.settings import IdentifySettings, kinds_of
 from hilctl.identify.workers import Map, one_by_one
+from hilctl.models.structure import Mode
 
 WHOLE: tuple[Mapping[str, Any], ...] = (
     {"kind": "field", "drags": 0, "plays": 8, "cells": 12, "knots": 16},
@@ -52,12 +53,26 @@ class CandidateError:
     peak_percent: float
 
 
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """What a kind of model is chosen for.
+
+    Attributes:
+        records: The data.
+        settings: How files were read, and which parts that may be left out are looked for; of the
+            fit, nothing else.
+        unit: Unit of the command.
+        modes: Further modes of the structure that are known, for kinds that have them.
+    """
+
+    records: tuple[Record, ...]
+    settings: IdentifySettings
+    unit: CommandUnit
+    modes: tuple[Mode, ...] = ()
+
+
 def choose_kind(
-    records: Sequence[Record],
-    settings: IdentifySettings,
-    unit: CommandUnit,
-    run: Map,
-    progress: OnProgress,
+    choice: Choice, run: Map, progress: OnProgress
 ) -> tuple[IdentifySettings, HeldOut, tuple[CandidateError, ...]]:
     """Fit each candidate to a part of the data, and take the one that does best on the rest.
 
@@ -65,9 +80,7 @@ def choose_kind(
     are several times those of the right one at any size.
 
     Args:
-        records: The data.
-        settings: How files were read; of the fit, nothing.
-        unit: Unit of the command.
+        choice: The data, and what else all candidates share.
         run: Runs fits that do not depend on each other.
         progress: Called with what is being done.
 
@@ -77,8 +90,8 @@ def choose_kind(
     Raises:
         DataError: There are too few data to leave some out.
     """
-    whole = any(isinstance(record, History) for record in records)
-    trials = _Trials(tuple(records), settings, unit, run, progress)
+    whole = any(isinstance(record, History) for record in choice.records)
+    trials = _Trials(choice, run, progress)
     errors = trials.of(WHOLE if whole else LOOPS)
     if whole and not any(each.rms_percent < WELL_PERCENT for each in errors):
         errors += trials.of((PLAIN,))
@@ -120,9 +133,7 @@ def _rms_percent(tried: _Tried) -> float:
 class _Trials:
     """Fits of candidates to a part of the records."""
 
-    records: tuple[Record, ...]
-    settings: IdentifySettings
-    unit: CommandUnit
+    choice: Choice
     run: Map
     progress: OnProgress
 
@@ -130,10 +141,14 @@ class _Trials:
         self, candidates: Sequence[Mapping[str, Any]], starts: Sequence[object | None] = ()
     ) -> list[_Tried]:
         """Return how candidates do that can be fitted; searches begin where others ended."""
-        given = self.settings
-        shared = {"whole": given.whole, "table": given.table, "points": given.points}
+        given = self.choice.settings
+        shared: dict[str, Any] = {
+            "whole": given.whole,
+            "table": given.table,
+            "points": given.points,
+        }
         trials = [
-            _Trial(self.records, IdentifySettings(**{**each, **shared}), self.unit, start)
+            _Trial(self.choice, IdentifySettings(**each, **shared, **_parts(each, given)), start)
             for each, start in zip_longest(candidates, starts)
         ]
         names = [", ".join(f"{key} {value}" for key, value in each.items()) for each in candidates]
@@ -142,15 +157,23 @@ class _Trials:
         return [_Tried(name, trial.settings, out) for name, trial, out in found if out is not None]
 
 
+def _parts(candidate: Mapping[str, Any], given: IdentifySettings) -> dict[str, Any]:
+    """Return whether parts that may be left out are looked for, those that a kind has."""
+    fields, kind = IdentifySettings.model_fields, candidate["kind"]
+    has = [name for name in ("creep_stage", "modes") if kind in kinds_of(fields[name])]
+    return {name: getattr(given, name) for name in has}
+
+
 @dataclass(frozen=True, slots=True)
 class _Trial:
-    records: tuple[Record, ...]
+    choice: Choice
     settings: IdentifySettings
-    unit: CommandUnit
     start: object | None
 
 
 def _held_out(trial: _Trial) -> HeldOut | None:
+    choice, settings = trial.choice, trial.settings
+    modes = choice.modes if settings.looks_for("modes") else ()
     return held_out_error(
-        trial.records, trial.settings, trial.unit, one_by_one, ignore_progress, trial.start
+        choice.records, settings, choice.unit, one_by_one, ignore_progress, trial.start, modes
     )

@@ -11,7 +11,7 @@ from hilctl.base.device import CommandUnit
 from hilctl.base.errors import InputError
 from hilctl.base.files import check_writable, write_text
 from hilctl.base.yaml.document import Document
-from hilctl.identify.candidates import CandidateError, choose_kind
+from hilctl.identify.candidates import CandidateError, Choice, choose_kind
 from hilctl.identify.catalogue import entry
 from hilctl.identify.data.files import load_records
 from hilctl.identify.data.records import Record
@@ -22,9 +22,11 @@ from hilctl.identify.judge import Judgement, judge
 from hilctl.identify.model_size import OrderError, choose_lag, choose_order
 from hilctl.identify.settings import FitSettings, IdentifySettings
 from hilctl.identify.verdict import Verdict, verdict_of
+from hilctl.identify.with_modes import with_modes
 from hilctl.identify.workers import Map, one_by_one, workers
 from hilctl.models.base import HysteresisModel
 from hilctl.models.files import dump_model
+from hilctl.models.structure import Mode
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,27 +150,47 @@ def identify_records(
     Raises:
         DataError: The data can't be used as asked, or there are none.
     """
-    chosen, orders = settings, tuple[OrderError, ...]()
-    candidates = tuple[CandidateError, ...]()
-    held_out: HeldOut | None = None
-    if isinstance(settings, IdentifySettings) and settings.auto:
-        chosen, held_out, candidates = choose_kind(records, settings, unit, run, progress)
-    elif settings.size == "auto":
-        chosen, orders = choose_order(records, settings, run, progress)
     created = datetime.now(UTC).isoformat(timespec="seconds")
-    fit = fit_model(
-        records, chosen, time.perf_counter, unit=unit, source=source, created=created,
-        progress=progress, run=run, start=None if held_out is None else held_out.end,
-    )  # fmt: skip
+
+    def found(modes: Sequence[Mode]) -> _Found:
+        chosen, orders = settings, tuple[OrderError, ...]()
+        candidates = tuple[CandidateError, ...]()
+        held_out: HeldOut | None = None
+        if isinstance(settings, IdentifySettings) and settings.auto:
+            data = Choice(tuple(records), settings, unit, tuple(modes))
+            chosen, held_out, candidates = choose_kind(data, run, progress)
+        elif settings.size == "auto":
+            chosen, orders = choose_order(records, settings, run, progress)
+        known = modes if chosen.looks_for("modes") else ()
+        fit = fit_model(
+            records, chosen, time.perf_counter, unit=unit, source=source, created=created,
+            progress=progress, run=run, start=None if held_out is None else held_out.end,
+            modes=known,
+        )  # fmt: skip
+        if held_out is None and not validate:
+            held_out = held_out_error(records, chosen, unit, run, progress, modes=known)
+        return _Found(fit, held_out, chosen, orders, candidates)
+
+    best = with_modes(records, found)
+    fit, held_out = best.fit, best.held_out
     if validate:
-        judged = judge(fit.model, validate, creep=settings.creep)
-        held_out = HeldOut(judged, tuple(validate), "files that were not fitted")
-    elif held_out is None:
-        held_out = held_out_error(records, chosen, unit, run, progress)
-    verdict = verdict_of(fit, records, chosen, held_out)
+        others = judge(fit.model, validate, creep=settings.creep)
+        held_out = HeldOut(others, tuple(validate), "files that were not fitted")
+    verdict = verdict_of(fit, records, best.settings, held_out)
     if held_out is not None:
         fit = replace(fit, model=_with_held_out(fit.model, held_out.judgement))
-    return Identification(fit, records, verdict, held_out, orders, 0, candidates)
+    return Identification(fit, records, verdict, held_out, best.orders, 0, best.candidates)
+
+
+@dataclass(frozen=True, slots=True)
+class _Found:
+    """A model with given modes, and how it was chosen."""
+
+    fit: FittedModel
+    held_out: HeldOut | None
+    settings: FitSettings
+    orders: tuple[OrderError, ...]
+    candidates: tuple[CandidateError, ...]
 
 
 def _with_held_out(model: HysteresisModel, judgement: Judgement) -> HysteresisModel:

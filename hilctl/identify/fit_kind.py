@@ -1,6 +1,8 @@
-"""One kind of model fitted to records, with creep taken off them first where it can be told."""
+"""One kind of model fitted to records, with what stands behind it taken off them first."""
 
+from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 from hilctl.base.device import CommandUnit
 from hilctl.identify.catalogue import CATALOGUE
@@ -8,8 +10,10 @@ from hilctl.identify.creep import creep_of, without_creep
 from hilctl.identify.data.records import Records
 from hilctl.identify.fit_data import FitData, search_data
 from hilctl.identify.job import FitJob, FoundModel, OnProgress, ignore_progress
+from hilctl.identify.modes import without_modes
 from hilctl.identify.settings import FitSettings
 from hilctl.identify.workers import Map, one_by_one
+from hilctl.models.structure import Mode
 
 
 def fit_kind(
@@ -20,8 +24,12 @@ def fit_kind(
     run: Map = one_by_one,
     progress: OnProgress = ignore_progress,
     start: object | None = None,
+    modes: Sequence[Mode] = (),
 ) -> FoundModel:
     """Fit a kind of model.
+
+    Creep that rests show is taken off the records first, and so are modes that are known; the model
+    has both.
 
     Args:
         records: The data.
@@ -30,20 +38,27 @@ def fit_kind(
         run: Follows starts that do not depend on each other.
         progress: Called with what is being done.
         start: Where the search begins, see :class:`~hilctl.identify.job.FitJob`.
+        modes: Further modes of the structure.
 
     Raises:
         DataError: The data can't be used as asked, or there are none.
     """
-    creep = creep_of(records) if settings.has("creep_stage") and settings.creep_stage else None
+    creep = creep_of(records) if settings.looks_for("creep_stage") else None
     bare = records if creep is None else without_creep(records, creep)
+    bare = without_modes(bare, modes) if modes else bare
     job = FitJob(search_data(bare, settings.kind, unit), settings, run, progress, start)
     found = CATALOGUE[settings.kind].fit(job)
-    if creep is None:
+    known, parameters, numbers = dict[str, Any](), dict(found.parameters), found.numbers
+    if creep is not None:
+        known["creep"] = creep
+        parameters["creep_share"] = sum(creep.shares)
+        numbers += len(creep.shares)
+    for k, mode in enumerate(modes, start=2):
+        known["modes"] = tuple(modes)
+        parameters |= {f"{name}_{k}": value for name, value in mode.model_dump().items()}
+        numbers += len(type(mode).model_fields)
+    if not known:
         return found
-    crept = {"creep": creep, "output_range_um": FitData(records, unit).output_range_um}
-    return replace(
-        found,
-        model=found.model.model_copy(update=crept),
-        numbers=found.numbers + len(creep.shares),
-        parameters={**found.parameters, "creep_share": sum(creep.shares)},
-    )
+    known["output_range_um"] = FitData(records, unit).output_range_um
+    model = found.model.model_copy(update=known)
+    return replace(found, model=model, numbers=numbers, parameters=parameters)

@@ -19,6 +19,7 @@ from hilctl.identify.judge import Judgement, judge
 from hilctl.identify.settings import FitSettings
 from hilctl.identify.workers import Map, one_by_one
 from hilctl.models.base import HysteresisModel, Provenance
+from hilctl.models.structure import Mode
 
 VERSIONS = {"hilctl": hilctl.__version__, "numpy": np.__version__, "scipy": scipy.__version__}
 
@@ -70,6 +71,7 @@ def fit_model(
     progress: OnProgress = ignore_progress,
     run: Map = one_by_one,
     start: object | None = None,
+    modes: Sequence[Mode] = (),
 ) -> FittedModel:
     """Fit a model's parameters to steady loops and time histories.
 
@@ -89,13 +91,14 @@ def fit_model(
         progress: Called with what is being done.
         run: Follows starts that do not depend on each other.
         start: Where the search begins, see :class:`~hilctl.identify.job.FitJob`.
+        modes: Further modes of the structure, for kinds that have them.
 
     Raises:
         DataError: The data can't be used as asked, or there are none.
     """
     begin = clock()
     data = FitData(records, unit)
-    found = fit_kind(records, settings, unit, run=run, progress=progress, start=start)
+    found = fit_kind(records, settings, unit, run=run, progress=progress, start=start, modes=modes)
     judged = judge(found.model, data, creep=settings.creep)
     provenance = Provenance(
         source=tuple(source),

@@ -16,6 +16,7 @@ from hilctl.identify.job import OnProgress
 from hilctl.identify.judge import Judgement, judge, judgement_of
 from hilctl.identify.settings import FitSettings
 from hilctl.identify.workers import Map
+from hilctl.models.structure import Mode
 
 FEWEST_LOOPS = 4
 FOLDS = 3
@@ -65,6 +66,7 @@ class _Trial:
     settings: FitSettings
     unit: CommandUnit
     start: object | None
+    modes: Sequence[Mode]
 
 
 def folds_of(records: Sequence[Record]) -> list[Fold]:
@@ -99,6 +101,7 @@ def held_out_error(
     run: Map,
     progress: OnProgress,
     start: object | None = None,
+    modes: Sequence[Mode] = (),
 ) -> HeldOut | None:
     """Fit with parts of the data left out, and judge on these; None where too few are left.
 
@@ -109,9 +112,10 @@ def held_out_error(
         run: Runs fits that do not depend on each other.
         progress: Called with what is being done.
         start: Where fits begin, see :class:`~hilctl.identify.job.FitJob`.
+        modes: Further modes of the structure, for kinds that have them.
     """
     lean = settings.model_copy(update={"starts": 1})
-    trials = [_Trial(fold, lean, unit, start) for fold in folds_of(records)]
+    trials = [_Trial(fold, lean, unit, start, modes) for fold in folds_of(records)]
     progress(0.0, f"{len(trials)} fits with data left out")
     done = [
         (trial.fold.held_out, *found)
@@ -132,7 +136,7 @@ def _tried(trial: _Trial) -> tuple[F64, object | None] | None:
     """Return what a model gives of the data that it did not see, and where its search ended."""
     fitted, settings = trial.fold.fitted, trial.settings
     try:
-        found = fit_kind(fitted, settings, trial.unit, start=trial.start)
+        found = fit_kind(fitted, settings, trial.unit, start=trial.start, modes=trial.modes)
     except DataError:  # what is left is too little for this kind of fit; all of it need not be
         return None
     judged = judge(found.model, trial.fold.held_out, creep=settings.creep)

@@ -139,6 +139,13 @@ class FitSettings(Strict):
         default=True,
         description="Whether creep is looked for, where histories rest for 0.5 s and more.",
     )
+    modes: bool = _of(
+        "staged",
+        "field",
+        "generalised_duhem",
+        default=True,
+        description="Whether further modes of the structure are looked for in histories.",
+    )
     hysteresis: Literal["integrated", "preisach"] = _of(
         "staged",
         default="integrated",
@@ -211,6 +218,10 @@ class FitSettings(Strict):
         """Whether a setting belongs to this kind of model."""
         kinds = kinds_of(type(self).model_fields[name])
         return not kinds or self.kind in kinds
+
+    def looks_for(self, name: str) -> bool:
+        """Whether a part that may be left out belongs to this kind, and is looked for."""
+        return self.has(name) and bool(getattr(self, name))
 
     def changes(self) -> str:
         """Return what is not as published for the kind, as ``key=value`` with commas between."""

@@ -9,6 +9,7 @@ integrated.py  the integrated model: RDPI, then deadbands, and its inverse
 butterfly.py   plays, then an even function: rods without bias, inverted on one side
 staged.py      field lag, hysteresis, structure, delay, creep, and their inverse; chain.py joins
                them, and undoes the structure
+structure.py   the structure's first mode; further ones, and their exact inverse
 creep.py       creep of a displacement, and its exact inverse
 generalised.py generalised PI model: plays between envelopes, and its inverse
 numeric_inverse.py  models whose inverse is found root by root: preisach.py, kp.py

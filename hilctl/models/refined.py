@@ -30,7 +30,8 @@ from hilctl.models.kp import KrasnoselskiiPokrovskiiModel
 from hilctl.models.plays import PpiModel, RdpiModel
 from hilctl.models.preisach import PreisachModel
 from hilctl.models.spi import SpiModel
-from hilctl.models.staged import StagedModel, Structure
+from hilctl.models.staged import StagedModel
+from hilctl.models.structure import Structure
 
 Refinable: TypeAlias = (
     PpiModel

@@ -1,6 +1,6 @@
 """Hysteresis between the stages that carry it: field lag, structure, transport delay, creep.
 
-Command -> field lag -> hysteresis -> structure -> transport delay -> creep -> displacement. What is
+Command -> field lag -> hysteresis -> structure -> modes -> delay -> creep -> displacement. What is
 linear may stand in any order; creep, as the last, is undone first. A displacement is sampled when a
 command is put out and can't yet show it, as :mod:`hilctl.base.device` has it. So the forward
 operator answers one sample later than its input, whatever its stages; ``delay_s`` is what comes on
@@ -10,7 +10,8 @@ The inverse goes the other way round, and its input must run ahead of its output
 :attr:`~hilctl.models.base.Operator.preview` samples: one for the loop, then the delay, then what
 the smoothing reaches ahead. ``inverse.process(reference[k + preview])`` is the command of sample k.
 It is finite for every finite reference: the lag's inverse is held within what the lag can follow,
-and the structure's is one of a displacement smoothed over a radian of its natural frequency.
+the structure's is one of a displacement smoothed over a radian of its natural frequency, and
+further modes are undone exactly.
 """
 
 import math
@@ -20,14 +21,8 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from hilctl.base.arrays import F64
-from hilctl.base.errors import ModelError
 from hilctl.base.strict import Strict
-from hilctl.kernels.dynamics import (
-    lag_block,
-    lead_stage,
-    structure_block,
-    weigh_block,
-)
+from hilctl.kernels.dynamics import lag_block, lead_stage, weigh_block
 from hilctl.models.base import HysteresisModel, Operator, Provenance, refuse
 from hilctl.models.chain import Chain, between, delayed, smoothing_weights
 from hilctl.models.creep import Creep
@@ -36,13 +31,13 @@ from hilctl.models.generalised_duhem import GeneralisedDuhemModel
 from hilctl.models.integrated import IntegratedModel
 from hilctl.models.plays import PpiModel, RdpiModel
 from hilctl.models.preisach import PreisachModel
+from hilctl.models.structure import Mode, Structure
 
 AnyHysteresis = Annotated[
     PpiModel | RdpiModel | IntegratedModel | PreisachModel | FieldModel | GeneralisedDuhemModel,
     Field(discriminator="kind"),
 ]
 _WHOLE = 1e-6
-_SLOWEST = 1e12  # samples in a radian of the structure: beyond it, it does not move
 
 
 class FieldLag(Strict):
@@ -74,49 +69,6 @@ class FieldLag(Strict):
         return lead
 
 
-class Structure(Strict):
-    """y'' / w^2 + 2 zeta y' / w + y = x: the mass of the actuator and its load on its stiffness.
-
-    Attributes:
-        natural_hz: w / (2 pi), in Hz.
-        damping_ratio: zeta.
-    """
-
-    natural_hz: float = Field(gt=0.0, le=1e9)
-    damping_ratio: float = Field(gt=0.0, le=10.0)
-
-    def forward(self, sample_rate_hz: float) -> Operator:
-        """Return the structure, exact for an x that changes linearly between samples."""
-        motion = self._motion(1.0 / sample_rate_hz)
-
-        def run(x: F64, memory: F64, out: F64) -> None:
-            structure_block(x, motion, memory, out)
-
-        return Operator(run, 2)
-
-    @property
-    def radian_s(self) -> float:
-        """1 / w, in s."""
-        return 0.5 / (math.pi * self.natural_hz)
-
-    def _motion(self, step_s: float) -> F64:
-        """Return float64[2, 4], see :func:`~hilctl.kernels.dynamics.structure_block`.
-
-        Velocity is in um per radian of the natural frequency, so that the matrix is well scaled.
-        """
-        from scipy.linalg import expm
-
-        rates = np.zeros((4, 4))  # position, velocity, x, its change over the step
-        rates[0, 1] = 1.0
-        rates[1, :3] = (-1.0, -2.0 * self.damping_ratio, 1.0)
-        rates[2, 3] = 1.0 / (2.0 * math.pi * self.natural_hz * step_s)
-        if not rates[2, 3] < _SLOWEST:
-            raise ModelError(f"natural_hz is too low for a step of {step_s:g} s: {self.natural_hz}")
-        motion: F64 = np.ascontiguousarray(expm(rates / rates[2, 3])[:2])
-        motion[:, 2] -= motion[:, 3]
-        return motion
-
-
 class StagedModel(HysteresisModel):
     """A model of hysteresis with the linear stages around it.
 
@@ -124,6 +76,7 @@ class StagedModel(HysteresisModel):
         hysteresis: Model of the hysteresis; the unit and the ranges are the staged model's.
         lag: Lag of the field behind the command; None where there is none.
         structure: What the displacement goes through; None where it is rigid.
+        modes: Further modes of it, each with its antiresonance.
         delay_s: Transport delay beyond the one sample that every loop has, in s.
         smoothing_s: Standard deviation of the smoothing in the inverse, in s, not less than 1 / w
             where there is a structure. Corners of a reference are rounded within about twice that;
@@ -135,6 +88,7 @@ class StagedModel(HysteresisModel):
     hysteresis: AnyHysteresis
     lag: FieldLag | None = None
     structure: Structure | None = None
+    modes: tuple[Mode, ...] = Field(default=(), max_length=8)
     delay_s: float = Field(default=0.0, ge=0.0, le=1.0)
     smoothing_s: float = Field(default=0.0, ge=0.0, le=0.1)
     creep: Creep | None = None
@@ -146,6 +100,7 @@ class StagedModel(HysteresisModel):
         *,
         lag: FieldLag | None = None,
         structure: Structure | None = None,
+        modes: tuple[Mode, ...] = (),
         delay_s: float = 0.0,
         smoothing_s: float = 0.0,
         creep: Creep | None = None,
@@ -158,6 +113,7 @@ class StagedModel(HysteresisModel):
             hysteresis=inner,
             lag=lag,
             structure=structure,
+            modes=modes,
             delay_s=delay_s,
             smoothing_s=smoothing_s,
             creep=creep,
@@ -189,6 +145,7 @@ class StagedModel(HysteresisModel):
         stages.append(self.hysteresis.forward(sample_rate_hz))
         if self.structure is not None:
             stages.append(self.structure.forward(sample_rate_hz))
+        stages += [mode.forward(sample_rate_hz) for mode in self.modes]
         if whole:
             stages.append(delayed(whole))
         if part:
@@ -201,7 +158,8 @@ class StagedModel(HysteresisModel):
         """Return the operator from displacement in um, ``preview`` samples ahead, to command.
 
         Raises:
-            ModelError: The numbers of the hysteresis' inverse are not finite.
+            ModelError: The numbers of the hysteresis' inverse are not finite, or modes can't be
+                undone at this sample rate.
         """
         whole, part = self._delay(sample_rate_hz)
         preview = 1 + whole + (1 if part else 0)
@@ -210,6 +168,7 @@ class StagedModel(HysteresisModel):
             stages.append(self.creep.inverse(sample_rate_hz, self.hysteresis.output_offset_um))
         if part:
             stages.append(between(part))
+        stages += [mode.inverse(sample_rate_hz) for mode in self.modes]
         if self.structure is not None or self.smoothing_s > 0.0:
             stages.append(self._unstructure(sample_rate_hz))
             preview += stages[-1].preview

@@ -23,12 +23,8 @@ from hilctl.base.arrays import F64
 from hilctl.base.samples import Flag
 from hilctl.experiment.check import check
 from hilctl.experiment.load import LoadedExperiment, load_experiment
-from hilctl.identify.candidates import choose_kind
+from hilctl.identify.command import identify_records, settings_from
 from hilctl.identify.data.records import History
-from hilctl.identify.fit_model import fit_model
-from hilctl.identify.job import ignore_progress
-from hilctl.identify.settings import IdentifySettings
-from hilctl.identify.workers import one_by_one
 from hilctl.loop.adaptation import Adaptation, AdaptationBounds, DisplacementOperator
 from hilctl.models.files import dump_model, load_model
 from hilctl.run.assemble import assemble
@@ -123,10 +119,8 @@ def identified(physics: Physics, path: Path) -> None:
     noise_um = np.random.default_rng(3).normal(0.0, NOISE_UM, command.size)
     displacement_um = driven(rig(physics, 0.0), command) + noise_um
     history = History("campaign", command, displacement_um, RATE_HZ)
-    asked = IdentifySettings(whole=True)
-    settings, held_out, _ = choose_kind([history], asked, "A", one_by_one, ignore_progress)
-    fit = fit_model([history], settings, time.process_time, start=held_out.end)
-    path.write_text(dump_model(fit.model))
+    found = identify_records([history], settings_from("auto", []), "A")
+    path.write_text(dump_model(found.fit.model))
 
 
 def waveforms(low_um: float, high_um: float) -> Iterator[tuple[str, float, str]]:

@@ -28,12 +28,9 @@ from hilctl.experiment.condition import conditioning_of
 from hilctl.experiment.correction import Correction, write_correction
 from hilctl.experiment.initial_state import InitialState, begin, left_by
 from hilctl.experiment.load import LoadedExperiment, load_experiment
-from hilctl.identify.candidates import choose_kind
+from hilctl.identify.command import identify_records, settings_from
 from hilctl.identify.data.records import History
-from hilctl.identify.fit_model import FittedModel, fit_model
-from hilctl.identify.job import ignore_progress
-from hilctl.identify.settings import FitSettings, IdentifySettings
-from hilctl.identify.workers import one_by_one
+from hilctl.identify.fit_model import FittedModel
 from hilctl.learning.session import Session, correction_setting
 from hilctl.loop.compensator import Compensator
 from hilctl.models.base import HysteresisModel
@@ -52,11 +49,22 @@ MARGIN = 0.06  # of the range that a model was identified on, at either end
 MOST_A = 8.0
 LEARNED_HZ = (10.0, 100.0, 250.0)
 LEARNED_GOAL = 0.05
-EXTRAS: Mapping[str, Mapping[str, float]] = {
-    "creep": {"share": 0.05},
-    "thermal": {"rise_k_per_a2": 0.5, "tau_s": 60.0, "growth_um_per_k": 0.5, "ambient_k": 2.0},
-    "second_mode": {"frequency_hz": 1200.0, "damping_ratio": 0.05, "share": 0.03},
-    "amplifier": {"voltage_max_v": 60.0, "resistance_ohm": 2.0, "inductance_h": 5e-3},
+EXTRAS: Mapping[str, tuple[str, Mapping[str, float]]] = {
+    "creep": ("creep", {"share": 0.05}),
+    "thermal": (
+        "thermal",
+        {"rise_k_per_a2": 0.5, "tau_s": 60.0, "growth_um_per_k": 0.5, "ambient_k": 2.0},
+    ),
+    "second_mode": ("second_mode", {"frequency_hz": 1200.0, "damping_ratio": 0.05, "share": 0.03}),
+    "low_mode": ("second_mode", {"frequency_hz": 600.0, "damping_ratio": 0.03, "share": 0.1}),
+    "opposite_mode": (
+        "second_mode",
+        {"frequency_hz": 450.0, "damping_ratio": 0.02, "share": -0.05},
+    ),
+    "amplifier": (
+        "amplifier",
+        {"voltage_max_v": 60.0, "resistance_ohm": 2.0, "inductance_h": 5e-3},
+    ),
 }
 """Options of the rig and what they are set to, see ``extras.py`` of the simulated rig."""
 
@@ -113,7 +121,7 @@ class Rig:
 
     def __init__(self, physics: Physics, extras: Sequence[str]) -> None:
         self.physics = physics
-        chosen = {name: EXTRAS[name] for name in extras}
+        chosen = dict(EXTRAS[name] for name in extras)
         self.device = {"physics": physics, **chosen}
         self._options = TerfenolOptions.model_validate(self.device)
         self.parameters = self._options.parameters()
@@ -138,17 +146,8 @@ def identified(rig: Rig, kind: str, seed: int) -> tuple[FittedModel, float]:
     measured = driven(rig.at_rest(noise=True, seed=seed), command)
     records = [History("campaign", command, measured, RATE_HZ)]
     start = time.process_time()
-    end = None
-    if kind == "auto":
-        settings: FitSettings
-        settings, held_out, _ = choose_kind(
-            records, IdentifySettings(whole=True), "A", one_by_one, ignore_progress
-        )
-        end = held_out.end
-    else:
-        settings = FitSettings.model_validate({"kind": kind})
-    fit = fit_model(records, settings, time.process_time, start=end)
-    return fit, time.process_time() - start
+    found = identify_records(records, settings_from(kind, []), "A")
+    return found.fit, time.process_time() - start
 
 
 def conditioned(

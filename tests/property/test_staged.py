@@ -9,7 +9,8 @@ from hilctl.models.chain import smoothing_weights
 from hilctl.models.files import dump_model, parse_model
 from hilctl.models.integrated import IntegratedModel
 from hilctl.models.plays import PpiModel, RdpiModel
-from hilctl.models.staged import FieldLag, StagedModel, Structure
+from hilctl.models.staged import FieldLag, StagedModel
+from hilctl.models.structure import Structure
 
 LEVEL = st.floats(-100.0, 100.0)
 RATES_HZ = st.sampled_from((100.0, 5e3, 50e3, 1e6))

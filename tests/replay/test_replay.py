@@ -18,7 +18,8 @@ from hilctl.experiment.initial_state import initial_state_after
 from hilctl.loop.compensator import Compensator
 from hilctl.models.base import HysteresisModel
 from hilctl.models.files import dump_model
-from hilctl.models.staged import FieldLag, StagedModel, Structure
+from hilctl.models.staged import FieldLag, StagedModel
+from hilctl.models.structure import Structure
 from hilctl.recording.data import Recording
 from hilctl.recording.reader import read
 from hilctl.run.result import RunResult

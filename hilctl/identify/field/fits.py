@@ -12,7 +12,8 @@ from hilctl.identify.field.search import FieldEnd, FieldSearch, Size
 from hilctl.identify.field.stages import Stages
 from hilctl.identify.job import FitJob, FoundModel
 from hilctl.models.field import FieldModel, OutputCurve
-from hilctl.models.staged import StagedModel, Structure
+from hilctl.models.staged import StagedModel
+from hilctl.models.structure import Structure
 
 FINER = 8  # cells of the model's tables to each piece of a spline
 

@@ -11,7 +11,8 @@ from hilctl.identify.generalised_duhem.search import DuhemEnd, DuhemSearch
 from hilctl.identify.generalised_duhem.signals import NAMES
 from hilctl.identify.job import FitJob, FoundModel
 from hilctl.models.generalised_duhem import GeneralisedDuhemModel
-from hilctl.models.staged import StagedModel, Structure
+from hilctl.models.staged import StagedModel
+from hilctl.models.structure import Structure
 
 POINTS = 45  # samples that are left of the fastest cycle; a table has no thresholds to turn on
 

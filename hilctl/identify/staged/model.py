@@ -11,7 +11,8 @@ from hilctl.identify.staged.layered import Layers, Point, loop_delay_s
 from hilctl.models.deadband import DeadbandFunction
 from hilctl.models.integrated import IntegratedModel
 from hilctl.models.plays import PlayModel
-from hilctl.models.staged import FieldLag, StagedModel, Structure
+from hilctl.models.staged import FieldLag, StagedModel
+from hilctl.models.structure import Structure
 
 HIGHEST_DAMPING = 10.0  # that a Structure takes
 STAGE_PARAMETERS = ("tau_s", "growth_per_unit", "natural_hz", "damping_ratio", "delay_s")

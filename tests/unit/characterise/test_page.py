@@ -11,6 +11,9 @@ from hilctl.characterise.page import (
     write_characterisation,
 )
 from hilctl.characterise.results import Measured, StepRow
+from hilctl.models.staged import StagedModel
+from hilctl.models.structure import Mode
+from tests.published import piezo_ppi
 from tests.unit.characterise.test_plots import SMALL
 from tests.unit.characterise.test_results import FOUND, LOOP, UNSEEN, identification
 
@@ -61,6 +64,23 @@ def test_a_page_is_written_over(tmp_path):
 
 
 def test_creep_is_a_figure_where_it_was_looked_for():
-    rows = dict(figure_rows(Measured(crept_percent=(2.44, -3.1)), "A"))
+    rows = dict(figure_rows(replace(FOUND, measured=Measured(crept_percent=(2.44, -3.1)))))
     assert rows["moves on in rests"] == "+2.4 % and -3.1 % in 4 s"
-    assert "moves on in rests" not in dict(figure_rows(Measured(), "A"))
+    assert "moves on in rests" not in dict(figure_rows(replace(FOUND, measured=Measured())))
+
+
+def test_further_modes_of_the_model_are_figures():
+    """Those that the small-signal response is not fitted with."""
+    mode = Mode(
+        natural_hz=602.0, damping_ratio=0.024, antiresonance_hz=633.0,
+        antiresonance_damping_ratio=0.02,
+    )  # fmt: skip
+    known = identification()
+    plain = dict(figure_rows(replace(FOUND, identification=known)))
+    assert "further mode, in the model" not in plain
+    model = StagedModel.around(piezo_ppi(), modes=(mode,))
+    ringing = replace(known, fit=replace(known.fit, model=model))
+    rows = dict(figure_rows(replace(FOUND, identification=ringing)))
+    assert rows["further mode, in the model"] == (
+        "602.0 Hz, damping ratio 0.024; antiresonance 633.0 Hz"
+    )

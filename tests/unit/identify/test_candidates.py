@@ -7,17 +7,21 @@ import pytest
 
 from hilctl.base.errors import DataError
 from hilctl.identify import candidates
-from hilctl.identify.candidates import LOOPS, choose_kind
+from hilctl.identify.candidates import LOOPS, Choice, choose_kind
 from hilctl.identify.command import settings_from
 from hilctl.identify.data.records import History, Record, SteadyLoop
 from hilctl.identify.held_out import HeldOut
 from hilctl.identify.job import ignore_progress
 from hilctl.identify.judge import Judgement
 from hilctl.identify.workers import one_by_one
+from hilctl.models.structure import Mode
 
 WAVE = np.sin(np.linspace(0.0, 6.0, 64))
 HISTORY = History("history", WAVE, 9.0 * WAVE, 100.0)
 LOOP = SteadyLoop("loop", WAVE, 9.0 * WAVE, 1.0)
+MODE = Mode(
+    natural_hz=20.0, damping_ratio=0.1, antiresonance_hz=18.0, antiresonance_damping_ratio=0.1
+)
 
 
 SMALL = {"field 0 8": 0.6, "generalised_duhem 12": 0.9, "field 0 32": 0.3, "field 3 32": 0.2}
@@ -32,7 +36,7 @@ def fake(monkeypatch: pytest.MonkeyPatch, errors: dict[str, float | None]) -> li
             "field": f"field {settings.drags} {settings.plays}",
             "generalised_duhem": f"generalised_duhem {settings.cells}",
         }.get(settings.kind, settings.kind)
-        seen.append((name, rest[-1]))
+        seen.append((name, rest[-2]))
         rms = errors[name]
         if rms is None:
             return None
@@ -46,7 +50,8 @@ def fake(monkeypatch: pytest.MonkeyPatch, errors: dict[str, float | None]) -> li
 
 
 def chosen(records: list[Record]) -> Any:
-    return choose_kind(records, settings_from("auto", []), "A", one_by_one, ignore_progress)
+    choice = Choice(tuple(records), settings_from("auto", []), "A")
+    return choose_kind(choice, one_by_one, ignore_progress)
 
 
 def test_the_kind_whose_small_model_does_well_is_tried_in_full(
@@ -99,3 +104,26 @@ def test_without_anything_held_out_there_is_no_choice(monkeypatch: pytest.Monkey
     fake(monkeypatch, dict.fromkeys(("field 0 8", "generalised_duhem 12", "integrated")))
     with pytest.raises(DataError, match="name a --model"):
         chosen([HISTORY])
+
+
+@pytest.mark.parametrize("looked_for", [True, False])
+def test_known_modes_are_for_kinds_that_look_for_them(
+    monkeypatch: pytest.MonkeyPatch, looked_for: bool
+) -> None:
+    given: list[tuple[str, bool, tuple[Mode, ...]]] = []
+
+    def held_out_error(records: Any, settings: Any, *rest: Any) -> HeldOut | None:
+        given.append((settings.kind, settings.creep_stage, rest[-1]))
+        return None
+
+    monkeypatch.setattr(candidates, "held_out_error", held_out_error)
+    texts = [f"modes={looked_for}".lower(), "creep_stage=false"]
+    choice = Choice((HISTORY,), settings_from("auto", texts), "A", (MODE,))
+    with pytest.raises(DataError, match="too few data"):
+        choose_kind(choice, one_by_one, ignore_progress)
+    known = (MODE,) if looked_for else ()
+    assert given == [
+        ("field", False, known),
+        ("generalised_duhem", False, known),
+        ("integrated", True, ()),
+    ]

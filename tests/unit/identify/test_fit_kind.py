@@ -1,5 +1,7 @@
 """A kind of model is fitted to what is left of records without creep, and creeps itself."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -10,6 +12,7 @@ from hilctl.identify.settings import FitSettings
 from hilctl.models.creep import Creep
 from hilctl.models.published import exponential_integrated
 from hilctl.models.staged import FieldLag, StagedModel
+from hilctl.models.structure import Mode
 
 RATE_HZ = 2000.0
 FIELD = FitSettings(kind="field", plays=8, drags=0, cells=8, knots=8)
@@ -62,6 +65,22 @@ def test_the_range_is_that_of_the_displacement_with_creep(records):
     low_um, high_um = fit_kind(records, FIELD, "A").model.output_range_um
     (record,) = records
     assert (low_um, high_um) == (record.displacement_um.min(), record.displacement_um.max())
+
+
+def test_known_modes_are_taken_off_the_records_and_put_into_the_model(records):
+    mode = Mode(
+        natural_hz=150.0, damping_ratio=0.1, antiresonance_hz=140.0, antiresonance_damping_ratio=0.1
+    )
+    (record,) = records
+    ringing_um = mode.forward(RATE_HZ).process(record.displacement_um)
+    moved = [replace(record, displacement_um=ringing_um)]
+    bare, with_it = fit_kind(records, FIELD, "A"), fit_kind(moved, FIELD, "A", modes=[mode])
+    assert with_it.model.modes == (mode,)
+    assert with_it.model.output_range_um == (ringing_um.min(), ringing_um.max())
+    assert with_it.parameters["antiresonance_hz_2"] == mode.antiresonance_hz
+    assert len(with_it.parameters) == len(bare.parameters) + 4
+    assert with_it.numbers > bare.numbers  # weights that come out as 0 do not count
+    assert error_um(with_it.model, moved) < 2.0 * error_um(bare.model, records)
 
 
 def test_kinds_without_stages_have_no_creep(records):

@@ -6,7 +6,8 @@ import pytest
 from hilctl.identify.data.records import SteadyLoop
 from hilctl.identify.judge import judge
 from hilctl.models.plays import PpiModel, RdpiModel
-from hilctl.models.staged import FieldLag, StagedModel, Structure
+from hilctl.models.staged import FieldLag, StagedModel
+from hilctl.models.structure import Structure
 
 PLAYS = {"direct": 4.0, "weights": (1.0, 2.0), "thresholds": (0.5, 1.5)}
 PPI = PpiModel(**PLAYS)

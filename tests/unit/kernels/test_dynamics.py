@@ -10,11 +10,12 @@ from scipy.signal import StateSpace, lsim
 from hilctl.kernels import dynamics
 from hilctl.kernels.hysteresis import rest_memory
 from hilctl.models.chain import smoothing_weights
-from hilctl.models.staged import FieldLag, Structure
+from hilctl.models.staged import FieldLag
+from hilctl.models.structure import Structure
 
 RATE_HZ = 20_000.0
 SIGNAL = 2.0 * np.sin(np.arange(400) / 9.0) + 0.6 * np.cos(np.arange(400) / 2.3)
-MOTION = Structure(natural_hz=1500.0, damping_ratio=0.1)._motion(1.0 / RATE_HZ)
+MOTION = Structure(natural_hz=1500.0, damping_ratio=0.1).motion(RATE_HZ)
 STREAMING = {
     "lag": (dynamics.lag_block, (0.3, 0.4), 1),
     "linear lag": (dynamics.lag_block, (0.3, 0.0), 1),

@@ -19,9 +19,11 @@ from hilctl.loop.plan import Plan
 from hilctl.models.base import Operator
 from hilctl.models.bouc_wen import BoucWenModel
 from hilctl.models.chain import Chain
+from hilctl.models.creep import Creep
 from hilctl.models.files import load_model
 from hilctl.models.spi import SpiModel
-from hilctl.models.staged import FieldLag, StagedModel, Structure
+from hilctl.models.staged import FieldLag, StagedModel
+from hilctl.models.structure import Mode, Structure
 from tests.fakes import FakeClock, FakeDevice, FakeFifoDevice, FakeHost, made_block
 from tests.published import piezo_ppi, terfenol_rdpi
 
@@ -30,6 +32,10 @@ LIMITS = CommandLimits(low=-5.0, high=5.0, slew_per_s=2000.0, safe=0.0, ramp_per
 SHIPPED = Path("configs/models")
 LAG = FieldLag(tau_s=2e-4, growth_per_unit=0.05)
 STRUCTURE = Structure(natural_hz=300.0, damping_ratio=0.1)
+MODE = Mode(
+    natural_hz=120.0, damping_ratio=0.05, antiresonance_hz=110.0, antiresonance_damping_ratio=0.05
+)
+CREEP = Creep(time_constants_s=(0.1, 1.0), shares=(0.02, 0.02))
 PPI = piezo_ppi().model_copy(update={"input_unit": "A", "output_offset_um": 0.25})
 MODELS = {
     "none": None,
@@ -41,6 +47,7 @@ MODELS = {
         command_span=(-5.0, 5.0), direct=8.0, hysteretic=1.0, beta=1.0, gamma=0.5
     ),
     "staged": StagedModel.around(terfenol_rdpi(), lag=LAG, structure=STRUCTURE, delay_s=1.3e-3),
+    "ringing": StagedModel.around(terfenol_rdpi(), structure=STRUCTURE, modes=(MODE,), creep=CREEP),
     "preisach": load_model(SHIPPED / "terfenol_staged_preisach.yaml"),
 }
 

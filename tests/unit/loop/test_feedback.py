@@ -18,7 +18,8 @@ from hilctl.experiment.parts import PiFeedbackConfig
 from hilctl.loop.compensator import Compensator
 from hilctl.loop.feedback import Feedback, Gains
 from hilctl.models.plays import PpiModel
-from hilctl.models.staged import FieldLag, StagedModel, Structure
+from hilctl.models.staged import FieldLag, StagedModel
+from hilctl.models.structure import Structure
 from tests.fakes import made_block
 
 RATE_HZ = 5000.0

@@ -9,7 +9,8 @@ from pydantic import ValidationError
 from hilctl.base.arrays import F64
 from hilctl.models.field import FieldLosses, FieldModel, OutputCurve
 from hilctl.models.files import dump_model, parse_model
-from hilctl.models.staged import StagedModel, Structure
+from hilctl.models.staged import StagedModel
+from hilctl.models.structure import Structure
 
 RATE_HZ = 50_000.0
 CURVE = OutputCurve(operators_um=(-60.0, 0.0, 60.0), displacement_um=(-50.0, 0.0, 45.0))

@@ -10,7 +10,8 @@ from hilctl.base.arrays import F64
 from hilctl.models.field import FieldLosses
 from hilctl.models.files import dump_model, parse_model
 from hilctl.models.generalised_duhem import GeneralisedDuhemModel
-from hilctl.models.staged import StagedModel, Structure
+from hilctl.models.staged import StagedModel
+from hilctl.models.structure import Structure
 
 RATE_HZ = 50_000.0
 LOSSES = FieldLosses(field_s=1e-4, output_s=2e-6, decay_s=3e-5, growth=0.1, bend=0.02, excess=0.05)

@@ -7,7 +7,8 @@ from pydantic import ValidationError
 from hilctl.models.base import Provenance
 from hilctl.models.files import dump_model, parse_model
 from hilctl.models.refined import RefinedModel, ResidualOperator, rest_um
-from hilctl.models.staged import FieldLag, StagedModel, Structure
+from hilctl.models.staged import FieldLag, StagedModel
+from hilctl.models.structure import Structure
 from tests.published import piezo_ppi, terfenol_rdpi
 
 RATE_HZ = 50_000.0

@@ -10,7 +10,8 @@ from hilctl.models.chain import smoothing_weights
 from hilctl.models.creep import Creep
 from hilctl.models.files import dump_model, parse_model
 from hilctl.models.published import exponential_integrated
-from hilctl.models.staged import FieldLag, StagedModel, Structure
+from hilctl.models.staged import FieldLag, StagedModel
+from hilctl.models.structure import Mode, Structure
 from tests.published import piezo_ppi, terfenol_rdpi
 
 RATE_HZ = 50_000.0
@@ -20,6 +21,9 @@ OMEGA = exponential_integrated(
     alpha=0.3, gamma_s=0.0, a_0=1.0, alpha_0=0.2, beta_0=0.3, g_0=6.0, alpha_1=0.3, beta_1=0.1,
     d_p=0.8, alpha_2=0.4, beta_2=0.1, d_n=0.8, plays=6, deadbands_a_side=2,
 )  # fmt: skip
+MODE = Mode(
+    natural_hz=600.0, damping_ratio=0.03, antiresonance_hz=630.0, antiresonance_damping_ratio=0.03
+)
 CREEP = Creep(time_constants_s=(0.02, 0.3), shares=(0.03, 0.02))
 STAGES = {
     "bare": {},
@@ -28,12 +32,19 @@ STAGES = {
     "delay": {"delay_s": 3 / RATE_HZ},
     "part of a sample": {"delay_s": 2.35 / RATE_HZ},
     "structure": {"structure": STRUCTURE},
+    "modes": {"lag": LAG, "modes": (MODE,)},
     "smoothing": {"lag": LAG, "smoothing_s": 1.0 / (2.0 * np.pi * 2200.0)},
     "creep": {"lag": LAG, "creep": CREEP},
-    "all": {"lag": LAG, "structure": STRUCTURE, "delay_s": 2.7e-5, "creep": CREEP},
+    "all": {
+        "lag": LAG,
+        "structure": STRUCTURE,
+        "modes": (MODE,),
+        "delay_s": 2.7e-5,
+        "creep": CREEP,
+    },
 }
 PREVIEW = {"bare": 1, "lag": 1, "linear lag": 1, "delay": 4, "part of a sample": 4, "structure": 12,
-           "creep": 1, "all": 14, "smoothing": 12}  # fmt: skip
+           "modes": 1, "creep": 1, "all": 14, "smoothing": 12}  # fmt: skip
 
 
 def sine(frequency_hz, n=12_000):
@@ -77,6 +88,8 @@ def test_around_takes_over_unit_ranges_and_provenance():
     ({"lag": {"tau_s": 1e-4, "growth_per_unit": -0.1}}, "greater than or equal to 0"),
     ({"structure": {"natural_hz": 0.0, "damping_ratio": 0.1}}, "greater than 0"),
     ({"structure": {"natural_hz": 100.0, "damping_ratio": 0.0}}, "greater than 0"),
+    ({"modes": ({**MODE.model_dump(), "damping_ratio": 0.0},)}, "greater than 0"),
+    ({"modes": (MODE,) * 9}, "at most 8 items"),
     ({"delay_s": -1e-6}, "greater than or equal to 0"),
     ({"delay_s": float("nan")}, "finite number"),
 ])  # fmt: skip
@@ -106,7 +119,14 @@ def test_model_answers_later_than_its_input():
     """No command shows in the displacement sampled when it is put out, nor before the delay."""
     step = np.zeros(40)
     step[10:] = 2.0
-    stages = ("bare", 11), ("lag", 11), ("structure", 11), ("delay", 14), ("creep", 11)
+    stages = (
+        ("bare", 11),
+        ("lag", 11),
+        ("structure", 11),
+        ("modes", 11),
+        ("delay", 14),
+        ("creep", 11),
+    )
     for name, first in stages:
         came = StagedModel.around(OMEGA, **STAGES[name]).forward(RATE_HZ).process(step)
         assert np.flatnonzero(came != came[0])[0] == first, name

@@ -23,7 +23,8 @@ from hilctl.identify.field.search import (
 )
 from hilctl.identify.field.stages import HIGH, LOW, Stages, row
 from hilctl.models.field import FieldLosses, FieldModel, OutputCurve
-from hilctl.models.staged import StagedModel, Structure
+from hilctl.models.staged import StagedModel
+from hilctl.models.structure import Structure
 
 RATE_HZ = 2000.0
 SIZE = Size(4, 1, 6, 5)

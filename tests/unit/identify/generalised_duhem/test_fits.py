@@ -13,7 +13,8 @@ from hilctl.identify.judge import judge
 from hilctl.identify.settings import FitSettings
 from hilctl.models.field import FieldLosses
 from hilctl.models.generalised_duhem import GeneralisedDuhemModel
-from hilctl.models.staged import StagedModel, Structure
+from hilctl.models.staged import StagedModel
+from hilctl.models.structure import Structure
 from tests.unit.models.test_generalised_duhem import duhem_model
 
 RATE_HZ = 20_000.0

@@ -9,7 +9,8 @@ import pytest
 from hilctl.identify.data.records import SteadyLoop
 from hilctl.identify.judge import judge
 from hilctl.models.files import dump_model, parse_model
-from hilctl.models.staged import FieldLag, StagedModel, Structure
+from hilctl.models.staged import FieldLag, StagedModel
+from hilctl.models.structure import Structure
 from tests.staged import GRID, fit, truth
 
 Loops = Callable[..., list[SteadyLoop]]

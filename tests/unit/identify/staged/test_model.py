@@ -16,7 +16,7 @@ from hilctl.identify.staged.model import (
     structure_of,
 )
 from hilctl.models.published import exponential_integrated
-from hilctl.models.staged import Structure
+from hilctl.models.structure import Structure
 
 HALF_S = 1e-5
 LAYERS = Layers(plays=2, deadbands=1, half_period_s=HALF_S)
