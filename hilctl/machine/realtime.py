@@ -9,11 +9,13 @@ import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from typing import Literal, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Literal, Protocol, TypeAlias
 
 from hilctl.base.errors import InputError
 from hilctl.machine.linux import DMA_LATENCY, LinuxProcess
-from hilctl.machine.settings import Realtime
+
+if TYPE_CHECKING:  # importing it early would decide whether a process checks what it gets
+    from hilctl.machine.settings import Realtime
 
 StepOutcome: TypeAlias = Literal["done", "refused", "not asked"]
 
@@ -29,7 +31,7 @@ PRIORITY_REMEDY = (
 )
 """What to do where SCHED_FIFO is refused, or its supervisor may not come before others."""
 
-_HEAP_BYTES = 8 << 20
+_HEAP_BYTES = 2 << 20
 _HEADROOM_BYTES = 256 << 20
 _FAVOURED_NICE = -10
 _FIRST_NICE = -20
@@ -137,7 +139,7 @@ def _lock_memory(system: System) -> SetUpStep:
     return _step("memory", detail, system.lock_memory, remedy)
 
 
-def _pin(settings: Realtime, system: System) -> SetUpStep:
+def _pin(settings: "Realtime", system: System) -> SetUpStep:
     cpu = settings.cpu
     if cpu is None:
         with suppress(OSError):
@@ -148,10 +150,10 @@ def _pin(settings: Realtime, system: System) -> SetUpStep:
     return _step("cpu", f"CPU {cpu}", lambda: system.pin(cpu), remedy)
 
 
-def _set_fifo(settings: Realtime, system: System) -> SetUpStep:
+def _set_fifo(settings: "Realtime", system: System, *, never_sleeps: bool) -> SetUpStep:
     priority = settings.priority
     throttling = _throttling(system)
-    if settings.wait == "spin" and throttling.startswith(_AT_MOST):
+    if never_sleeps and throttling.startswith(_AT_MOST):
         return _come_first(throttling, system)
     try:
         system.set_fifo(priority)
@@ -172,7 +174,7 @@ def _come_first(throttling: str, system: System) -> SetUpStep:
     The kernel takes its CPU for 50 ms of each second, so that others get their turn.
     """
     instead = _step("nice", f"nice {_FIRST_NICE}", lambda: system.set_nice(_FIRST_NICE)).detail
-    detail = f"it spins, and SCHED_FIFO gets {throttling}; instead, {instead}"
+    detail = f"it never sleeps, and SCHED_FIFO gets {throttling}; instead, {instead}"
     return SetUpStep("fifo", "not asked", detail, f"write -1 to {RT_RUNTIME}")
 
 
@@ -188,12 +190,15 @@ def _throttling(system: System) -> str:
 _THIS_PROCESS = LinuxProcess()
 
 
-def prepare(settings: Realtime, system: System = _THIS_PROCESS) -> tuple[SetUpStep, ...]:
+def prepare(
+    settings: "Realtime", system: System = _THIS_PROCESS, *, never_sleeps: bool = False
+) -> tuple[SetUpStep, ...]:
     """Take every step that is allowed; call it last, when all memory is mapped and warm.
 
     Args:
         settings: What the experiment asks for.
         system: The operating system.
+        never_sleeps: Whether the process is awake all the time.
 
     Returns:
         The steps in the order in which they were tried.
@@ -202,12 +207,12 @@ def prepare(settings: Realtime, system: System = _THIS_PROCESS) -> tuple[SetUpSt
     # taken from everybody else; SCHED_FIFO last, as the steps before it take milliseconds.
     return (
         _step("gc", "collected once, then off", system.freeze_gc),
+        _lock_memory(system),
         _step(
             "prefault",
             f"{_HEAP_BYTES >> 20} MB of heap and 512 kB of stack",
             lambda: system.prefault(_HEAP_BYTES),
         ),
-        _lock_memory(system),
         _step("timer_slack", "1 ns", lambda: system.set_timer_slack(1)),
         _step(
             "dma_latency",
@@ -216,7 +221,7 @@ def prepare(settings: Realtime, system: System = _THIS_PROCESS) -> tuple[SetUpSt
             'a udev rule: KERNEL=="cpu_dma_latency", GROUP="realtime", MODE="0660"',
         ),
         _pin(settings, system),
-        _set_fifo(settings, system),
+        _set_fifo(settings, system, never_sleeps=never_sleeps),
     )
 
 
@@ -240,7 +245,7 @@ def require(steps: Sequence[SetUpStep]) -> None:
         )
 
 
-def require_another_cpu(settings: Realtime, cpus: int) -> None:
+def require_another_cpu(settings: "Realtime", cpus: int) -> None:
     """Refuse to spin on the only CPU, where nobody could end the run any more.
 
     Args:

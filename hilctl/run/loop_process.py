@@ -22,7 +22,7 @@ from hilctl.kernels.interlock import interlock_block
 from hilctl.kernels.jit import load
 from hilctl.kernels.limit import limit_block
 from hilctl.loop.loop import Loop
-from hilctl.loop.pacer import SpinningClock, SystemClock
+from hilctl.loop.pacer import SpinningClock, SystemClock, spin_ns
 from hilctl.loop.plan import Outcome
 from hilctl.machine.memory import ProcessMemory
 from hilctl.machine.realtime import (
@@ -108,7 +108,8 @@ def run_job(
         HilctlError: It could not start, or broke; the output was put at its safe value.
     """
     config, device, page = loaded.config, loaded.device, ring.page
-    clock = SpinningClock() if config.realtime.wait == "spin" else SystemClock()
+    awake_ns = spin_ns(config.tick_s * 1e9) if config.realtime.wait == "spin" else 0
+    clock = SpinningClock(awake_ns) if awake_ns else SystemClock()
     host = RingHost(ring, clock, job.supervisor, job.silence_s)
     conditioning = conditioning_of(loaded, job.stands_um)
     reference, input_um = job.arrays()
@@ -126,7 +127,7 @@ def run_job(
     require_another_cpu(config.realtime, len(os.sched_getaffinity(0)))
     # After the warm-up, so that all it has mapped gets locked; before the device is opened, so that
     # a refusal moves nothing.
-    steps = prepare(config.realtime)
+    steps = prepare(config.realtime, never_sleeps=awake_ns >= config.tick_s * 1e9)
     if config.realtime.require:
         require(steps)
     device.open(config.sample_rate_hz, config.block)

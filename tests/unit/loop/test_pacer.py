@@ -6,13 +6,13 @@ from itertools import count
 import pytest
 
 from hilctl.loop.pacer import (
-    SPIN_NS,
     Lateness,
     LateRules,
     Pacer,
     SpinningClock,
     SystemClock,
     deadline_misses,
+    spin_ns,
 )
 from tests.fakes import FakeClock
 
@@ -224,7 +224,16 @@ def test_system_clock_sleeps_to_a_deadline():
     clock.sleep_until_ns(deadline_ns)
 
 
-def test_sleep_that_a_signal_interrupts_goes_on():
+@pytest.mark.parametrize("past_ns", [0, 1, 10**9])
+def test_the_kernel_is_not_asked_for_a_sleep_that_is_over(monkeypatch, past_ns):
+    """It takes a timer and a change of threads for it: a tick that is late would be later."""
+    clock = SystemClock()
+    monkeypatch.setattr(clock, "now_ns", lambda: 2 * 10**9)
+    monkeypatch.setattr(clock, "_nanosleep", lambda *_: 1 / 0)
+    clock.sleep_until_ns(2 * 10**9 - past_ns)
+
+
+def test_sleep_that_a_signal_interrupts_goes_on(monkeypatch):
     """To the same deadline, as it is absolute; any other error is one."""
     clock, codes, deadlines = SystemClock(), [errno.EINTR, errno.EINTR, 0], []
 
@@ -233,27 +242,44 @@ def test_sleep_that_a_signal_interrupts_goes_on():
         return codes.pop(0)
 
     clock._nanosleep = nanosleep
+    monkeypatch.setattr(clock, "now_ns", lambda: 2_000_000_000)
     clock.sleep_until_ns(3_000_000_007)
     assert deadlines == [(3, 7)] * 3
     codes.append(errno.EINVAL)
     with pytest.raises(OSError, match="Invalid argument") as caught:
-        clock.sleep_until_ns(0)
+        clock.sleep_until_ns(2_000_000_001)
     assert caught.value.errno == errno.EINVAL
 
 
-@pytest.mark.parametrize("ahead_ns", [SPIN_NS + 1, SPIN_NS, 0, -5])
+AWAKE_NS = 30_000
+
+
+@pytest.mark.parametrize("ahead_ns", [AWAKE_NS + 1, AWAKE_NS, 0, -5])
 def test_a_clock_that_spins_sleeps_until_shortly_before_a_time_and_then_looks(
     monkeypatch, ahead_ns
 ):
     """At a time that comes with each look, so that no sleep of the machine's is in it."""
-    clock, looks, slept_until = SpinningClock(), count(1_000_000, 50), []
+    clock, looks, slept_until = SpinningClock(AWAKE_NS), count(1_000_000, 50), []
     now = next(looks)
     monkeypatch.setattr(clock, "now_ns", lambda: next(looks))
     monkeypatch.setattr(SystemClock, "sleep_until_ns", lambda _, to_ns: slept_until.append(to_ns))
     deadline_ns = now + 50 + ahead_ns  # after the first look
     clock.sleep_until_ns(deadline_ns)
-    assert slept_until == ([deadline_ns - SPIN_NS] if ahead_ns > SPIN_NS else [])
+    assert slept_until == ([deadline_ns - AWAKE_NS] if ahead_ns > AWAKE_NS else [])
     assert deadline_ns <= next(looks) - 50 <= max(deadline_ns, now + 100) + 50
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "awake_ns"), [(100, 200_000), (1000, 200_000), (20_000, 30_000), (25_000, 24_000)]
+)
+def test_a_loop_that_spins_leaves_some_of_each_period_to_sleep_in(rate_hz, awake_ns):
+    """Else the kernel stops it; a long time awake before each tick gains nothing."""
+    assert spin_ns(1e9 / rate_hz) == awake_ns
+
+
+@pytest.mark.parametrize("rate_hz", [25_001, 50_000, 1e6])
+def test_a_period_too_short_to_sleep_in_is_spent_awake(rate_hz):
+    assert spin_ns(1e9 / rate_hz) >= 1e9 / rate_hz
 
 
 class TestTooLate:

@@ -27,7 +27,7 @@ from hilctl.machine.realtime import (
 )
 from hilctl.machine.settings import Realtime
 
-NAMES = ["gc", "prefault", "memory", "timer_slack", "dma_latency", "cpu", "fifo"]
+NAMES = ["gc", "memory", "prefault", "timer_slack", "dma_latency", "cpu", "fifo"]
 
 
 @dataclass
@@ -111,8 +111,8 @@ def test_every_step_is_taken_in_order():
     assert {step.outcome for step in steps} == {"done"}
     assert [asked[0] for asked in system.asked] == [
         "freeze_gc",
-        "prefault",
         "lock_memory",
+        "prefault",
         "set_timer_slack",
         "hold_dma_latency",
         "pin",
@@ -196,10 +196,10 @@ def test_throttling_is_reported(runtime, said):
 THROTTLED = {RT_RUNTIME: "950000\n", RT_PERIOD: "1000000\n"}
 
 
-def test_a_loop_that_spins_comes_first_without_being_real_time():
+def test_a_loop_that_never_sleeps_comes_first_without_being_real_time():
     """The kernel would keep it from its CPU for a twentieth of the time."""
     system = FakeSystem(files=THROTTLED)
-    step = by_name(prepare(Realtime(wait="spin"), system))["fifo"]
+    step = by_name(prepare(Realtime(), system, never_sleeps=True))["fifo"]
     assert step.outcome == "not asked"
     assert "at most 950000 of 1000000 us; instead, nice -20" in step.detail
     assert "write -1 to" in step.remedy
@@ -207,16 +207,20 @@ def test_a_loop_that_spins_comes_first_without_being_real_time():
     assert not [each for each in system.asked if each[0] == "set_fifo"]
 
 
-def test_a_loop_that_spins_says_where_it_may_not_come_first():
+def test_a_loop_that_never_sleeps_says_where_it_may_not_come_first():
     system = FakeSystem(files=THROTTLED, refuses={"set_nice"})
-    step = by_name(prepare(Realtime(wait="spin"), system))["fifo"]
+    step = by_name(prepare(Realtime(), system, never_sleeps=True))["fifo"]
     assert step.detail.endswith("nice -20: Operation not permitted")
 
 
-@pytest.mark.parametrize("files", [{}, {**THROTTLED, RT_RUNTIME: "-1\n"}])
-def test_a_loop_that_spins_is_real_time_where_nothing_is_taken_from_it(files):
+@pytest.mark.parametrize(
+    ("files", "never_sleeps"),
+    [({}, True), ({**THROTTLED, RT_RUNTIME: "-1\n"}, True), (THROTTLED, False)],
+)
+def test_it_is_real_time_where_nothing_is_taken_from_it(files, never_sleeps):
     system = FakeSystem(files=files)
-    assert by_name(prepare(Realtime(wait="spin"), system))["fifo"].outcome == "done"
+    steps = prepare(Realtime(wait="spin"), system, never_sleeps=never_sleeps)
+    assert by_name(steps)["fifo"].outcome == "done"
     assert system.nice_now == 0
 
 

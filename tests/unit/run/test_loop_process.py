@@ -71,7 +71,8 @@ class Prepared:
         memory = SimpleNamespace(release=lambda: self.device.events.append("small"))
         monkeypatch.setattr(loop_process, "ProcessMemory", lambda: memory)
 
-    def _prepare(self, settings):
+    def _prepare(self, settings, *, never_sleeps):
+        self.never_sleeps = never_sleeps
         assert settings is self.loaded.config.realtime
         self.device.events.append("prepare")
         return self.steps
