@@ -12,13 +12,12 @@ from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import Field, model_validator
 
 from hilctl.base.arrays import C128, F64, I64
 from hilctl.base.errors import InputError
 from hilctl.base.files import TextFiles, write_text
 from hilctl.base.segments import Segment
-from hilctl.base.strict import Strict
+from hilctl.base.strict import Field, Strict, model_validator
 from hilctl.base.values import Added, Values, held
 from hilctl.base.yaml.document import load_document
 from hilctl.base.yaml.plain import dump

@@ -2,9 +2,7 @@
 
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import BeforeValidator, Field
-
-from hilctl.base.strict import Strict
+from hilctl.base.strict import BeforeValidator, Field, Strict
 from hilctl.experiment.labels import Labels
 from hilctl.experiment.limits import Limits
 from hilctl.experiment.parts import (

@@ -5,9 +5,8 @@ import re
 from collections.abc import Sequence
 from typing import Annotated, Any, TypeAlias
 
-from pydantic import AfterValidator, BeforeValidator, Field, WithJsonSchema
-
 from hilctl.base.errors import ConfigError, Problem
+from hilctl.base.strict import AfterValidator, BeforeValidator, Field, WithJsonSchema
 from hilctl.recording.facts import LabelValue
 
 MOST_LABELS = 32

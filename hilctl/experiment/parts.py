@@ -3,15 +3,14 @@
 import re
 from typing import Annotated, Any, Literal, Self, TypeAlias
 
-from pydantic import (
+from hilctl.base.strict import (
     AfterValidator,
     BeforeValidator,
     Field,
+    Strict,
     WithJsonSchema,
     model_validator,
 )
-
-from hilctl.base.strict import Strict
 from hilctl.recording.facts import RECORDINGS
 
 _NAME = "[A-Za-z0-9][A-Za-z0-9_.-]{0,79}"

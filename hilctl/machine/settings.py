@@ -2,9 +2,7 @@
 
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field
-
-from hilctl.base.strict import Strict
+from hilctl.base.strict import BeforeValidator, Field, Strict
 
 
 def _none_or_number(value: Any) -> Any:
@@ -18,9 +16,9 @@ class Realtime(Strict):
         priority: Its SCHED_FIFO priority.
         cpu: CPU that it runs on; ``none`` takes the first isolated one, or else leaves it open.
         require: Whether a run without SCHED_FIFO and locked memory is refused.
-        wait: How it waits for a tick: ``sleep``, or ``spin``, which looks at the clock all the time
-            for the last 0.2 ms. No timer wakes it late then, but it takes a CPU for itself, and
-            another one has to be left for all the rest.
+        wait: How it waits for a tick: ``sleep``, or ``spin``, which wakes up to 0.2 ms early
+            and looks at the clock all the time until then. No timer wakes it late so, but it takes
+            most of a CPU, and another one has to be left for all the rest.
     """
 
     priority: Annotated[int, Field(ge=1, le=98)] = 80

@@ -4,8 +4,8 @@ from collections.abc import Iterator
 from typing import Literal, Self
 
 import numpy as np
-from pydantic import model_validator
 
+from hilctl.base.strict import model_validator
 from hilctl.kernels.implicit import BOUC_WEN
 from hilctl.models.base import refuse
 from hilctl.models.numeric_inverse import NOTHING, ImplicitModel, Packed

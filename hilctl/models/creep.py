@@ -3,10 +3,9 @@
 from typing import Annotated, Self
 
 import numpy as np
-from pydantic import Field, model_validator
 
 from hilctl.base.arrays import F64
-from hilctl.base.strict import Strict
+from hilctl.base.strict import Field, Strict, model_validator
 from hilctl.kernels.creep import creep_stage, uncreep_stage
 from hilctl.models.base import Operator, StageKernel, refuse, threshold_problems
 

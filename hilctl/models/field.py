@@ -5,10 +5,9 @@ from collections.abc import Iterator
 from typing import Annotated, Literal, Self
 
 import numpy as np
-from pydantic import Field, model_validator
 
 from hilctl.base.arrays import F64
-from hilctl.base.strict import Strict
+from hilctl.base.strict import Field, Strict, model_validator
 from hilctl.kernels.field import Bank, Losses, field_forward, field_inverse
 from hilctl.models.base import HysteresisModel, Operator, Thresholds, Weights, refuse
 from hilctl.models.preisach import cell_problems, table_problems

@@ -3,10 +3,8 @@
 from pathlib import Path
 from typing import Annotated, TypeAlias
 
-from pydantic import Field
-
 from hilctl.base.files import TextFiles
-from hilctl.base.strict import Strict
+from hilctl.base.strict import Field, Strict
 from hilctl.base.yaml.document import Document, load_document
 from hilctl.base.yaml.plain import dump
 from hilctl.models.base import HysteresisModel

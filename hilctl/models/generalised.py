@@ -4,10 +4,9 @@ from collections.abc import Iterator
 from typing import Literal, Self
 
 import numpy as np
-from pydantic import model_validator
 
 from hilctl.base.arrays import F64
-from hilctl.base.strict import Strict
+from hilctl.base.strict import Strict, model_validator
 from hilctl.kernels.envelope import envelope_forward, envelope_inverse
 from hilctl.models.base import (
     Operator,

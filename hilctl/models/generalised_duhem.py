@@ -4,9 +4,9 @@ from collections.abc import Iterator
 from typing import Literal, Self, TypeAlias
 
 import numpy as np
-from pydantic import model_validator
 
 from hilctl.base.arrays import F64
+from hilctl.base.strict import model_validator
 from hilctl.kernels.generalised_duhem import Band, Losses, duhem_forward, duhem_inverse
 from hilctl.models.base import HysteresisModel, Operator, Weights, refuse
 from hilctl.models.field import FieldLosses

@@ -3,9 +3,9 @@
 from typing import Literal
 
 import numpy as np
-from pydantic import Field
 
 from hilctl.base.arrays import F64
+from hilctl.base.strict import Field
 from hilctl.kernels.hysteresis import integrated_forward, integrated_inverse_stage
 from hilctl.models.base import Operator
 from hilctl.models.deadband import DeadbandFunction

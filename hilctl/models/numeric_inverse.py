@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
-from pydantic import model_validator
 
 from hilctl.base.arrays import F64
+from hilctl.base.strict import model_validator
 from hilctl.kernels.implicit import implicit_forward, implicit_inverse_stage
 from hilctl.models.base import HysteresisModel, Operator
 

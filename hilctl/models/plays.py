@@ -3,10 +3,10 @@
 from typing import Literal, Self
 
 import numpy as np
-from pydantic import Field, model_validator
 
 from hilctl.base.arrays import F64
 from hilctl.base.errors import ModelError
+from hilctl.base.strict import Field, model_validator
 from hilctl.kernels.hysteresis import play_sum, play_sum_stage
 from hilctl.models.base import (
     HysteresisModel,

@@ -4,8 +4,8 @@ from collections.abc import Iterator, Sequence
 from typing import Literal, Self
 
 import numpy as np
-from pydantic import model_validator
 
+from hilctl.base.strict import model_validator
 from hilctl.kernels.implicit import PREISACH
 from hilctl.models.base import Thresholds, Weights, refuse
 from hilctl.models.numeric_inverse import ImplicitModel, Packed

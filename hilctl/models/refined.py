@@ -6,10 +6,9 @@ from itertools import combinations
 from typing import Annotated, Any, Literal, Self, TypeAlias
 
 import numpy as np
-from pydantic import Field, model_validator
 
 from hilctl.base.arrays import F64
-from hilctl.base.strict import Strict
+from hilctl.base.strict import Field, Strict, model_validator
 from hilctl.kernels.residual import Tables, residual_forward, residual_inverse
 from hilctl.models.base import (
     HysteresisModel,

@@ -18,10 +18,9 @@ import math
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import Field, model_validator
 
 from hilctl.base.arrays import F64
-from hilctl.base.strict import Strict
+from hilctl.base.strict import Field, Strict, model_validator
 from hilctl.kernels.dynamics import lag_block, lead_stage, weigh_block
 from hilctl.models.base import HysteresisModel, Operator, Provenance, refuse
 from hilctl.models.chain import Chain, between, delayed, smoothing_weights

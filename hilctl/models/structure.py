@@ -3,12 +3,11 @@
 import math
 
 import numpy as np
-from pydantic import Field
 
 from hilctl.base.arrays import C128, F64
 from hilctl.base.errors import ModelError
 from hilctl.base.exponential import exponential
-from hilctl.base.strict import Strict
+from hilctl.base.strict import Field, Strict
 from hilctl.kernels.dynamics import structure_block
 from hilctl.kernels.modes import mode_stage, unmode_stage
 from hilctl.models.base import Operator

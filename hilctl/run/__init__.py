@@ -3,14 +3,15 @@
 start.py           from an experiment file to a finished run
 step.py            one run of several, and by what its recording is known
 architecture.py    processors that a run may be on
-job.py             the experiment as it goes to the loop's process
+job.py             what was checked as it goes to the loop's process
 assemble.py        from a checked experiment to the plan of its loop
 supervisor.py      starts loop, guardian and recorder; started_run.py  sees to them to the end
 child.py           the supervisor's hold on the loop's process; hang_watch.py  whether it hangs
 guardian.py        a process that makes the output safe where the loop can't, started by
                    guardian_process.py; safety.py  sees to it, and stands in for it;
                    safe_action.py  what both do then
-loop_process.py    the loop's process; host.py  its side of the shared memory,
+loop_process.py    the loop's process; carried_out.py  what it does with its job,
+                   host.py  its side of the shared memory,
                    waiting_loop.py  started before its run is known
 starting.py        where the output is before a run
 reference_window.py  a reference that is longer than memory, worked out ahead of the loop

@@ -9,7 +9,7 @@ from hilctl.experiment.adaptation import make_adaptation
 from hilctl.experiment.feedback import make_feedback
 from hilctl.experiment.file import Experiment
 from hilctl.experiment.interlocks import interlock_context
-from hilctl.experiment.load import LoadedExperiment
+from hilctl.experiment.run_parts import RunParts
 from hilctl.loop.adaptation import DisplacementOperator
 from hilctl.loop.compensator import Compensator
 from hilctl.loop.conditioning import Conditioning
@@ -22,7 +22,7 @@ _MISSED_WINDOW_S = 10.0
 
 
 def assemble(
-    loaded: LoadedExperiment,
+    parts: RunParts,
     reference: F64,
     input_um: F64,
     state: F64 | None,
@@ -36,7 +36,7 @@ def assemble(
     """Return what a run does; its compensator is warmed up.
 
     Args:
-        loaded: The experiment.
+        parts: Of the experiment.
         reference: float64[n], in the waveform's unit; a window of it where there is one.
         input_um: float64[n], the compensator's input; the same.
         state: The compensator's memory before the first sample; at rest where None.
@@ -46,10 +46,10 @@ def assemble(
         paced: Whether the run keeps real time; else no tick is late.
         heat_a2: Heat of the coil before it, in A^2.
     """
-    config, info = loaded.config, loaded.device.info
+    config, info = parts.config, parts.device.info
     rate_hz = config.sample_rate_hz
     policy = _late_policy(config, info) if paced else "catch_up"
-    compensator = Compensator(loaded.model, rate_hz)
+    compensator = Compensator(parts.model, rate_hz)
     compensator.warm_up()
     if state is not None:
         compensator.restore(state)

@@ -41,7 +41,7 @@ class LoopChild:
         self._page = ring.page
         job = Job.of(checked, folder, supervisor=os.getpid(), silence_s=silence_s)
         # One that died at once is reported by await_ready.
-        self._process = taken().give(job.to_json(), inherits)
+        self._process = taken().give(job.to_bytes(), inherits)
 
     def await_ready(self, stopped: Callable[[], bool]) -> None:
         """Wait until it needs only the start signal.

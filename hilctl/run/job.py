@@ -1,58 +1,103 @@
-"""What the supervisor hands to the loop's process: the checked experiment and its arrays."""
+"""What the supervisor hands to the loop's process: the checked experiment and its arrays.
 
-import json
+It goes there as it is, checks and files behind it, so that process imports nothing that checks or
+reads files: no pydantic, no YAML. Only a device that can't go there before it is opened, as it
+holds what a process has for itself, is made there anew, and checked once more.
+"""
+
+import pickle
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
 from hilctl.base.arrays import F64
+from hilctl.base.device import Device
 from hilctl.base.errors import RunError
-from hilctl.base.files import TextFiles
 from hilctl.base.values import Values, in_memory
-from hilctl.base.yaml.document import Document
-from hilctl.experiment.load import LoadedExperiment, resolve
+from hilctl.experiment.file import Experiment
 from hilctl.loop.adaptation import DisplacementOperator
 from hilctl.loop.window import window_size
+from hilctl.models.base import HysteresisModel
+from hilctl.run.waiting_loop import CHECKING, PLAIN
 
 if TYPE_CHECKING:  # the loop's process has no use for what these import
     from hilctl.experiment.check import Checked
+    from hilctl.experiment.load import LoadedExperiment
     from hilctl.run.run_folder import RunFolder
+
+_OURS = "hilctl_drivers."
 
 
 @dataclass(frozen=True, slots=True)
-class Job:
-    """One run, as text.
+class DeviceText:
+    """A device as text.
 
     Attributes:
         experiment: The experiment as YAML, command-line settings included.
         files: Texts of the files that it refers to, as they were checked, by absolute path.
         folder: Folder that file names in it are relative to.
-        ring: File of the ring.
-        reference: File of the reference samples, or of a window of them.
-        input_um: File of the compensator's input, or of a window of it.
-        samples: Samples of the waveform: of a window, there are more than it has.
-        state: The compensator's memory before the first sample; None where it is at rest.
-        heat_a2: Heat of the coil before the run, in A^2.
-        stands_um: Displacement there by the model, where the sensor is held against it.
-        operator: What the run adapts, as lists; None where nothing is adapted.
-        supervisor: The supervisor's process number.
-        silence_s: Longest that it may be silent.
     """
 
     experiment: str
     files: Mapping[str, str]
     folder: str
-    ring: str
+
+    def made(self) -> Device:
+        """Return the device; nothing is read from disk."""
+        from hilctl.base.files import TextFiles
+        from hilctl.base.yaml.document import Document
+        from hilctl.experiment.device import made_device
+
+        document = Document("experiment", self.experiment)
+        device = made_device(document, Path(self.folder), TextFiles(self.files))
+        assert device is not None  # it was checked
+        return device
+
+
+@dataclass(frozen=True, slots=True)
+class GivenParts:
+    """See :class:`hilctl.experiment.run_parts.RunParts`."""
+
+    config: Experiment
+    device: Device
+    model: HysteresisModel | None
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """One run.
+
+    Attributes:
+        config: The experiment.
+        model: The compensator's model; None where nothing compensates.
+        device: Not opened, pickled; or what it is made from.
+        ring: File of the ring.
+        reference: File of the reference samples, or of a window of them.
+        input_um: File of the compensator's input, or of a window of it.
+        samples: Samples of the waveform: of a window, there are more than it has.
+        state: float64[s], the compensator's memory before the first sample; None where it is at
+            rest.
+        heat_a2: Heat of the coil before the run, in A^2.
+        stands_um: Displacement there by the model, where the sensor is held against it.
+        adapted: What the run adapts; None where nothing is adapted.
+        supervisor: The supervisor's process number.
+        silence_s: Longest that it may be silent.
+    """
+
+    config: Experiment
+    model: HysteresisModel | None
+    device: bytes | DeviceText
+    ring: Path
     reference: str
     input_um: str
     samples: int
-    state: list[float] | None
+    state: F64 | None
     heat_a2: float
     stands_um: float | None
-    operator: list[Any] | None
+    adapted: DisplacementOperator | None
     supervisor: int
     silence_s: float
 
@@ -70,10 +115,9 @@ class Job:
         from hilctl.run.description import RunDescription
 
         begun, values = checked.begun, checked.reference.values
-        size = values.size
+        loaded, size = checked.loaded, values.size
         if not in_memory(values):
-            config = checked.loaded.config
-            size = window_size(config.block, config.sample_rate_hz)
+            size = window_size(loaded.config.block, loaded.config.sample_rate_hz)
         reference = input_um = folder.reference
         _save(reference, values, size)
         if begun.input_um is not values:
@@ -81,55 +125,56 @@ class Job:
             _save(input_um, begun.input_um, size)
         RunDescription.of(checked).write(folder.description)
         return cls(
-            experiment=checked.loaded.yaml_text,
-            files=checked.loaded.files.texts,
-            folder=str(checked.loaded.folder.resolve()),
-            ring=str(folder.ring),
+            config=loaded.config,
+            model=loaded.model,
+            device=_device(loaded),
+            ring=folder.ring,
             reference=str(reference),
             input_um=str(input_um),
             samples=values.size,
-            state=None if begun.state is None else begun.state.tolist(),
+            state=begun.state,
             heat_a2=checked.heat_a2,
             stands_um=begun.stands_um,
-            operator=None if checked.operator is None else checked.operator.to_lists(),
+            adapted=checked.operator,
             supervisor=supervisor,
             silence_s=silence_s,
         )
 
-    def to_json(self) -> str:
-        """Return the fields as JSON."""
-        return json.dumps(asdict(self))
+    def to_bytes(self) -> bytes:
+        """Return whether it needs checks, :data:`PLAIN` or :data:`CHECKING`, and its fields."""
+        needs = PLAIN if isinstance(self.device, bytes) else CHECKING
+        return needs + pickle.dumps(self)
 
-    @classmethod
-    def from_json(cls, text: str) -> Self:
-        """Undo :meth:`to_json`."""
-        return cls(**json.loads(text))
+    @staticmethod
+    def from_bytes(data: bytes) -> "Job":
+        """Undo :meth:`to_bytes`, for what comes from a process of the same run."""
+        job: Job = pickle.loads(data[1:])  # noqa: S301  its maker is this process's own
+        return job
 
-    @property
-    def ring_path(self) -> Path:
-        """File of the ring."""
-        return Path(self.ring)
-
-    @property
-    def memory(self) -> F64 | None:
-        """The compensator's memory before the first sample: float64[s]; None at rest."""
-        return None if self.state is None else np.array(self.state)
-
-    def load(self) -> LoadedExperiment:
-        """Return the experiment, from the texts that were checked: nothing is read from disk."""
-        document = Document("experiment", self.experiment)
-        return resolve(document, Path(self.folder), files=TextFiles(self.files))
-
-    @property
-    def adapted(self) -> DisplacementOperator | None:
-        """What the run adapts; None where nothing is adapted."""
-        return None if self.operator is None else DisplacementOperator.from_lists(self.operator)
+    def parts(self) -> GivenParts:
+        """Return what was checked: nothing is read from disk."""
+        given = self.device
+        device: Device = (
+            pickle.loads(given) if isinstance(given, bytes) else given.made()  # noqa: S301
+        )
+        return GivenParts(self.config, device, self.model)
 
     def arrays(self) -> tuple[F64, F64]:
         """Return reference and input, one array where they are the same: float64[n], mapped."""
         reference = _mapped(self.reference)
         same = self.input_um == self.reference
         return reference, reference if same else _mapped(self.input_um)
+
+
+def _device(loaded: "LoadedExperiment") -> bytes | DeviceText:
+    """Return a device as it is; one that can't be had so, or is of others, as its text."""
+    device = loaded.device
+    if type(device).__module__.startswith(_OURS):  # others may count on their options' checks
+        try:
+            return pickle.dumps(device)
+        except (TypeError, AttributeError, pickle.PicklingError):  # it holds what can't go there
+            pass
+    return DeviceText(loaded.yaml_text, loaded.files.texts, str(loaded.folder.resolve()))
 
 
 def _save(path: Path, values: Values, size: int) -> None:

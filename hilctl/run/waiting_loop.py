@@ -12,6 +12,8 @@ import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 
+PLAIN, CHECKING = b"p", b"c"
+"""First byte of a job: whether what it holds needs no checks in the loop's process."""
 _MOST_LOCKS = 64
 _ERRORS = 2
 _WITH_ERRORS, _WITHOUT = b"e", b"-"
@@ -36,11 +38,11 @@ class WaitingLoop:
                 start_new_session=True,  # a Ctrl-C in the terminal is the supervisor's to handle
             )
 
-    def give(self, job: str, inherits: Sequence[int]) -> "subprocess.Popen[bytes]":
+    def give(self, job: bytes, inherits: Sequence[int]) -> "subprocess.Popen[bytes]":
         """Give it its job, and return it.
 
         Args:
-            job: JSON of an object.
+            job: See :meth:`hilctl.run.job.Job.to_bytes`.
             inherits: Descriptors of locks that it is to hold.
         """
         with self._socket, suppress(BrokenPipeError, ConnectionResetError):  # it died: seen later
@@ -48,7 +50,7 @@ class WaitingLoop:
             first = _WITH_ERRORS if errors else _WITHOUT
             # With the first byte: the loop holds the locks before it can know what to do.
             socket.send_fds(self._socket, [first], [*errors, *inherits])
-            self._socket.sendall(job.encode())
+            self._socket.sendall(job)
             # Not by closing alone: a process that was forked meanwhile has this end too.
             self._socket.shutdown(socket.SHUT_WR)
         return self._process
@@ -60,7 +62,7 @@ class WaitingLoop:
         self._process.wait()
 
 
-def received_job(descriptor: int) -> str:
+def received_job(descriptor: int) -> bytes:
     """Return what :meth:`WaitingLoop.give` gave, in the loop's process; empty where none comes.
 
     This process's standard error is that of who gave it from then on, and descriptors that come
@@ -75,8 +77,8 @@ def received_job(descriptor: int) -> str:
             os.dup2(descriptors[0], _ERRORS)
             os.close(descriptors[0])
         with connection.makefile("rb") as rest:
-            return rest.read().decode()
-    return ""
+            return rest.read()
+    return b""
 
 
 def _is_open(descriptor: int) -> bool:

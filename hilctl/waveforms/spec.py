@@ -7,14 +7,7 @@ reference into a command, A or V where none stands between.
 import math
 from typing import Annotated, Any, Literal, TypeAlias
 
-from pydantic import (
-    AfterValidator,
-    Field,
-    ValidationInfo,
-    field_validator,
-)
-
-from hilctl.base.strict import Strict
+from hilctl.base.strict import AfterValidator, Field, Strict, ValidationInfo, field_validator
 
 WaveformUnit: TypeAlias = Literal["um", "A", "V"]
 Positive: TypeAlias = Annotated[float, Field(gt=0.0)]

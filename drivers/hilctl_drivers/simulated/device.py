@@ -9,12 +9,11 @@ from abc import abstractmethod
 from typing import ClassVar, Literal
 
 import numpy as np
-from pydantic import Field
 
 from hilctl.base.arrays import F64
 from hilctl.base.device import DeviceInfo, DeviceOptions
 from hilctl.base.errors import DeviceError
-from hilctl.base.strict import Strict
+from hilctl.base.strict import Field, Strict
 from hilctl_drivers.device import DacDevice
 from hilctl_drivers.simulated.plant import Plant
 

@@ -2,9 +2,8 @@
 
 from typing import Annotated, TypeAlias
 
-from pydantic import Field
-
 from hilctl.base.device import DeviceOptions
+from hilctl.base.strict import Field
 
 TimeConstant: TypeAlias = Annotated[float, Field(ge=1e-3, le=1e5)]
 

@@ -3,9 +3,8 @@
 from dataclasses import asdict, replace
 from typing import Annotated, Any, ClassVar, Literal, Self, TypeAlias
 
-from pydantic import Field, model_validator
-
 from hilctl.base.device import DeviceInfo, DeviceOptions
+from hilctl.base.strict import Field, model_validator
 from hilctl_drivers.simulated.device import (
     FIFO_DEPTH,
     MAX_RATE_HZ,

@@ -35,7 +35,7 @@ def started(tmp_path, monkeypatch):
 
     monkeypatch.setattr(module, "taken", lambda: SimpleNamespace(give=give))
     monkeypatch.setattr(
-        module.Job, "of", lambda *a, **k: SimpleNamespace(to_json=lambda: '{"job": 1}')
+        module.Job, "of", lambda *a, **k: SimpleNamespace(to_bytes=lambda: b"a job")
     )
     ring = SampleRing.create(tmp_path / "ring", slots=4, block=1, state_size=1)
     return LoopChild(None, None, ring, (5, 6), 1.0), ring.page
@@ -47,7 +47,7 @@ def never():
 
 def test_the_job_is_given_with_the_locks(started):
     process = started[0]._process
-    assert process.job == '{"job": 1}'
+    assert process.job == b"a job"
     assert process.inherits == (5, 6)
 
 

@@ -40,7 +40,7 @@ def descriptors_of(path):
 def test_a_job_comes_whole_and_brings_the_locks(waiting, tmp_path):
     """Also where a process that was forked meanwhile has the sender's end too."""
     path = tmp_path / "lock"
-    job = '{"text": "' + "ä" * 20_000 + '"}'
+    job = b"\x00\xff\n" * 20_000
     with path.open("w") as lock, waiting._socket.dup():
         process = waiting.give(job, [lock.fileno()])
         lock.close()
@@ -56,9 +56,9 @@ def test_its_errors_are_the_runs_from_the_job_on(waiting, tmp_path, monkeypatch)
     mine = (tmp_path / "errors").open("w+")
     theirs = os.open(os.devnull, os.O_WRONLY)
     monkeypatch.setattr(module, "_ERRORS", mine.fileno())
-    process = waiting.give("{}", [])
+    process = waiting.give(b"p{}", [])
     monkeypatch.setattr(module, "_ERRORS", theirs)
-    assert received_job(process.stdin) == "{}"
+    assert received_job(process.stdin) == b"p{}"
     os.write(theirs, b"broken")
     os.close(theirs)
     assert mine.seek(0) == 0
@@ -68,20 +68,20 @@ def test_its_errors_are_the_runs_from_the_job_on(waiting, tmp_path, monkeypatch)
 
 def test_a_run_without_standard_error_has_a_loop_without(waiting, monkeypatch):
     monkeypatch.setattr(module, "_ERRORS", 10_000)
-    process = waiting.give("{}", [])
-    assert received_job(process.stdin) == "{}"
+    process = waiting.give(b"p{}", [])
+    assert received_job(process.stdin) == b"p{}"
 
 
 def test_a_loop_that_died_is_seen_later(waiting):
     """What could not be sent is no error here: the supervisor asks how it ended."""
     os.close(waiting._process.stdin)
-    assert waiting.give("{}", []) is waiting._process
+    assert waiting.give(b"p{}", []) is waiting._process
 
 
 def test_where_no_job_comes_there_is_none():
     ours, theirs = socket.socketpair()
     ours.close()
-    assert received_job(theirs.detach()) == ""
+    assert received_job(theirs.detach()) == b""
 
 
 def test_one_that_nobody_takes_is_ended(waiting, monkeypatch):

@@ -1,0 +1,146 @@
+"""A job carried out by the loop's process: prepares everything, runs the loop, says how it went.
+
+It prints nothing and writes no file: all it has to say goes into the ring's page.
+"""
+
+import json
+import os
+import time
+from collections.abc import Callable
+
+from hilctl.base.errors import DeviceError, HilctlError, InputError, RunError
+from hilctl.experiment.condition import conditioning_of
+from hilctl.experiment.run_parts import RunParts
+from hilctl.loop.loop import Loop
+from hilctl.loop.pacer import SpinningClock, SystemClock, spin_ns
+from hilctl.loop.plan import Outcome
+from hilctl.machine.memory import ProcessMemory
+from hilctl.machine.realtime import (
+    prepare,
+    refusals,
+    require,
+    require_another_cpu,
+    step_facts,
+)
+from hilctl.machine.usage import ProcessUsage
+from hilctl.run.assemble import assemble
+from hilctl.run.host import RingHost, SharedWindow
+from hilctl.run.job import Job
+from hilctl.run.ring import SampleRing
+from hilctl.run.shared_page import Field, PageText, Phase, SharedPage
+from hilctl.run.starting import starting_output
+
+
+def carry_out(data: bytes, all_compiled: Callable[[], None]) -> int:
+    """Carry out a job, and leave what came of it in the ring's page; return the exit code.
+
+    Args:
+        data: See :meth:`hilctl.run.job.Job.to_bytes`.
+        all_compiled: See :func:`run_job`.
+    """
+    job = Job.from_bytes(data)
+    ring = SampleRing(job.ring)
+    page = ring.page
+    try:
+        outcome = run_job(job, ring, job.parts(), all_compiled)
+    except InputError as error:  # before anything has moved
+        return _failed(page, str(error), Phase.REFUSED)
+    except HilctlError as error:
+        return _failed(page, str(error))
+    except Exception as error:  # noqa: BLE001  the supervisor must know it and make the rig safe
+        return _failed(page, f"the loop broke: {type(error).__name__}: {error}")
+    page.leave_outcome(outcome)
+    return 0
+
+
+def _failed(page: SharedPage, text: str, phase: Phase = Phase.FAILED) -> int:
+    # The text first: the phase says that it is there.
+    page.write_text(PageText.ERROR, text)
+    page.put(Field.PHASE, phase)
+    return 1
+
+
+def run_job(
+    job: Job,
+    ring: SampleRing,
+    parts: RunParts,
+    all_compiled: Callable[[], None] = lambda: None,
+) -> Outcome:
+    """Run a job, from set-up to the closed device.
+
+    Args:
+        job: What to run, and for whom.
+        ring: Where samples go.
+        parts: Of the experiment.
+        all_compiled: Called before the first tick, when no more kernel is needed.
+
+    Raises:
+        HilctlError: It could not start, or broke; the output was put at its safe value.
+    """
+    config, device, page = parts.config, parts.device, ring.page
+    awake_ns = spin_ns(config.tick_s * 1e9) if config.realtime.wait == "spin" else 0
+    clock = SpinningClock(awake_ns) if awake_ns else SystemClock()
+    host = RingHost(ring, clock, job.supervisor, job.silence_s)
+    conditioning = conditioning_of(parts, job.stands_um)
+    reference, input_um = job.arrays()
+    plan = assemble(
+        parts,
+        reference,
+        input_um,
+        job.state,
+        conditioning,
+        operator=job.adapted,
+        window=SharedWindow(page, job.samples) if job.samples > reference.size else None,
+        heat_a2=job.heat_a2,
+    )
+    loop = Loop(plan, device, host)
+    require_another_cpu(config.realtime, len(os.sched_getaffinity(0)))
+    # After the warm-up, so that all it has mapped gets locked; before the device is opened, so that
+    # a refusal moves nothing.
+    steps = prepare(config.realtime, never_sleeps=awake_ns >= config.tick_s * 1e9)
+    if config.realtime.require:
+        require(steps)
+    device.open(config.sample_rate_hz, config.block)
+    try:
+        waveform_at = loop.begin_at(starting_output(device, config.safe.at_start))
+    except BaseException:
+        device.close()  # and no safe value: what starts elsewhere is not to step there
+        raise
+    try:
+        # A device may load kernels of its own when it is opened.
+        all_compiled()
+        ProcessMemory().release()
+        page.put(Field.WAVEFORM_AT, waveform_at)
+        page.write_text(PageText.SET_UP, json.dumps([step_facts(steps), refusals(steps)]))
+        # After the text, which the supervisor reads then.
+        page.put(Field.PHASE, Phase.READY)
+        start_ns = _await_go(page, host)
+        page.put(Field.PHASE, Phase.RUNNING)
+        before = ProcessUsage.now()
+        outcome = loop.run(start_ns)
+        page.leave_usage(ProcessUsage.now().since(before))
+        # Before the device is closed: that may take its time-outs, and is no hang.
+        host.closing()
+    except BaseException as error:
+        try:
+            device.make_safe(config.safe.value)
+        except DeviceError as second:
+            # The cause first: a device that can't be reached is often only what follows from it.
+            cause = str(error) if isinstance(error, HilctlError) else f"the loop broke: {error!r}"
+            text = f"{cause}; the safe value could not be confirmed: {second}"
+            raise RunError(text) from error
+        raise
+    finally:
+        device.close()
+        page.leave_lateness(loop.lateness)
+    return outcome
+
+
+def _await_go(page: SharedPage, host: RingHost) -> int:
+    """Return when the first tick is due."""
+    while not page.get(Field.GO):
+        if not host.supervised():
+            # The loop ends in its first tick then: by its ramp, where the output is not at rest.
+            return host.clock.now_ns()
+        time.sleep(0.001)
+    return page.get(Field.START_NS)
