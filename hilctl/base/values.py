@@ -8,8 +8,8 @@ import numpy as np
 
 from hilctl.base.arrays import F64
 
-IN_MEMORY = 1_000_000
-"""Most of them that are held as an array, 8 MB; longer ones are worked out part by part."""
+IN_MEMORY = 400_000
+"""Most of them that are held as an array, 3 MB; longer ones are worked out part by part."""
 
 CHUNK = 1_000_000
 """Values that are looked at together."""

@@ -18,14 +18,17 @@ _NOT_IN_A_TICK = (
     "libgfortran",
     "libquadmath",
     "libstdc++",
-    "/numpy/random/",
     "/numpy/linalg/",
     "/numpy/fft/",
     "/scipy/",
     "libcrypto",
     "_pydantic_core",
     "/_yaml",
+    "/unicodedata.",
+    "/_decimal.",
+    "/locale/",
 )
+_AS_FAR_AS_TOUCHED = ("[heap]", "/numpy/random/")
 _RESERVED_BYTES = 8 << 20  # stacks of threads and BLAS' buffers are reserved, and never filled
 _LOCK_ON_FAULT = 7  # MCL_CURRENT | MCL_FUTURE | MCL_ONFAULT
 _DONTNEED = 4
@@ -64,7 +67,8 @@ class Mapping:
     def whole(self) -> bool:
         """Whether all of it is to be in RAM before the first tick."""
         readable = self.access[0] == "r" and not self.path.startswith("[v")  # the kernel's own
-        return readable and (self.of_file or self.size < _RESERVED_BYTES or self.path == "[heap]")
+        touched = any(part in self.path for part in _AS_FAR_AS_TOUCHED)
+        return readable and not touched and (self.of_file or self.size < _RESERVED_BYTES)
 
     @property
     def of_file(self) -> bool:

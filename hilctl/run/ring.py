@@ -289,6 +289,9 @@ class SampleRing:
         self._clean(slice(0, max(0, first + count - self.slots)))
         self._released = until
         self.page.put(Field.TAIL, until)
+        # They stay in the ring; this process maps again what it looks at, some at a time, and does
+        # not have all of it in its memory as soon as it has been round once.
+        self._map.madvise(mmap.MADV_DONTNEED)
 
     def _clean(self, slots: slice) -> None:
         """Let slots hold no flag and no answer."""
