@@ -15,6 +15,8 @@ from hilctl.base.device import DeviceInfo, DeviceOptions
 from hilctl.base.errors import DeviceError
 from hilctl_drivers.wire.timing import RateLimit
 
+_SHORT = 64
+
 
 class DacDevice(ABC):
     """A :class:`~hilctl.base.device.Device`; back ends implement the underscored methods.
@@ -107,10 +109,7 @@ class DacDevice(ABC):
         block = self._block
         if not command.size == displacement_um.size == measured.size == block or not block:
             self._check_sizes(command, displacement_um, measured)
-        if block == 1:  # most devices: a comparison of arrays takes ten times as long
-            if not self._low <= command.item() <= self._high:
-                raise self._out_of_range(command)
-        elif not (self._low <= command.min() and command.max() <= self._high):  # both NaN for a NaN
+        if not self._in_range(command):
             raise self._out_of_range(command)
         try:
             self._exchange(first_sample, command, displacement_um, measured)
@@ -214,6 +213,14 @@ class DacDevice(ABC):
         size = "1 sample" if self._block == 1 else f"{self._block} samples"
         rule = f"block must be {size}, as at open"
         raise self._error(self._action, f"{rule}, got {sizes}")
+
+    def _in_range(self, command: F64) -> bool:
+        """Return whether all of a block's commands are in range; one that is no number is not."""
+        low, high = self._low, self._high
+        if command.size > _SHORT:
+            return bool(low <= command.min() and command.max() <= high)  # both NaN for a NaN
+        # numpy takes as long for a few as for hundreds.
+        return all(low <= value <= high for value in command.tolist())
 
     def _error(self, action: str, what: str) -> DeviceError:
         return DeviceError(f"{self._title}: {what} (to {action})")

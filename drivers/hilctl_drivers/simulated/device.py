@@ -89,14 +89,17 @@ class SimulatedDevice(DacDevice):
         if first_sample < self._next_sample:
             rule = f"first sample must be >= {self._next_sample}, which is next"
             raise DeviceError(f"{rule}, got {first_sample}")
-        self._fail_exchange(first_sample + command.size)
+        fault = self._fault
+        if fault is not None:
+            self._fail_exchange(fault, first_sample + command.size)
         if first_sample > self._next_sample:
             self._plant.hold(first_sample - self._next_sample, self._last_command)
         self._plant.step(command, displacement_um, measured)
-        self._spoil(first_sample, displacement_um)
+        if fault is not None:
+            self._spoil(fault, first_sample, displacement_um)
+            self._last_reading_um = displacement_um.item(-1)
         self._next_sample = first_sample + command.size
-        self._last_command = float(command[-1])
-        self._last_reading_um = float(displacement_um[-1])
+        self._last_command = command.item(-1)
 
     def _put_out(self, command: float) -> None:
         """Put the output there; an injected fault does not prevent it."""
@@ -118,20 +121,18 @@ class SimulatedDevice(DacDevice):
         if not self._block or len(sizes) > 1 or not 1 <= command.size <= self._block:
             super()._check_sizes(command, displacement_um, measured)
 
-    def _fail_exchange(self, end_sample: int) -> None:
+    def _fail_exchange(self, fault: SimulatedFault, end_sample: int) -> None:
         """Raise what an injected fault of the connection raises in a block that ends here."""
-        fault = self._fault
-        if fault is None or end_sample <= fault.at_sample:
+        if end_sample <= fault.at_sample:
             return
         if fault.kind == "no_answer":
             raise DeviceError("no answer in time (injected fault)")
         if fault.kind == "refused":
             raise DeviceError("the block was refused (injected fault)")
 
-    def _spoil(self, first_sample: int, displacement_um: F64) -> None:
+    def _spoil(self, fault: SimulatedFault, first_sample: int, displacement_um: F64) -> None:
         """Put an injected sensor fault on the readings it has reached."""
-        fault = self._fault
-        if fault is None or first_sample + displacement_um.size <= fault.at_sample:
+        if first_sample + displacement_um.size <= fault.at_sample:
             return
         start = max(0, fault.at_sample - first_sample)
         good = self._last_reading_um if start == 0 else displacement_um[start - 1]

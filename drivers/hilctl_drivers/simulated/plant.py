@@ -7,6 +7,42 @@ import numpy as np
 from hilctl.base.arrays import F64
 
 CHUNK = 4096  # samples a kernel call; bounds the scratch memory
+_DRAWN = 256
+
+
+class SensorNoise:
+    """Noise of a sensor's readings, the same however it is divided into parts.
+
+    Args:
+        std_um: Its standard deviation.
+        seed: What it begins with.
+    """
+
+    def __init__(self, std_um: float, seed: int) -> None:
+        self._std_um, self._seed = std_um, seed
+        self._values = np.empty(CHUNK + _DRAWN)
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin anew."""
+        self._generator = np.random.Generator(np.random.PCG64(self._seed))
+        self._at = self._stop = 0
+
+    def draw(self, samples: int) -> F64:
+        """Return the noise of the next samples, at most ``CHUNK``: the caller's until it draws."""
+        if self._at + samples > self._stop:
+            self._draw_more(samples)
+        at, self._at = self._at, self._at + samples
+        return self._values[at : self._at]
+
+    def _draw_more(self, samples: int) -> None:
+        # Some hundreds at once: a call for every short block takes longer than the drawing.
+        left = self._stop - self._at
+        self._values[:left] = self._values[self._at : self._stop]
+        self._at, self._stop = 0, max(samples, _DRAWN)
+        new = self._values[left : self._stop]
+        self._generator.standard_normal(out=new)
+        new *= self._std_um
 
 
 class Plant(ABC):
@@ -24,16 +60,13 @@ class Plant(ABC):
             noise_um: Noise of each reading, rms.
             seed: Seed of that noise.
         """
-        self._noise_um = noise_um
-        self._seed = seed
+        self._noise = SensorNoise(noise_um, seed)
         self._command = np.empty(CHUNK)
-        self._noise = np.empty(CHUNK)
-        self._parts = self._command, self._noise
-        self._generator = np.random.Generator(np.random.PCG64(seed))
+        self._held = self._command
 
     def reset(self) -> None:
         """Go back to rest, with the noise from its start."""
-        self._generator = np.random.Generator(np.random.PCG64(self._seed))
+        self._noise.reset()
         self._rest()
 
     def step(self, command: F64, displacement_um: F64, measured: F64) -> None:
@@ -53,13 +86,11 @@ class Plant(ABC):
             self._step(command[part], displacement_um[part], measured[part])
 
     def _step(self, command: F64, displacement_um: F64, measured: F64) -> None:
-        held, noise = self._parts
-        if held.size != command.size:  # views are kept: one block is as long as the next
-            self._parts = held, noise = self._command[: command.size], self._noise[: command.size]
+        samples, held = command.size, self._held
+        if held.size != samples:  # the view is kept: one block is as long as the next
+            self._held = held = self._command[:samples]
         held[:] = command  # a copy: compiled code refuses read-only arrays
-        self._generator.standard_normal(out=noise)
-        noise *= self._noise_um
-        self._advance(held, noise, displacement_um, measured)
+        self._advance(held, self._noise.draw(samples), displacement_um, measured)
 
     def warm_up(self) -> None:
         """Go on by one sample and back to rest, so that nothing is compiled or loaded later."""

@@ -186,6 +186,7 @@ class TerfenolActuator(Plant):
         self._part = max(1, CHUNK // self._substeps)
         self._halves = np.empty(2 * self._part * self._substeps + 1)
         self._free = np.empty(self._part * self._substeps)
+        self._parts = self._halves, self._free
         self.warm_up()
 
     def _rest(self) -> None:
@@ -216,7 +217,9 @@ class TerfenolActuator(Plant):
         all the steps at once.
         """
         steps = command.size * self._substeps
-        halves, free = self._halves[: 2 * steps + 1], self._free[:steps]
+        halves, free = self._parts
+        if free.size != steps:  # the views are kept: one block is as long as the next
+            self._parts = halves, free = self._halves[: 2 * steps + 1], self._free[:steps]
         amplify(command, measured, halves, self._current, self._amplifier, self._substeps)
         self._rods.follow(halves, free)
         if self._creep.size:

@@ -53,15 +53,16 @@ def exchange(device, *command):
     device.exchange(0, values, np.empty(values.size), np.empty(values.size))
 
 
-@pytest.mark.parametrize("longest", [1, 3])
-@pytest.mark.parametrize("bad", [2.0001, -2.0001, np.nan, np.inf])
-def test_a_command_out_of_range_is_refused_and_not_sent(longest, bad):
-    """Never clipped; the device stays open, so that the loop can ramp down."""
+@pytest.mark.parametrize("place", [0, -1])
+@pytest.mark.parametrize("longest", [1, 3, 64, 65])
+@pytest.mark.parametrize("bad", [2.0001, -2.0001, np.nan, np.inf, -np.inf])
+def test_a_command_out_of_range_is_refused_and_not_sent(longest, bad, place):
+    """Never clipped, in short blocks and in long ones; the device stays open for the ramp."""
     device = NotingDac(longest)
     device.open(1000.0, longest)
     command = [0.0] * longest
     exchange(device, *command)
-    command[-1] = bad
+    command[place] = bad
     with pytest.raises(DeviceError, match=r"must be in \[-2, 2\] A, got .* nothing was sent"):
         exchange(device, *command)
     with pytest.raises(DeviceError, match="nothing was sent"):

@@ -5,6 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hilctl.base.arrays import F64
+from hilctl_drivers.simulated.plant import CHUNK, SensorNoise
 from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
 
 RATED = TerfenolParameters()
@@ -15,6 +16,18 @@ def run(actuator: TerfenolActuator, command_a: F64) -> F64:
     displacement_um = np.empty_like(command_a)
     actuator.step(command_a, displacement_um, np.empty_like(command_a))
     return displacement_um
+
+
+@settings(max_examples=50, deadline=None)
+@given(parts=st.lists(st.integers(0, CHUNK), max_size=20))
+def test_noise_is_that_of_one_draw(parts: list[int]) -> None:
+    """However it is divided; and once more from the start after a reset."""
+    noise = SensorNoise(0.5, 7)
+    expected = 0.5 * np.random.Generator(np.random.PCG64(7)).standard_normal(sum(parts))
+    for _ in range(2):
+        drawn = [noise.draw(samples).copy() for samples in parts]
+        np.testing.assert_array_equal(np.concatenate([*drawn, np.empty(0)]), expected)
+        noise.reset()
 
 
 class TestBlocks:
