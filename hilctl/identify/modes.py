@@ -26,6 +26,7 @@ FEWEST_BINS = 40
 AT_ONCE = 64  # segments, of which a long record has many
 LOWEST_BIN = 2  # those below have the trend of each segment in them
 WORTH = 0.9  # of a model's rms error: what better modes must bring it to
+ROUNDING = 1e-20  # of the power of a displacement: less than that is left by no model
 TRIES = 24, (0.01, 0.03, 0.1, 0.3)  # natural frequencies and damping ratios that are tried first
 FOLLOWED = 3  # of the best of them
 APART = 1.4  # from the first mode, either way: what is nearer is that mode, found not quite right
@@ -129,7 +130,8 @@ def _spectra(
         frequency_hz=(np.arange(count) / SEGMENT_S)[bins],
         transfer=np.asarray(cross / np.maximum(own, 1e-300), dtype=np.complex128)[bins],
         power=own[bins],
-        left=max(left, 1e-300),
+        # Of a model that leaves nothing, whatever makes rounding a little less would be worth all.
+        left=max(left, ROUNDING * float(own.sum()), 1e-300),
     )
 
 
