@@ -1,8 +1,8 @@
 """What the supervisor hands to the loop's process: the checked experiment and its arrays.
 
 It goes there as it is, checks and files behind it, so that process imports nothing that checks or
-reads files: no pydantic, no YAML. Only a device that can't go there before it is opened, as it
-holds what a process has for itself, is made there anew, and checked once more.
+reads files: no pydantic, no YAML. Only a device that is not simulated is made there anew, and its
+options are checked once more: it holds what a process has for itself, and may count on the checks.
 """
 
 import pickle
@@ -28,7 +28,7 @@ if TYPE_CHECKING:  # the loop's process has no use for what these import
     from hilctl.experiment.load import LoadedExperiment
     from hilctl.run.run_folder import RunFolder
 
-_OURS = "hilctl_drivers."
+_SENT = "hilctl_drivers.simulated."
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,13 +167,9 @@ class Job:
 
 
 def _device(loaded: "LoadedExperiment") -> bytes | DeviceText:
-    """Return a device as it is; one that can't be had so, or is of others, as its text."""
-    device = loaded.device
-    if type(device).__module__.startswith(_OURS):  # others may count on their options' checks
-        try:
-            return pickle.dumps(device)
-        except (TypeError, AttributeError, pickle.PicklingError):  # it holds what can't go there
-            pass
+    """Return a simulated device as it is, any other as its text."""
+    if type(loaded.device).__module__.startswith(_SENT):
+        return pickle.dumps(loaded.device)
     return DeviceText(loaded.yaml_text, loaded.files.texts, str(loaded.folder.resolve()))
 
 

@@ -63,10 +63,10 @@ def test_samples_that_find_no_room_are_told(folder, monkeypatch):
 
 
 @pytest.mark.parametrize("of_others", [False, True])
-def test_a_device_that_can_not_be_sent_is_made_from_what_was_checked(
+def test_a_device_that_is_not_sent_is_made_from_what_was_checked(
     folder, tmp_path, monkeypatch, of_others
 ):
-    """A port that is polled stays in its process; who else makes devices may count on checks."""
+    """A port that is polled stays in its process; other people's devices may count on checks."""
     file = "demo.yaml" if of_others else "serial_cobs_fifo.yaml"
     shutil.copytree(CONFIGS, tmp_path / "configs")
     checked = checked_experiment(tmp_path / "configs" / file, ["waveform.duration_s=1.0"])
