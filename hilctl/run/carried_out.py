@@ -78,7 +78,8 @@ def run_job(
         HilctlError: It could not start, or broke; the output was put at its safe value.
     """
     config, device, page = parts.config, parts.device, ring.page
-    awake_ns = spin_ns(config.tick_s * 1e9) if config.realtime.wait == "spin" else 0
+    period_ns = config.tick_s * 1e9
+    awake_ns = spin_ns(period_ns) if config.realtime.wait == "spin" else 0
     clock = SpinningClock(awake_ns) if awake_ns else SystemClock()
     host = RingHost(ring, clock, job.supervisor, job.silence_s)
     conditioning = conditioning_of(parts, job.stands_um)
@@ -97,7 +98,7 @@ def run_job(
     require_another_cpu(config.realtime, len(os.sched_getaffinity(0)))
     # After the warm-up, so that all it has mapped gets locked; before the device is opened, so that
     # a refusal moves nothing.
-    steps = prepare(config.realtime, never_sleeps=awake_ns >= config.tick_s * 1e9)
+    steps = prepare(config.realtime, never_sleeps=awake_ns >= period_ns)
     if config.realtime.require:
         require(steps)
     device.open(config.sample_rate_hz, config.block)

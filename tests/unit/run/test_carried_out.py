@@ -148,6 +148,22 @@ def test_the_loop_waits_as_it_is_asked_to(prepared, monkeypatch, wait):
     assert clocks == [SpinningClock if wait == "spin" else SystemClock]
 
 
+@pytest.mark.parametrize("awake_ns", [999_999, 1_000_000])
+def test_a_loop_that_never_sleeps_is_set_up_as_such(prepared, monkeypatch, awake_ns):
+    """Its period is 1 ms: 50 samples at 50 kHz."""
+    made, periods_ns, clocks = prepared(), [], []
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1})
+    monkeypatch.setattr(carried_out, "spin_ns", lambda ns: periods_ns.append(ns) or awake_ns)
+    realtime = made.parts.config.realtime.model_copy(update={"wait": "spin"})
+    object.__setattr__(made.parts.config, "realtime", realtime)
+    made.loop_does(lambda self, start_ns: clocks.append(self._host.clock._awake_ns) or 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        made.run()
+    assert periods_ns == [1e6]
+    assert clocks == [awake_ns]
+    assert made.never_sleeps == (awake_ns == 1_000_000)
+
+
 def test_spinning_on_the_only_cpu_is_refused_before_anything_is_touched(prepared, monkeypatch):
     made = prepared()
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {3})

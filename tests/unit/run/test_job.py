@@ -29,6 +29,7 @@ def test_the_job_is_what_was_checked_even_where_its_files_have_gone(folder, tmp_
     job = Job.of(checked, folder, supervisor=7, silence_s=5.0)
     shutil.rmtree(tmp_path / "models")
     (tmp_path / "demo.yaml").unlink()
+    assert folder.description.exists()  # who looks on finds it before the first sample
     sent = job.to_bytes()
     assert sent.startswith(PLAIN)
     again = Job.from_bytes(sent)
