@@ -8,6 +8,7 @@ initial_state.py  what the run before left in the actuator
 heat.py           the coil's heat, from run to run; history.py  what the last run left
 check.py          the whole run worked out beforehand, held against device, model and limits
 model_range.py    whether the reference stays within what the model was identified on
+pace.py           whether no timer is quick enough for its ticks
 forecast.py       what a run will do, by all of its commands; whole_run.py  works those out
 tuned.py          what it would with another gain and offset
 interlocks.py     interlocks, feedback.py feedback and adaptation.py adaptation, by the file's keys

@@ -38,6 +38,7 @@ from hilctl.experiment.initial_state import (
 from hilctl.experiment.interlocks import interlock_problems
 from hilctl.experiment.load import LoadedExperiment
 from hilctl.experiment.model_range import RangeFindings, range_findings
+from hilctl.experiment.pace import pace_warnings
 from hilctl.loop.adaptation import DisplacementOperator
 from hilctl.loop.compensator import Compensator
 from hilctl.loop.conditioning import Conditioning
@@ -59,7 +60,7 @@ class Checked:
         reference: Every sample of its waveform.
         forecast: What it will do.
         begun: What the compensator is given, and what it begins with.
-        warnings: What keeps it from doing as well as its model promises.
+        warnings: What keeps it from doing as well as its model, or its rate, promises.
         heat_a2: Heat of the coil before it, the running mean square of its current in A^2.
         operator: What its adaptation adapts; None where nothing is adapted.
     """
@@ -144,6 +145,7 @@ def check(
     if problems:
         raise ConfigError(problems)
     warnings = findings.warnings + adaptation_warnings(config, reference.segments)
+    warnings += pace_warnings(config, loaded.device.info)
     return Checked(loaded, reference, forecast, begun, warnings, heat_a2, operator)
 
 
