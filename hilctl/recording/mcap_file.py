@@ -60,7 +60,7 @@ _INDEX_ROW = struct.Struct("<QQ")
 _FOOTER = struct.Struct("<BQQQ")
 _FOOTER_BYTES = 8 + 8 + 4
 _PACKED_BYTES = 1 << 16
-_FIRST_ROOM_BYTES = 1 << 20
+_FIRST_ROOM_BYTES = CHUNK_BYTES + (1 << 20)
 
 
 class McapWriter:
@@ -151,8 +151,11 @@ class McapWriter:
         head = _MESSAGE.pack(
             Opcode.MESSAGE, _FIXED + len(data), channel, sequence, logged_ns, published_ns
         )
-        self._chunk.add_message(channel, logged_ns, head, data)
-        self._count(channel, 1, logged_ns, logged_ns)
+        chunk = self._chunk
+        chunk.index(channel, _INDEX_ROW.pack(logged_ns, chunk.size))
+        chunk.add(head)
+        chunk.add(data)
+        self._close_full()
 
     def add_rows(self, channel: int, times_ns: I64, rows: MessageRows, sequence: int) -> None:
         """Write messages of one channel.
@@ -171,20 +174,14 @@ class McapWriter:
         heads["sequence"] = np.arange(sequence, sequence + count)
         heads["logged"] = heads["published"] = times_ns
         data = rows.behind(heads.view(np.uint8).reshape(count, -1))
-        first_ns, last_ns = int(times_ns.min()), int(times_ns.max())
         places = np.empty((count, 2), dtype="<u8")
         places[:, 0] = times_ns
         places[:, 1] = self._chunk.size + np.cumsum(whole) - whole
-        self._chunk.add_messages(channel, first_ns, last_ns, places.tobytes(), data)
-        self._count(channel, count, first_ns, last_ns)
+        self._chunk.index(channel, places.tobytes())
+        self._chunk.add(data)
+        self._close_full()
 
-    def _count(self, channel: int, messages: int, first_ns: int, last_ns: int) -> None:
-        found = self._statistics
-        earlier_ns = found.message_start_time if found.message_count else first_ns
-        found.message_start_time = min(earlier_ns, first_ns)
-        found.message_end_time = max(found.message_end_time, last_ns)
-        found.channel_message_counts[channel] += messages
-        found.message_count += messages
+    def _close_full(self) -> None:
         if self._chunk.size > self._chunk_bytes:
             self._close_chunk()
 
@@ -197,11 +194,12 @@ class McapWriter:
         closing = self._chunk
         if not closing.indexes:
             return
+        first_ns, last_ns = self._count(closing)
         data = self._room.filled(closing.size)
         compressed = self._compressor.compress(data)
         head = _CHUNK.pack(
-            Opcode.CHUNK, _CHUNK.size - FRAME.size + len(compressed), closing.first_ns,
-            closing.last_ns, len(data), zlib.crc32(data), len(_ZSTD), _ZSTD, len(compressed),
+            Opcode.CHUNK, _CHUNK.size - FRAME.size + len(compressed), first_ns, last_ns,
+            len(data), zlib.crc32(data), len(_ZSTD), _ZSTD, len(compressed),
         )  # fmt: skip
         start, length = self._stream.tell(), len(head) + len(compressed)
         offsets, indexes = {}, bytearray()
@@ -211,15 +209,30 @@ class McapWriter:
             indexes += _INDEX.pack(Opcode.MESSAGE_INDEX, size, channel, len(places)) + places
         index = ChunkIndex(
             chunk_length=length, chunk_start_offset=start, compression=_ZSTD.decode(),
-            compressed_size=len(compressed), message_end_time=closing.last_ns,
+            compressed_size=len(compressed), message_end_time=last_ns,
             message_index_length=len(indexes), message_index_offsets=offsets,
-            message_start_time=closing.first_ns, uncompressed_size=len(data),
+            message_start_time=first_ns, uncompressed_size=len(data),
         )  # fmt: skip
         self._chunk = _OpenChunk(self._room)
         for part in (head, compressed, indexes):
             self._stream.write(part)
         self._chunk_indexes.add(_bytes(index))
-        self._statistics.chunk_count += 1
+
+    def _count(self, closing: "_OpenChunk") -> tuple[int, int]:
+        """Count the messages of a chunk; return the first and the last of their times in ns."""
+        found = self._statistics
+        ends: list[int] = []
+        for channel, places in closing.indexes.items():
+            times_ns = np.frombuffer(places, "<u8")[::2]
+            ends += int(times_ns.min()), int(times_ns.max())
+            found.channel_message_counts[channel] += times_ns.size
+            found.message_count += times_ns.size
+        first_ns, last_ns = min(ends), max(ends)
+        earlier_ns = found.message_start_time if found.chunk_count else first_ns
+        found.message_start_time = min(earlier_ns, first_ns)
+        found.message_end_time = max(found.message_end_time, last_ns)
+        found.chunk_count += 1
+        return first_ns, last_ns
 
     def finish(self) -> None:
         """Close the chunk in work, and write index and foot of the file."""
@@ -270,13 +283,14 @@ class _Room:
     """Where one chunk after the other is put together; memory is got once, for the longest."""
 
     def __init__(self) -> None:
-        self._bytes = memoryview(bytearray(_FIRST_ROOM_BYTES))
+        # Not a bytearray: filled with zeros, it would take memory that short chunks leave alone.
+        self._bytes = np.empty(_FIRST_ROOM_BYTES, dtype=np.uint8).data
 
     def put(self, at: int, part: bytes) -> None:
         """Put bytes where those before end."""
         end = at + len(part)
         if end > len(self._bytes):
-            larger = memoryview(bytearray(max(end, 2 * len(self._bytes))))
+            larger = np.empty(max(end, 2 * len(self._bytes)), dtype=np.uint8).data
             larger[:at] = self._bytes[:at]
             self._bytes = larger
         self._bytes[at:end] = part
@@ -292,25 +306,16 @@ class _OpenChunk:
     def __init__(self, room: _Room) -> None:
         self._room = room
         self.size = 0
-        self.first_ns = self.last_ns = 0
         self.indexes: dict[int, bytearray] = {}
         """Time and place of each message, by channel."""
 
-    def add(self, record: bytes) -> None:
-        self._room.put(self.size, record)
-        self.size += len(record)
+    def add(self, part: bytes) -> None:
+        self._room.put(self.size, part)
+        self.size += len(part)
 
-    def add_message(self, channel: int, time_ns: int, head: bytes, data: bytes) -> None:
-        self.add_messages(channel, time_ns, time_ns, _INDEX_ROW.pack(time_ns, self.size), head)
-        self.add(data)
-
-    def add_messages(
-        self, channel: int, first_ns: int, last_ns: int, places: bytes, records: bytes
-    ) -> None:
-        self.first_ns = min(self.first_ns, first_ns) if self.indexes else first_ns
-        self.last_ns = max(self.last_ns, last_ns)
+    def index(self, channel: int, places: bytes) -> None:
+        """Enter messages that are added next, by their times and places."""
         self.indexes.setdefault(channel, bytearray()).extend(places)
-        self.add(records)
 
 
 def _bytes(record: McapRecord) -> bytes:
