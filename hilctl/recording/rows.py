@@ -90,10 +90,10 @@ def _varint_cells(field: int, values: I64) -> tuple[Cells, Kept]:
     """Return tag and bytes of numbers of no sign: lowest first, seven bits in each."""
     width = max(1, -(-int(values.max(initial=0)).bit_length() // 7))
     left = values[:, np.newaxis] >> _shifts(width)
-    cells = (left & _SEVEN_BITS).astype(np.uint8)
-    cells[:, 1:-1] |= (left[:, 2:] > 0).view(np.uint8) << 7  # another one follows
+    cells, kept = (left & _SEVEN_BITS).astype(np.uint8), left > 0
+    cells[:, 1:-1] |= kept[:, 2:].view(np.uint8) << 7  # another one follows
     cells[:, 0] = field << 3 | _VARINT
-    return cells, left > 0
+    return cells, kept
 
 
 @lru_cache
