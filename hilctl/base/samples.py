@@ -156,6 +156,11 @@ class Samples:
         """
         return cls(index=index, flags=flags, **dict(zip(COLUMNS, values, strict=True)))
 
+    def column(self, name: str) -> F64:
+        """Return one column."""
+        values: F64 = getattr(self, name)
+        return values
+
     def columns(self) -> dict[str, F64]:
         """Return the columns by name, in order."""
         return {name: getattr(self, name) for name in COLUMNS}
@@ -191,6 +196,7 @@ RECORDED_FIELDS = tuple(
     dict.fromkeys(each.field(unit) for each in COLUMNS.values() for unit in ("A", "V"))
 )
 """The fields of all columns, whatever the unit of the commands."""
+_ROW = {name: row for row, name in enumerate(COLUMNS)}
 ANSWERS = [row for row, each in enumerate(COLUMNS.values()) if each.answered]
 """Rows of a block's columns that the device fills."""
 _ALL = slice(None)
@@ -246,11 +252,18 @@ class Batch:
 
     def samples(self, blocks: slice = _ALL) -> Samples:
         """Return the samples of some blocks, one after the other."""
-        flags = self.flags[blocks]
-        firsts = self.heads[blocks, Head.FIRST_SAMPLE]
-        index = (firsts[:, None] + np.arange(flags.shape[1])).ravel()
         values = self.columns[blocks].transpose(1, 0, 2).reshape(len(COLUMNS), -1)
-        return Samples.of(index, values, flags.ravel())
+        return Samples.of(self.index(blocks), values, self.flags[blocks].ravel())
+
+    def index(self, blocks: slice = _ALL) -> I64:
+        """Return the sample indices of some blocks, one after the other."""
+        firsts = self.heads[blocks, Head.FIRST_SAMPLE]
+        index: I64 = (firsts[:, None] + np.arange(self.flags.shape[1])).ravel()
+        return index
+
+    def column(self, name: str) -> F64:
+        """Return one column, one sample after the other."""
+        return self.columns[:, _ROW[name]].ravel()
 
 
 class Flag(IntFlag):

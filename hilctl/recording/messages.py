@@ -93,11 +93,11 @@ class RecordingLayout:
         given = {"measured": self.measures_command, "own_input": self.records_input}
         return given.get(column.when, True)
 
-    def recorded(self, samples: Samples) -> Iterator[tuple[RecordedField, F64]]:
+    def recorded(self, samples: Samples | Batch) -> Iterator[tuple[RecordedField, F64]]:
         """Yield field and values of each column that is recorded."""
-        for name, values in samples.columns().items():
-            column = COLUMNS[name]
+        for name, column in COLUMNS.items():
             if self.records(column):
+                values = samples.column(name)
                 elsewhere = column.in_waveform_unit and self.waveform_unit != "um"
                 known = np.full_like(values, np.nan) if elsewhere else values
                 yield column.field(self.command_unit), known
@@ -194,9 +194,9 @@ class MessageMaker:
         gaps = batch.heads[:, Head.DROPPED_BEFORE].tolist()
         block = batch.flags.shape[1]
         largest = max(1, _MAX_BLOCK // block)
-        samples = batch.samples()
-        columns = list(self._layout.recorded(samples))
-        t_rel = samples.index / self._layout.sample_rate_hz
+        index, flags = batch.index(), batch.flags.ravel()
+        columns = list(self._layout.recorded(batch))
+        t_rel = index / self._layout.sample_rate_hz
         row = 0
         while row < len(gaps):
             stop = row + 1
@@ -204,17 +204,15 @@ class MessageMaker:
                 stop += 1
             part = slice(row * block, stop * block)
             cut = {field.name: values[part] for field, values in columns}
-            yield self._block(batch, row, samples.flags[part], cut, t_rel[part])
+            yield self._block(batch, row, flags[part], cut, t_rel[part])
             row = stop
         # NumPy divides by one number in half of the time that a remainder takes.
-        on_grid = samples.index // self._stride * self._stride == samples.index
-        shown = np.flatnonzero(on_grid)
+        shown = np.flatnonzero(index // self._stride * self._stride == index)
         if shown.size:
             doubles = {field.scope: of[shown] for field, of in columns if field.scope}
             doubles[SCOPE_T_REL] = t_rel[shown]
-            index = samples.index[shown]
-            rows = scope_rows(index, samples.flags[shown], doubles)
-            yield EncodedRows("/scope", self._layout.times_ns(index), rows)
+            rows = scope_rows(index[shown], flags[shown], doubles)
+            yield EncodedRows("/scope", self._layout.times_ns(index[shown]), rows)
         yield self._ticks(batch)
 
     def _block(

@@ -68,22 +68,30 @@ def scope_rows(samples: I64, flags: U32, doubles: Mapping[int, F64]) -> MessageR
     """
     numbers = sorted(doubles)
     tagged = np.empty((samples.size, len(numbers)), dtype=_DOUBLE)
-    tagged["tag"] = np.array(numbers) << 3 | _EIGHT_BYTES
+    tagged["tag"] = _tags(*numbers)
     tagged["value"] = np.array([doubles[field] for field in numbers]).T
+    cells, index = tagged.view(np.uint8), _varint_cells(_SAMPLE, samples)
     there = tagged["value"].view(np.int64) != 0  # a zero is left out, as it is the default
-    cells, kept = tagged.view(np.uint8), there.repeat(_DOUBLE.itemsize, axis=1)
-    parts = [_varint_cells(_SAMPLE, samples), (cells, kept)]
-    if flags.any():
-        before = _DOUBLE.itemsize * sum(field < _FLAGS for field in numbers)
-        parts[1:] = [
-            (cells[:, :before], kept[:, :before]),
-            _varint_cells(_FLAGS, flags.astype(np.int64)),
-            (cells[:, before:], kept[:, before:]),
-        ]
-    all_kept = np.concatenate([part for _, part in parts], axis=1)
-    return MessageRows(
-        np.concatenate([part for part, _ in parts], axis=1), None if all_kept.all() else all_kept
+    if not flags.any() and there.all() and index[1].all():
+        return MessageRows(np.concatenate((index[0], cells), axis=1), None)
+    kept = there.repeat(_DOUBLE.itemsize, axis=1)
+    before = _DOUBLE.itemsize * sum(field < _FLAGS for field in numbers)
+    parts = (
+        index,
+        (cells[:, :before], kept[:, :before]),
+        _varint_cells(_FLAGS, flags.astype(np.int64)),
+        (cells[:, before:], kept[:, before:]),
     )
+    return MessageRows(
+        np.concatenate([part for part, _ in parts], axis=1),
+        np.concatenate([part for _, part in parts], axis=1),
+    )
+
+
+@lru_cache
+def _tags(*numbers: int) -> Cells:
+    """Return what stands before each number of eight bytes."""
+    return (np.array(numbers) << 3 | _EIGHT_BYTES).astype(np.uint8)
 
 
 def _varint_cells(field: int, values: I64) -> tuple[Cells, Kept]:
