@@ -176,7 +176,7 @@ class McapWriter:
         data = rows.behind(heads.view(np.uint8).reshape(count, -1))
         places = np.empty((count, 2), dtype="<u8")
         places[:, 0] = times_ns
-        places[:, 1] = self._chunk.size + np.cumsum(whole) - whole
+        places[:, 1] = self._chunk.size + whole.cumsum() - whole
         self._chunk.index(channel, places.tobytes())
         self._chunk.add(data)
         self._close_full()

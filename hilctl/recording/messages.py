@@ -20,6 +20,7 @@ from hilctl.recording.wire import BlockArrays, block_bytes
 
 _MAX_BLOCK = 2500
 _NONE = np.empty(0)
+_TICK_HEADS = {name: int(Head[name.upper()]) for name in TICK_COLUMNS}
 _YEAR_NS = 366 * 86_400 * 10**9
 
 
@@ -237,8 +238,8 @@ class MessageMaker:
 
     def _ticks(self, batch: Batch) -> Encoded:
         out = schema.message("TickBlock")
-        for name in TICK_COLUMNS:
-            getattr(out, name).extend(batch.heads[:, Head[name.upper()]].tolist())
+        for name, column in _TICK_HEADS.items():
+            getattr(out, name).extend(batch.heads[:, column].tolist())
         first = int(batch.heads[0, Head.FIRST_SAMPLE])
         return Encoded("/ticks", self._layout.time_ns(first), out.SerializeToString())
 
