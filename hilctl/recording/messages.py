@@ -198,7 +198,7 @@ class MessageMaker:
         index, flags = batch.index(), batch.flags.ravel()
         columns = list(self._layout.recorded(batch))
         t_rel = index / self._layout.sample_rate_hz
-        row = 0
+        row, on_grid = 0, []
         while row < len(gaps):
             stop = row + 1
             while stop < len(gaps) and stop - row < largest and gaps[stop] == 0:
@@ -206,9 +206,10 @@ class MessageMaker:
             part = slice(row * block, stop * block)
             cut = {field.name: values[part] for field, values in columns}
             yield self._block(batch, row, flags[part], cut, t_rel[part])
+            first = part.start + -int(index[part.start]) % self._stride
+            on_grid.append(np.arange(first, part.stop, self._stride))
             row = stop
-        # NumPy divides by one number in half of the time that a remainder takes.
-        shown = np.flatnonzero(index // self._stride * self._stride == index)
+        shown = np.concatenate(on_grid)
         if shown.size:
             doubles = {field.scope: of[shown] for field, of in columns if field.scope}
             doubles[SCOPE_T_REL] = t_rel[shown]
