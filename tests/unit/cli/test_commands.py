@@ -119,6 +119,21 @@ def hilctl(*arguments):
     )
 
 
+def test_a_command_never_searches_for_garbage(tmp_path):
+    """Neither in what it imports nor when it ends: there is none, and it takes long."""
+    code = """
+import atexit, gc
+from hilctl.cli import main
+def searches():
+    return sum(each["collections"] for each in gc.get_stats())
+before = searches()
+atexit.register(lambda: print(searches() - before, gc.get_freeze_count() > 0))
+main()
+"""
+    ended = in_a_process(code, "report", str(tmp_path / "absent.mcap"))
+    assert (ended.returncode, ended.stdout) == (2, "0 True\n")
+
+
 def test_help_imports_nothing_heavy():
     """Help and a first look at the commands cost no numerics."""
     code = (
