@@ -8,9 +8,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
-from hilctl.base.device import CommandUnit
 from hilctl.base.errors import InputError
 from hilctl.base.files import TextFiles
+from hilctl.base.units import CommandUnit
 from hilctl_drivers.profile import load_profile
 from hilctl_drivers.profile_parts import BaseProfile, Range, Watchdog
 

@@ -10,9 +10,10 @@ from typing import Annotated, Literal, Self, TypeAlias, TypeVar
 
 from pydantic import Field, model_validator
 
-from hilctl.base.device import CommandUnit, DeviceOptions
+from hilctl.base.device import DeviceOptions
 from hilctl.base.errors import InputError
 from hilctl.base.strict import Strict
+from hilctl.base.units import CommandUnit
 from hilctl_drivers.profile import ProfileName
 from hilctl_drivers.profile_parts import Range, Watchdog
 

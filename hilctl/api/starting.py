@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 from hilctl.api.given import PathLike, Settings, path_or_none, texts_of
 
 if TYPE_CHECKING:
-    from hilctl.base.device import CommandUnit, DeviceInfo
+    from hilctl.base.device import DeviceInfo
+    from hilctl.base.units import CommandUnit
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,7 +1,7 @@
 """What all rooms share; it knows none of them.
 
 arrays.py    array types; values.py  arrays, or what stands for one that is longer than memory
-device.py    the contract of a device and of a clock
+device.py    the contract of a device and of a clock; units.py  of its commands
 errors.py    every exception that is raised on purpose
 strict.py    base of every pydantic model; plain.py  stands in for it where nothing is checked
 files.py     texts, each read once; files written whole or not at all

@@ -6,13 +6,11 @@ people's packages; :mod:`hilctl.loop.pacer` and the tests supply clocks.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Literal, Protocol, TypeAlias, runtime_checkable
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 from hilctl.base.arrays import F64
 from hilctl.base.strict import Strict
-
-CommandUnit: TypeAlias = Literal["A", "V"]
-"""Unit of what is sent to the device: coil current in ampere, or drive voltage in volt."""
+from hilctl.base.units import CommandUnit
 
 
 class DeviceOptions(Strict):

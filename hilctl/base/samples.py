@@ -6,15 +6,13 @@ units are made from it. A new column is one more field there, and whoever fills 
 
 from dataclasses import dataclass, field, fields, replace
 from enum import IntEnum, IntFlag
-from typing import TYPE_CHECKING, Annotated, Literal, Self, TypeAlias, get_type_hints
+from typing import Annotated, Literal, Self, TypeAlias, get_type_hints
 
 import numpy as np
 import numpy.typing as npt
 
 from hilctl.base.arrays import F64, I64, U32
-
-if TYPE_CHECKING:  # kernels import this, and a device's contract takes pydantic
-    from hilctl.base.device import CommandUnit
+from hilctl.base.units import CommandUnit
 
 LAST_SAMPLE = 2**40
 """No index reaches it: a hundred million samples, and a safe ramp of an hour at 1 MHz."""
@@ -68,7 +66,7 @@ class SampleColumn:
     answered: bool = False
     in_waveform_unit: bool = False
 
-    def field(self, unit: "CommandUnit") -> RecordedField:
+    def field(self, unit: CommandUnit) -> RecordedField:
         """Return its field in a recording whose commands are in ``unit``."""
         return self.recorded_as if unit == "A" else self.recorded_in_v or self.recorded_as
 

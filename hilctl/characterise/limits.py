@@ -4,8 +4,8 @@ import math
 from dataclasses import dataclass
 
 from hilctl.base.arrays import F64
-from hilctl.base.device import CommandUnit
 from hilctl.base.errors import InputError
+from hilctl.base.units import CommandUnit
 from hilctl.experiment.forecast import CommandFigures
 from hilctl.experiment.load import LoadedExperiment
 

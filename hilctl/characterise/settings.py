@@ -4,7 +4,7 @@ import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from hilctl.base.device import CommandUnit
+from hilctl.base.units import CommandUnit
 from hilctl.base.yaml.document import Document, load_document
 from hilctl.characterise.waveforms import Keys
 from hilctl.loop.interlocks import InterlockSettings, Needs

@@ -2,8 +2,8 @@
 
 from typing import Annotated, Self
 
-from hilctl.base.device import CommandUnit
 from hilctl.base.strict import Field, model_validator
+from hilctl.base.units import CommandUnit
 from hilctl.experiment.parts import Interval
 from hilctl.loop.interlocks import InterlockSettings
 

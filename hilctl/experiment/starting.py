@@ -12,9 +12,10 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from hilctl.base.device import CommandUnit, DeviceInfo
+from hilctl.base.device import DeviceInfo
 from hilctl.base.errors import ConfigError, InputError, Problem
 from hilctl.base.files import TextFiles
+from hilctl.base.units import CommandUnit
 from hilctl.base.yaml.commented import commented
 from hilctl.base.yaml.document import Document
 from hilctl.base.yaml.messages import did_you_mean

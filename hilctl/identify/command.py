@@ -7,9 +7,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from hilctl.base.device import CommandUnit
 from hilctl.base.errors import InputError
 from hilctl.base.files import check_writable, write_text
+from hilctl.base.units import CommandUnit
 from hilctl.base.yaml.document import Document
 from hilctl.identify.candidates import CandidateError, Choice, choose_kind
 from hilctl.identify.catalogue import entry

@@ -10,8 +10,8 @@ from typing import Any, Literal, Self, TypeAlias, get_args, get_origin
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 from pydantic.fields import FieldInfo
 
-from hilctl.base.device import CommandUnit
 from hilctl.base.strict import Strict
+from hilctl.base.units import CommandUnit
 
 FitKind: TypeAlias = Literal[
     "integrated", "staged", "rdpi", "asymmetric", "ppi", "spi", "generalised", "preisach", "kp",

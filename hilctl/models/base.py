@@ -7,9 +7,9 @@ from typing import Annotated, Any, NamedTuple, Self, TypeAlias
 import numpy as np
 
 from hilctl.base.arrays import F64
-from hilctl.base.device import CommandUnit
 from hilctl.base.errors import ModelError
 from hilctl.base.strict import Field, Strict, field_validator, model_validator
+from hilctl.base.units import CommandUnit
 from hilctl.kernels.dynamics import offset_stage
 from hilctl.kernels.hysteresis import rest_memory
 

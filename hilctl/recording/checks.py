@@ -16,11 +16,11 @@ from google.protobuf.message import DecodeError
 from mcap.records import Channel, McapRecord, Message, Schema
 from pydantic import Field, TypeAdapter, ValidationError
 
-from hilctl.base.device import CommandUnit
 from hilctl.base.events import CHANGES, INVERSE
 from hilctl.base.samples import COLUMNS, LAST_SAMPLE, LONGEST_NS, RECORDED_FIELDS, Batch, Head
 from hilctl.base.segments import SHORTEST_PERIOD, Segment
 from hilctl.base.strict import Strict
+from hilctl.base.units import CommandUnit
 from hilctl.recording import schema, wire
 from hilctl.recording.data import TICK_COLUMNS, Ticks
 from hilctl.recording.facts import LABELS_FACT, LabelValue

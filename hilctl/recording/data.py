@@ -5,10 +5,10 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 
 from hilctl.base.arrays import F64, I64
-from hilctl.base.device import CommandUnit
 from hilctl.base.events import Event
 from hilctl.base.samples import Samples
 from hilctl.base.segments import Segment
+from hilctl.base.units import CommandUnit
 from hilctl.recording.facts import LabelValue
 
 

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from hilctl.base.arrays import F64
-from hilctl.base.device import CommandUnit
 from hilctl.base.errors import DataError, InputError
 from hilctl.base.samples import Flag
+from hilctl.base.units import CommandUnit
 from hilctl.identify.data.cycles import find_cycles, loops_from_pieces
 from hilctl.identify.data.records import History, Record
 from hilctl.identify.data.tables import read_table
