@@ -6,20 +6,17 @@ leaves the message out.
 
 import json
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from functools import cache
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from google.protobuf.message import DecodeError
 from mcap.records import Channel, McapRecord, Message, Schema
-from pydantic import Field, TypeAdapter, ValidationError
 
 from hilctl.base.events import CHANGES, INVERSE
 from hilctl.base.samples import COLUMNS, LAST_SAMPLE, LONGEST_NS, RECORDED_FIELDS, Batch, Head
-from hilctl.base.segments import SHORTEST_PERIOD, Segment
-from hilctl.base.strict import Strict
 from hilctl.base.units import CommandUnit
 from hilctl.recording import schema, wire
 from hilctl.recording.data import TICK_COLUMNS, Ticks
@@ -31,7 +28,6 @@ MAX_UNIX_NS = 2**63 - 1
 RATES_HZ = (1e-6, 1e9)
 """Lowest and highest rate of samples: far beyond those of any experiment."""
 
-_MOST_SEGMENTS_TEXT = 2**24
 _MOST_VALUES = 1000
 _UNITS: tuple[CommandUnit, ...] = ("A", "V")
 _MOST_DIGITS = 15
@@ -223,57 +219,6 @@ class SoundMessages:
         if topic == "/samples" and not problem:
             self.next_sample = message.tick0 + message.n
         return message, f"{topic}: {problem}" if problem else ""
-
-
-_Index = Annotated[int, Field(ge=0, lt=LAST_SAMPLE)]
-
-
-class _RecordedSegment(Strict):
-    """The fields of a :class:`~hilctl.base.segments.Segment` as a recording has them."""
-
-    label: str
-    start: _Index
-    stop: _Index
-    steady_start: _Index
-    steady_stop: _Index
-    period: Annotated[float, Field(ge=0.0)] = 0.0
-
-
-_SEGMENTS = TypeAdapter(list[_RecordedSegment])
-
-
-def segments_of(text: str) -> tuple[Segment, ...]:
-    """Return the stretches of a run from a fact of it.
-
-    Raises:
-        ValueError: They are not what :meth:`~hilctl.base.segments.Segment.to_mapping` gives, do not
-            follow one another, or have no such steady part or period.
-    """
-    if len(text) > _MOST_SEGMENTS_TEXT:
-        raise ValueError(f"segments: {len(text)} characters are more than any run has")
-    try:
-        given = _SEGMENTS.validate_python(json.loads(text))
-    except RecursionError:
-        raise ValueError("segments: nested too deep") from None
-    except ValidationError as error:
-        first = error.errors(include_url=False, include_input=False)[0]
-        where = ".".join(map(str, first["loc"]))
-        raise ValueError(f"segments: {where}: {first['msg']}") from None
-    segments = tuple(Segment.from_mapping(each.model_dump()) for each in given)
-    for problem in _segment_problems(segments):
-        raise ValueError(f"segments: {problem}")
-    return segments
-
-
-def _segment_problems(segments: Iterable[Segment]) -> Iterator[str]:
-    end = 0
-    for number, each in enumerate(segments):
-        places = [end, each.start, each.steady_start, each.steady_stop, each.stop]
-        if places != sorted(places):
-            yield f"{number}: its samples must follow those before it and rise: {places}"
-        if 0.0 < each.period < SHORTEST_PERIOD:
-            yield f"{number}: a period of {each.period!r} samples can't be"
-        end = each.stop
 
 
 def labels_of(facts: Mapping[str, str]) -> dict[str, LabelValue]:

@@ -19,12 +19,12 @@ from hilctl.recording.checks import (
     count_of,
     labels_of,
     number_of,
-    segments_of,
     short,
 )
 from hilctl.recording.chunks import Messages
 from hilctl.recording.data import TICK_COLUMNS, Recording, ReplayStart, Ticks
 from hilctl.recording.salvage import Salvage
+from hilctl.recording.segments import segments_of
 from hilctl.recording.stretch import Stretch
 from hilctl.recording.wire import BlockArrays
 

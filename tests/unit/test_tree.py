@@ -9,6 +9,7 @@ PACKAGES = {Path(): ROOT / "hilctl", Path("drivers"): ROOT / "drivers" / "hilctl
 WITHOUT = {
     "base/arrays": "names of array types; nothing runs",
     "base/device": "the contract of devices: tests/contract/test_devices.py holds each to it",
+    "base/units": "a name of a type; nothing runs",
     "base/events": "one record of plain values; seen in run/test_shared_page.py",
     "cli/options": "types of options; cli/test_commands.py loads every command that has them",
     "drivers/emulator/wire": "a contract and a record; drivers/emulator/test_server.py uses both",

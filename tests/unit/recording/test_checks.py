@@ -1,7 +1,6 @@
 """What facts and messages of a recording must be; a file that holds others is refused by a line."""
 
 import io
-import json
 import struct
 
 import pytest
@@ -12,22 +11,18 @@ from mcap.writer import Writer
 from hilctl.base.errors import DataError, InputError
 from hilctl.base.events import INVERSE, TUNED, Event
 from hilctl.base.samples import Head
-from hilctl.base.segments import Segment
 from hilctl.recording import schema
 from hilctl.recording.checks import (
     LAST_SAMPLE,
     count_of,
     labels_of,
     number_of,
-    segments_of,
     sound_blocks,
 )
 from hilctl.recording.messages import RecordingLayout
 from hilctl.recording.reader import read
 from hilctl.recording.recover import recover_recording
 from hilctl.recording.salvage import Salvage
-
-GOOD = Segment("sine", 0, 100, 10, 90, 20.0).to_mapping()
 
 FADE = {"share": 0.0, "samples": 10.0, "slope": 0.1, "at_zero": 0.0}
 
@@ -174,24 +169,6 @@ def test_a_topic_with_another_schema_is_refused(crafted, tmp_path):
     recovered = recover_recording(path, output=tmp_path / "sound.mcap")
     assert recovered.samples == 0
     assert read(recovered.path).events
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"start": -1}, {"stop": 2**63}, {"start": 1.5}, {"start": 95}, {"steady_stop": 101},
-        {"period": -1.0}, {"period": 1e-300}, {"period": float("nan")}, {"label": 3}, {"more": 1},
-    ],
-)  # fmt: skip
-def test_segments_that_can_not_be(change):
-    assert segments_of(json.dumps([GOOD])) == (Segment.from_mapping(GOOD),)
-    with pytest.raises(ValueError, match="segments: "):
-        segments_of(json.dumps([{**GOOD, **change}]))
-
-
-def test_segments_follow_one_another():
-    with pytest.raises(ValueError, match="must follow those before it"):
-        segments_of(json.dumps([GOOD, GOOD]))
 
 
 def test_numbers_of_facts():
