@@ -1,9 +1,8 @@
 """What a run took of its machine, as its recording says."""
 
-from dataclasses import astuple
-from typing import Literal
-
-from pydantic import TypeAdapter, ValidationError
+import json
+from dataclasses import astuple, fields
+from typing import Any, Literal
 
 from hilctl.base.errors import DataError
 from hilctl.base.quantity import quantity
@@ -11,7 +10,8 @@ from hilctl.machine.usage import ProcessUsage
 from hilctl.recording.data import Recording
 from hilctl.recording.facts import USAGE_FACT
 
-_USAGE = TypeAdapter(dict[Literal["loop", "supervisor"], ProcessUsage])
+_PROCESSES = {"loop", "supervisor"}
+_NAMES = {each.name for each in fields(ProcessUsage)}
 _MOST = 2**63
 
 
@@ -23,14 +23,41 @@ def processes_of(recording: Recording) -> dict[str, ProcessUsage]:
     """
     text = recording.end.get(USAGE_FACT, "{}")
     where = f"{recording.path}: hilctl.end: {USAGE_FACT}"
+    found = _plain(text)
+    if found is None:
+        found = _understood(text, where)
+    if any(not 0 <= value < _MOST for each in found.values() for value in astuple(each)):
+        raise DataError(f"{where}: every number must be in [0, 2^63)")
+    return found
+
+
+def _plain(text: str) -> dict[str, ProcessUsage] | None:
+    """Return what hilctl has written; None where it is anything else."""
     try:
-        found = _USAGE.validate_json(text)
+        given = json.loads(text)
+    except (ValueError, RecursionError):
+        return None
+    if not (isinstance(given, dict) and given.keys() <= _PROCESSES):
+        return None
+    if not all(map(_is_plain, given.values())):
+        return None
+    return {name: ProcessUsage(**each) for name, each in given.items()}
+
+
+def _is_plain(each: Any) -> bool:
+    whole = isinstance(each, dict) and each.keys() == _NAMES
+    return whole and all(type(value) is int for value in each.values())
+
+
+def _understood(text: str, where: str) -> dict[str, ProcessUsage]:
+    from pydantic import TypeAdapter, ValidationError  # only to say what is wrong, as a rule
+
+    try:
+        found = TypeAdapter(dict[Literal["loop", "supervisor"], ProcessUsage]).validate_json(text)
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False)[0]
         place = ".".join(str(part) for part in first["loc"])
         raise DataError(f"{where}: {place}: {first['msg']}") from None
-    if any(not 0 <= value < _MOST for each in found.values() for value in astuple(each)):
-        raise DataError(f"{where}: every number must be in [0, 2^63)")
     return {str(name): usage for name, usage in found.items()}
 
 

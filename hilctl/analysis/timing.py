@@ -5,8 +5,7 @@ import numpy as np
 from hilctl.analysis.quantiles import MOST_EXACT, Quantiles
 from hilctl.base.arrays import I64
 from hilctl.base.errors import DataError
-from hilctl.experiment.parts import Timing
-from hilctl.loop.pacer import deadline_misses
+from hilctl.loop.pacer import USUAL_MISSED_SHARE, deadline_misses
 from hilctl.recording.data import Recording, Ticks
 
 MOST_ROWS = 1440
@@ -136,8 +135,7 @@ def misses(recording: Recording, ticks: int) -> str:
         DataError: A number that the recording says of it is none.
     """
     skipped = counter(recording, "skipped_ticks", None) or 0
-    usual = Timing().max_missed_share
-    text = recording.run.get("max_missed_share", repr(usual))
+    text = recording.run.get("max_missed_share", repr(USUAL_MISSED_SHARE))
     try:
         max_share = float(text)
     except ValueError:

@@ -14,8 +14,8 @@ watching.py    a run in the terminal: watcher.py  keys and screens, watch_view.p
                braille.py  curves, terminal.py  the terminal itself
 live.py        the page of runs that are going on
 listing.py     recordings below a folder, found by what they say
-recordings.py  judge, replay, export and recover them, identify models;
-               identify_view.py and report_view.py
+reading.py     judge, replay and export recordings; report_view.py
+recordings.py  recover them, identify models; identify_view.py
 comparing.py   models against one another; compare_view.py
 learning.py    corrections from run to run
 campaigning.py  many runs of one experiment; campaign_view.py
@@ -48,9 +48,11 @@ from hilctl.cli.volume import heard_as_asked, print_origin, take_volume
 
 STEERING = ("status", "set", "mark", "stop")
 """Commands about runs that are going on."""
-QUICK = (*STEERING, "list")
+READING = ("report", "replay", "export")
+"""Commands about recordings that are there."""
+QUICK = (*STEERING, *READING, "list")
 """Commands that nobody wants to wait for: they go past the application, which takes longer to
-import than they take to run."""
+import than most of them take to run."""
 
 _SEARCHED_OBJECTS = 500_000
 """New objects after which Python searches for garbage: more than any command imports."""
@@ -108,7 +110,6 @@ def _memory_said_once() -> Iterator[None]:
 
 def _command() -> None:
     if len(sys.argv) > 1 and sys.argv[1] in QUICK:
-        gc.disable()  # it ends before a search for garbage would pay
         raise SystemExit(quick(sys.argv[1], sys.argv[2:]))
     from hilctl.cli.application import app
 
@@ -121,6 +122,10 @@ def quick(name: str, words: Sequence[str]) -> int:
         from hilctl.cli.steering import steer
 
         return steer(name, words)
+    if name in READING:
+        from hilctl.cli.reading import read_recording
+
+        return read_recording(name, words)
     from hilctl.cli.listing import list_recordings
 
     return list_recordings(words)

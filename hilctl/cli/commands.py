@@ -77,7 +77,7 @@ COMMANDS: dict[str, CommandEntry] = {
         "List the recordings below a folder, by what their first and last bytes say.",
     ),
     "report": CommandEntry(
-        "hilctl.cli.recordings:report",
+        "hilctl.cli.reading:report",
         "Judge a recording: hysteresis, error, noise, lateness; or many, or a campaign's folder.",
     ),
     "figures": CommandEntry(
@@ -85,11 +85,11 @@ COMMANDS: dict[str, CommandEntry] = {
         "Draw the figures that apply to runs, by what varied among them: loops, trends, errors.",
     ),
     "replay": CommandEntry(
-        "hilctl.cli.recordings:replay",
+        "hilctl.cli.reading:replay",
         "Recompute the commands from the recorded reference and compare them bit for bit.",
     ),
     "export": CommandEntry(
-        "hilctl.cli.recordings:export",
+        "hilctl.cli.reading:export",
         "Write a recording's samples as CSV, NumPy, Parquet or MATLAB file.",
     ),
     "recover": CommandEntry(

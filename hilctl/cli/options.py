@@ -19,8 +19,6 @@ LabelTexts = Annotated[
     list[str] | None,
     typer.Option("--label", metavar="KEY=VALUE", help="What the run is found by; may be repeated."),
 ]
-FromS = Annotated[float | None, typer.Option("--from", help="From this time of the run, in s.")]
-ToS = Annotated[float | None, typer.Option("--to", help="Up to this time of the run, in s.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object for programs.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace the file if it exists.")]
 

@@ -11,6 +11,7 @@ from hilctl.base.strict import (
     WithJsonSchema,
     model_validator,
 )
+from hilctl.loop.pacer import USUAL_MISSED_SHARE
 from hilctl.recording.facts import RECORDINGS
 
 _NAME = "[A-Za-z0-9][A-Za-z0-9_.-]{0,79}"
@@ -77,7 +78,7 @@ class Timing(Strict):
     max_consecutive_late: Annotated[int, Field(ge=0)] | None = None
     grace_s: Annotated[float, Field(ge=0.0)] = 0.0
     on_misses: Literal["warn", "fault"] = "fault"
-    max_missed_share: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.01
+    max_missed_share: Annotated[float, Field(ge=0.0, lt=1.0)] = USUAL_MISSED_SHARE
     hang_s: Annotated[float, Field(ge=0.02, le=60.0)] | None = None
 
 

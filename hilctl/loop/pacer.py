@@ -7,11 +7,15 @@ import os
 import time
 from collections import deque
 from dataclasses import dataclass
-from typing import Literal, TypeAlias
+from typing import TYPE_CHECKING, Literal, TypeAlias
 
-from hilctl.base.device import Clock
+if TYPE_CHECKING:
+    from hilctl.base.device import Clock
 
 LatePolicy: TypeAlias = Literal["skip", "catch_up", "slip", "follow"]
+
+USUAL_MISSED_SHARE = 0.01
+"""Share of ticks that may be skipped, where no other is given."""
 
 _FOLLOW = 1.0 / 64.0
 _FEWEST_STALLS = 5  # one stall, however long, may be an accident; what goes on stalling is none
@@ -154,7 +158,7 @@ class Pacer:
     """
 
     def __init__(
-        self, clock: Clock, period_ns: float, policy: LatePolicy, rules: LateRules
+        self, clock: "Clock", period_ns: float, policy: LatePolicy, rules: LateRules
     ) -> None:
         self._clock = clock
         self._period_ns = period_ns

@@ -48,6 +48,12 @@ def test_what_is_damaged_is_refused_with_its_place(text):
         processes_of(recording({USAGE_FACT: text}))
 
 
+def test_a_number_with_a_point_that_is_whole_is_one():
+    """Other programs may write it so."""
+    text = usage_facts(LOOP, SUPERVISOR)[USAGE_FACT].replace("98000000", "98000000.0")
+    assert processes_of(recording({USAGE_FACT: text}))["loop"] == LOOP
+
+
 def test_people_read_megabytes_and_seconds():
     assert usage_text(LOOP) == (
         "98 MB, 1.50 s of CPU, 15 page faults, 3 from a disk; 1,234 involuntary switches"

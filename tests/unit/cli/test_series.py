@@ -8,7 +8,7 @@ import pytest
 
 from hilctl.analysis import html
 from hilctl.base.errors import InputError
-from hilctl.cli.recordings import report
+from hilctl.cli.reading import report
 from hilctl.cli.series import figures
 
 GOLDEN = Path(__file__).parents[3] / "recordings" / "golden"
