@@ -21,6 +21,7 @@ Facts: TypeAlias = Mapping[str, str]
 _CSV_ROWS = 20_000
 _GROUP_ROWS = 2**20  # as pyarrow has it
 _BATCH_ROWS = 2**16  # that are encoded at once; pages are of as many or twice that
+_WRITTEN_BYTES = 2**21  # at once: Arrow waits for the interpreter each time, at every page
 _LARGEST_MAT_BYTES = 2**31 - 1  # of a variable, as MATLAB reads files of this version
 _MAT_HEADER_BYTES = 128
 _MATRIX, _DIMENSIONS, _NAME, _FLAGS = 14, 5, 1, 6
@@ -76,6 +77,33 @@ class CsvFile:
         """Do nothing."""
 
 
+class _RefusedOnce:
+    """A stream for Arrow, which tries again what was refused, and prints that it was in vain.
+
+    Args:
+        stream: Where it goes; it stays open.
+    """
+
+    def __init__(self, stream: BinaryIO) -> None:
+        self._stream = stream
+        self._refused = self.closed = False
+
+    def write(self, data: bytes) -> int:
+        if self._refused or self._stream.closed:
+            return len(data)
+        try:
+            return self._stream.write(data)
+        except OSError:
+            self._refused = True
+            raise
+
+    def flush(self) -> None:
+        pass
+
+    def close(self) -> None:
+        self.closed = True
+
+
 class ParquetFile:
     """Row groups of a million or two; facts are the schema's metadata.
 
@@ -92,7 +120,8 @@ class ParquetFile:
     def __init__(self, stream: BinaryIO, aside: IO[bytes] | None = None) -> None:
         del aside
         self._pa = arrow()
-        self._stream = stream
+        file = self._pa.PythonFile(_RefusedOnce(stream), mode="w")
+        self._stream = self._pa.BufferedOutputStream(file, _WRITTEN_BYTES)
         self._writer: Any = None
         self._waiting: list[Any] = []
 
@@ -123,6 +152,7 @@ class ParquetFile:
             kept = {"ARROW:schema": b64encode(schema.serialize()).decode(), **metadata}
             self._writer.add_key_value_metadata(kept)
         self._writer.close()
+        self._stream.close()
 
     def _write(self, *, store_schema: bool = False) -> None:
         if not self._waiting:

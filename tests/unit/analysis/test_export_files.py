@@ -1,5 +1,7 @@
 """Files of columns that come in pieces: the same as of all at once."""
 
+import errno
+import gc
 import io
 import json
 from tempfile import TemporaryFile
@@ -90,6 +92,41 @@ def test_parquet_row_groups_fill_up_across_pieces(tmp_path, monkeypatch, rows):
     assert {f"hilctl.{name}".encode(): text.encode() for name, text in FACTS.items()}.items() <= (
         metadata.items()
     )
+
+
+class Full(io.BytesIO):
+    """A disk with room for a few bytes."""
+
+    def write(self, data):
+        if self.tell() + len(data) > 1000:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return super().write(data)
+
+
+@pytest.mark.parametrize("size", [1, 2**21])
+def test_parquet_that_is_refused_is_refused_once(monkeypatch, capfd, size):
+    """Whenever it is written; Arrow, which tries again, has nothing to say of that."""
+    monkeypatch.setattr(export_files, "_WRITTEN_BYTES", size)
+
+    def refused():
+        file = ParquetFile(Full())
+        file.add(WHOLE)
+        file.finish(FACTS)
+
+    with pytest.raises(OSError, match="No space left on device"):
+        refused()
+    gc.collect()
+    assert capfd.readouterr() == ("", "")
+
+
+def test_parquet_that_is_given_up_leaves_its_stream_alone(capfd):
+    """As where a recording breaks off."""
+    stream = io.BytesIO()
+    file = ParquetFile(stream)
+    file.add(PARTS[0])
+    stream.close()
+    del file
+    assert capfd.readouterr() == ("", "")
 
 
 def test_only_columns_that_can_have_nulls_say_so(tmp_path):
