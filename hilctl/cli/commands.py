@@ -4,6 +4,8 @@ A name stands for where its function is, so that a command may come from ``hilct
 ``hilctl`` never imports, and ``--help`` costs no more than this table.
 """
 
+import argparse
+import inspect
 from importlib import import_module
 from typing import Any, NamedTuple
 
@@ -176,6 +178,28 @@ class _Quick(TyperCommand):
         raise typer.Exit(quick(str(self.name), ctx.args))
 
 
+def _options(parser: argparse.ArgumentParser) -> list[Any]:
+    """Return the options of a command that reads its own arguments, for shells to complete."""
+
+    def takes_them(**_options: Any) -> None:
+        pass
+
+    parameters = [
+        inspect.Parameter(
+            each.dest,
+            inspect.Parameter.KEYWORD_ONLY,
+            default=typer.Option(None, *each.option_strings, help=each.help),
+            annotation=bool if each.nargs == 0 else str,
+        )
+        for each in parser._actions  # noqa: SLF001, argparse has no other way to them
+        if each.option_strings and each.dest != "help"
+    ]
+    setattr(takes_them, "__signature__", inspect.Signature(parameters))  # noqa: B010, no other has it
+    alone = typer.Typer(add_completion=False)
+    alone.command()(takes_them)
+    return typer.main.get_command(alone).params
+
+
 def load(name: str) -> Any:
     """Return a command of the table, ready to be called.
 
@@ -184,13 +208,14 @@ def load(name: str) -> Any:
     """
     module_name, _, attribute = COMMANDS[name].place.partition(":")
     try:
-        found = getattr(import_module(module_name), attribute)
+        module = import_module(module_name)
+        found = getattr(module, attribute)
     except (ImportError, AttributeError) as error:
         if error.name in OF_LINUX:
             raise
         raise InputError(f"{name} can't be loaded: {error}") from error
     if name in QUICK:
-        return _Quick(name, help=found.__doc__)
+        return _Quick(name, help=found.__doc__, params=_options(module.parser_of(name)))
     if isinstance(found, typer.Typer):
         group = typer.main.get_group(found)
         group.name = name

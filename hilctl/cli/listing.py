@@ -33,7 +33,7 @@ _TO_SECONDS = len("2000-01-01T00:00:00")
 
 def list_recordings(words: Sequence[str]) -> int:
     """List the recordings below a folder, by what their first and last bytes say."""
-    given = _parser().parse_args(words)
+    given = parser_of("list").parse_args(words)
     finish_orphans()
     catalogue = read_catalogue(given.folder)
     if given.keys:
@@ -47,9 +47,10 @@ def list_recordings(words: Sequence[str]) -> int:
     return 0
 
 
-def _parser() -> argparse.ArgumentParser:
+def parser_of(name: str) -> argparse.ArgumentParser:
+    """Return what reads the words of the command."""
     parser = argparse.ArgumentParser(
-        "hilctl list",
+        f"hilctl {name}",
         description=list_recordings.__doc__,
         epilog="Example: --where 'frequency_hz > 100 and label.sample == \"A7\"'",
         allow_abbrev=False,

@@ -27,6 +27,12 @@ def read_recording(name: str, words: Sequence[str]) -> int:
     Raises:
         HilctlError: It could not be done.
     """
+    command, _ = _COMMANDS[name]
+    return command(**vars(parser_of(name).parse_intermixed_args(words)))
+
+
+def parser_of(name: str) -> argparse.ArgumentParser:
+    """Return what reads the words of a command."""
     command, add_arguments = _COMMANDS[name]
     parser = argparse.ArgumentParser(
         f"hilctl {name}", description=command.__doc__, allow_abbrev=False
@@ -35,7 +41,7 @@ def read_recording(name: str, words: Sequence[str]) -> int:
     parser.add_argument(
         "--json", dest="as_json", action="store_true", help="Print one JSON object for programs."
     )
-    return command(**vars(parser.parse_intermixed_args(words)))
+    return parser
 
 
 def report(

@@ -36,9 +36,13 @@ def steer(name: str, words: Sequence[str]) -> int:
     Raises:
         HilctlError: It could not be done.
     """
-    command = _COMMANDS[name]
+    return _COMMANDS[name](parser_of(name).parse_args(words))
+
+
+def parser_of(name: str) -> argparse.ArgumentParser:
+    """Return what reads the words of a command."""
     parser = argparse.ArgumentParser(
-        f"hilctl {name}", description=command.__doc__, allow_abbrev=False
+        f"hilctl {name}", description=_COMMANDS[name].__doc__, allow_abbrev=False
     )
     parser.add_argument("--json", action="store_true", help="Print one JSON object for programs.")
     if name != "status":
@@ -47,7 +51,7 @@ def steer(name: str, words: Sequence[str]) -> int:
         )
     if name in _ARGUMENTS:
         _ARGUMENTS[name](parser)
-    return command(parser.parse_args(words))
+    return parser
 
 
 def status(given: argparse.Namespace) -> int:

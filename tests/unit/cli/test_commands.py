@@ -1,6 +1,7 @@
 """The table of commands: every place is right, and nothing is loaded before it is called."""
 
 import json
+import os
 import subprocess
 import sys
 
@@ -117,6 +118,29 @@ def hilctl(*arguments):
         text=True,
         timeout=120,
     )
+
+
+@pytest.mark.parametrize(
+    ("words", "some"),
+    [
+        ("hilctl report --", {"--html", "--from", "--json", "--help"}),
+        ("hilctl list --", {"--where", "--reverse"}),
+        ("hilctl stop --", {"--all", "--wait", "--run"}),
+        ("hilctl check --", {"--set"}),
+    ],
+)
+def test_a_shell_completes_the_options_of_every_command(words, some):
+    """Of those that read their own arguments, too."""
+    code = "import sys; sys.argv[0] = 'hilctl'; from hilctl.cli import main; main()"
+    asked = {"_HILCTL_COMPLETE": "complete_bash", "COMP_WORDS": words, "COMP_CWORD": "2"}
+    ended = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        env={**os.environ, **asked},
+    )
+    assert set(ended.stdout.split()) >= some, ended.stderr
 
 
 def test_a_command_never_searches_for_garbage(tmp_path):
