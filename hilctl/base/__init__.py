@@ -9,7 +9,7 @@ private.py   folders that belong to one user alone
 samples.py   a sample's columns and flags, and blocks of samples
 events.py    what a run records beside its samples
 segments.py  which samples of a run are judged
-exponential.py of a matrix, and error_function.py, both without SciPy
+exponential.py of a matrix, without SciPy
 metrics.py   pure: folding onto one cycle, peak hysteresis, loop area, errors, sensor noise
 remedy.py    what the system says of files and ports, and what to do about it
 printable.py texts from files as people may be shown them

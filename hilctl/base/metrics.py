@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from hilctl.base.arrays import F64, I64
-from hilctl.base.error_function import erf
 
 MAX_BINS = 1000
 """Most phase bins of an average cycle: at 1000 a sine's peak loses 2e-6 of its amplitude."""
@@ -318,7 +317,8 @@ def noise_of(median_um: float, windows: int) -> float | None:
 def expected_maximum(values: int) -> float:
     """Return the expected largest magnitude of that many independent standard normal values."""
     x = np.linspace(0.0, 10.0, 2001)
-    below = erf(x / np.sqrt(2.0)) ** values
+    erf = np.array([math.erf(each) for each in (x / math.sqrt(2.0)).tolist()])
+    below = erf**values
     return float(np.trapezoid(1.0 - below, x))
 
 
