@@ -219,8 +219,12 @@ class DacDevice(ABC):
         low, high = self._low, self._high
         if command.size > _SHORT:
             return bool(low <= command.min() and command.max() <= high)  # both NaN for a NaN
-        # numpy takes as long for a few as for hundreds.
-        return all(low <= value <= high for value in command.tolist())
+        for value in command.tolist():  # numpy takes as long for a few as for hundreds
+            if not low <= value <= high:
+                break
+        else:
+            return True
+        return False
 
     def _error(self, action: str, what: str) -> DeviceError:
         return DeviceError(f"{self._title}: {what} (to {action})")

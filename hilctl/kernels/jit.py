@@ -88,9 +88,9 @@ def entry(each: Function) -> Function:
     """Return a kernel of one signature as a function that does not look up its arguments' types.
 
     Calling it takes half the time. Nothing refuses arrays of other types: for callers that make
-    what they pass.
+    what they pass. Where numba is told not to compile, it is the function itself.
     """
-    return cast("Function", cast("_Kernel", each).only().entry_point)
+    return cast("Function", each.only().entry_point) if isinstance(each, _Kernel) else each
 
 
 def is_kernel(value: object) -> bool:

@@ -148,10 +148,9 @@ class Loop:
         return Outcome(self._code, self._reason, self._ended_at, True, self._dropped)
 
     def _tick(self) -> bool:
-        """Run one tick; return whether the safe value is reached in it."""
-        skipped = self._wait()
-        if not skipped and self._usual_tick():
-            return False
+        """Run usual ticks and then another one; return whether the safe value is reached in it."""
+        while not (skipped := self._wait()) and self._usual_tick():
+            pass
         block = self._claim(skipped)
         # Supervision comes before the commands are worked out: what it asks for holds at once.
         self._supervise()
@@ -196,7 +195,8 @@ class Loop:
         if tripped >= 0:
             block = usual.newest()
             self._take(block, usual.trip(block, tripped))
-        self._leave_invalid(first_sample, invalid)
+        if invalid >= 0:
+            self._leave_invalid(first_sample, invalid)
         return True
 
     def _leave_invalid(self, first_sample: int, invalid: int) -> None:

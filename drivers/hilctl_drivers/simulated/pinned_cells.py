@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hilctl.base.arrays import F64
-from hilctl.kernels.jit import kernel
+from hilctl.kernels.jit import entry, kernel
 from hilctl_drivers.simulated.rods import Coil, RodParameters, Rods
 
 
@@ -173,6 +173,7 @@ class PinnedCells(Rods):
         )
         self._cells = parameters.table()
         self._state = np.zeros(1)
+        self._follow = entry(_follow)
 
     def rest(self) -> float:
         """Put every cell at the bias field."""
@@ -182,4 +183,4 @@ class PinnedCells(Rods):
 
     def follow(self, halves_a: F64, free_um: F64) -> None:
         """Advance step by step."""
-        _follow(halves_a, free_um, self._state, self._cells, self._coil, self._curve)
+        self._follow(halves_a, free_um, self._state, self._cells, self._coil, self._curve)

@@ -61,8 +61,8 @@ class Plant(ABC):
             seed: Seed of that noise.
         """
         self._noise = SensorNoise(noise_um, seed)
-        self._command = np.empty(CHUNK)
-        self._held = self._command
+        self._arrays = np.empty((3, CHUNK))
+        self._block = tuple(self._arrays)
 
     def reset(self) -> None:
         """Go back to rest, with the noise from its start."""
@@ -78,19 +78,19 @@ class Plant(ABC):
             displacement_um: float64[n], filled with readings of the displacement from rest.
             measured: float64[n], filled with the command as it had come about at each reading.
         """
-        if command.size <= CHUNK:
-            self._step(command, displacement_um, measured)
+        samples = command.size
+        if samples > CHUNK:
+            for start in range(0, samples, CHUNK):
+                part = slice(start, start + CHUNK)
+                self.step(command[part], displacement_um[part], measured[part])
             return
-        for start in range(0, command.size, CHUNK):
-            part = slice(start, start + CHUNK)
-            self._step(command[part], displacement_um[part], measured[part])
-
-    def _step(self, command: F64, displacement_um: F64, measured: F64) -> None:
-        samples, held = command.size, self._held
-        if held.size != samples:  # the view is kept: one block is as long as the next
-            self._held = held = self._command[:samples]
-        held[:] = command  # a copy: compiled code refuses read-only arrays
-        self._advance(held, self._noise.draw(samples), displacement_um, measured)
+        # Copies: whatever callers have, what is compiled gets arrays of its one kind.
+        held, read_um, read = self._block
+        if held.size != samples:  # the views are kept: one block is as long as the next
+            self._block = held, read_um, read = tuple(self._arrays[:, :samples])
+        held[:] = command
+        self._advance(held, self._noise.draw(samples), read_um, read)
+        displacement_um[:], measured[:] = read_um, read
 
     def warm_up(self) -> None:
         """Go on by one sample and back to rest, so that nothing is compiled or loaded later."""
@@ -112,4 +112,4 @@ class Plant(ABC):
 
     @abstractmethod
     def _advance(self, command: F64, noise_um: F64, displacement_um: F64, measured: F64) -> None:
-        """Do :meth:`step` for one chunk with its noise."""
+        """Do :meth:`step` for one chunk with its noise; all arrays are contiguous."""

@@ -239,3 +239,12 @@ def test_a_kept_kernel_is_loaded_without_what_compiling_takes():
 def test_called_with_a_type_that_casts():
     """The first call takes what later ones take: an integer for a number."""
     assert jit.kernel("float64(float64)")(double)(2) == 4.0
+
+
+def test_what_is_no_kernel_is_its_own_entry():
+    """As where numba is told not to compile: who calls by entries works there, too."""
+
+    def plain(x):
+        return x
+
+    assert jit.entry(plain) is plain
