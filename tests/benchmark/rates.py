@@ -130,7 +130,7 @@ def measured(case: Case, pairs: int, seconds: float, folder: Path) -> bool:
         f"{case.rate_hz} Hz, blocks of {case.block}, {case.wait}, {case.model}: "
         f"late {text(late)} %, C that only sleeps {text(late_c)} %"
         f"{f', that only spins {text(spinning)} %' if spinning else ''}; "
-        f"cores {loop_cores:.2f} (rig {statistics.median(rig_cores):.2f}) "
+        f"cores {loop_cores:.3f} (rig {statistics.median(rig_cores):.2f}) "
         f"and {supervisor_cores:.2f}, C {statistics.median(cores_c):.2f}; "
         f"resident {memory_mb[0]:.0f} and {memory_mb[1]:.0f} MB"
     )
