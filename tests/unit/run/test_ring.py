@@ -1,11 +1,14 @@
 """The ring between loop and recorder."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from hilctl.base.samples import LAST_SAMPLE, LONGEST_NS, Flag, Head
+from hilctl.machine.memory import mappings
 from hilctl.run import ring as module
 from hilctl.run.ring import SampleRing
 from hilctl.run.shared_page import Field, PageText
@@ -59,6 +62,27 @@ def test_full_ring_refuses_and_keeps_what_it_has(tmp_path):
     assert not push(ring, 9)
     other.release()
     assert push(ring, 9)
+
+
+def test_the_consumer_keeps_no_page_that_it_has_given_back(tmp_path):
+    """Not mapped any more in the process that was through all of it; what stands there stays."""
+
+    def mapped():
+        with Path("/proc/self/smaps").open(encoding="utf-8") as lines:
+            return sum(each.resident for each in mappings(lines) if each.path == str(ring.path))
+
+    ring = make(tmp_path, slots=1000)
+    for number in range(1000):
+        push(ring, number)
+    other = SampleRing(ring.path)
+    for _ in other.batches():
+        pass
+    before = mapped()
+    other.release(keep=10)
+    after = mapped()
+    assert before - after > 1000 * BLOCK * 8
+    batch, _ = other.look(990)
+    assert batch.columns[:, 1, 0].tolist() == list(range(990, 1000))
 
 
 def test_many_come_out_some_at_a_time(tmp_path, monkeypatch):
