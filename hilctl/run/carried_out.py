@@ -39,7 +39,7 @@ def carry_out(data: bytes, all_compiled: Callable[[], None]) -> int:
         all_compiled: See :func:`run_job`.
     """
     job = Job.from_bytes(data)
-    ring = SampleRing(job.ring)
+    ring = SampleRing(job.ring, at_once=True)
     page = ring.page
     try:
         outcome = run_job(job, ring, job.parts(), all_compiled)

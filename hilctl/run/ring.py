@@ -49,6 +49,8 @@ class SampleRing:
     Args:
         path: File that holds it; one that :meth:`create` made.
         look_only: Map it so that nothing can be written: for those who look on.
+        at_once: Map all of it now, and not page by page as it is touched: for the loop, whose
+            memory may not be locked.
 
     Attributes:
         page: Numbers, texts and events beside the blocks.
@@ -60,12 +62,14 @@ class SampleRing:
         OSError: It can't be opened.
     """
 
-    def __init__(self, path: Path, *, look_only: bool = False) -> None:
+    def __init__(self, path: Path, *, look_only: bool = False, at_once: bool = False) -> None:
         self.path = path
         descriptor = os.open(path, os.O_RDONLY if look_only else os.O_RDWR)
         try:
-            access = mmap.ACCESS_READ if look_only else mmap.ACCESS_WRITE
-            self._map = mmap.mmap(descriptor, os.fstat(descriptor).st_size, access=access)
+            prot = mmap.PROT_READ if look_only else mmap.PROT_READ | mmap.PROT_WRITE
+            flags = mmap.MAP_SHARED | (mmap.MAP_POPULATE if at_once else 0)
+            size = os.fstat(descriptor).st_size
+            self._map = mmap.mmap(descriptor, size, flags=flags, prot=prot)
         finally:
             os.close(descriptor)
         if len(self._map) < _PAGE_SIZE:

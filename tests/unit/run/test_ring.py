@@ -64,22 +64,31 @@ def test_full_ring_refuses_and_keeps_what_it_has(tmp_path):
     assert push(ring, 9)
 
 
+def mapped(ring):
+    """Return the bytes of a ring's file that this process has mapped, in all of its mappings."""
+    with Path("/proc/self/smaps").open(encoding="utf-8") as lines:
+        return sum(each.resident for each in mappings(lines) if each.path == str(ring.path))
+
+
+def test_a_loop_has_all_of_it_mapped_before_its_first_tick(tmp_path):
+    """Where memory can't be locked, a block would be the first to touch its pages."""
+    size = make(tmp_path, slots=1000).path.stat().st_size
+    assert mapped(SampleRing(tmp_path / "ring")) < size
+    whole = SampleRing(tmp_path / "ring", at_once=True)
+    assert mapped(whole) >= size
+
+
 def test_the_consumer_keeps_no_page_that_it_has_given_back(tmp_path):
     """Not mapped any more in the process that was through all of it; what stands there stays."""
-
-    def mapped():
-        with Path("/proc/self/smaps").open(encoding="utf-8") as lines:
-            return sum(each.resident for each in mappings(lines) if each.path == str(ring.path))
-
     ring = make(tmp_path, slots=1000)
     for number in range(1000):
         push(ring, number)
     other = SampleRing(ring.path)
     for _ in other.batches():
         pass
-    before = mapped()
+    before = mapped(ring)
     other.release(keep=10)
-    after = mapped()
+    after = mapped(ring)
     assert before - after > 1000 * BLOCK * 8
     batch, _ = other.look(990)
     assert batch.columns[:, 1, 0].tolist() == list(range(990, 1000))
