@@ -215,9 +215,9 @@ def test_slip_moves_the_grid():
     assert paced.late_ns == 0
 
 
-def test_system_clock_sleeps_to_a_deadline():
+@pytest.mark.parametrize("clock", [SystemClock(), SpinningClock(100_000)])
+def test_system_clock_sleeps_to_a_deadline(clock):
     """A sleep ends after its deadline, and one in the past at once."""
-    clock = SystemClock()
     deadline_ns = clock.now_ns() + 2_000_000
     clock.sleep_until_ns(deadline_ns)
     assert clock.now_ns() >= deadline_ns
@@ -267,6 +267,14 @@ def test_a_clock_that_spins_sleeps_until_shortly_before_a_time_and_then_looks(
     clock.sleep_until_ns(deadline_ns)
     assert slept_until == ([deadline_ns - AWAKE_NS] if ahead_ns > AWAKE_NS else [])
     assert deadline_ns <= next(looks) - 50 <= max(deadline_ns, now + 100) + 50
+
+
+def test_a_clock_that_spins_ends_at_the_time_itself(monkeypatch):
+    """It looks once whether to sleep, and then until the time has come."""
+    clock, looks = SpinningClock(AWAKE_NS), iter([0, 99, 100])
+    monkeypatch.setattr(clock, "now_ns", lambda: next(looks))
+    clock.sleep_until_ns(100)
+    assert list(looks) == []
 
 
 @pytest.mark.parametrize(
