@@ -203,7 +203,8 @@ def prepare(
     Returns:
         The steps in the order in which they were tried.
     """
-    # The heap before the lock, which keeps it in RAM; the CPU before the policy, so that none is
+    # The heap after the lock, which gives back what is free of it first; from then on pages stay in
+    # RAM once they are touched. The CPU before the policy, so that none is
     # taken from everybody else; SCHED_FIFO last, as the steps before it take milliseconds.
     return (
         _step("gc", "collected once, then off", system.freeze_gc),
