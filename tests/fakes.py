@@ -87,13 +87,13 @@ class FakeInfo:
     """What the loop asks of a device's info."""
 
     measures_command: bool = False
+    in_order: bool = False
 
 
 @dataclass
 class FakeDevice:
     """Answers ten times the last command; may break at a sample."""
 
-    info = FakeInfo()
     output_at_open: float = 0.0
     break_at: int = 10**9
     nan_at: int = 10**9
@@ -101,6 +101,7 @@ class FakeDevice:
     commands: list[float] = field(default_factory=list)
     firsts: list[int] = field(default_factory=list)
     made_safe: list[float] = field(default_factory=list)
+    info: FakeInfo = FakeInfo()
 
     def output(self):
         return self.output_at_open
@@ -191,6 +192,7 @@ class FakeHost:
         self.events: list[Event] = []
         self.heartbeats: list[int] = []
         self.sent: list[tuple[int, list[float]]] = []
+        self.safe_writes: list[float] = []
         self.closed = False
 
     def direct(self):
@@ -225,6 +227,9 @@ class FakeHost:
 
     def record_event(self, event):
         self.events.append(event)
+
+    def writing_safe(self, value):
+        self.safe_writes.append(value)
 
     def column(self, row):
         return np.concatenate([columns[row] for columns in self.columns])

@@ -48,6 +48,9 @@ class DeviceInfo:
         watchdog_reason: Why that is not the experiment's safe value; empty where it is.
         safe_note: What stands behind the safe value where a message with it takes longer than 0.2 s
             to get there, in words; empty where it does not.
+        in_order: Whether it executes commands in the order in which they were sent, across
+            connections too, as a device on a serial line does. Otherwise a command that was never
+            answered may be executed after a later one that was.
         details: Anything worth keeping with a recording (serial numbers, physical parameters).
     """
 
@@ -69,6 +72,7 @@ class DeviceInfo:
     watchdog_command: float | None = None
     watchdog_reason: str = ""
     safe_note: str = ""
+    in_order: bool = False
     details: Mapping[str, str] = field(default_factory=dict)
 
 

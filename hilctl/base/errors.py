@@ -7,6 +7,7 @@ HilctlError
 |   `-- DataError         a recording or a data file can't be read or doesn't hold what is asked
 `-- RunError              something went wrong while current was flowing (exit code 3)
     `-- DeviceError       the device refused, answered wrongly or went away
+        `-- UnconfirmedError  a command was sent to a device that cannot confirm it
 """
 
 from collections.abc import Iterable
@@ -91,4 +92,12 @@ class DeviceError(RunError):
 
     Example scenarios: a command outside the device's range, a time-out, an unplugged cable. The
     text names the device and what it was doing.
+    """
+
+
+class UnconfirmedError(DeviceError):
+    """A command was sent, and the device has no way to confirm it.
+
+    Example scenarios: a text profile with ``reply: none`` and neither ``readback`` nor
+    ``error_query``; a reply that equals the request, on a line that may echo.
     """

@@ -112,12 +112,15 @@ def run_mapping(result: "RunResult", report: "RunReport | None") -> dict[str, An
 def print_run(result: "RunResult", report: "RunReport | None") -> None:
     """Print how a run ended and, unless it is very long, its report."""
     from hilctl.cli.report_view import render
+    from hilctl.loop.safe_output import describe
 
     terminal = console()
     colour = {"completed": "green", "stopped": "yellow"}.get(result.code, "red")
     terminal.print(Text(result.code, colour) + f": {result.reason}")
     if not result.safe:
-        terminal.print("The output is not known to be at its safe value.", style="bold red")
+        terminal.print(f"Not safe: {describe(result.output_state)}.", style="bold red")
+    if result.guardian_active:
+        terminal.print("The guardian keeps trying: see hilctl status, or end it with hilctl safe.")
     if result.deadline_misses:
         terminal.print(result.deadline_misses, style="bold yellow")
     if result.samples == 0:

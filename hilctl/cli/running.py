@@ -99,7 +99,7 @@ def _run(
         print_json(run_mapping(result, report))
     else:
         print_run(result, report)
-    if result.code == "fault" or unread:
+    if result.code == "fault" or unread or not result.safe:
         raise typer.Exit(3)
     if result.stop_signal:
         raise typer.Exit(128 + result.stop_signal)
@@ -158,15 +158,18 @@ def check(experiment: ExperimentFile, settings: Settings = None, as_json: AsJson
 
 def safe(experiment: ExperimentFile, settings: Settings = None, as_json: AsJson = False) -> None:
     """Put a device at its safe value by hand, where no run holds it."""
+    from hilctl.loop.safe_output import describe
     from hilctl.run.by_hand import put_safe
 
     put = put_safe(experiment, settings or [])
+    where = f"{put.device}: {describe(put.output, put.error)} ({put.value:g} {put.unit})"
     if as_json:
         print_json(put.to_mapping())
-    elif put.error:
-        print(f"the safe value could not be confirmed: {put.error}", file=sys.stderr)
-        print("The output is NOT known to be at its safe value: look at it.", file=sys.stderr)
+    elif put.output == "confirmed":
+        print(where)
     else:
-        print(f"{put.device}: at its safe value, {put.value:g} {put.unit}, confirmed")
-    if put.error:
+        print(where, file=sys.stderr)
+        if put.guardian_active:
+            print("The guardian of the last run keeps trying: see hilctl status.", file=sys.stderr)
+    if put.output != "confirmed":
         raise typer.Exit(3)

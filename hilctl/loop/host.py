@@ -105,6 +105,10 @@ class Host(Protocol):
         """Note that no more samples are exchanged: what follows may take a device's time-outs."""
         ...
 
+    def writing_safe(self, value: float) -> None:
+        """Note a write on the way to the safe value, so that another process can go on from it."""
+        ...
+
     def tuning(self) -> Tuning | None:
         """Return a change of the reference that begins now: each one once."""
         ...

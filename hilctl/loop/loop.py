@@ -31,6 +31,7 @@ from hilctl.loop.interlocks import Interlocks, Trip
 from hilctl.loop.limiter import Limiter
 from hilctl.loop.pacer import Lateness, Pacer
 from hilctl.loop.plan import Code, Outcome, Plan
+from hilctl.loop.safe_output import SafeGoal, describe, drive_to_safe
 from hilctl.loop.tuning import Tuner
 from hilctl.loop.usual import UsualTicks
 
@@ -50,6 +51,7 @@ class _Phase(Enum):
 
 
 _BEFORE = (_Phase.STARTING, _Phase.CONDITIONING)
+_AFTER = (_Phase.LEAVING, _Phase.HOLDING)
 _FOLLOWING = _Phase.FOLLOWING  # looked up once: in Python 3.11 that is a call
 
 
@@ -93,6 +95,7 @@ class Loop:
         self._dropped = 0
         self._code: Code = "completed"
         self._reason = "waveform completed"
+        self._faults: set[str] = set()
         self._phase = _Phase.FOLLOWING
 
     @property
@@ -145,7 +148,7 @@ class Loop:
         except DeviceError as error:
             return self._lost_device(error)
         self._record_adapted(ended=True)
-        return Outcome(self._code, self._reason, self._ended_at, True, self._dropped)
+        return Outcome(self._code, self._reason, self._ended_at, "confirmed", self._dropped)
 
     def _tick(self) -> bool:
         """Run usual ticks and then another one; return whether the safe value is reached in it."""
@@ -310,15 +313,22 @@ class Loop:
     def _leave(self, code: Code, event: str, reason: str, sample: int | None = None) -> None:
         """Ramp to the safe value from the next block on.
 
-        Leaving twice is ignored, but for a fault of the waveform that shows after its end.
+        The first reason is that of the run, except that a fault of the waveform that shows after
+        its end replaces it.
         """
-        if self._phase is not _Phase.LEAVING and self._phase is not _Phase.HOLDING:
+        if self._phase not in _AFTER:
             self._phase = _Phase.LEAVING
             self._pacer.policy = self._plan.ramp_policy
-        elif self._code != "completed" or code != "fault":
-            return
-        self._code, self._reason = code, reason
+            self._code, self._reason = code, reason
+        elif self._code == "completed" and code == "fault":
+            self._code, self._reason = code, reason
         if code == "fault":
+            self._record_fault(event, reason, sample)
+
+    def _record_fault(self, event: str, reason: str, sample: int | None) -> None:
+        """Record a fault as an event, the first of each kind only."""
+        if event not in self._faults:
+            self._faults.add(event)
             at = self._next_sample if sample is None else sample
             self._host.record_event(Event(at, "error", event, reason))
 
@@ -430,6 +440,8 @@ class Loop:
         self._record(block)
         if trip is not None and block.guarded:
             self._leave("fault", trip.code, trip.reason, trip.sample)
+        elif trip is not None and self._phase in _AFTER:
+            self._record_fault(trip.code, trip.reason, trip.sample)
 
     def _record(self, block: Block) -> None:
         block.head[_DROPPED_BEFORE] = self._missing + block.skipped
@@ -449,17 +461,25 @@ class Loop:
         self._host.record_event(event)
         # Before the device: its time-outs would look like a hanging loop to the supervisor.
         self._host.closing()
-        safe = True
+        limits = self._limiter.limits
+        pending = not self._device.info.in_order
+        goal = SafeGoal(limits.safe, limits.ramp_per_s, self._limiter.last, pending)
         # The coil first: the samples stand in shared memory, and nothing is lost by waiting.
-        try:
-            self._device.make_safe(self._limiter.limits.safe)
-        except DeviceError as second:
-            text += f"; the safe value could not be confirmed: {second}"
-            safe = False
+        output = drive_to_safe(
+            self._device, goal, self._seconds, self._sleep, self._host.writing_safe
+        )
+        if output.state != "confirmed":
+            text += f"; {describe(output.state, output.error)}"
         for block in self._in_flight:
             if block.due:
                 block.displacement_um[:] = block.measured[:] = np.nan
                 block.flags |= (Flag.SENSOR_INVALID | Flag.UNANSWERED).value
                 self._record(block)
         self._record_adapted(ended=True)
-        return Outcome("fault", text, self._ended_at, safe, self._dropped)
+        return Outcome("fault", text, self._ended_at, output.state, self._dropped)
+
+    def _seconds(self) -> float:
+        return self._clock.now_ns() * 1e-9
+
+    def _sleep(self, wait_s: float) -> None:
+        self._clock.sleep_until_ns(self._clock.now_ns() + round(wait_s * 1e9))

@@ -11,6 +11,7 @@ from hilctl.loop.feedback import Controller
 from hilctl.loop.interlocks import InterlockContext, InterlockSettings
 from hilctl.loop.limiter import CommandLimits
 from hilctl.loop.pacer import LatePolicy, LateRules
+from hilctl.loop.safe_output import OutputState
 from hilctl.loop.window import Window
 
 Code: TypeAlias = Literal["completed", "stopped", "fault"]
@@ -24,15 +25,20 @@ class Outcome:
         code: ``completed``, ``stopped`` on request, or ``fault``.
         reason: One line for people.
         ended_at: Index after the last sample that was sent.
-        safe: Whether the output is known to be at its safe value.
+        output: What is known of the output.
         dropped: Samples that were exchanged but found no room in the ring.
     """
 
     code: Code
     reason: str
     ended_at: int
-    safe: bool
+    output: OutputState
     dropped: int
+
+    @property
+    def safe(self) -> bool:
+        """Whether the device confirmed its safe value."""
+        return self.output == "confirmed"
 
 
 @dataclass(frozen=True, slots=True)

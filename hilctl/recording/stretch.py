@@ -9,7 +9,7 @@ from hilctl.base.samples import LAST_SAMPLE
 from hilctl.base.segments import Segment
 from hilctl.recording.data import Recording, Ticks
 
-_OF_ANY_PART = {"code", "reason", "output_safe", "ended", "recovered"}
+_OF_ANY_PART = {"code", "reason", "output_safe", "output_state", "ended", "recovered"}
 """Facts of the end that hold for every part of a run; the others count the whole of it."""
 
 

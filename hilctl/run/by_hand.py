@@ -1,33 +1,48 @@
-"""A device put at its safe value by hand, with no run."""
+"""Set a device to its safe value by hand, without a run."""
 
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from hilctl.base.errors import ConfigError, DeviceError, Problem
+from hilctl.base.errors import ConfigError, Problem
 from hilctl.base.files import TextFiles
 from hilctl.base.yaml.document import load_document
 from hilctl.experiment.device import made_device
 from hilctl.experiment.file import Safe
-from hilctl.run.run_folder import held_devices
+from hilctl.loop.safe_output import (
+    HOLD_S,
+    PATIENCE_S,
+    LocalError,
+    OutputState,
+    SafeGoal,
+    SafeOutput,
+)
+from hilctl.run.guardian_process import GuardianRelief
+from hilctl.run.run_folder import held_devices, runs
 
 
 @dataclass(frozen=True, slots=True)
-class SafeByHand:
+class SafeResult:
     """What came of it.
 
     Attributes:
         device: The device, for people.
         value: The safe value.
         unit: Its unit, ``A`` or ``V``.
-        error: Why it could not be confirmed; empty where the device confirmed it.
+        output: What is known of the output.
+        error: Why it is not confirmed; empty if no write failed.
+        guardian_active: Whether the guardian of an earlier run keeps trying.
     """
 
     device: str
     value: float
     unit: str
+    output: OutputState
     error: str
+    guardian_active: bool = False
 
     def to_mapping(self) -> dict[str, Any]:
         """Return the fields as plain values."""
@@ -35,22 +50,32 @@ class SafeByHand:
             "device": self.device,
             "safe_value": self.value,
             "unit": self.unit,
-            "output_safe": not self.error,
+            "output_safe": self.output == "confirmed",
+            "output_state": self.output,
             "error": self.error,
+            "guardian_active": self.guardian_active,
         }
 
 
-def put_safe(path: Path, settings: Sequence[str]) -> SafeByHand:
-    """Put the device of an experiment at the experiment's safe value, at once and without a ramp.
+def put_safe(
+    path: Path,
+    settings: Sequence[str],
+    clock: Callable[[], float] = time.monotonic,
+    sleep: Callable[[float], None] = time.sleep,
+) -> SafeResult:
+    """Set the device of an experiment to the experiment's safe value, without a ramp.
 
-    Nothing else of the file is needed, and so nothing else of it can be in the way.
+    Nothing else of the file is needed, and so nothing else of it is checked. A guardian that still
+    drives the device after an earlier run is relieved, and goes on if the device does not confirm.
 
     Args:
         path: Experiment file.
         settings: ``key=value`` texts over it.
+        clock: Monotonic time in s.
+        sleep: Waits that many s.
 
     Raises:
-        InputError: The file can't be used, or a run holds the device. Nothing was sent.
+        InputError: The file can't be used, or a run holds the device; nothing was sent.
     """
     document = load_document(path)
     for setting in settings:
@@ -61,11 +86,57 @@ def put_safe(path: Path, settings: Sequence[str]) -> SafeByHand:
     if device is None:
         raise ConfigError([Problem(str(path), "device", "is required, with a key kind")])
     info = device.info
-    # Not past a run that holds it: its loop would write over the safe value a tick later.
-    with held_devices(info.holds):
+    # A run that died, or that a guardian had to end, may have left a command without an answer.
+    died = any(not run.supervised and set(run.card.holds) & set(info.holds) for run in runs())
+    goal = SafeGoal(safe.value, 1.0, None, pending=died and not info.in_order)
+    relief, output = GuardianRelief(info.holds), SafeOutput(device, goal, clock)
+    with ExitStack() as stack:
+        locks: list[int] = []
         try:
-            device.make_safe(safe.value)
-            error = ""
-        except DeviceError as raised:
-            error = str(raised)
-    return SafeByHand(info.description, safe.value, info.command_unit, error)
+            # Not past a run that holds it: its loop would overwrite the safe value a tick later.
+            locks = stack.enter_context(held_devices(info.holds))
+            _drive(output, clock, sleep, watches=not relief.runs)
+        finally:
+            if output.final:
+                relief.discard()
+            else:
+                relief.resume(locks)
+    return SafeResult(
+        device=info.description,
+        value=safe.value,
+        unit=info.command_unit,
+        output=output.state,
+        error=output.error,
+        guardian_active=bool(relief.runs) and not output.final,
+    )
+
+
+def _drive(
+    output: SafeOutput,
+    clock: Callable[[], float],
+    sleep: Callable[[float], None],
+    *,
+    watches: bool,
+) -> None:
+    """Write until the outcome is final, or nothing more is gained; Ctrl-C ends it too.
+
+    Args:
+        output: What is driven.
+        clock: Monotonic time in s.
+        sleep: Waits that many s.
+        watches: Whether to watch a value that is set until no older command can follow.
+    """
+    give_up_s = clock() + PATIENCE_S
+    try:
+        while True:
+            try:
+                output.attempt()
+            except LocalError as error:
+                output.error = str(error)
+            now_s = clock()
+            watched = watches and output.state == "set" and now_s < give_up_s + HOLD_S
+            if output.final or (now_s >= give_up_s and not watched):
+                return
+            sleep(output.pause_s)
+    except KeyboardInterrupt:
+        return

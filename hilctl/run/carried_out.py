@@ -8,12 +8,13 @@ import os
 import time
 from collections.abc import Callable
 
-from hilctl.base.errors import DeviceError, HilctlError, InputError, RunError
+from hilctl.base.errors import HilctlError, InputError, RunError
 from hilctl.experiment.condition import conditioning_of
 from hilctl.experiment.run_parts import RunParts
 from hilctl.loop.loop import Loop
 from hilctl.loop.pacer import SpinningClock, SystemClock, spin_ns
 from hilctl.loop.plan import Outcome
+from hilctl.loop.safe_output import SafeGoal, describe, drive_to_safe
 from hilctl.machine.memory import ProcessMemory
 from hilctl.machine.realtime import (
     prepare,
@@ -103,7 +104,8 @@ def run_job(
         require(steps)
     device.open(config.sample_rate_hz, config.block)
     try:
-        waveform_at = loop.begin_at(starting_output(device, config.safe.at_start))
+        output = starting_output(device, config.safe.at_start)
+        waveform_at = loop.begin_at(output)
     except BaseException:
         device.close()  # and no safe value: what starts elsewhere is not to step there
         raise
@@ -111,6 +113,8 @@ def run_job(
         # A device may load kernels of its own when it is opened.
         all_compiled()
         ProcessMemory().release()
+        page.put_float(Field.OUTPUT_AT_START, output)
+        page.put(Field.REAL_TIME, int(any(s.name == "fifo" and s.outcome == "done" for s in steps)))
         page.put(Field.WAVEFORM_AT, waveform_at)
         page.write_text(PageText.SET_UP, json.dumps([step_facts(steps), refusals(steps)]))
         # After the text, which the supervisor reads then.
@@ -123,13 +127,14 @@ def run_job(
         # Before the device is closed: that may take its time-outs, and is no hang.
         host.closing()
     except BaseException as error:
-        try:
-            device.make_safe(config.safe.value)
-        except DeviceError as second:
+        limits = config.command_limits()
+        pending = bool(page.get(Field.EXCHANGING)) and not device.info.in_order
+        goal = SafeGoal(limits.safe, limits.ramp_per_s, ring.last_command(), pending)
+        found = drive_to_safe(device, goal, on_write=page.note_safe_write)
+        if found.state != "confirmed":
             # The cause first: a device that can't be reached is often only what follows from it.
             cause = str(error) if isinstance(error, HilctlError) else f"the loop broke: {error!r}"
-            text = f"{cause}; the safe value could not be confirmed: {second}"
-            raise RunError(text) from error
+            raise RunError(f"{cause}; {describe(found.state, found.error)}") from error
         raise
     finally:
         device.close()

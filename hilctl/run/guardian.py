@@ -1,17 +1,20 @@
-"""The guardian: a small process that makes the output safe where the loop no longer can.
+"""The guardian: a small process that sets the output to its safe value if the loop cannot.
 
-Started by the supervisor as ``python -m hilctl.run.guardian`` with the file of its job and a pidfd
-of the loop's process. It reads no file and imports nothing after it has said that it watches, and
-it waits for nobody: neither a disk nor the supervisor stands between a dead loop and the coil.
+Started by the supervisor as ``python -m hilctl.run.guardian JOB PIDFD``, with a pidfd of the loop's
+process. Once it watches, it reads no file, imports nothing and waits for no other process, so that
+neither a disk nor the supervisor can delay the safe value.
 
-It acts whenever the loop has died without an outcome, or hangs. The supervisor makes the output
-safe only after it has seen the guardian dead, or killed it: so no two of them ever hold the device.
+It acts if the loop dies without a confirmed safe output, or hangs. It keeps trying until the device
+confirms the safe value, also after the supervisor has ended; SIGTERM ends it then. The supervisor
+drives the device only after the guardian has ended or was killed, so two processes never hold it.
+
+As ``python -m hilctl.run.guardian JOB act`` it has no loop to watch, and acts at once.
 """
 
 import json
-import mmap
 import os
 import select
+import shutil
 import signal
 import sys
 import time
@@ -20,6 +23,7 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
+from types import FrameType
 from typing import Self
 
 from hilctl.base.device import Device
@@ -27,11 +31,20 @@ from hilctl.base.errors import HilctlError, InputError
 from hilctl.base.files import TextFiles
 from hilctl.base.yaml.document import Document
 from hilctl.experiment.device import made_device
+from hilctl.loop.safe_output import SafeGoal
 from hilctl.machine.linux import LinuxProcess
 from hilctl.machine.realtime import be_quick
 from hilctl.run.hang_watch import HangWatch, SilenceLimits, is_stopped
+from hilctl.run.ring import SampleRing
 from hilctl.run.safe_action import SafeAction
-from hilctl.run.shared_page import SIZE, Field, GuardianPhase, PageText, Phase, SharedPage
+from hilctl.run.shared_page import (
+    Field,
+    GuardianPhase,
+    PageText,
+    Phase,
+    SafeActionResult,
+    SharedPage,
+)
 
 _POLL_MS = 5
 LAST_CALL_MS = 5
@@ -48,9 +61,11 @@ class GuardianJob:
         files: Texts of the files that its device refers to, by absolute path.
         folder: Folder that file names in it are relative to.
         ring: File of the ring.
-        safe_value: What to put out, in the device's command unit.
+        safe_value: The safe value, in the device's command unit.
+        ramp_per_s: Fastest change on the way there.
         limits: How long the loop may be silent.
         loop: Process number of the loop.
+        supervisor: Process number of the supervisor.
         priority: SCHED_FIFO priority that is asked for.
     """
 
@@ -59,8 +74,10 @@ class GuardianJob:
     folder: str
     ring: str
     safe_value: float
+    ramp_per_s: float
     limits: SilenceLimits
     loop: int
+    supervisor: int
     priority: int
 
     def to_json(self) -> str:
@@ -87,32 +104,37 @@ class GuardianJob:
 
 
 class Guardian:
-    """Watches the loop, and makes the output safe where it died or hangs.
+    """Watches the loop, and sets the output to its safe value if the loop died or hangs.
 
     Args:
-        page: Shared with loop and supervisor.
+        ring: Shared with loop and supervisor.
         device: Not open.
         job: What to guard.
         loop: A pidfd of the loop's process.
-        prepare: Called first in the thread that makes the output safe.
+        prepare: Called first in the thread that drives the device.
     """
 
     def __init__(
         self,
-        page: SharedPage,
+        ring: SampleRing,
         device: Device,
         job: GuardianJob,
         loop: int,
         prepare: Callable[[], object] = lambda: None,
     ) -> None:
-        self._page, self._device, self._job, self._loop = page, device, job, loop
+        self._ring, self._page = ring, ring.page
+        self._device, self._job, self._loop = device, job, loop
         self._prepare = prepare
-        self._watch = HangWatch(page, job.limits, lambda: is_stopped(job.loop))
+        self._watch = HangWatch(ring.page, job.limits, lambda: is_stopped(job.loop))
         self._death = select.poll()
         self._death.register(loop, select.POLLIN)
 
-    def watch(self) -> None:
-        """Watch until the loop is gone, and the output safe as far as that can be had."""
+    def watch(self) -> bool:
+        """Watch until the loop is gone, and the output safe if that can be had.
+
+        Returns:
+            False if this process cannot drive the device, and another one has to.
+        """
         page = self._page
         page.put(Field.GUARDIAN_HEARTBEAT_NS, time.monotonic_ns())
         # After the heartbeat: an old one would pass for silence.
@@ -121,14 +143,16 @@ class Guardian:
             now_ns = time.monotonic_ns()
             page.put(Field.GUARDIAN_HEARTBEAT_NS, now_ns)
             if self._death.poll(_POLL_MS):
-                # Without the start signal nothing was sent: the output is as somebody left it.
-                if page.get(Field.GO) and page.get(Field.PHASE) != Phase.ENDED:
-                    self._make_safe(hung=False)
-                return
+                # Without the start signal nothing was sent: the output is as it was before.
+                if not page.get(Field.GO) or page.ended_safely():
+                    return True
+                return act(page, self._device, self._goal(), hung=False, prepare=self._prepare)
             if self._watch.hangs(now_ns):
                 self._kill_loop()
-                self._make_safe(hung=True)
-                return
+                return act(page, self._device, self._goal(), hung=True, prepare=self._prepare)
+
+    def _goal(self) -> SafeGoal:
+        return safe_goal(self._ring, self._device, self._job.safe_value, self._job.ramp_per_s)
 
     def _kill_loop(self) -> None:
         """End the loop for good: should it go on, it would send commands from before."""
@@ -136,42 +160,103 @@ class Guardian:
             signal.pidfd_send_signal(self._loop, signal.SIGKILL)
         self._death.poll(LAST_CALL_MS)
 
-    def _make_safe(self, *, hung: bool) -> None:
-        page = self._page
-        page.put(Field.GUARDIAN_PHASE, GuardianPhase.ACTING)
-        action = SafeAction(self._device, self._job.safe_value, hung=hung, prepare=self._prepare)
-        while (made_safe := action.result(_POLL_MS * 1e-3)) is None:
-            page.put(Field.GUARDIAN_HEARTBEAT_NS, time.monotonic_ns())
-        page.leave_made_safe(made_safe)
+
+def safe_goal(ring: SampleRing, device: Device, value: float, ramp_per_s: float) -> SafeGoal:
+    """Return where the output goes after a loop that has died, by what it left in the ring."""
+    page, info = ring.page, device.info
+    # Loop, guardian or supervisor may have been on the way before.
+    start = page.last_safe_write()
+    if start is None:
+        start = ring.last_command()
+    # A loop that has ended without a confirmed output lost its device in an exchange.
+    unanswered = page.get(Field.EXCHANGING) or page.get(Field.PHASE) == Phase.ENDED
+    return SafeGoal(
+        value, ramp_per_s, None if info.simulated else start, bool(unanswered) and not info.in_order
+    )
+
+
+def act(
+    page: SharedPage,
+    device: Device,
+    goal: SafeGoal,
+    *,
+    hung: bool,
+    prepare: Callable[[], object] = lambda: None,
+) -> bool:
+    """Drive the device until its safe value is confirmed, cannot be, or SIGTERM ends it.
+
+    Args:
+        page: Shared with the supervisor; shows how far it is.
+        device: Not open.
+        goal: Where the output goes.
+        hung: Whether the loop had to be killed.
+        prepare: Called first in the thread that drives the device.
+
+    Returns:
+        False if this process cannot drive the device, and another one has to.
+    """
+    ended_by_user = False
+
+    def end(number: int, frame: FrameType | None) -> None:
+        nonlocal ended_by_user
+        ended_by_user = True
+
+    page.leave_safe_result(SafeActionResult(hung, "unknown", "", final=False))
+    page.put(Field.GUARDIAN_PHASE, GuardianPhase.ACTING)
+    signal.signal(signal.SIGTERM, end)
+    action = SafeAction(page, device, goal, hung=hung, prepare=prepare)
+    while not (result := action.result(_POLL_MS * 1e-3)).final and not ended_by_user:
+        page.put(Field.GUARDIAN_HEARTBEAT_NS, time.monotonic_ns())
+        page.leave_safe_result(result)
+        if action.failed:
+            _fail(page, action.failed)
+            return False
+    page.leave_safe_result(result)
+    return True
+
+
+def _fail(page: SharedPage, text: str) -> None:
+    page.write_text(PageText.GUARDIAN, text)
+    # The text first: the phase says that it is there.
+    page.put(Field.GUARDIAN_PHASE, GuardianPhase.FAILED)
 
 
 def main(words: list[str]) -> int:
-    """Guard one run; the exit code is 0 where the job could be read and the device made."""
+    """Guard one run; the exit code is 0 if the job could be read and the device driven."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)  # it ends with the loop, and not before
     job = GuardianJob.from_json(Path(words[0]).read_text(encoding="utf-8"))
-    page = _page(job.ring)
+    ring = SampleRing(Path(job.ring))
+    page = ring.page
+    page.put(Field.GUARDIAN_PID, os.getpid())
     try:
         device = job.device()
     except HilctlError as error:
-        page.write_text(PageText.GUARDIAN, str(error))
-        page.put(Field.GUARDIAN_PHASE, GuardianPhase.FAILED)
+        _fail(page, str(error))
         return 1
     "localhost".encode("idna")  # the codec, which is imported at the first connection otherwise
     process = LinuxProcess()
     _stay_in_memory(process)
     be_quick(job.priority, process)
     prepare = partial(be_quick, job.priority, process)
-    Guardian(page, device, job, int(words[1]), prepare).watch()
-    return 0
+    if words[1] == "act":
+        goal = safe_goal(ring, device, job.safe_value, job.ramp_per_s)
+        done = act(page, device, goal, hung=False, prepare=prepare)
+    else:
+        done = Guardian(ring, device, job, int(words[1]), prepare).watch()
+    if done and not _is_running(job.supervisor):
+        # Nobody else is left to remove it; the recording was closed before the supervisor ended.
+        _discard(Path(words[0]).parent, page)
+    return 0 if done else 1
 
 
-def _page(ring: str) -> SharedPage:
-    descriptor = os.open(ring, os.O_RDWR)
-    try:
-        return SharedPage(mmap.mmap(descriptor, SIZE))
-    finally:
-        os.close(descriptor)
+def _is_running(process: int) -> bool:
+    return os.getppid() == process
+
+
+def _discard(folder: Path, page: SharedPage) -> None:
+    if page.get(Field.RECORDED) and page.get(Field.GUARDIAN_PHASE) == GuardianPhase.DONE:
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def _stay_in_memory(process: LinuxProcess) -> None:

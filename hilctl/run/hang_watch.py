@@ -15,13 +15,15 @@ class SilenceLimits:
     """How long the loop may be silent.
 
     Attributes:
-        loop_s: While it runs.
+        real_time_s: While it runs with real-time priority.
+        ordinary_s: While it runs without: a busy machine may keep it waiting for so long.
         exchange_s: What is added while it waits for the device.
         stopped_s: While its process is stopped, as by SIGSTOP: it waits for nothing that could
             come, and it is no busy machine that keeps it.
     """
 
-    loop_s: float
+    real_time_s: float
+    ordinary_s: float
     exchange_s: float
     stopped_s: float
 
@@ -64,10 +66,12 @@ class HangWatch:
         silent_s = (now_ns - self._seen_ns) * 1e-9
         if self._polls <= _POLLS:
             return False
-        if silent_s > self._limits.loop_s + self._wait_s(phase):
+        limits = self._limits
+        loop_s = limits.real_time_s if page.get(Field.REAL_TIME) else limits.ordinary_s
+        if silent_s > loop_s + self._wait_s(phase):
             return True
         # Last, since it asks the kernel.
-        return silent_s > self._limits.stopped_s and self._is_stopped()
+        return silent_s > limits.stopped_s and self._is_stopped()
 
     def _wait_s(self, phase: int) -> float:
         """Return how long the loop may be waiting for its device."""

@@ -59,6 +59,7 @@ class RingHost:
         self.clock = clock
         self.claim, self.sending, self.answered = ring.claim, ring.sending, ring.answered
         self.record_event = ring.page.push_event
+        self.writing_safe = ring.page.note_safe_write
         self._ring, self._page = ring, ring.page
         self._numbers = ring.page.numbers
         self._supervisor = supervisor

@@ -123,6 +123,7 @@ def end_facts(outcome: Outcome, counters: Lateness, lost_events: int = 0) -> dic
         "code": outcome.code,
         "reason": outcome.reason,
         "output_safe": str(outcome.safe).lower(),
+        "output_state": outcome.output,
         "late_ticks": str(counters.late_ticks),
         "skipped_ticks": str(counters.skipped_ticks),
         "worst_late_ns": str(counters.worst_ns),

@@ -10,6 +10,7 @@ from hilctl.base.errors import HilctlError
 from hilctl.base.events import Event
 from hilctl.base.samples import Batch, Head
 from hilctl.loop.plan import Outcome
+from hilctl.loop.safe_output import describe
 from hilctl.recording.recover import recover_recording
 from hilctl.run.metadata import end_facts
 from hilctl.run.ring import SampleRing
@@ -53,7 +54,9 @@ def recover_orphans() -> list[Orphan]:
 def _recover(run: RunFolder) -> Orphan:
     path = Path(run.card.recording)
     outcome, batches, events, end = _left_behind(run)
-    where = "at its safe value" if outcome.safe else "NOT known to be safe: look at it"
+    where = "at its safe value" if outcome.safe else "NOT confirmed to be safe: check it"
+    if _is_recorded(run):
+        return Orphan(run.card.name, path, outcome.safe, f"{outcome.reason}; output {where}")
     try:
         recovered = recover_recording(path, batches, end, events=events, ended_at=outcome.ended_at)
         text = f"{outcome.reason}; output {where}; {recovered.samples} samples: {recovered.reason}"
@@ -63,15 +66,33 @@ def _recover(run: RunFolder) -> Orphan:
     return Orphan(run.card.name, path, outcome.safe, text)
 
 
+def _is_recorded(run: RunFolder) -> bool:
+    """Return whether the supervisor closed the recording, and only the output was still to do."""
+    try:
+        return bool(SampleRing(run.ring).page.get(Field.RECORDED))
+    except (OSError, ValueError):
+        return False
+
+
 def _left_behind(
     run: RunFolder,
 ) -> tuple[Outcome, list[Batch], list[Event], dict[str, str]]:
     """Return how the loop ended, blocks and events that are not safe yet, facts of the end."""
-    died = Outcome("fault", "supervisor and loop died", 0, False, 0)
+    died = Outcome("fault", "supervisor and loop died", 0, "unknown", 0)
     try:
         ring = SampleRing(run.ring)
     except (OSError, ValueError):
-        return died, [], [], {"code": died.code, "reason": died.reason, "output_safe": "false"}
+        return (
+            died,
+            [],
+            [],
+            {
+                "code": died.code,
+                "reason": died.reason,
+                "output_safe": "false",
+                "output_state": died.output,
+            },
+        )
     batches = []
     while True:
         while (batch := ring.pop()) is not None:
@@ -82,11 +103,9 @@ def _left_behind(
     outcome = page.outcome() or died
     if page.get(Field.PHASE) == Phase.FAILED:
         outcome = replace(died, reason=page.read_text(PageText.ERROR))
-    if page.outcome() is None and (made_safe := page.made_safe()) is not None:
-        did = "the guardian put the output at its safe value"
-        if not made_safe.confirmed:
-            did = f"the guardian could not confirm the safe value: {made_safe.error}"
-        outcome = replace(outcome, reason=f"{outcome.reason}; {did}", safe=made_safe.confirmed)
+    if not page.ended_safely() and (result := page.safe_result()) is not None:
+        did = f"guardian: {describe(result.output, result.error)}"
+        outcome = replace(outcome, reason=f"{outcome.reason}; {did}", output=result.output)
     if page.get(Field.PHASE) != Phase.ENDED:
         last = batches[-1].heads[-1] if batches else None
         next_sample = 0 if last is None else int(last[Head.FIRST_SAMPLE]) + ring.block

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from hilctl.base.samples import Batch
+from hilctl.loop.safe_output import OutputState
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +34,7 @@ class RunResult:
         path: The recording.
         code: ``completed``, ``stopped`` or ``fault``.
         reason: One line for people.
-        safe: Whether the output is known to be at its safe value.
+        output_state: What is known of the output.
         stop_signal: Number of the signal that stopped it, SIGTERM for a requested stop, or 0.
         samples: Samples recorded.
         missing: Samples counted as dropped, skipped or lost.
@@ -42,12 +43,13 @@ class RunResult:
         adapted: What adaptation made of the model by the end, by name, see
             :data:`hilctl.base.events.ADAPTED`; empty without it.
         on_end: What became of what was started once it was over.
+        guardian_active: Whether a guardian still drives the output to its safe value.
     """
 
     path: Path
     code: str
     reason: str
-    safe: bool
+    output_state: OutputState
     stop_signal: int
     samples: int
     missing: int
@@ -55,6 +57,12 @@ class RunResult:
     deadline_misses: str = ""
     adapted: Mapping[str, float] = field(default_factory=dict)
     on_end: tuple[EndCommandResult, ...] = ()
+    guardian_active: bool = False
+
+    @property
+    def safe(self) -> bool:
+        """Whether the device confirmed its safe value."""
+        return self.output_state == "confirmed"
 
     def to_mapping(self) -> dict[str, Any]:
         """Return what a program reads of it, as plain values."""
@@ -65,6 +73,8 @@ class RunResult:
             "code": self.code,
             "reason": self.reason,
             "output_safe": self.safe,
+            "output_state": self.output_state,
+            "guardian_active": self.guardian_active,
             "deadline_misses": self.deadline_misses,
             "adapted": dict(self.adapted),
             "on_end": [asdict(each) for each in self.on_end],

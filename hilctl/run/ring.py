@@ -26,7 +26,7 @@ import numpy.typing as npt
 
 from hilctl.base.arrays import F64, I64
 from hilctl.base.samples import ANSWERS, COLUMNS, LAST_SAMPLE, LONGEST_NS, Batch, Flag, Head
-from hilctl.loop.block import Block
+from hilctl.loop.block import COMMAND, Block
 from hilctl.run.shared_page import SIZE as _PAGE_SIZE
 from hilctl.run.shared_page import Field, SharedPage
 
@@ -160,6 +160,27 @@ class SampleRing:
         """Return the block that was sent last; its slot is its own, and the sender asks."""
         number = self._numbers[_SENT] - 1
         return self._block(number % self.slots, number)
+
+    def last_command(self) -> float | None:
+        """Return the command that the device is at, as far as the ring tells; for any process.
+
+        Of a device that plays blocks from a FIFO it is the end of the first block that has no
+        answer yet. Before the first block it is where the output was when the loop began.
+
+        Returns:
+            Command in the device's unit; None if the block was not in a slot of its own.
+        """
+        sent, head = self.page.get(Field.SENT), self.page.get(Field.HEAD)
+        if self.page.get(Field.ENDED_AT) == 0:
+            return self.page.get_float(Field.OUTPUT_AT_START)
+        number = min(head, sent - 1)
+        slot = number % self.slots
+        first = int(self._area.heads[slot, Head.FIRST_SAMPLE])
+        if number < 0 or (
+            number == sent - 1 and first + self.block != self.page.get(Field.ENDED_AT)
+        ):
+            return None
+        return float(self._area.columns[slot, COMMAND, -1])
 
     def _block(self, slot: int, number: int, *, due: bool = True) -> Block:
         at = slot * _HEAD_NUMBERS

@@ -19,13 +19,14 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from hilctl.base.errors import InputError, RunError
 from hilctl.base.locks import is_locked, take_lock
 from hilctl.base.private import private_folder, user_folders
 
 _CARD = "run.json"
+_KEPT = "kept"
 _PEER = struct.Struct("3i")  # process, user and group, as in unix(7)
 _REFUSED_ONES = 1000  # so many may ask a lock's socket who holds it
 
@@ -40,6 +41,7 @@ class RunCard:
         recording: Absolute path of the recording.
         supervisor: Process number of the supervisor.
         started: Unix time in s.
+        holds: What its device holds alone, as :attr:`hilctl.base.device.DeviceInfo.holds`.
     """
 
     name: str
@@ -47,6 +49,13 @@ class RunCard:
     recording: str
     supervisor: int
     started: float
+    holds: tuple[str, ...] = ()
+
+    @classmethod
+    def from_json(cls, text: str) -> Self:
+        """Undo the JSON of the fields."""
+        fields = json.loads(text)
+        return cls(**{**fields, "holds": tuple(fields.get("holds", ()))})
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,6 +109,15 @@ class RunFolder:
     def alive(self) -> bool:
         """Whether supervisor or loop lives."""
         return _is_locked(self.path / "run.lock")
+
+    @property
+    def kept(self) -> bool:
+        """Whether a guardian drives the output to its safe value after the supervisor's end."""
+        return (self.path / _KEPT).exists()
+
+    def keep(self) -> None:
+        """Keep it when the supervisor ends: its guardian is still active, and removes it."""
+        (self.path / _KEPT).touch()
 
     def remove(self) -> None:
         """Remove it and all that is in it."""
@@ -158,14 +176,14 @@ def runs() -> list[RunFolder]:
     found = []
     for folder in (each for base in _base_folders(make=False) for each in sorted(base.iterdir())):
         with suppress(OSError, ValueError, TypeError):  # being made or removed at this moment
-            card = RunCard(**json.loads((folder / _CARD).read_text(encoding="utf-8")))
+            card = RunCard.from_json((folder / _CARD).read_text(encoding="utf-8"))
             found.append(RunFolder(folder, card))
     return sorted(found, key=lambda run: run.card.started)
 
 
 @contextmanager
 def run_folder(
-    experiment: str, recording: Path, started: float
+    experiment: str, recording: Path, started: float, holds: Sequence[str] = ()
 ) -> Iterator[tuple[RunFolder, list[int]]]:
     """Make a run's folder and hold its locks; remove it in the end.
 
@@ -180,13 +198,14 @@ def run_folder(
     with ExitStack() as stack:
         try:
             path = _new_folder(base / f"{experiment}-{number}")
-            stack.callback(shutil.rmtree, path, ignore_errors=True)
-            card = RunCard(path.name, experiment, recorded, number, started)
+            card = RunCard(path.name, experiment, recorded, number, started, tuple(holds))
             folder = RunFolder(path, card)
+            removal = stack.enter_context(ExitStack())
+            removal.callback(folder.remove)
             shared = stack.enter_context(_locked(path / "run.lock"))
             stack.enter_context(_locked(path / "supervisor.lock"))
             # Under the locks: a folder with a card and without locks is a dead run to others.
-            stack.callback(folder.remove)
+            stack.callback(lambda: removal.pop_all() if folder.kept else removal.close())
             (path / _CARD).write_text(json.dumps(asdict(card)), encoding="utf-8")
         except OSError as error:
             raise RunError(f"{base}: no run's folder can be made: {error.strerror}") from None
@@ -277,6 +296,17 @@ def _locked(path: Path) -> Iterator[int]:
         yield descriptor
     finally:
         os.close(descriptor)
+
+
+@contextmanager
+def locked_run(run: RunFolder) -> Iterator[int]:
+    """Hold the lock of a run whose processes have ended; yield its descriptor.
+
+    Raises:
+        BlockingIOError: One of them lives.
+    """
+    with _locked(run.path / "run.lock") as descriptor:
+        yield descriptor
 
 
 @contextmanager

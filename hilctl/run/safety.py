@@ -1,30 +1,63 @@
-"""The supervisor's part in making the output safe: it sees to the guardian, and stands in for it.
+"""The supervisor's part in setting the output to its safe value.
 
-Whoever finds the loop dead or hanging first is the guardian, which acts by itself. The supervisor
-acts where there is none: for a simulated device, and where the guardian has died, is stopped, or
-has not started again yet. It kills the guardian first, so that one of them holds the device only.
+The guardian acts by itself if the loop dies or hangs. The supervisor restarts a guardian that is
+lost, and acts in its place if there is none: for a simulated device, and if the guardian has died,
+hangs, cannot drive the device, or has not restarted yet. It kills the guardian first, so that only
+one process holds the device. What is not confirmed when the run ends is left to a guardian.
 """
 
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Sequence
 from functools import partial
 
 from hilctl.base.errors import RunError
 from hilctl.base.events import Event
 from hilctl.experiment.check import Checked
+from hilctl.loop.safe_output import PATIENCE_S
 from hilctl.machine.realtime import be_ordinary, be_quick
 from hilctl.run.child import LoopChild
-from hilctl.run.guardian import LAST_CALL_MS
-from hilctl.run.guardian_process import GuardianProcess, safe_priority, silence_limits
+from hilctl.run.guardian import LAST_CALL_MS, safe_goal
+from hilctl.run.guardian_process import (
+    GuardianProcess,
+    safe_priority,
+    silence_limits,
+    write_guardian_job,
+)
 from hilctl.run.hang_watch import HangWatch, is_stopped
+from hilctl.run.ring import SampleRing
+from hilctl.run.run_folder import RunFolder
 from hilctl.run.safe_action import SafeAction
-from hilctl.run.shared_page import Field, GuardianPhase, MadeSafe, SharedPage
+from hilctl.run.shared_page import Field, GuardianPhase, SafeActionResult
 
 _AWAKE_NS = 50_000_000
 _LOST_NS = 1_000_000_000
 _LOST_LOOKS = 3
 _START_NS = 60_000_000_000
 _AGAIN_NS = 5_000_000_000
-_ACTING_NS = 60_000_000_000
+_HAND_OVER_S = 10.0
+_POLL_S = 0.01
+_ACTING = {GuardianPhase.ACTING, GuardianPhase.DONE}
+
+
+def guardian_starter(
+    checked: Checked, folder: RunFolder, ring: SampleRing, loop: int, inherits: Sequence[int]
+) -> Callable[[int | None], GuardianProcess] | None:
+    """Return what starts the guardian of a run; None for a simulated device, which needs none.
+
+    Args:
+        checked: The experiment.
+        folder: The run's folder.
+        ring: The run's ring.
+        loop: Process number of the loop.
+        inherits: Descriptors of locks that the guardian is to hold.
+
+    Raises:
+        OSError: The guardian's job cannot be written.
+    """
+    if checked.loaded.device.info.simulated:
+        return None
+    write_guardian_job(checked, folder, loop)
+    return lambda watched: GuardianProcess(folder, ring.page, inherits, watched)
 
 
 class Safety:
@@ -32,39 +65,42 @@ class Safety:
 
     Args:
         checked: The experiment.
-        page: Shared with loop and guardian.
+        ring: Shared with loop and guardian.
         child: The loop's process.
-        start_guardian: Starts a guardian; None where the run needs none.
+        start_guardian: Starts a guardian, to watch that process or to act at once if None; None if
+            the run needs none.
         record_event: Records an event.
     """
 
     def __init__(
         self,
         checked: Checked,
-        page: SharedPage,
+        ring: SampleRing,
         child: LoopChild,
-        start_guardian: Callable[[], GuardianProcess] | None,
+        start_guardian: Callable[[int | None], GuardianProcess] | None,
         record_event: Callable[[Event], None],
     ) -> None:
-        self._page, self._child = page, child
+        self._ring, self._page, self._child = ring, ring.page, child
         self._device = checked.loaded.device
-        self._safe_value = checked.loaded.config.safe.value
+        self._limits = limits = checked.loaded.config.command_limits()
+        way = max(limits.high - limits.safe, limits.safe - limits.low)
+        self._patience_ns = round(1e9 * (PATIENCE_S + way / limits.ramp_per_s))
         self._priority = safe_priority(checked)
-        self._watch = HangWatch(page, silence_limits(checked), lambda: is_stopped(child.pid))
+        self._watch = HangWatch(ring.page, silence_limits(checked), lambda: is_stopped(child.pid))
         self._start_guardian, self._record_event = start_guardian, record_event
-        self._guardian = start_guardian() if start_guardian else None
+        self._guardian = start_guardian(child.pid) if start_guardian else None
         self._started_ns: int | None = None
         self._heartbeat_ns, self._looks = 0, 0
         self._trouble_ns = 0
         self._hung = False
         self._action: SafeAction | None = None
-        self.made_safe: MadeSafe | None = None
-        """What came of making the output safe; None where nobody had to, or it still goes on."""
+        self.result: SafeActionResult | None = None
+        """What came of it, once a run may end with it; None if nobody had to act, or still acts."""
         self.by = ""
-        """Who has made it safe."""
+        """Which process acted."""
 
     def ready(self) -> bool:
-        """Return whether the guardian watches, where there is one.
+        """Return whether the guardian watches, if the run needs one.
 
         Raises:
             RunError: It could not be started.
@@ -76,37 +112,49 @@ class Safety:
             raise RunError(f"the guardian could not be started: {guardian.error}")
         return False
 
-    def look(self, now_ns: int, *, ended: bool) -> None:
+    def update(self, now_ns: int, *, ended: bool) -> None:
         """Look once, and do what has to be done; never waits for device or guardian.
 
         Args:
             now_ns: Monotonic time.
             ended: Whether the loop's process was gone before.
         """
-        if self.made_safe is not None:
+        if self.result is not None:
             return
-        if self._action is not None:
-            self.made_safe, self.by = self._action.result(), "supervisor"
-        elif self._in_trouble(now_ns, ended=ended):
-            self._see_to_it(now_ns, ended=ended)
+        if self._in_trouble(now_ns, ended=ended):
+            self._follow_up(now_ns, ended=ended)
         elif not ended and self._start_guardian is not None:
             self._keep_guardian(now_ns)
 
     def _in_trouble(self, now_ns: int, *, ended: bool) -> bool:
         if not self._trouble_ns:
             hung = not ended and self._watch.hangs(now_ns)
-            if hung or (ended and self._page.outcome() is None):
+            if hung or (ended and not self._page.ended_safely()):
                 self._trouble_ns, self._hung = now_ns, hung
         return self._trouble_ns != 0
 
-    def _see_to_it(self, now_ns: int, *, ended: bool) -> None:
-        """Leave it to the guardian where that one is at it, or make the output safe here."""
-        if ended and (made_safe := self._page.made_safe()) is not None:
-            self.made_safe, self.by = made_safe, "guardian"
-        elif not self._guardian_acts(now_ns):
+    def _follow_up(self, now_ns: int, *, ended: bool) -> None:
+        """Follow whoever drives the device, and drive it here if the guardian does not."""
+        action = self._action
+        if action is None and not self._guardian_acts(now_ns):
             be_quick(self._priority)
-            self._stand_in()
-            be_ordinary()
+            try:
+                self._stand_in()
+            finally:
+                be_ordinary()
+        elif action is not None and action.failed:
+            self._action = None  # and again at the next look: there is nobody else
+        by, result = self._reached()
+        over = now_ns - self._trouble_ns > self._patience_ns
+        # A loop that was killed in a call takes a while to be gone.
+        gone = ended or self._action is not None
+        if result is not None and ((result.final and gone) or over):
+            self.result, self.by = result, by
+
+    def _reached(self) -> tuple[str, SafeActionResult | None]:
+        if self._action is not None:
+            return "supervisor", self._action.result()
+        return "guardian", self._page.safe_result()
 
     def _stand_in(self) -> None:
         # Both before the device: neither may come back to it.
@@ -115,24 +163,25 @@ class Safety:
             self._guardian.kill(last_call_s)
         self._child.kill(last_call_s)
         # It may have been done in the very last moment.
-        self.made_safe, self.by = self._page.made_safe(), "guardian"
-        if self.made_safe is None:
+        result = self._page.safe_result()
+        if result is None or not result.final:
+            limits = self._limits
+            goal = safe_goal(self._ring, self._device, limits.safe, limits.ramp_per_s)
             prepare = partial(be_quick, self._priority)
             self._action = SafeAction(
-                self._device, self._safe_value, hung=self._hung, prepare=prepare
+                self._page, self._device, goal, hung=self._hung, prepare=prepare
             )
 
     def _guardian_acts(self, now_ns: int) -> bool:
         guardian = self._guardian
         if guardian is None or guardian.ended:
-            return False
+            return guardian is not None and guardian.phase == GuardianPhase.DONE
         at_it = guardian.phase in {GuardianPhase.WATCHING, GuardianPhase.ACTING}
         awake = at_it and now_ns - guardian.heartbeat_ns < _AWAKE_NS
-        in_time = now_ns - self._trouble_ns <= _ACTING_NS
-        return in_time and (awake or guardian.phase == GuardianPhase.DONE)
+        return awake or guardian.phase == GuardianPhase.DONE
 
     def _keep_guardian(self, now_ns: int) -> None:
-        """Start another guardian where this one is lost, and say so."""
+        """Start another guardian if this one is lost, and record that."""
         guardian = self._guardian
         if self._started_ns is None:
             self._started_ns = now_ns
@@ -140,26 +189,26 @@ class Safety:
             why = "died" if guardian.ended else self._silent(guardian, now_ns)
             if not why:
                 return
-            guardian.kill()
+            guardian.kill(0.0)
             self._guardian = None
-            self._say(f"the guardian {why}; until there is another one, the supervisor watches")
+            self._say(f"the guardian {why}; the supervisor watches until there is another one")
         if now_ns - self._started_ns < _AGAIN_NS and self._heartbeat_ns == 0:
             return  # it never got as far as to watch: not again and again without a pause
         assert self._start_guardian is not None
         self._started_ns, self._heartbeat_ns = now_ns, 0
         try:
-            self._guardian = self._start_guardian()
+            self._guardian = self._start_guardian(self._child.pid)
         except OSError as error:
-            self._say(f"the guardian can't be started: {error.strerror}")
+            self._say(f"the guardian cannot be started: {error.strerror}")
 
     def _silent(self, guardian: GuardianProcess, now_ns: int) -> str:
-        """Return how a guardian that lives is silent; empty where it is not."""
+        """Return how a guardian that lives is silent; empty if it is not."""
         heartbeat_ns = guardian.heartbeat_ns
         if heartbeat_ns != self._heartbeat_ns or heartbeat_ns == 0:
             self._heartbeat_ns, self._looks = heartbeat_ns, 0
             starting = heartbeat_ns == 0 and now_ns - (self._started_ns or now_ns) > _START_NS
             return "does not start" if starting else ""
-        # Where all stood still, this side too, it is given the time to go on.
+        # If all stood still, this process too, it is given the time to go on.
         self._looks += 1
         lost = self._looks > _LOST_LOOKS and now_ns - heartbeat_ns > _LOST_NS
         return "gives no sign any more" if lost else ""
@@ -168,7 +217,46 @@ class Safety:
         sample = self._page.get(Field.NEXT_SAMPLE)
         self._record_event(Event(sample, "warning", "guardian_lost", text))
 
-    def close(self) -> None:
-        """End the guardian, whose loop has ended or never started."""
-        if self._guardian is not None:
-            self._guardian.end()
+    def close(self, stopped: Callable[[], bool] = lambda: False) -> bool:
+        """End the guardian, or leave an output that is not confirmed to one.
+
+        Args:
+            stopped: Whether the user ends it.
+
+        Returns:
+            Whether a guardian goes on after this process.
+        """
+        if self.result is None or self.result.final or self._start_guardian is None:
+            if self._guardian is not None:
+                self._guardian.end()
+            return False
+        if self._action is None:
+            return self._guardian is not None and not self._guardian.ended
+        return self._hand_over(stopped)
+
+    def _hand_over(self, stopped: Callable[[], bool]) -> bool:
+        """Have a new guardian go on with what is not confirmed yet, or go on here until it is."""
+        while self._action is not None and not stopped():
+            self._action.end(_HAND_OVER_S)
+            if self._started_to_act(stopped):
+                return True
+            self._stand_in()
+            deadline_s = time.monotonic() + _HAND_OVER_S
+            while time.monotonic() < deadline_s and not stopped() and not self._action.failed:
+                self.result = self._action.result(_POLL_S)
+                if self.result.final:
+                    return False
+        return False
+
+    def _started_to_act(self, stopped: Callable[[], bool]) -> bool:
+        assert self._start_guardian is not None
+        try:
+            guardian = self._guardian = self._start_guardian(None)
+        except OSError:
+            return False
+        deadline_s = time.monotonic() + _HAND_OVER_S
+        while not guardian.ended and time.monotonic() < deadline_s and not stopped():
+            if guardian.phase in _ACTING:
+                return True
+            time.sleep(_POLL_S)
+        return False

@@ -17,6 +17,7 @@ import numpy as np
 
 from hilctl.base.arrays import F64, I64
 from hilctl.base.events import Event
+from hilctl.loop.safe_output import OutputState
 
 if TYPE_CHECKING:
     from hilctl.loop.pacer import Lateness
@@ -40,7 +41,7 @@ class PageText(IntEnum):
     ERROR = 2
     """Why it could not start or go on, for people."""
     GUARDIAN = 3
-    """What the guardian did: JSON of :class:`MadeSafe`, or why it could not start, for people."""
+    """What the guardian did: JSON of :class:`SafeActionResult`, or why it failed, for people."""
 
 
 _EVENTS_AT = _PAGE + len(PageText) * _TEXT_BYTES
@@ -99,6 +100,12 @@ class Field(IntEnum):
     MAJOR_FAULTS = 67
     INVOLUNTARY_SWITCHES = 68
     REFERENCE_READY = 72
+    OUTPUT_AT_START = 73
+    REAL_TIME = 74
+    RECORDED = 75
+    GUARDIAN_PID = 76
+    SAFE_WRITES = 77
+    LAST_SAFE_WRITE = 78
 
 
 class Phase(IntEnum):
@@ -124,21 +131,25 @@ class GuardianPhase(IntEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class MadeSafe:
-    """What came of putting the output at its safe value in the place of a loop that can't.
+class SafeActionResult:
+    """What came of setting the output to its safe value in place of a loop that cannot.
 
     Attributes:
-        hung: Whether the loop lived, but gave no sign of it, and was killed.
-        error: Why the safe value could not be confirmed; empty where the device confirmed it.
+        hung: Whether the loop was alive, but silent, and was killed.
+        output: What is known of the output.
+        error: Why it is not confirmed; empty if no write failed since.
+        final: Whether no further write follows.
     """
 
     hung: bool
-    error: str
+    output: OutputState
+    error: str = ""
+    final: bool = True
 
     @property
     def confirmed(self) -> bool:
-        """Whether the device has confirmed the safe value."""
-        return not self.error
+        """Whether the device confirmed the safe value."""
+        return self.output == "confirmed"
 
 
 class Stop(IntEnum):
@@ -266,18 +277,38 @@ class SharedPage:
             return Outcome(**json.loads(self.read_text(PageText.OUTCOME)))
         return None
 
-    def leave_made_safe(self, made_safe: MadeSafe) -> None:
-        """Leave what came of making the output safe, for the supervisor or who comes after it."""
-        self.write_text(PageText.GUARDIAN, json.dumps(asdict(made_safe)))
-        # The text first: the phase says that it is there.
-        self.put(Field.GUARDIAN_PHASE, GuardianPhase.DONE)
+    def note_safe_write(self, value: float) -> None:
+        """Note a write on the way to the safe value, so that another process can go on from it."""
+        self.put_float(Field.LAST_SAFE_WRITE, value)
+        # The value first: the count says that it is there.
+        self.put(Field.SAFE_WRITES, self.get(Field.SAFE_WRITES) + 1)
 
-    def made_safe(self) -> MadeSafe | None:
-        """Return what came of the guardian's making the output safe; None where it did not act."""
-        if self.get(Field.GUARDIAN_PHASE) != GuardianPhase.DONE:
-            return None
+    def last_safe_write(self) -> float | None:
+        """Return the last value written on the way to the safe value; None before the first."""
+        return self.get_float(Field.LAST_SAFE_WRITE) if self.get(Field.SAFE_WRITES) else None
+
+    def ended_safely(self) -> bool:
+        """Return whether the loop said how it ended, and no further write is needed."""
+        if self.get(Field.PHASE) != Phase.ENDED:
+            return False
         with suppress(ValueError, TypeError):  # damaged
-            return MadeSafe(**json.loads(self.read_text(PageText.GUARDIAN)))
+            # Not by outcome(), which imports numba: the guardian calls this.
+            return json.loads(self.read_text(PageText.OUTCOME))["output"] in {"confirmed", "sent"}
+        return False
+
+    def leave_safe_result(self, result: SafeActionResult) -> None:
+        """Leave what the guardian has reached so far, for the supervisor and later commands."""
+        self.write_text(PageText.GUARDIAN, json.dumps(asdict(result)))
+        # The text first: the phase says that it is there.
+        if result.final:
+            self.put(Field.GUARDIAN_PHASE, GuardianPhase.DONE)
+
+    def safe_result(self) -> SafeActionResult | None:
+        """Return what the guardian has reached so far; None if it has not acted."""
+        if self.get(Field.GUARDIAN_PHASE) not in {GuardianPhase.ACTING, GuardianPhase.DONE}:
+            return None
+        with suppress(ValueError, TypeError):  # damaged, or just being written
+            return SafeActionResult(**json.loads(self.read_text(PageText.GUARDIAN)))
         return None
 
     def push_event(self, event: Event) -> None:

@@ -6,10 +6,12 @@ input or output, and waits for nobody who does.
 
 import signal
 import time
+from dataclasses import replace
 
 from hilctl.base.events import Event
 from hilctl.experiment.check import Checked
 from hilctl.loop.plan import Outcome
+from hilctl.loop.safe_output import describe
 from hilctl.run.child import LoopChild
 from hilctl.run.result import Progress
 from hilctl.run.ring import SampleRing
@@ -65,7 +67,7 @@ class StartedRun:
         self._page.put(Field.SUPERVISOR_HEARTBEAT_NS, now_ns)
         self._pass_stop_on(stop_signal)
         if self.outcome is None:
-            self._safety.look(now_ns, ended=ended)
+            self._safety.update(now_ns, ended=ended)
             # The coil comes before the samples: those wait in memory, and lose nothing by it.
             self._conclude(ended=ended)
         return not self._recording.finished
@@ -95,19 +97,21 @@ class StartedRun:
         self._recording.record_event(Event(sample, "warning", "progress_failed", text))
 
     def _conclude(self, *, ended: bool) -> None:
-        made_safe = self._safety.made_safe
-        if made_safe is not None:
+        result, said = self._safety.result, self._page.outcome() if ended else None
+        if result is None:
+            # Without a safe end, somebody is still to act.
+            self.outcome = said if self._page.ended_safely() else None
+        else:
             hung = "the loop process hung, and was killed"
-            reason = hung if made_safe.hung else self._child.death()
-            if self._safety.by == "guardian" and made_safe.confirmed:
-                reason += "; the guardian put the output at its safe value"
-            if not made_safe.confirmed:
-                reason += f"; the safe value could not be confirmed: {made_safe.error}"
-            self.outcome = Outcome("fault", reason, 0, made_safe.confirmed, 0)
-        elif ended:
-            self.outcome = self._page.outcome()  # None where somebody is still to make it safe
+            reason = hung if result.hung else said.reason if said else self._child.death()
+            if self._safety.by == "guardian" and result.confirmed:
+                reason += "; the guardian set the output to its safe value"
+            if not result.confirmed:
+                reason += f"; {describe(result.output, result.error)}"
+            last = said or Outcome("fault", "", 0, "unknown", 0)
+            self.outcome = replace(last, code="fault", reason=reason, output=result.output)
         if self.outcome is not None:
-            self._recording.end(self.outcome, lost_loop=made_safe is not None)
+            self._recording.end(self.outcome, lost_loop=result is not None and said is None)
 
     def _pass_stop_on(self, stop_signal: int) -> None:
         page, recorder = self._page, self._recording.recorder

@@ -13,9 +13,13 @@ STOP_SIGNAL = signal.SIGUSR1
 def request_stop(run: RunFolder) -> bool:
     """Request a run to end by its safe ramp; return whether there was a supervisor to take it.
 
+    The guardian of a run that has ended is ended at once.
+
     Raises:
         RunError: The kernel refuses.
     """
+    if run.kept:
+        return _end_guardian(run)
     try:
         process = os.pidfd_open(run.card.supervisor)
         try:
@@ -30,3 +34,9 @@ def request_stop(run: RunFolder) -> bool:
     except OSError as error:
         raise RunError(f"{run.card.name}: can't be stopped: {error.strerror}") from None
     return True
+
+
+def _end_guardian(run: RunFolder) -> bool:
+    from hilctl.run.guardian_process import signal_guardian
+
+    return signal_guardian(run, signal.SIGTERM)

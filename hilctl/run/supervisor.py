@@ -21,7 +21,7 @@ from hilctl.machine.realtime import be_ordinary, favoured
 from hilctl.run.change_worker import ChangeWorker
 from hilctl.run.child import LoopChild
 from hilctl.run.control_socket import ControlServer
-from hilctl.run.guardian_process import guardian_of
+from hilctl.run.guardian_process import GuardianRelief
 from hilctl.run.progress import ProgressThread
 from hilctl.run.recorder import Recorder
 from hilctl.run.reference_window import ReferenceProcess
@@ -30,7 +30,7 @@ from hilctl.run.result import Progress, RunResult
 from hilctl.run.ring import SampleRing
 from hilctl.run.ring_recorder import RingRecorder
 from hilctl.run.run_folder import RunFolder, held_devices, run_folder
-from hilctl.run.safety import Safety
+from hilctl.run.safety import Safety, guardian_starter
 from hilctl.run.shared_page import Field, PageText, SharedPage
 from hilctl.run.started_run import STOPS, StartedRun
 from hilctl.run.stopping import STOP_SIGNAL
@@ -41,6 +41,7 @@ _log = logging.getLogger(__name__)
 _POLL_S = 0.01
 _START_DELAY_NS = 50_000_000
 _START_TRIES = 3
+_GUARDIAN_READY_S = 60.0
 
 
 class Supervisor:
@@ -87,27 +88,37 @@ class Supervisor:
             # Before anything is held or started: a fork has all that its maker has.
             worker = stack.enter_context(ChangeWorker(self._checked))
             filling = stack.enter_context(ReferenceProcess(self._checked))
-            # The device before the recording: a run that is refused must not touch a file.
-            locks = stack.enter_context(held_devices(self._checked.loaded.device.info.holds))
-            recorder = Recorder(self._checked, self._output, overwrite=self._overwrite)
+            holds = self._checked.loaded.device.info.holds
+            relief = GuardianRelief(holds)
+            locks: list[int] = []
+            recorder = None
             try:
+                # The device before the recording: a run that is refused must not touch a file.
+                locks = stack.enter_context(held_devices(holds))
+                recorder = Recorder(self._checked, self._output, overwrite=self._overwrite)
                 folder, own = stack.enter_context(
-                    run_folder(config.name, self._output, time.time())
+                    run_folder(config.name, self._output, time.time(), holds)
                 )
                 ring = self._make_ring(folder)
                 recording = RingRecorder(ring, recorder, config.recording.flush_s)
                 requests = Requests(self._checked, folder, ring.page, recording, worker)
                 server = stack.enter_context(ControlServer(folder.socket, requests.answer))
                 child = LoopChild(self._checked, folder, ring, locks + own, self._silence_s)
+                run = folder, ring, child, recording
+                safety, start_ns = self._start(stack, *run, locks + own, filling)
+                started = StartedRun(self._checked, ring, child, safety, recording)
             except BaseException:
-                recorder.give_back()
+                if recorder is not None:
+                    recorder.give_back()
+                relief.resume(locks)
                 raise
-            run = folder, ring, child, recording
-            safety = self._start(stack, *run, locks + own, filling)
-            started = StartedRun(self._checked, ring, child, safety, recording)
+            relief.discard()
+            _go(ring.page, start_ns)
             self._attend(started, server, requests)
-            safety.close()
-            return self._result(started, recorder, ring)
+            ring.page.put(Field.RECORDED, int(not recorder.error))
+            if kept := safety.close(lambda: self._stop_signal != 0):
+                folder.keep()
+            return self._result(started, recorder, ring, kept=kept)
 
     def _start(
         self,
@@ -118,19 +129,21 @@ class Supervisor:
         recording: RingRecorder,
         locks: list[int],
         filling: ReferenceProcess,
-    ) -> Safety:
-        """Wait for loop and guardian to be ready, and give the start signal."""
+    ) -> tuple[Safety, int]:
+        """Wait for loop and guardian to be ready, and begin the recording.
+
+        Returns:
+            What sees to a safe output, and when sample 0 is due, monotonic time in ns.
+        """
         page, checked = ring.page, self._checked
-        simulated = checked.loaded.device.info.simulated  # there is no coil to guard
         safety = None
         try:
-            guardian = None if simulated else guardian_of(checked, folder, page, child.pid, locks)
-            safety = Safety(checked, page, child, guardian, recording.record_event)
+            guardian = guardian_starter(checked, folder, ring, child.pid, locks)
+            safety = Safety(checked, ring, child, guardian, recording.record_event)
             child.await_ready(lambda: self._stop_signal != 0)
             filling.begin(folder, page)
             # It is started after the loop, to watch its process, and ready long before it.
-            while not safety.ready():
-                time.sleep(0.005)
+            self._await_guardian(safety)
             ProcessMemory().stay_small()  # all is compiled
             start_ns = self._begin(recording.recorder, page)
             # Before there are threads: all that share the interpreter with this one come along.
@@ -140,15 +153,19 @@ class Supervisor:
             child.kill()  # it waits for the start signal, so nothing has moved
             if safety is not None:
                 safety.close()
-            recording.recorder.give_back()
             if isinstance(error, OSError):
                 raise RunError(f"the run can't be started: {error}; nothing has moved") from error
             raise
-        # GO last: the loop then reads its start time, and would take an old heartbeat for silence.
-        page.put(Field.SUPERVISOR_HEARTBEAT_NS, time.monotonic_ns())
-        page.put(Field.START_NS, start_ns)
-        page.put(Field.GO, 1)
-        return safety
+        return safety, start_ns
+
+    def _await_guardian(self, safety: Safety) -> None:
+        deadline_s = time.monotonic() + _GUARDIAN_READY_S
+        while not safety.ready():
+            if self._stop_signal:
+                raise RunError("stopped before the start; nothing has moved")
+            if time.monotonic() > deadline_s:
+                raise RunError(f"the guardian was not ready within {_GUARDIAN_READY_S:g} s")
+            time.sleep(_POLL_S)
 
     def _begin(self, recorder: Recorder, page: SharedPage) -> int:
         """Write what the recording begins with; return when sample 0 is due, monotonic time in ns.
@@ -174,8 +191,9 @@ class Supervisor:
 
     def _attend(self, started: StartedRun, server: ControlServer, requests: Requests) -> None:
         """See to a run until its recording is closed, whatever goes wrong meanwhile."""
-        shown = ProgressThread(started.progress, self._on_progress, started.progress_failed)
+        shown: ProgressThread | None = None
         try:
+            shown = ProgressThread(started.progress, self._on_progress, started.progress_failed)
             shown.start()
             self._notifier.say("READY=1", f"STATUS=recording to {self._output}")
             while started.attend(self._stop_signal):
@@ -185,10 +203,19 @@ class Supervisor:
             self._notifier.say("STOPPING=1")
         except Exception as error:  # noqa: BLE001  it must not cost coil, ring or recording
             started.break_off(error)
-            # Without whatever may have broken: no requests, no display, no service manager.
-            while started.attend(self._stop_signal):
-                time.sleep(_POLL_S)
-        shown.end()
+            self._attend_only(started)
+        if shown is not None:
+            shown.end()
+
+    def _attend_only(self, started: StartedRun) -> None:
+        """See to a run without what may have broken: no requests, display or service manager."""
+        while True:
+            try:
+                if not started.attend(self._stop_signal):
+                    return
+            except Exception as error:  # noqa: BLE001  the loop must not go on without a recorder
+                started.break_off(error)
+            time.sleep(_POLL_S)
 
     def _warn(self, refused: list[str]) -> None:
         """Say what real time was refused, where a late tick would be one of a real device."""
@@ -230,7 +257,9 @@ class Supervisor:
             hint = "less recording.ring_s needs less of it"
             raise RunError(f"{folder.ring}: no memory: {error.strerror}; {hint}") from None
 
-    def _result(self, started: StartedRun, recorder: Recorder, ring: SampleRing) -> RunResult:
+    def _result(
+        self, started: StartedRun, recorder: Recorder, ring: SampleRing, *, kept: bool
+    ) -> RunResult:
         outcome = started.outcome
         assert outcome is not None
         requested = self._stop_signal == STOP_SIGNAL
@@ -247,7 +276,8 @@ class Supervisor:
             path=recorder.path,
             code=code,
             reason=outcome.reason + broke + moved + cut,
-            safe=outcome.safe,
+            output_state=outcome.output,
+            guardian_active=kept,
             stop_signal=stop_signal if code == "stopped" else 0,
             samples=recorder.samples,
             missing=recorder.missing,
@@ -255,3 +285,11 @@ class Supervisor:
             deadline_misses=deadline_misses(skipped, due, self._config.timing.max_missed_share),
             adapted=recorder.adapted,
         )
+
+
+def _go(page: SharedPage, start_ns: int) -> None:
+    """Give the loop the start signal."""
+    page.put(Field.SUPERVISOR_HEARTBEAT_NS, time.monotonic_ns())
+    page.put(Field.START_NS, start_ns)
+    # Last: the loop then reads its start time, and would take an old heartbeat for silence.
+    page.put(Field.GO, 1)

@@ -116,6 +116,9 @@ class BatchHost:
         """Return no change: nobody requests one."""
         return None
 
+    def writing_safe(self, value: float) -> None:
+        """Do nothing: no other process could go on from it."""
+
     def record_event(self, event: Event) -> None:
         """Pass an event on, after the blocks before it."""
         # An event is recorded with the samples that led to it.
@@ -145,7 +148,7 @@ def run_unpaced(checked: Checked, output: Path, *, overwrite: bool = False) -> R
         path=output,
         code="fault" if recorder.error else outcome.code,
         reason=outcome.reason + cut,
-        safe=outcome.safe,
+        output_state=outcome.output,
         stop_signal=0,
         samples=recorder.samples,
         missing=recorder.missing,

@@ -142,7 +142,7 @@ class TestStart:
     def test_a_lost_device_on_the_way_in_is_made_safe(self):
         rig = Rig(sine(100), device=FakeDevice(4.0, break_at=20))
         outcome = rig.run()
-        assert (outcome.code, outcome.ended_at, rig.device.made_safe) == ("fault", 21, [0.0])
+        assert (outcome.code, outcome.ended_at, rig.device.made_safe[-1]) == ("fault", 21, 0.0)
 
     def test_a_stall_at_the_end_of_the_ramp_costs_no_reference(self):
         """The waveform waits: it begins with its first sample, and from the safe value."""

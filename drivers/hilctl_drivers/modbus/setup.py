@@ -247,6 +247,7 @@ class ModbusSetup:
             holds=tuple(dict.fromkeys(writer.holds + reader.holds)),
             watchdog_command=options.watchdog_command,
             watchdog_reason=options.watchdog_reason,
+            in_order=options.serial_port is not None,
             details=details,
         )
 

@@ -127,6 +127,7 @@ def _info(setup: SerialSetup, wire: SerialWire) -> DeviceInfo:
         watchdog_command=options.watchdog_command,
         watchdog_reason=options.watchdog_reason,
         safe_note=_safe_note(setup, wire.longest_message_s),
+        in_order=True,
         details=details,
     )
 

@@ -178,6 +178,7 @@ _COMMON: dict[str, Any] = {
     "fifo_depth": FIFO_DEPTH,
     "measures_command": True,
     "simulated": True,
+    "in_order": True,
 }
 
 

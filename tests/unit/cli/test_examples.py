@@ -42,7 +42,7 @@ def runs(tmp_path, monkeypatch):
         path = tmp_path / f"{len(seen)}.mcap"
         path.write_bytes(GOLDEN.read_bytes())
         seen.append((experiment.name, settings))
-        return RunResult(path, ends["code"], "because", True, ends["stop_signal"], 0, 0, 0)
+        return RunResult(path, ends["code"], "because", "confirmed", ends["stop_signal"], 0, 0, 0)
 
     monkeypatch.setattr("hilctl.run.start.start_run", start_run)
 

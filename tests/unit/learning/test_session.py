@@ -25,7 +25,7 @@ class Runs:
         self.settings.append(settings)
         if len(self.settings) <= self.last:
             return unpaced(path, settings, output)
-        return RunResult(output, self.code, "by a test", True, self.stop_signal, 0, 0, 0)
+        return RunResult(output, self.code, "by a test", "confirmed", self.stop_signal, 0, 0, 0)
 
 
 def learned(folder, runs, cycles=2):

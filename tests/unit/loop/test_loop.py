@@ -14,7 +14,7 @@ from hilctl.loop.loop import Loop
 from hilctl.loop.pacer import LateRules
 from hilctl.loop.plan import Plan
 from hilctl.models.files import load_model
-from tests.fakes import FakeClock, FakeDevice, FakeFifoDevice, FakeHost
+from tests.fakes import FakeClock, FakeDevice, FakeFifoDevice, FakeHost, FakeInfo
 from tests.published import terfenol_rdpi
 
 RATE_HZ = 1000.0
@@ -203,15 +203,23 @@ def test_reference_that_is_not_a_number_ramps_down(bad):
 
 
 def test_lost_device_is_made_safe():
-    """When exchanges fail there is no ramp: the last resort is used, and the reason kept."""
-    rig = Rig(np.full(1000, 2.0), device=FakeDevice(break_at=60))
+    """When exchanges fail the ramp goes by single writes, and the reason is kept."""
+    rig = Rig(np.full(1000, 2.0), device=FakeDevice(break_at=60, info=FakeInfo(in_order=True)))
     outcome = rig.run()
-    assert (outcome.code, outcome.safe) == ("fault", True)
+    assert (outcome.code, outcome.output) == ("fault", "confirmed")
     assert outcome.reason == "fake: no answer within 0.1 s"
-    assert rig.device.made_safe == [0.0]
+    ramp = rig.device.made_safe
+    assert ramp == sorted(ramp, reverse=True) == rig.host.safe_writes
+    assert (ramp[0] < 2.0, len(ramp) > 2, ramp[-1]) == (True, True, 0.0)
     assert outcome.ended_at == 61
     assert [event.code for event in rig.host.events] == ["device_lost"]
     assert rig.host.closed
+
+
+def test_a_command_without_answer_may_be_executed_after_the_safe_value():
+    """The output is set then, and not yet confirmed: the guardian watches it further."""
+    rig = Rig(np.full(1000, 2.0), device=FakeDevice(break_at=60))
+    assert rig.run().output == "set"
 
 
 def test_sample_that_the_device_did_not_answer_is_recorded():
@@ -237,7 +245,7 @@ def test_device_lost_on_the_ramp_keeps_the_first_reason():
     device = FakeDevice(nan_at=40, break_at=45)
     outcome = Rig(np.full(1000, 2.0), device=device).run()
     assert outcome.reason.startswith("displacement nan µm at sample 40")
-    assert outcome.reason.endswith("; then fake: no answer within 0.1 s")
+    assert "; then fake: no answer within 0.1 s" in outcome.reason
 
 
 def test_very_late_tick_ends_the_run():
@@ -360,8 +368,9 @@ def test_blocks_under_way_to_a_lost_device_are_recorded(break_at):
     device = FakeFifoDevice(3, break_at=break_at)
     rig = Rig(sine(200), block=10, device=device)
     outcome = rig.run()
-    assert (outcome.code, outcome.reason) == ("fault", "fake: no answer within 0.1 s")
-    assert device.made_safe == [LIMITS.safe]
+    assert outcome.code == "fault"
+    assert outcome.reason.startswith("fake: no answer within 0.1 s")
+    assert device.made_safe[-1] == LIMITS.safe
     recorded = rig.host.column(2)
     assert recorded.size == outcome.ended_at
     known = min(len(device.commands), recorded.size)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import yaml
 
-from hilctl.base.errors import ConfigError, DeviceError, InputError
+from hilctl.base.errors import ConfigError, DeviceError, InputError, UnconfirmedError
 from hilctl.run.by_hand import put_safe
 from hilctl.run.run_folder import held_devices
 from hilctl_drivers.simulated.rigs import SimulatedTerfenol
@@ -16,6 +16,15 @@ class Amplifier(SimulatedTerfenol):
 
     asked: list
     error = ""
+    now_s = 0.0
+
+    @classmethod
+    def clock(cls):
+        return cls.now_s
+
+    @classmethod
+    def sleep(cls, wait_s):
+        cls.now_s += wait_s
 
     @property
     def info(self):
@@ -23,6 +32,7 @@ class Amplifier(SimulatedTerfenol):
 
     def make_safe(self, command):
         self.asked.append(command)
+        type(self).now_s += 0.1
         if self.error:
             raise DeviceError(self.error)
 
@@ -53,8 +63,19 @@ def test_the_experiment_s_safe_value_is_put_out_and_confirmed(amplifier, experim
 
 def test_an_output_that_is_not_confirmed_is_not_called_safe(amplifier, experiment):
     amplifier.error = "no answer"
-    found = put_safe(experiment, []).to_mapping()
+    found = put_safe(experiment, [], amplifier.clock, amplifier.sleep).to_mapping()
     assert (found["output_safe"], found["error"]) == (False, "no answer")
+    assert (found["output_state"], found["guardian_active"]) == ("unknown", False)
+    assert len(amplifier.asked) > 10  # it is tried again and again
+
+
+def test_a_device_without_confirmation_is_sent_the_value(amplifier, experiment, monkeypatch):
+    def make_safe(self, command):
+        raise UnconfirmedError("it does not answer")
+
+    monkeypatch.setattr(Amplifier, "make_safe", make_safe)
+    found = put_safe(experiment, [], amplifier.clock, amplifier.sleep).to_mapping()
+    assert (found["output_safe"], found["output_state"]) == (False, "sent")
 
 
 def test_a_device_that_a_run_holds_is_left_to_it(amplifier, experiment):

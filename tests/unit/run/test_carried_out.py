@@ -181,7 +181,7 @@ def test_the_waveform_begins_after_the_ramp(broken, output, ramps):
     assert (page.get(Field.WAVEFORM_AT) > 0) == ramps
 
 
-OUTCOME = Outcome("completed", "waveform completed", 7, True, 0)
+OUTCOME = Outcome("completed", "waveform completed", 7, "confirmed", 0)
 REFUSED = (SetUpStep("fifo", "failed", "not permitted", "raise rtprio"),)
 
 

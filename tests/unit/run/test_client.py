@@ -20,7 +20,9 @@ from tests.fakes import SteppingClock
 
 def run(name, *, supervised=True, alive=True):
     card = SimpleNamespace(name=name, recording="a.mcap", supervisor=1, started=0.0)
-    return SimpleNamespace(card=card, supervised=supervised, alive=alive, socket=f"{name}.sock")
+    return SimpleNamespace(
+        card=card, supervised=supervised, alive=alive, socket=f"{name}.sock", kept=False
+    )
 
 
 @pytest.fixture

@@ -20,7 +20,7 @@ GOLDEN = Path(__file__).parents[3] / "recordings" / "golden" / "terfenol_compens
 
 @pytest.fixture
 def result(tmp_path):
-    return RunResult(tmp_path / "run.mcap", "stopped", "by hand", True, 15, 90, 2, 1)
+    return RunResult(tmp_path / "run.mcap", "stopped", "by hand", "confirmed", 15, 90, 2, 1)
 
 
 def ended(result, *commands, timeout_s=120.0):

@@ -33,6 +33,8 @@ class Device:
     def __init__(self, loop, error=None):
         self.loop, self.error, self.asked = loop, error, []
 
+    info = SimpleNamespace(in_order=True, simulated=False)
+
     def make_safe(self, value):
         with suppress(subprocess.TimeoutExpired):  # one that was killed may still be dying
             self.loop.wait(5.0)
@@ -45,18 +47,24 @@ class Device:
 def guarded(tmp_path):
     """A process that stands for the loop, and a function that guards it until it is gone."""
     loop = subprocess.Popen(SLEEP)
-    page = SampleRing.create(tmp_path / "ring", slots=4, block=1, state_size=1).page
+    ring = SampleRing.create(tmp_path / "ring", slots=4, block=1, state_size=1)
+    page = ring.page
     page.put(Field.GO, 1)
     page.put(Field.PHASE, Phase.RUNNING)
+    page.put(Field.REAL_TIME, 1)
+    page.put_float(Field.OUTPUT_AT_START, 0.25)
     pidfd = os.pidfd_open(loop.pid)
-    made = SimpleNamespace(loop=loop, page=page, device=Device(loop), pidfd=pidfd)
+    before = signal.getsignal(signal.SIGTERM)
+    made = SimpleNamespace(loop=loop, page=page, ring=ring, device=Device(loop), pidfd=pidfd)
 
     def guard(hang_s=60.0):
-        job = GuardianJob("", {}, "", "", 0.25, SilenceLimits(hang_s, 60.0, hang_s), loop.pid, 1)
-        Guardian(page, made.device, job, pidfd).watch()
+        limits = SilenceLimits(hang_s, hang_s, 60.0, hang_s)
+        job = GuardianJob("", {}, "", "", 0.25, 50.0, limits, loop.pid, 1, 1)
+        return Guardian(ring, made.device, job, pidfd).watch()
 
     made.guard = guard
     yield made
+    signal.signal(signal.SIGTERM, before)
     loop.kill()
     loop.wait()
     os.close(pidfd)
@@ -66,8 +74,8 @@ def test_a_loop_that_died_is_followed_by_the_safe_value(guarded):
     guarded.loop.kill()
     guarded.guard()
     assert [value for value, _ in guarded.device.asked] == [0.25]
-    assert guarded.page.made_safe().confirmed
-    assert not guarded.page.made_safe().hung
+    assert guarded.page.safe_result().confirmed
+    assert not guarded.page.safe_result().hung
 
 
 @pytest.mark.parametrize("how", ["stopped", "silent"])
@@ -81,7 +89,7 @@ def test_a_loop_that_hangs_is_killed_before_the_device_is_touched(guarded, how):
     guarded.guard(hang_s=0.03)
     assert guarded.device.asked == [(0.25, False)]
     assert guarded.loop.wait() == -signal.SIGKILL
-    assert guarded.page.made_safe().hung
+    assert guarded.page.safe_result().hung
 
 
 def test_a_loop_that_goes_on_is_left_alone(guarded, monkeypatch):
@@ -100,8 +108,8 @@ def test_a_loop_that_goes_on_is_left_alone(guarded, monkeypatch):
     heartbeats_ns = [value for field, value in page if field == Field.GUARDIAN_HEARTBEAT_NS]
     assert [field for field, _ in page[:6]].count(Field.GUARDIAN_HEARTBEAT_NS) == 5
     assert heartbeats_ns == sorted(set(heartbeats_ns))
-    assert guarded.page.made_safe().confirmed
-    assert not guarded.page.made_safe().hung
+    assert guarded.page.safe_result().confirmed
+    assert not guarded.page.safe_result().hung
 
 
 def test_a_loop_that_hangs_may_end_a_call_before_the_device_is_touched(guarded, monkeypatch):
@@ -121,7 +129,14 @@ def test_a_loop_that_hangs_may_end_a_call_before_the_device_is_touched(guarded, 
 
     monkeypatch.setattr(guardian, "select", SimpleNamespace(poll=Death, POLLIN=select.POLLIN))
     monkeypatch.setattr(
-        guardian, "signal", SimpleNamespace(SIGKILL=signal.SIGKILL, pidfd_send_signal=send)
+        guardian,
+        "signal",
+        SimpleNamespace(
+            SIGKILL=signal.SIGKILL,
+            SIGTERM=signal.SIGTERM,
+            signal=lambda number, handler: None,
+            pidfd_send_signal=send,
+        ),
     )
     guarded.page.put(Field.LOOP_HEARTBEAT_NS, 1)
     guarded.guard(hang_s=0.0)
@@ -129,11 +144,11 @@ def test_a_loop_that_hangs_may_end_a_call_before_the_device_is_touched(guarded, 
 
 
 def test_a_loop_that_ended_by_itself_is_left_to_what_it_said(guarded):
-    guarded.page.leave_outcome(Outcome("completed", "waveform completed", 7, True, 0))
+    guarded.page.leave_outcome(Outcome("completed", "waveform completed", 7, "confirmed", 0))
     guarded.loop.kill()
     guarded.guard()
     assert guarded.device.asked == []
-    assert guarded.page.made_safe() is None
+    assert guarded.page.safe_result() is None
 
 
 def test_a_loop_that_died_before_the_start_has_moved_nothing(guarded):
@@ -152,13 +167,61 @@ def test_a_loop_that_broke_is_followed_by_the_safe_value(guarded):
     assert len(guarded.device.asked) == 1
 
 
-@pytest.mark.parametrize("error", [DeviceError("no answer"), ZeroDivisionError("no answer")])
-def test_what_is_not_confirmed_is_not_called_safe(guarded, error):
-    guarded.device.error = error
+def test_the_way_is_a_ramp_from_the_last_command(guarded):
+    guarded.page.put_float(Field.OUTPUT_AT_START, 1.25)
+    guarded.loop.kill()
+    assert guarded.guard()
+    values = [value for value, _ in guarded.device.asked]
+    assert values[0] == pytest.approx(1.0)
+    assert values == sorted(values, reverse=True)
+    assert values[-1] == 0.25
+
+
+def test_a_ramp_that_another_process_began_is_gone_on_with(guarded):
+    """It would step back to the last command otherwise."""
+    guarded.page.put_float(Field.OUTPUT_AT_START, 4.0)
+    guarded.page.note_safe_write(0.3)
     guarded.loop.kill()
     guarded.guard()
-    assert "no answer" in guarded.page.made_safe().error
-    assert not guarded.page.made_safe().confirmed
+    assert max(value for value, _ in guarded.device.asked) <= 0.3
+
+
+@pytest.mark.parametrize("output", ["unknown", "set"])
+def test_a_loop_that_gave_up_is_followed(guarded, output):
+    """It has its outcome, but the device did not confirm it."""
+    guarded.page.leave_outcome(Outcome("fault", "no answer", 7, output, 0))
+    guarded.loop.kill()
+    assert guarded.guard()
+    assert guarded.page.safe_result().confirmed
+
+
+def test_it_keeps_trying_until_the_user_ends_it(guarded):
+    """What is not confirmed is not called safe."""
+    tries = []
+
+    def make_safe(value):
+        tries.append(value)
+        if len(tries) == 3:
+            os.kill(os.getpid(), signal.SIGTERM)
+        raise DeviceError("no answer")
+
+    guarded.device.make_safe = make_safe
+    guarded.loop.kill()
+    assert guarded.guard()
+    assert len(tries) >= 3
+    assert "no answer" in guarded.page.safe_result().error
+    assert not guarded.page.safe_result().final
+
+
+@pytest.mark.parametrize("error", [MemoryError(), ZeroDivisionError("a bug")])
+def test_a_guardian_that_cannot_drive_the_device_says_so_and_ends(guarded, error):
+    """The supervisor tries then, which may be able to."""
+    guarded.device.error = error
+    guarded.loop.kill()
+    assert not guarded.guard()
+    assert guarded.page.get(Field.GUARDIAN_PHASE) == GuardianPhase.FAILED
+    assert guarded.page.safe_result() is None
+    assert type(error).__name__ in guarded.page.read_text(PageText.GUARDIAN)
 
 
 def test_it_gives_signs_of_life_while_the_device_keeps_it(guarded, monkeypatch):
@@ -183,7 +246,7 @@ def test_it_gives_signs_of_life_while_the_device_keeps_it(guarded, monkeypatch):
     guarded.loop.kill()
     guarded.guard()
     assert go_on.is_set()
-    assert guarded.page.made_safe().confirmed
+    assert guarded.page.safe_result().confirmed
 
 
 @pytest.fixture
@@ -194,8 +257,8 @@ def written(tmp_path):
     before = {number: signal.getsignal(number) for number in IGNORED}
 
     def call(experiment, loop=0):
-        limits = SilenceLimits(1.0, 1.0, 1.0)
-        job = GuardianJob(experiment, {}, "", str(ring), 0.25, limits, 1, 7)
+        limits = SilenceLimits(1.0, 1.0, 1.0, 1.0)
+        job = GuardianJob(experiment, {}, "", str(ring), 0.25, 50.0, limits, 1, 2, 7)
         assert GuardianJob.from_json(job.to_json()) == job
         (tmp_path / "job").write_text(job.to_json(), encoding="utf-8")
         return main([str(tmp_path / "job"), str(loop)])
@@ -219,8 +282,8 @@ def test_a_device_that_can_not_be_made_is_said_before_the_start(written, experim
 
 
 def test_the_device_is_made_of_the_experiment_alone():
-    limits = SilenceLimits(1.0, 1.0, 1.0)
-    job = GuardianJob("device: {kind: simulated_terfenol}", {}, "", "", 0.0, limits, 1, 1)
+    limits = SilenceLimits(1.0, 1.0, 1.0, 1.0)
+    job = GuardianJob("device: {kind: simulated_terfenol}", {}, "", "", 0.0, 1.0, limits, 1, 1, 1)
     assert job.device().info.simulated
 
 
@@ -242,8 +305,9 @@ def test_it_prepares_for_a_machine_that_does_nothing_else(written, guarded, monk
     assert written.call("", guarded.pidfd) == 0
     assert guarded.device.asked == [(0.25, False)]
     locked = ["locked"] if limit is None else []
-    assert done == ["frozen", *locked, (7, "MainThread"), (7, "make safe")]
-    assert [signal.getsignal(number) for number in IGNORED] == [signal.SIG_IGN] * 3
+    assert done == ["frozen", *locked, (7, "MainThread"), (7, "safe action")]
+    for number in (signal.SIGINT, signal.SIGHUP):  # SIGTERM ends an action that goes on
+        assert signal.getsignal(number) == signal.SIG_IGN
     assert set(DESCRIPTORS.iterdir()) <= descriptors
 
 

@@ -10,7 +10,7 @@ from hilctl.run.hang_watch import HangWatch, SilenceLimits, is_stopped
 from hilctl.run.ring import SampleRing
 from hilctl.run.shared_page import Field, Phase
 
-LIMITS = SilenceLimits(loop_s=1.0, exchange_s=2.0, stopped_s=0.4)
+LIMITS = SilenceLimits(real_time_s=1.0, ordinary_s=1.6, exchange_s=2.0, stopped_s=0.4)
 
 
 class Watched:
@@ -20,6 +20,7 @@ class Watched:
         self.page = SampleRing.create(folder / "ring", slots=4, block=1, state_size=1).page
         self.page.put(Field.PHASE, Phase.RUNNING)
         self.page.put(Field.LOOP_HEARTBEAT_NS, 1)
+        self.page.put(Field.REAL_TIME, 1)
         self.stopped = False
         self.watch = HangWatch(self.page, LIMITS, lambda: self.stopped)
 
@@ -39,6 +40,11 @@ def watched(tmp_path):
 def test_silence_beyond_the_limit_is_a_hang(watched):
     """A heartbeat that stands still for longer than the limit is found, and not before."""
     assert watched.looks(*[0.1 * k for k in range(13)]) == [False] * 11 + [True] * 2
+
+
+def test_without_real_time_priority_a_busy_machine_may_keep_the_loop_waiting(watched):
+    watched.page.put(Field.REAL_TIME, 0)
+    assert watched.hangs_after_s() == 1.7
 
 
 def test_heartbeat_starts_the_time_again(watched):

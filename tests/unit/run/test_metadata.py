@@ -13,12 +13,13 @@ from hilctl.run.shared_page import SIZE, SharedPage
 from hilctl.run.start import checked_experiment
 
 EXPERIMENT = Path(__file__).parents[3] / "configs" / "demo.yaml"
-OUTCOME = Outcome("stopped", "asked to", 400, True, 50)
+OUTCOME = Outcome("stopped", "asked to", 400, "confirmed", 50)
 COUNTERS = Lateness(late_ticks=1, skipped_ticks=2, worst_ns=3, worst_tick=4, longest_run=5)
 FACTS = {
     "code": "stopped",
     "reason": "asked to",
     "output_safe": "true",
+    "output_state": "confirmed",
     "late_ticks": "1",
     "skipped_ticks": "2",
     "worst_late_ns": "3",

@@ -12,7 +12,7 @@ from hilctl.recording.reader import read
 from hilctl.run.orphans import recover_orphans
 from hilctl.run.ring import SampleRing
 from hilctl.run.run_folder import run_folder, runs
-from hilctl.run.shared_page import Field, MadeSafe, PageText, Phase
+from hilctl.run.shared_page import Field, PageText, Phase, SafeActionResult
 
 GOLDEN = Path(__file__).parents[3] / "recordings" / "golden" / "terfenol_uncompensated.mcap"
 
@@ -40,7 +40,7 @@ def test_a_run_that_left_no_ring_is_not_known_to_be_safe(dead):
     (orphan,) = recover_orphans()
     assert orphan.recording == recording
     assert not orphan.safe
-    assert "NOT known to be safe: look at it" in orphan.text
+    assert "NOT confirmed to be safe: check it" in orphan.text
     assert read(recording).samples.index.size > 0
     assert runs() == []
     assert recover_orphans() == []
@@ -51,7 +51,7 @@ def test_a_loop_that_ended_by_its_ramp_is_believed(dead):
 
     def fill(folder):
         page = SampleRing.create(folder.ring, slots=4, block=1, state_size=1).page
-        ended = Outcome("stopped", "stopped because the supervisor died", 0, True, 0)
+        ended = Outcome("stopped", "stopped because the supervisor died", 0, "confirmed", 0)
         page.write_text(PageText.OUTCOME, json.dumps(asdict(ended)))
         page.put(Field.PHASE, Phase.ENDED)
 
@@ -62,7 +62,7 @@ def test_a_loop_that_ended_by_its_ramp_is_believed(dead):
 
 
 @pytest.mark.parametrize(
-    ("error", "words"), [("", "put the output at"), ("no answer", "no answer")]
+    ("error", "words"), [("", "confirmed by the device"), ("no answer", "no answer")]
 )
 def test_what_the_guardian_did_is_said(dead, error, words):
     """Both others were dead; what it could not confirm is not called safe."""
@@ -70,14 +70,15 @@ def test_what_the_guardian_did_is_said(dead, error, words):
     def fill(folder):
         page = SampleRing.create(folder.ring, slots=4, block=1, state_size=1).page
         page.put(Field.PHASE, Phase.RUNNING)
-        page.leave_made_safe(MadeSafe(hung=False, error=error))
+        output = "unknown" if error else "confirmed"
+        page.leave_safe_result(SafeActionResult(hung=False, output=output, error=error))
 
     recording = dead(fill)
     (orphan,) = recover_orphans()
     assert orphan.safe == (not error)
-    assert "supervisor and loop died; the guardian" in orphan.text
+    assert "supervisor and loop died; guardian: " in orphan.text
     assert words in orphan.text
-    assert ("NOT known to be safe" in orphan.text) == bool(error)
+    assert ("NOT confirmed to be safe" in orphan.text) == bool(error)
     assert read(recording).samples.index.size > 0
 
 

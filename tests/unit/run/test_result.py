@@ -9,7 +9,7 @@ from hilctl.cli.run_view import run_mapping
 from hilctl.run.result import RunResult
 
 RESULT = RunResult(
-    path=Path("a.mcap"), code="stopped", reason="by a test", safe=False, stop_signal=15,
+    path=Path("a.mcap"), code="stopped", reason="by a test", output_state="unknown", stop_signal=15,
     samples=90, missing=10, late_ticks=3, deadline_misses="2 of 5",
 )  # fmt: skip
 
@@ -17,10 +17,10 @@ RESULT = RunResult(
 def test_programs_get_every_figure_of_a_run_too_long_to_report():
     """All but the two that the exit code and the recording's own report tell."""
     mapping = run_mapping(RESULT, None)
-    told = {"a.mcap", "stopped", "by a test", False, 90, 10, "2 of 5"}
+    told = {"a.mcap", "stopped", "by a test", False, "unknown", 90, 10, "2 of 5"}
     assert (mapping.pop("adapted"), mapping.pop("on_end")) == ({}, [])
     assert set(mapping.values()) == told
-    assert len(mapping) == len(fields(RunResult)) - 4
+    assert len(mapping) == len(fields(RunResult)) - 3
 
 
 def test_a_result_does_not_change():

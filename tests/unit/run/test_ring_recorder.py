@@ -12,7 +12,7 @@ from hilctl.run.ring import SampleRing
 from hilctl.run.ring_recorder import RingRecorder
 from hilctl.run.shared_page import Field
 
-ENDED = Outcome("completed", "waveform completed", 8, True, 0)
+ENDED = Outcome("completed", "waveform completed", 8, "confirmed", 0)
 
 
 class Recorder:
@@ -141,7 +141,7 @@ def test_what_a_dead_loop_had_sent_is_recorded_as_not_answered(ring, recording):
     exchange(ring, 4)
     exchange(ring, 2, answered=False)
     ring._area.heads[1, Head.SEQUENCE] = 77
-    recording.end(Outcome("fault", "it died", 0, True, 0), lost_loop=True)
+    recording.end(Outcome("fault", "it died", 0, "confirmed", 0), lost_loop=True)
     recording._finish()
     assert recording.recorder.firsts == [0, 2, 3, 4, 5]
     assert recording.recorder.finished == ("it died", 6)

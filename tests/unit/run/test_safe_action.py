@@ -1,4 +1,4 @@
-"""Making a device safe beside whatever else there is to do."""
+"""A safe action runs beside whatever else there is to do."""
 
 import threading
 from types import SimpleNamespace
@@ -6,43 +6,64 @@ from types import SimpleNamespace
 import pytest
 
 from hilctl.base.errors import DeviceError
+from hilctl.loop.safe_output import SafeGoal
+from hilctl.run.ring import SampleRing
 from hilctl.run.safe_action import SafeAction
-from hilctl.run.shared_page import MadeSafe
+from hilctl.run.shared_page import SafeActionResult
+
+GOAL = SafeGoal(0.5, 1.0, None, pending=False)
 
 
-def test_nobody_is_kept_waiting():
+@pytest.fixture
+def act(tmp_path):
+    """Return a function that starts a safe action."""
+    page = SampleRing.create(tmp_path / "ring", slots=4, block=1, state_size=1).page
+
+    def start(make_safe, **changes):
+        device = SimpleNamespace(make_safe=make_safe)
+        action = SafeAction(page, device, GOAL, **{"hung": False, **changes})
+        action.page = page
+        return action
+
+    return start
+
+
+def test_the_caller_is_not_blocked(act):
     go_on, asked = threading.Event(), []
 
     def make_safe(value):
         go_on.wait(30.0)
         asked.append(value)
 
-    device = SimpleNamespace(make_safe=make_safe)
-    action = SafeAction(device, 0.5, hung=True, prepare=lambda: asked.append("prepared"))
-    assert action.result() is None
-    assert action._thread.daemon  # nor is the process that ends meanwhile
+    action = act(make_safe, hung=True, prepare=lambda: asked.append("prepared"))
+    assert not action.result().final
+    assert action._thread.daemon  # nor does it keep the process from ending
     go_on.set()
-    assert action.result(30.0) == MadeSafe(hung=True, error="")
+    assert action.result(30.0) == SafeActionResult(hung=True, output="confirmed")
     assert asked == ["prepared", 0.5]
+    assert action.page.last_safe_write() == 0.5
 
 
-@pytest.mark.parametrize(
-    ("error", "words"),
-    [(DeviceError("no answer"), "no answer"), (KeyError("x"), "KeyError: 'x'")],
-)
-def test_no_error_passes_for_a_confirmed_output(error, words):
+def test_an_action_goes_on_until_it_is_ended(act):
+    asked = threading.Event()
+
+    def make_safe(value):
+        asked.set()
+        raise DeviceError("no answer")
+
+    action = act(make_safe)
+    assert asked.wait(30.0)
+    assert action.end(30.0)
+    assert (action.result().output, action.result().error) == ("unknown", "no answer")
+    assert not action.result().final
+
+
+@pytest.mark.parametrize("error", [KeyError("x"), MemoryError()])
+def test_a_failure_of_this_process_is_no_answer_of_the_device(act, error):
     def make_safe(value):
         raise error
 
-    action = SafeAction(SimpleNamespace(make_safe=make_safe), 0.0, hung=False)
-    assert action.result(30.0).error == words
-    assert not action.result().confirmed
-
-
-def test_a_look_at_what_came_of_it_does_not_wait():
-    waited_s = []
-    action = SafeAction(SimpleNamespace(make_safe=lambda value: None), 0.0, hung=False)
+    action = act(make_safe)
     action.result(30.0)
-    action._thread = SimpleNamespace(join=waited_s.append)
-    assert action.result().confirmed
-    assert waited_s == [0.0]
+    assert type(error).__name__ in action.failed
+    assert not action.result().final

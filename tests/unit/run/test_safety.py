@@ -4,13 +4,14 @@ from types import SimpleNamespace
 
 import pytest
 
-from hilctl.base.errors import RunError
+from hilctl.base.errors import DeviceError, RunError
+from hilctl.loop.limiter import CommandLimits
 from hilctl.loop.plan import Outcome
 from hilctl.run import safety as module
 from hilctl.run.guardian import LAST_CALL_MS
 from hilctl.run.ring import SampleRing
 from hilctl.run.safety import Safety
-from hilctl.run.shared_page import Field, GuardianPhase, MadeSafe, Phase
+from hilctl.run.shared_page import Field, GuardianPhase, Phase, SafeActionResult
 
 MS = 1_000_000
 
@@ -34,18 +35,19 @@ class Guardian:
 class Run:
     """A run's safety, with time in the test's hand."""
 
-    def __init__(self, page, monkeypatch, *, guarded=True, simulated=False):
+    def __init__(self, ring, monkeypatch, *, guarded=True, simulated=False):
+        page = ring.page
         self.page, self.log, self.events, self.guardians = page, [], [], []
-        self.now_ns, self.fail_start = 10**9, None
+        self.now_ns, self.fail_start, self.error = 10**9, None, None
+        self.watched = []
         device = SimpleNamespace(
-            info=SimpleNamespace(simulated=simulated),
-            make_safe=lambda value: self.log.append(f"safe {value}"),
+            info=SimpleNamespace(simulated=simulated, in_order=True), make_safe=self.make_safe
         )
         timing = SimpleNamespace(hang_s=None, max_late_s=1.0)
         config = SimpleNamespace(
             timing=timing,
             tick_s=0.01,
-            safe=SimpleNamespace(value=0.25),
+            command_limits=lambda: CommandLimits(-5.0, 5.0, 50.0, 0.25, 50.0),
             realtime=SimpleNamespace(priority=80),
         )
         self.checked = SimpleNamespace(loaded=SimpleNamespace(config=config, device=device))
@@ -55,9 +57,15 @@ class Run:
         monkeypatch.setattr(module, "be_quick", self.priorities.append)
         monkeypatch.setattr(module, "be_ordinary", lambda: self.priorities.append(0))
         start = self.start if guarded else None
-        self.safety = Safety(self.checked, page, child, start, self.events.append)
+        self.safety = Safety(self.checked, ring, child, start, self.events.append)
 
-    def start(self):
+    def make_safe(self, value):
+        self.log.append(f"safe {value}")
+        if self.error:
+            raise self.error
+
+    def start(self, watched):
+        self.watched.append(watched)
         if self.fail_start:
             raise self.fail_start
         self.guardians.append(Guardian(self.page, self.log))
@@ -71,7 +79,7 @@ class Run:
         self.now_ns += round(passed_ms * MS)
         if awake and self.guardians:
             self.guardians[-1].heartbeat_ns = self.now_ns
-        self.safety.look(self.now_ns, ended=ended)
+        self.safety.update(self.now_ns, ended=ended)
 
     def look_alive(self, page, passed_ms):
         """Look at a loop that has just given a sign of life; the guardian gives none."""
@@ -80,32 +88,39 @@ class Run:
 
     def settle(self):
         """Look until what has been begun is over."""
-        while self.safety.made_safe is None:
+        while self.safety.result is None:
             self.look(ended=True, awake=False)
-        return self.safety.made_safe
+        return self.safety.result
 
 
 @pytest.fixture
-def page(tmp_path):
-    page = SampleRing.create(tmp_path / "ring", slots=4, block=1, state_size=1).page
-    page.put(Field.PHASE, Phase.RUNNING)
-    page.put(Field.LOOP_HEARTBEAT_NS, 1)
-    return page
+def ring(tmp_path):
+    ring = SampleRing.create(tmp_path / "ring", slots=4, block=1, state_size=1)
+    ring.page.put(Field.PHASE, Phase.RUNNING)
+    ring.page.put(Field.LOOP_HEARTBEAT_NS, 1)
+    ring.page.put(Field.REAL_TIME, 1)
+    ring.page.put_float(Field.OUTPUT_AT_START, 0.25)
+    return ring
 
 
 @pytest.fixture
-def run(page, monkeypatch):
-    return Run(page, monkeypatch)
+def page(ring):
+    return ring.page
+
+
+@pytest.fixture
+def run(ring, monkeypatch):
+    return Run(ring, monkeypatch)
 
 
 def test_a_guardian_that_is_awake_does_it(run, page):
     """The supervisor only waits for it, and touches neither loop nor device."""
     for _ in range(5):
         run.look(ended=True)
-    assert (run.log, run.safety.made_safe) == ([], None)
-    page.leave_made_safe(MadeSafe(hung=True, error=""))
+    assert (run.log, run.safety.result) == ([], None)
+    page.leave_safe_result(SafeActionResult(hung=True, output="confirmed"))
     run.look(ended=True)
-    assert run.safety.made_safe == MadeSafe(hung=True, error="")
+    assert run.safety.result == SafeActionResult(hung=True, output="confirmed")
     assert run.safety.by == "guardian"
 
 
@@ -118,7 +133,7 @@ def test_where_the_guardian_can_not_the_supervisor_does(run, what):
     if what == "starting":
         guardian.phase = GuardianPhase.STARTING
     run.look(ended=True, passed_ms=60, awake=what != "silent")
-    assert run.settle() == MadeSafe(hung=False, error="")
+    assert run.settle() == SafeActionResult(hung=False, output="confirmed")
     assert run.log == ["guardian killed", "loop killed", "safe 0.25"]
     assert run.safety.by == "supervisor"
     assert guardian.waited_s == run.waited_s == pytest.approx(1e-3 * LAST_CALL_MS, rel=1e-6)
@@ -129,24 +144,84 @@ def test_where_the_guardian_can_not_the_supervisor_does(run, what):
 def test_a_guardian_that_was_just_done_when_it_was_killed_is_believed(run, page):
     """Nothing is sent twice."""
     guardian = run.guardians[0]
-    guardian.kill = lambda wait_s: page.leave_made_safe(MadeSafe(hung=False, error=""))
+    guardian.kill = lambda wait_s: page.leave_safe_result(
+        SafeActionResult(hung=False, output="confirmed")
+    )
     run.look(ended=True, passed_ms=60, awake=False)
     assert run.safety.by == "guardian"
     assert "safe 0.25" not in run.log
 
 
-def test_a_guardian_that_works_for_ever_is_not_waited_for(run):
+def acting(run, page, **result):
+    """Let the guardian act, and leave what it has reached so far."""
     run.guardians[0].phase = GuardianPhase.ACTING
+    page.put(Field.GUARDIAN_PHASE, GuardianPhase.ACTING)
+    page.leave_safe_result(SafeActionResult(hung=False, final=False, **result))
+
+
+def test_a_guardian_that_keeps_trying_is_left_to_it(run, page):
+    """The run ends without it, and says what is not confirmed; nobody else takes the device."""
+    acting(run, page, output="unknown", error="no answer")
     run.look(ended=True)
-    run.look(ended=True, passed_ms=60_000)
+    run.look(ended=True, passed_ms=5_000)
+    assert run.safety.result is None
+    run.look(ended=True, passed_ms=200)
+    assert (run.safety.result.output, run.safety.by) == ("unknown", "guardian")
+    assert run.safety.close()
     assert run.log == []
-    run.look(ended=True, passed_ms=1e-6)
-    assert run.log[:2] == ["guardian killed", "loop killed"]
+
+
+@pytest.mark.parametrize("phase", [GuardianPhase.FAILED, GuardianPhase.ACTING])
+def test_if_the_guardian_fails_the_supervisor_drives_the_device(run, page, phase):
+    """It may lack memory or descriptors, which is no answer of the device."""
+    acting(run, page, output="unknown", error="no answer")
+    run.look(ended=True)
+    run.guardians[0].phase, run.guardians[0].ended = phase, True
+    run.look(ended=True)
     assert run.settle().confirmed
+    assert run.safety.by == "supervisor"
 
 
-def test_a_simulated_device_has_no_guardian(page, monkeypatch):
-    run = Run(page, monkeypatch, guarded=False, simulated=True)
+def test_what_the_supervisor_cannot_confirm_is_left_to_a_new_guardian(run):
+    run.guardians[0].ended, run.error = True, DeviceError("no answer")
+    run.look(ended=True)
+    run.look(ended=True, passed_ms=5_200)
+    assert (run.safety.result.output, run.safety.by) == ("unknown", "supervisor")
+    monkeypatched = run.start
+
+    def start(watched):
+        guardian = monkeypatched(watched)
+        guardian.phase = GuardianPhase.ACTING
+        return guardian
+
+    run.safety._start_guardian = start
+    assert run.safety.close()
+    assert run.watched == [1, None]
+    sent = len(run.log)
+    assert not run.safety._action._thread.is_alive()
+    assert len(run.log) == sent
+
+
+def test_if_no_guardian_can_be_started_the_supervisor_goes_on_until_it_is_confirmed(run):
+    run.guardians[0].ended, run.error = True, DeviceError("no answer")
+    run.look(ended=True)
+    run.look(ended=True, passed_ms=5_200)
+    run.fail_start, run.error = OSError(24, "Too many open files"), None
+    assert not run.safety.close()
+    assert run.safety.result.confirmed
+
+
+def test_the_user_can_end_that(run):
+    run.guardians[0].ended, run.error = True, DeviceError("no answer")
+    run.look(ended=True)
+    run.look(ended=True, passed_ms=5_200)
+    run.fail_start = OSError(24, "Too many open files")
+    assert not run.safety.close(lambda: True)
+    assert run.safety.result.output == "unknown"
+
+
+def test_a_simulated_device_has_no_guardian(ring, monkeypatch):
+    run = Run(ring, monkeypatch, guarded=False, simulated=True)
     assert run.safety.ready()
     run.look()
     run.look(ended=True)
@@ -155,11 +230,11 @@ def test_a_simulated_device_has_no_guardian(page, monkeypatch):
 
 
 def test_a_loop_that_said_how_it_ended_is_left_alone(run, page):
-    page.leave_outcome(Outcome("completed", "waveform completed", 7, True, 0))
+    page.leave_outcome(Outcome("completed", "waveform completed", 7, "confirmed", 0))
     run.guardians[0].ended = True  # as it does by itself
     for _ in range(5):
         run.look(ended=True, awake=False, passed_ms=100)
-    assert (run.log, run.events, run.safety.made_safe) == ([], [], None)
+    assert (run.log, run.events, run.safety.result) == ([], [], None)
 
 
 def test_a_hanging_loop_is_found_here_too(run):
@@ -169,7 +244,7 @@ def test_a_hanging_loop_is_found_here_too(run):
     while not run.log:
         run.look(awake=False)
         looks += 1
-    assert run.settle() == MadeSafe(hung=True, error="")
+    assert run.settle() == SafeActionResult(hung=True, output="confirmed")
     assert looks * 10 == pytest.approx(100, abs=11)  # two periods of 10 ms, and 80 ms
     assert run.log == ["guardian killed", "loop killed", "safe 0.25"]
 
@@ -186,12 +261,15 @@ def test_a_guardian_that_is_done_is_believed_until_the_process_is_gone(run, page
     """A loop that it has killed takes a while to be gone."""
     run.look()
     run.guardians[0].phase = GuardianPhase.DONE
-    page.leave_made_safe(MadeSafe(hung=True, error=""))
+    page.leave_safe_result(SafeActionResult(hung=True, output="confirmed"))
     for _ in range(50):
         run.look(awake=False)
-    assert (run.log, run.safety.made_safe) == ([], None)
+    assert (run.log, run.safety.result) == ([], None)
     run.look(ended=True, awake=False)
-    assert (run.safety.made_safe, run.safety.by) == (MadeSafe(hung=True, error=""), "guardian")
+    assert (run.safety.result, run.safety.by) == (
+        SafeActionResult(hung=True, output="confirmed"),
+        "guardian",
+    )
 
 
 def heartbeat(run, page):
@@ -212,7 +290,7 @@ def test_a_lost_guardian_is_said_and_another_one_started(run, page, how):
     assert how in run.events[0].text
     assert run.log == ["guardian killed"]
     run.look(ended=True)
-    assert run.safety.made_safe is None
+    assert run.safety.result is None
 
 
 def test_a_guardian_is_lost_after_four_looks_and_more_than_a_second(run, page):
@@ -273,7 +351,7 @@ def test_one_that_can_not_be_started_again_is_said(run, page):
     run.guardians[0].ended = True
     run.fail_start = OSError(11, "Resource temporarily unavailable")
     heartbeat(run, page)
-    assert "can't be started: Resource temporarily unavailable" in run.events[-1].text
+    assert "cannot be started: Resource temporarily unavailable" in run.events[-1].text
     run.look(ended=True, awake=False)
     assert run.settle().confirmed
 

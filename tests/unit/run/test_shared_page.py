@@ -58,7 +58,7 @@ def test_events_come_once_and_are_cut_to_what_fits(sides):
 def test_outcome_counts_only_at_the_end(sides):
     """A text that is not there yet, or damaged, is no outcome."""
     one, other = sides
-    outcome = Outcome("stopped", "stopped by a test", 7, True, 2)
+    outcome = Outcome("stopped", "stopped by a test", 7, "confirmed", 2)
     one.write_text(PageText.OUTCOME, json.dumps(asdict(outcome)))
     assert other.outcome() is None
     one.put(Field.PHASE, Phase.ENDED)

@@ -8,7 +8,7 @@ import pytest
 from hilctl.loop.plan import Outcome
 from hilctl.run import started_run as module
 from hilctl.run.ring import SampleRing
-from hilctl.run.shared_page import Field, MadeSafe, Stop
+from hilctl.run.shared_page import Field, SafeActionResult, Stop
 from hilctl.run.started_run import StartedRun
 from hilctl.run.stopping import STOP_SIGNAL
 
@@ -31,7 +31,7 @@ class Run:
         )
         self.child = SimpleNamespace(ended=False, death=lambda: "the loop process died: of this")
         self.safety = SimpleNamespace(
-            made_safe=None, by="", look=lambda now_ns, *, ended: self.looks.append(ended)
+            result=None, by="", update=lambda now_ns, *, ended: self.looks.append(ended)
         )
         self.config = SimpleNamespace(
             recording=SimpleNamespace(on_failure="stop", ring_s=10.0), compensator=None
@@ -106,7 +106,7 @@ def test_half_a_ring_is_no_reason_to_stop(run):
 
 def test_a_loop_that_ended_by_itself_is_believed_once_it_is_gone(run):
     """Until then it may still be closing its device."""
-    outcome = Outcome("completed", "waveform completed", 7, True, 0)
+    outcome = Outcome("completed", "waveform completed", 7, "confirmed", 0)
     run.page.leave_outcome(outcome)
     run.started.attend(0)
     assert run.ended == []
@@ -127,29 +127,37 @@ def test_the_recording_is_not_closed_before_the_output_is_safe(run):
 
 
 @pytest.mark.parametrize(
-    ("made_safe", "by", "reason"),
+    ("result", "by", "words"),
     [
-        (MadeSafe(hung=False, error=""), "supervisor", "the loop process died: of this"),
-        (MadeSafe(hung=True, error=""), "supervisor", "the loop process hung, and was killed"),
-        (
-            MadeSafe(hung=True, error=""),
-            "guardian",
-            "the loop process hung, and was killed; the guardian put the output at its safe value",
-        ),
-        (
-            MadeSafe(hung=False, error="no answer"),
-            "guardian",
-            "the loop process died: of this; the safe value could not be confirmed: no answer",
-        ),
+        (SafeActionResult(False, "confirmed"), "supervisor", ["of this"]),
+        (SafeActionResult(True, "confirmed"), "supervisor", ["hung"]),
+        (SafeActionResult(True, "confirmed"), "guardian", ["hung", "the guardian set"]),
+        (SafeActionResult(False, "unknown", "no answer"), "guardian", ["of this", "no answer"]),
+        (SafeActionResult(False, "set", final=False), "guardian", ["not yet confirmed"]),
     ],
 )
-def test_who_made_the_output_safe_is_said_and_only_what_was_confirmed(run, made_safe, by, reason):
-    run.safety.made_safe, run.safety.by = made_safe, by
+def test_who_acted_is_said_and_only_what_was_confirmed(run, result, by, words):
+    run.safety.result, run.safety.by = result, by
     run.child.ended = True
     run.started.attend(0)
     ((outcome, lost_loop),) = run.ended
-    assert (outcome.code, outcome.reason, outcome.safe) == ("fault", reason, made_safe.confirmed)
+    assert (outcome.code, outcome.output) == ("fault", result.output)
+    assert all(word in outcome.reason for word in words)
     assert lost_loop
+
+
+def test_a_loop_that_lost_its_device_keeps_its_account_of_the_end(run):
+    """The guardian went on where it gave up; what the loop recorded is whole."""
+    run.page.leave_outcome(Outcome("fault", "no answer", 7, "unknown", 3))
+    run.child.ended = True
+    run.started.attend(0)
+    assert run.ended == []
+    run.safety.result, run.safety.by = SafeActionResult(False, "confirmed"), "guardian"
+    run.started.attend(0)
+    ((outcome, lost_loop),) = run.ended
+    assert (outcome.output, outcome.ended_at, outcome.dropped) == ("confirmed", 7, 3)
+    assert outcome.reason.startswith("no answer; the guardian set")
+    assert not lost_loop
 
 
 def test_what_broke_the_supervisor_first_is_what_is_said(run):

@@ -30,7 +30,8 @@ def process():
 
 
 def run(number, *, supervised=True):
-    return SimpleNamespace(card=SimpleNamespace(name="a", supervisor=number), supervised=supervised)
+    card = SimpleNamespace(name="a", supervisor=number)
+    return SimpleNamespace(card=card, supervised=supervised, kept=False)
 
 
 def test_the_supervisor_gets_the_signal(process):
@@ -51,6 +52,7 @@ def test_the_lock_is_looked_at_once_the_process_is_held(process, monkeypatch):
 
     class Going:
         card = SimpleNamespace(name="a", supervisor=process.pid)
+        kept = False
 
         @property
         def supervised(self):

@@ -46,6 +46,7 @@ class Time:
         self.time = lambda: 5.0
         self.time_ns = lambda: 10**18 + self.now_ns
         self.monotonic_ns = lambda: self.now_ns
+        self.monotonic = lambda: self.now_ns * 1e-9
 
     def sleep(self, seconds):
         self.now_ns += round(seconds * 1e9)
@@ -76,9 +77,14 @@ class Neighbours:
             path=self.output, samples=95, missing=5, error="", notes=[], adapted={},
             begin=self.begin, give_back=lambda: self.note("given back"),
         )  # fmt: skip
-        self.outcome, self.broke = Outcome("completed", "waveform completed", 100, True, 0), ""
-        self.folder = SimpleNamespace(ring=folder / "ring", socket=folder / "socket")
-        self.said = []
+        self.outcome, self.broke = (
+            Outcome("completed", "waveform completed", 100, "confirmed", 0),
+            "",
+        )
+        self.folder = SimpleNamespace(
+            ring=folder / "ring", socket=folder / "socket", keep=lambda: self.note("kept")
+        )
+        self.said, self.resumed, self.kept = [], [], False
         for name, double in {
             "time": self.time,
             "be_ordinary": lambda: self.note("ordinary"),
@@ -94,7 +100,10 @@ class Neighbours:
             "ControlServer": self.server,
             "LoopChild": self.child,
             "RingRecorder": self.ring_recorder,
-            "guardian_of": lambda *a: self.note("guardian", a[-1]),
+            "guardian_starter": self.guardian_starter,
+            "GuardianRelief": lambda holds: SimpleNamespace(
+                resume=self.resumed.append, discard=lambda: self.resumed.append("discarded")
+            ),
             "Safety": self.safety,
             "ProcessMemory": lambda: SimpleNamespace(stay_small=lambda: self.note("small")),
             "StartedRun": self.started_run,
@@ -122,8 +131,11 @@ class Neighbours:
         finally:
             self.log.append(afterwards)
 
-    def run_folder(self, name, output, started):
-        assert (name, output, started) == ("stage", self.output, 5.0)
+    def guardian_starter(self, checked, folder, ring, loop, inherits):
+        return None if self.info.simulated else self.note("guardian", inherits)
+
+    def run_folder(self, name, output, started, holds):
+        assert (name, output, started, holds) == ("stage", self.output, 5.0, ("tcp:here",))
         return self.around("folder", "folder removed", (self.folder, ["lock"]))
 
     @contextmanager
@@ -172,9 +184,11 @@ class Neighbours:
         assert self.ring.page.get(Field.GO) == 0
         self.note("recording")
 
-    def safety(self, checked, page, child, guardian, record_event):
+    def safety(self, checked, ring, child, guardian, record_event):
         self.guardian = guardian
-        return SimpleNamespace(ready=self.ready, close=lambda: self.note("safety closed"))
+        return SimpleNamespace(
+            ready=self.ready, close=lambda stopped=None: self.note("safety closed", self.kept)
+        )
 
     def ready(self):
         self.guardian_looks -= 1
@@ -230,6 +244,42 @@ def test_a_run_is_begun_in_one_order_and_undone_in_the_other(stage):
     assert (result.samples, result.missing, result.safe, result.stop_signal) == (95, 5, True, 0)
     ready = ["shown", "READY=1", f"STATUS=recording to {stage.output}"]
     assert stage.said == [*ready, *["alive"] * 3, "STOPPING=1"]
+
+
+def test_a_guardian_of_an_earlier_run_is_relieved_only_by_a_run_that_starts(stage):
+    stage.run()
+    assert stage.resumed == ["discarded"]
+
+
+@pytest.mark.parametrize("what", ["claimed", "await ready", "recording"])
+def test_a_run_that_does_not_start_leaves_the_device_to_the_earlier_guardian(stage, what):
+    stage.fails[what] = InputError("that")
+    with pytest.raises(InputError):
+        stage.run()
+    assert stage.resumed == [["tcp:here"]]
+
+
+def test_the_folder_is_kept_for_a_guardian_that_is_still_active(stage):
+    stage.kept = True
+    assert stage.run().guardian_active
+    assert stage.log.index("kept") < stage.log.index("folder removed")
+
+
+def test_a_guardian_that_does_not_get_ready_is_not_waited_for(stage):
+    stage.guardian_looks = 10**9
+    with pytest.raises(RunError, match="guardian was not ready"):
+        stage.run()
+    assert stage.ring.page.get(Field.GO) == 0
+
+
+def test_a_supervisor_that_breaks_again_and_again_still_sees_to_the_run(stage):
+    def broken():
+        raise ZeroDivisionError("a bug")
+
+    stage.on_attend = {1: broken, 2: broken, 3: broken}
+    stage.run()
+    assert stage.attended == [0] * 4
+    assert stage.log.count("broken off: a bug") == 3
 
 
 def test_a_simulated_device_has_no_guardian(stage):
@@ -329,7 +379,7 @@ def test_what_breaks_afterwards_costs_neither_coil_nor_recording(stage):
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, STOP_SIGNAL])
 def test_the_first_signal_is_the_one_that_stops_it(stage, number):
     """One that comes later changes nothing; afterwards signals are as they were."""
-    stage.outcome = Outcome("stopped", "stopped by someone", 100, True, 0)
+    stage.outcome = Outcome("stopped", "stopped by someone", 100, "confirmed", 0)
     stage.on_attend[1] = lambda: os.kill(os.getpid(), number)
     stage.on_attend[2] = lambda: os.kill(os.getpid(), signal.SIGTERM)
     before = signal.getsignal(signal.SIGINT)
@@ -353,8 +403,8 @@ def wrong(stage, **changes):
         ({"error": "no room"}, "fault", "waveform completed; 5 samples are lost: no room"),
         ({"broke": "a bug"}, "fault", "waveform completed; the supervisor broke: a bug"),
         ({"notes": ["it was renamed"]}, "fault", "waveform completed; it was renamed"),
-        ({"outcome": Outcome("stopped", "gone", 1, True, 0)}, "fault", "gone"),
-        ({"outcome": Outcome("fault", "late", 1, False, 0)}, "fault", "late"),
+        ({"outcome": Outcome("stopped", "gone", 1, "confirmed", 0)}, "fault", "gone"),
+        ({"outcome": Outcome("fault", "late", 1, "unknown", 0)}, "fault", "late"),
     ],
 )
 def test_how_it_ended(stage, changes, code, reason):

@@ -1,0 +1,185 @@
+"""An output on its way to the safe value: by a ramp, until the device confirms that it holds."""
+
+import errno
+from types import SimpleNamespace
+
+import pytest
+
+from hilctl.base.errors import DeviceError, UnconfirmedError
+from hilctl.loop.safe_output import (
+    HOLD_S,
+    PATIENCE_S,
+    LocalError,
+    SafeGoal,
+    SafeOutput,
+    describe,
+    drive_to_safe,
+)
+
+
+class Amplifier:
+    """Takes a write in ``takes_s``; executes one older command at ``older``, if there is one."""
+
+    def __init__(self, output=4.0, takes_s=0.0, older=None):
+        self.now_s, self.output, self.takes_s, self.older = 100.0, output, takes_s, older
+        self.writes, self.error, self.down_until_s = [], None, 0.0
+
+    def make_safe(self, value):
+        self.sleep(self.takes_s)
+        if self.now_s < self.down_until_s:
+            raise DeviceError("no answer")
+        if self.error:
+            raise self.error
+        self.output = value
+        self.writes.append((self.now_s, value))
+
+    def clock(self):
+        return self.now_s
+
+    def sleep(self, wait_s):
+        self.now_s += wait_s
+        if self.older and self.now_s >= self.older[0]:
+            self.output, self.older = self.older[1], None
+
+
+def driven(amplifier, until_s=1e3, *, start=4.0, pending=False, ramp_per_s=20.0):
+    """Attempt until it is final, as a guardian does."""
+    goal = SafeGoal(0.0, ramp_per_s, start, pending)
+    output = SafeOutput(amplifier, goal, amplifier.clock)
+    while not output.final and amplifier.now_s < until_s:
+        output.attempt()
+        amplifier.sleep(output.pause_s)
+    return output
+
+
+@pytest.mark.parametrize("start", [4.0, -4.0])
+@pytest.mark.parametrize("takes_s", [0.0, 0.001, 0.03])
+def test_the_way_is_a_ramp_by_time(start, takes_s):
+    """No step is larger than the slew of the ramp allows since the write before."""
+    amplifier = Amplifier(start, takes_s)
+    output = driven(amplifier, start=start)
+    times, values = zip(*amplifier.writes, strict=True)
+    steps = [b - a for a, b in zip((start, *values), values, strict=False)]
+    passed = [b - a for a, b in zip((times[0] - 0.005, *times), times, strict=False)]
+    allowed = [20.0 * s + 1e-9 for s in passed]
+    assert all(abs(step) <= most for step, most in zip(steps, allowed, strict=True))
+    assert (output.state, values[-1], amplifier.output) == ("confirmed", 0.0, 0.0)
+    assert times[-1] - times[0] == pytest.approx(0.2, abs=2 * takes_s + 0.006)
+
+
+def test_a_device_slower_than_the_ramp_gets_the_safe_value():
+    amplifier = Amplifier(takes_s=0.5)
+    assert driven(amplifier).state == "confirmed"
+    assert [value for _, value in amplifier.writes] == [pytest.approx(3.9), 0.0]
+
+
+def test_without_a_last_command_there_is_no_ramp():
+    amplifier = Amplifier()
+    assert driven(amplifier, start=None).state == "confirmed"
+    assert [value for _, value in amplifier.writes] == [0.0]
+
+
+@pytest.mark.parametrize("down_s", [1.0, 8.0, 60.0, 3600.0])
+def test_it_is_set_within_one_retry_of_the_return_of_the_device(down_s):
+    amplifier = Amplifier()
+    amplifier.down_until_s = amplifier.now_s + down_s
+    assert driven(amplifier, until_s=1e4).state == "confirmed"
+    (at_s, value), *_ = amplifier.writes
+    assert value == 0.0
+    assert at_s <= amplifier.down_until_s + 0.06
+
+
+@pytest.mark.parametrize("late_s", [0.1, 1.3, 2.5, 10.0, 25.0])
+def test_confirmed_is_not_said_before_an_older_command_may_be_executed(late_s):
+    amplifier = Amplifier(older=(100.0 + late_s, -4.0))
+    output = driven(amplifier, pending=True)
+    assert (output.state, amplifier.older, amplifier.output) == ("confirmed", None, 0.0)
+    assert amplifier.now_s >= 100.0 + HOLD_S
+
+
+def test_until_then_it_is_set_and_repeated():
+    amplifier = Amplifier()
+    output = driven(amplifier, until_s=110.0, start=None, pending=True)
+    assert (output.state, output.final) == ("set", False)
+    assert len(amplifier.writes) > 10
+
+
+def test_a_silence_starts_the_time_again():
+    """A device that was silent may find the older command beside the newer ones."""
+    amplifier = Amplifier()
+    goal = SafeGoal(0.0, 20.0, None, pending=True)
+    output = SafeOutput(amplifier, goal, amplifier.clock)
+    output.attempt()
+    amplifier.sleep(HOLD_S - 1.0)
+    amplifier.down_until_s = amplifier.now_s + 1.0
+    output.attempt()
+    assert (output.state, output.error) == ("unknown", "no answer")
+    amplifier.sleep(2.0)
+    output.attempt()
+    assert output.state == "set"
+    amplifier.sleep(HOLD_S)
+    output.attempt()
+    assert output.state == "confirmed"
+
+
+def test_a_device_that_cannot_confirm_is_sent_the_value_several_times():
+    amplifier = Amplifier()
+    sent = []
+
+    def make_safe(value):
+        sent.append(value)
+        raise UnconfirmedError("it does not answer")
+
+    output = driven(SimpleNamespace(**vars(amplifier), make_safe=make_safe, clock=amplifier.clock,
+                                    sleep=amplifier.sleep), start=None, pending=True)  # fmt: skip
+    assert (output.state, output.final) == ("sent", True)
+    assert sent == [0.0] * 5
+
+
+@pytest.mark.parametrize("number", [errno.EMFILE, errno.ENFILE, errno.ENOMEM])
+def test_what_this_process_lacks_is_not_taken_for_the_device(number):
+    """Another process may be able to drive it."""
+    amplifier = Amplifier()
+    try:
+        try:
+            raise OSError(number, "none left")
+        except OSError as error:
+            raise DeviceError(f"cannot connect: {error}") from None
+    except DeviceError as error:
+        amplifier.error = error
+    with pytest.raises(LocalError):
+        driven(amplifier)
+
+
+def test_driving_ends_as_soon_as_nothing_is_gained_by_waiting():
+    amplifier = Amplifier()
+    output = drive_to_safe(
+        amplifier, SafeGoal(0.0, 20.0, 4.0, pending=True), amplifier.clock, amplifier.sleep
+    )
+    assert output.state == "set"
+    assert amplifier.now_s == pytest.approx(100.2, abs=0.02)
+
+
+def test_driving_ends_after_its_patience():
+    amplifier = Amplifier()
+    amplifier.down_until_s = 1e9
+    output = drive_to_safe(
+        amplifier, SafeGoal(0.0, 20.0, 4.0, pending=True), amplifier.clock, amplifier.sleep
+    )
+    assert (output.state, output.error) == ("unknown", "no answer")
+    assert amplifier.now_s == pytest.approx(100.2 + PATIENCE_S, abs=0.1)
+
+
+def test_each_write_is_noted_before_it_is_sent():
+    amplifier, noted = Amplifier(), []
+    amplifier.error = DeviceError("no answer")
+    output = SafeOutput(
+        amplifier, SafeGoal(0.0, 20.0, 4.0, pending=False), amplifier.clock, noted.append
+    )
+    output.attempt()
+    assert noted == [pytest.approx(3.9)]
+
+
+def test_only_a_confirmed_output_is_called_confirmed():
+    assert [state for state in ("confirmed", "set", "sent", "unknown")
+            if "confirmed by" in describe(state)] == ["confirmed"]  # fmt: skip
