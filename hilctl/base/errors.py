@@ -7,6 +7,7 @@ HilctlError
 |   `-- DataError         a recording or a data file can't be read or doesn't hold what is asked
 `-- RunError              something went wrong while current was flowing (exit code 3)
     `-- DeviceError       the device refused, answered wrongly or went away
+        `-- UnconfirmedError  the command was sent; this device has no way to confirm it
 """
 
 from collections.abc import Iterable
@@ -91,4 +92,12 @@ class DeviceError(RunError):
 
     Example scenarios: a command outside the device's range, a time-out, an unplugged cable. The
     text names the device and what it was doing.
+    """
+
+
+class UnconfirmedError(DeviceError):
+    """The command was sent; this device has no way to confirm it.
+
+    Example scenarios: an output that is set by lines that are not answered and that cannot be read
+    back; a write whose correct reply equals the request, on a serial line that may be an echo.
     """
