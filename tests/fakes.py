@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 from mcap.writer import CompressionType, Writer
 
+from hilctl.base.device import Device
 from hilctl.base.errors import DeviceError, InputError
 from hilctl.base.events import Event
 from hilctl.base.samples import Batch, Head
@@ -348,6 +349,18 @@ class InProcessLink:
 
 
 _READ_FUNCTIONS = (1, 2, 3, 4)
+
+
+def made_safe(device: Device, command: float, attempts: int = 50) -> int:
+    """Attempt to make a device safe until it confirms; return the number of attempts."""
+    for attempt in range(1, attempts):
+        try:
+            device.make_safe(command)
+        except DeviceError:
+            continue
+        return attempt
+    device.make_safe(command)
+    return attempts
 
 
 class FaultyLink(InProcessLink):

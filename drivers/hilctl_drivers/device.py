@@ -12,7 +12,7 @@ import numpy as np
 
 from hilctl.base.arrays import F64
 from hilctl.base.device import DeviceInfo, DeviceOptions
-from hilctl.base.errors import DeviceError
+from hilctl.base.errors import DeviceError, UnconfirmedError
 from hilctl_drivers.wire.timing import RateLimit
 
 _SHORT = 64
@@ -119,12 +119,13 @@ class DacDevice(ABC):
             raise self._error(self._action, str(error)) from None
 
     def make_safe(self, command: float) -> None:
-        """Put the output at ``command`` at once and let go; a watchdog that is armed stays so.
+        """Put the output at ``command`` in one attempt, and let go; an armed watchdog stays armed.
 
-        Opens a connection of its own where there is none.
+        See :meth:`hilctl.base.device.Device.make_safe`.
 
         Raises:
-            DeviceError: ``command`` is out of range or not finite; the device can't be reached, or
+            UnconfirmedError: It was sent; the device has no way to confirm it.
+            DeviceError: ``command`` is out of range or not finite; the device cannot be reached, or
                 does not confirm.
         """
         if not self._low <= command <= self._high:
@@ -134,7 +135,10 @@ class DacDevice(ABC):
         try:
             self._put_out(command)
         except DeviceError as error:
-            raise self._error(f"make safe, {self._output_name}", str(error)) from None
+            made = self._error(f"make safe, {self._output_name}", str(error))
+            if isinstance(error, UnconfirmedError):
+                raise UnconfirmedError(str(made)) from None
+            raise made from None
         finally:
             self._release()
 
@@ -188,7 +192,7 @@ class DacDevice(ABC):
 
     @abstractmethod
     def _put_out(self, command: float) -> None:
-        """Put out a command that is in range, open or not; :meth:`_release` follows."""
+        """Attempt once to put out a command in range, open or not; :meth:`_release` follows."""
 
     @abstractmethod
     def _close(self) -> None:

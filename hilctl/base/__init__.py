@@ -16,8 +16,8 @@ printable.py texts from files as people may be shown them
 text_table.py  columns of CSV and its relatives, mistakes with their line
 yaml/        plain YAML in, with the line of every value and all problems at once
 
-A device outside of this repository needs ``Device``, ``DeviceInfo``, ``DeviceOptions`` and
-``DeviceError`` from here, and nothing else.
+A device outside of this repository needs ``Device``, ``DeviceInfo``, ``DeviceOptions``,
+``DeviceError`` and ``UnconfirmedError`` from here, and nothing else.
 """
 
 from importlib import import_module
@@ -28,14 +28,16 @@ if TYPE_CHECKING:
     from hilctl.base.device import DeviceInfo as DeviceInfo
     from hilctl.base.device import DeviceOptions as DeviceOptions
     from hilctl.base.errors import DeviceError as DeviceError
+    from hilctl.base.errors import UnconfirmedError as UnconfirmedError
 
-__all__ = ["Device", "DeviceError", "DeviceInfo", "DeviceOptions"]
+__all__ = ["Device", "DeviceError", "DeviceInfo", "DeviceOptions", "UnconfirmedError"]
 
 _STANDS_IN = {
     "Device": "device",
     "DeviceInfo": "device",
     "DeviceOptions": "device",
     "DeviceError": "errors",
+    "UnconfirmedError": "errors",
 }
 
 

@@ -144,18 +144,53 @@ class Device(Protocol):
         ...
 
     def make_safe(self, command: float) -> None:
-        """Put the output at ``command`` at once, without a ramp: the last resort.
+        """Put the output at ``command`` in one attempt, and return if the device confirms it.
 
-        Opens a connection of its own where there is none.
+        Open a connection if there is none, write, have the device confirm, and let go. The attempt
+        is bounded by the device's time-outs: it repeats nothing, waits for no older command and
+        watches nothing. It sends no self-test and no init step, and takes any command in range:
+        the caller retries until the value is confirmed, repeats the write while an older,
+        unanswered command may still be executed, and ramps with successive values.
+
+        On a serial line the value is sent before anything is waited for. The answer to an older
+        command is never taken as the confirmation.
 
         Raises:
-            DeviceError: The device can't be reached or does not confirm.
+            UnconfirmedError: The command was sent, and nothing that the device can answer would be
+                evidence of it. Repeating the attempt cannot confirm it.
+            DeviceError: The device cannot be reached, refused, or did not confirm in time.
         """
         ...
 
     def close(self) -> None:
         """Let go of the port and leave the output as it is. Closing twice is fine."""
         ...
+
+
+@runtime_checkable
+class WatchdogDevice(Protocol):
+    """A device with a watchdog of its own; devices without one need no :meth:`arm`."""
+
+    def arm(self) -> None:
+        """Arm the device's watchdog, if the experiment wants it.
+
+        Called once after the start signal, immediately before the first exchange: armed at
+        :meth:`Device.open`, it would count while the run waits to start. Must not move the output.
+
+        Raises:
+            DeviceError: The device did not confirm, or is not open.
+        """
+        ...
+
+
+def arm(device: Device) -> None:
+    """Arm a device's watchdog; do nothing for a device that has none.
+
+    Raises:
+        DeviceError: See :meth:`WatchdogDevice.arm`.
+    """
+    if isinstance(device, WatchdogDevice):
+        device.arm()
 
 
 @runtime_checkable

@@ -7,7 +7,7 @@ HilctlError
 |   `-- DataError         a recording or a data file can't be read or doesn't hold what is asked
 `-- RunError              something went wrong while current was flowing (exit code 3)
     `-- DeviceError       the device refused, answered wrongly or went away
-        `-- UnconfirmedError  a command was sent to a device that cannot confirm it
+        `-- UnconfirmedError  the command was sent; this device has no way to confirm it
 """
 
 from collections.abc import Iterable
@@ -96,8 +96,8 @@ class DeviceError(RunError):
 
 
 class UnconfirmedError(DeviceError):
-    """A command was sent, and the device has no way to confirm it.
+    """The command was sent; this device has no way to confirm it.
 
-    Example scenarios: a text profile with ``reply: none`` and neither ``readback`` nor
-    ``error_query``; a reply that equals the request, on a line that may echo.
+    Example scenarios: an output that is set by lines that are not answered and that cannot be read
+    back; a write whose correct reply equals the request, on a serial line that may be an echo.
     """

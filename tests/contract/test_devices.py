@@ -20,7 +20,6 @@ from hilctl.base.errors import DeviceError
 from hilctl.experiment.registry import BUILTIN, device_class, known_devices
 from hilctl_drivers.emulator.options import EmulatorOptions
 from hilctl_drivers.emulator.setup import build
-from hilctl_drivers.modbus import last_write
 from hilctl_drivers.modbus.profile import ModbusProfile
 from hilctl_drivers.profile import load_profile, shipped_profiles
 from tests.fakes import ManualClock, VirtualTime
@@ -179,7 +178,7 @@ def modbus(words: list[str], stack: list[Callable[[], None]]) -> DrivenDevice:
     if "reader" in options:
         options["reader"] = _fast(options["reader"])
     time = VirtualTime()  # of what the device waits for alone
-    device = chosen(chosen.Options.model_validate(options), sleep=time.sleep, clock=time)
+    device = chosen(chosen.Options.model_validate(options), clock=time)
     rate_hz = min(RATE_HZ, device.info.max_rate_hz)
 
     def pass_time() -> None:
@@ -202,9 +201,8 @@ CASES = [
 
 
 @pytest.fixture
-def make(tmp_path, monkeypatch) -> Iterator[Callable[[str], DrivenDevice]]:
+def make(tmp_path) -> Iterator[Callable[[str], DrivenDevice]]:
     """Return a function that makes a device of a kind; all are closed afterwards."""
-    monkeypatch.setattr(last_write, "ANSWER_S", TIMEOUT_S)
     benches: list[DrivenDevice] = []
     stack: list[Callable[[], None]] = []
 

@@ -5,6 +5,6 @@ frames.py      Modbus function 76
 stream.py      registers and messages of a stream; timing.py  how long they take
 setup.py       an experiment's options, held against the profile
 session.py     one stream
-last_write.py  the write that makes the output safe
+safe_write.py  one attempt to write the safe value
 device.py      the device
 """

@@ -17,12 +17,12 @@ from hilctl.base.device import DeviceOptions
 from hilctl.base.errors import DeviceError
 from hilctl_drivers.device import DacDevice
 from hilctl_drivers.labjack.frames import ModbusFeedback
-from hilctl_drivers.labjack.last_write import StreamLastWrite
+from hilctl_drivers.labjack.safe_write import StreamSafeWrite
 from hilctl_drivers.labjack.session import StreamSession
 from hilctl_drivers.labjack.setup import ModbusStreamOptions, StreamSetup
 from hilctl_drivers.labjack.stream import InputCalibration
-from hilctl_drivers.modbus.last_write import Connect
 from hilctl_drivers.modbus.look import look
+from hilctl_drivers.modbus.safe_write import Connect
 from hilctl_drivers.modbus.session import ModbusSession
 from hilctl_drivers.modbus.setup import ModbusPeer
 from hilctl_drivers.modbus.watchdog import ModbusGuard
@@ -70,9 +70,7 @@ class ModbusStream(DacDevice):
         self._next_sample = 0
         self._armed_s = 0.0
         self._peer = writer
-        self._last_write = StreamLastWrite(setup.base, connect, sleep, clock)
-        # Until it was open here: another process may have sent it a message.
-        self._under_way = True
+        self._safe_write = StreamSafeWrite(setup.base, connect)
 
     @property
     def stream(self) -> StreamSession | None:
@@ -111,7 +109,6 @@ class ModbusStream(DacDevice):
         self._stream = stream
         self._next_sample = 0
         self._armed_s = self._clock()
-        self._under_way = False
 
     def _output(self) -> float | None:
         assert self._session is not None
@@ -144,13 +141,11 @@ class ModbusStream(DacDevice):
             self._guard.check_fed(self._clock() - self._armed_s)
         gain, offset, um_per_unit, offset_um = self._factors
         # Queued before the readings are waited for: meanwhile the device must not run dry.
-        self._under_way = True
         stream.feed((command - offset) / gain)
         self._next_sample += command.size
         readings = self._readings(stream, command.size)
         if self._guard.feed_every and self._session is not None:
             self._guard.feed(self._session)
-        self._under_way = False
         if readings is not None:
             np.multiply(readings, um_per_unit, out=displacement_um)
             displacement_um += offset_um
@@ -170,8 +165,7 @@ class ModbusStream(DacDevice):
         """Stop the stream and put the output at ``command``; what is queued is dropped."""
         self._release()
         value = self._setup.base.chain.output(command)
-        self._last_write.put_out(self._peer, value, under_way=self._under_way)
-        self._under_way = False
+        self._safe_write.attempt(self._peer, value)
 
     def _look(self) -> tuple[float, float | None]:
         return look(self._setup.base)

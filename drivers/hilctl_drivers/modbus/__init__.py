@@ -6,7 +6,7 @@ transactions.py  requests prepared once and sent many times; session.py  one con
 timing.py        how long an exchange takes
 setup.py         an experiment's options, held against the profile
 watchdog.py      the module's host watchdog
-last_write.py    the write that makes the output safe
+safe_write.py    one attempt to write the safe value
 look.py          input and output of a device that is only read
 device.py        the device, and the one that reads the sensor where it is another
 """

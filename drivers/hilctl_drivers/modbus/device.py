@@ -15,14 +15,15 @@ from hilctl.base.arrays import F64
 from hilctl.base.device import DeviceOptions
 from hilctl.base.errors import DeviceError
 from hilctl_drivers.device import DacDevice
-from hilctl_drivers.modbus.last_write import Connect, ModbusLastWrite
 from hilctl_drivers.modbus.look import look
 from hilctl_drivers.modbus.pdu import feedback_pdu, read_pdu, write_read_pdu
+from hilctl_drivers.modbus.safe_write import Connect, ModbusSafeWrite
 from hilctl_drivers.modbus.session import ModbusSession
 from hilctl_drivers.modbus.setup import ModbusOptions, ModbusPeer, ModbusSetup
 from hilctl_drivers.modbus.watchdog import ModbusGuard
 from hilctl_drivers.wire.errors import Refused
 from hilctl_drivers.wire.links import NoAnswerError, naming
+from hilctl_drivers.wire.serial_port import SerialLink
 
 Swap: TypeAlias = Callable[[bytes], bytes]
 """Write these register bytes to the output, return those of the input.
@@ -41,7 +42,6 @@ class ModbusDac(DacDevice):
         self,
         options: ModbusOptions,
         connect: Connect = ModbusPeer.session,
-        sleep: Callable[[float], None] = time.sleep,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """Describe the device; nothing is sent before :meth:`open`.
@@ -49,7 +49,6 @@ class ModbusDac(DacDevice):
         Args:
             options: What the experiment says of it.
             connect: Makes a session on a new link to the device that has the output.
-            sleep: Waits that many s.
             clock: Monotonic time in s.
 
         Raises:
@@ -66,7 +65,7 @@ class ModbusDac(DacDevice):
         self._connect = connect
         self._peer = setup.writer
         self._clock = clock
-        self._last_write = ModbusLastWrite(setup, connect, sleep, clock)
+        self._safe_write = ModbusSafeWrite(setup, connect)
         self._factors = setup.chain.factors
         self._encode = setup.output.format.encode
         self._decode = setup.input.format.decode
@@ -74,8 +73,6 @@ class ModbusDac(DacDevice):
         self._pair: _Pair | None = None
         self._swap: Swap = _not_open
         self._feeds = False
-        # Until it was open here: another process may have sent it a command.
-        self._under_way = True
         self.one_transaction = False
         """Whether a tick is one transaction; known once it is open."""
 
@@ -101,7 +98,6 @@ class ModbusDac(DacDevice):
         self._guard.arm(pair.writer, sample_rate_hz)
         self._feeds = self._guard.feed_every > 0
         self._swap = self._first_of(swap, self._clock())
-        self._under_way = False
 
     def _first_of(self, swap: Swap, armed_s: float) -> Swap:
         """Return a swap that is preceded, the first time, by a look at the watchdog's time."""
@@ -123,18 +119,26 @@ class ModbusDac(DacDevice):
     ) -> None:
         gain, offset, um_per_unit, offset_um = self._factors
         request = self._encode((command.item() - offset) / gain)
-        self._under_way = True
         data = self._swap(request)
-        self._under_way = False
         displacement_um[0] = self._decode(data) * um_per_unit + offset_um
         if self._feeds and self._pair is not None:
             self._guard.feed(self._pair.writer)
 
     def _put_out(self, command: float) -> None:
-        self._release()  # many devices take one connection only
         value = self._setup.chain.output(command)
-        self._last_write.put_out(self._peer, value, under_way=self._under_way)
-        self._under_way = False
+        opened = self._pair.writer if self._pair is not None else None
+        if opened is not None and not isinstance(opened.link, SerialLink):
+            self._release()  # many devices take one connection only
+            opened = None
+        self._safe_write.attempt(self._peer, value, opened)
+
+    def _abandon(self) -> None:
+        """Keep a serial port, where opening it anew could reset a board before it is safe."""
+        link = None if self._pair is None else self._pair.writer.link
+        if isinstance(link, SerialLink):
+            link.doubt()
+        else:
+            self._release()
 
     def _look(self) -> tuple[float, float | None]:
         return look(self._setup)

@@ -88,6 +88,7 @@ class SerialDac(DacDevice):
 
     def _abandon(self) -> None:
         """Keep the port: opening it anew could reset a board before its output is safe."""
+        self._wire.doubt()
 
     def _put_out(self, command: float) -> None:
         self._wire.put_out(self._chain.output(command))

@@ -5,8 +5,8 @@ from abc import ABC, abstractmethod
 from hilctl.base.arrays import F64
 from hilctl.base.errors import DeviceError, InputError
 from hilctl_drivers.profile_parts import Range
-from hilctl_drivers.serial.last_write import SerialLastWrite
 from hilctl_drivers.serial.setup import SerialSetup
+from hilctl_drivers.wire.safe_exchange import SafeExchange
 from hilctl_drivers.wire.timing import RateLimit
 
 
@@ -19,7 +19,6 @@ class SerialWire(ABC):
         measures: Whether :meth:`exchange` fills ``measured``.
         longest_message_s: Longest until the safe value is there, after an exchange that is under
             way; 0 where that is too short to be worth a word.
-        last_write: How the safe value gets there.
 
     Args:
         setup: What the experiment says of it.
@@ -36,7 +35,7 @@ class SerialWire(ABC):
     def __init__(self, setup: SerialSetup) -> None:
         self._setup = setup
         self._link = setup.link()
-        self.last_write = SerialLastWrite()
+        self._safe_exchange = SafeExchange()
 
     @abstractmethod
     def rates(self, block: int) -> RateLimit:
@@ -61,14 +60,19 @@ class SerialWire(ABC):
         """
 
     def put_out(self, value: float) -> None:
-        """Put ``value`` out at once, by the open link or by a new one, until it is confirmed.
+        """Put ``value`` out at once in one attempt, by the open link or by a new one.
 
         Raises:
-            DeviceError: It is not known whether ``value`` stands.
+            UnconfirmedError: It was sent, and nothing that the device answers would confirm it.
+            DeviceError: It was not confirmed.
         """
-        self.last_write.carry_out(
+        self._safe_exchange.attempt(
             self._link, lambda: self._send(value), lambda: self._put_out(value)
         )
+
+    def doubt(self) -> None:
+        """Take no later answer for that to a message which failed."""
+        self._link.doubt()
 
     @abstractmethod
     def output(self) -> float | None:
@@ -95,7 +99,7 @@ class SerialWire(ABC):
 
     @abstractmethod
     def _put_out(self, value: float) -> None:
-        """Put ``value`` out, and raise unless the device says that it stands."""
+        """Put ``value`` out, and raise unless the device confirms it."""
 
     @abstractmethod
     def close(self) -> None:

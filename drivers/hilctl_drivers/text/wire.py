@@ -1,7 +1,7 @@
 """A device that speaks lines of text, sample by sample; its sensor may stand behind another one."""
 
 from hilctl.base.arrays import F64
-from hilctl.base.errors import InputError
+from hilctl.base.errors import InputError, UnconfirmedError
 from hilctl_drivers.profile_parts import Range
 from hilctl_drivers.serial.setup import SerialSetup
 from hilctl_drivers.serial.wire import SerialWire, check_stands
@@ -159,8 +159,14 @@ class AsciiWire(SerialWire):
         with naming(self._reader_name):
             return self._reader.number(self._input)
 
-    def _write(self, value: float) -> None:
-        self._writer.command(self._command(value), self._output.reply)
+    def _write(self, value: float) -> bool:
+        """Write the output; return whether the answer shows that a device has received it."""
+        text, reply = self._command(value), self._output.reply
+        if reply == "none":
+            self._writer.send(text)
+            return False
+        # A line that echoes gives an answer that equals what was sent.
+        return self._writer.ask(text, reply.pattern).string != text
 
     def _command(self, value: float) -> str:
         return self._writer.text(self._output.write, value=value)
@@ -181,16 +187,21 @@ class AsciiWire(SerialWire):
 
     def _put_out(self, value: float) -> None:
         try:
-            self._write(value)
+            answered = self._write(value)
         except WatchdogTripped:
             self._run("clear")
-            self._write(value)
-        # A command without a reply may have been ignored: the safe value must be seen to stand.
+            answered = self._write(value)
+        # A command without a reply may have been ignored.
         readback = self._output.readback
-        if readback == "none":
-            self._writer.check_errors()
-        else:
+        if readback != "none":
             check_stands(self._output, value, self._writer.number(readback))
+        elif self._profile.error_query != "none":
+            self._writer.check_errors()
+        elif not answered:
+            raise UnconfirmedError(
+                "the value was sent; the device does not answer it, and has no readback and no "
+                "error_query in its profile"
+            )
 
     def _clear_trip(self) -> None:
         """End a trip of an earlier run, at the safe value."""

@@ -140,7 +140,7 @@ class SerialLink:
         self._poll = select.poll()
         self._waiting = array.array("i", [0])
         self._count_waiting: Callable[[], object] = lambda: None
-        self._stale = False
+        self._stale = True
         self._quiet_at = 0.0
         self.low_latency = False
         """Whether the driver took the low-latency setting; without it an FTDI adapter holds bytes
@@ -184,7 +184,8 @@ class SerialLink:
         What it holds is thrown away.
 
         Args:
-            boot: Whether to wait for a device that opening may have reset.
+            boot: Whether to wait for a device that opening may have reset. Otherwise a port that
+                this object closed in step is in step.
         """
         self.close()
         try:
@@ -203,8 +204,8 @@ class SerialLink:
         self._poll = select.poll()
         self._poll.register(self._fd, select.POLLIN)
         if boot:
+            self._stale = True
             self._sleep(self._settings.boot_s)
-        self._stale = True
         self._quiet_at = self._clock()
 
     def transact(
@@ -266,12 +267,16 @@ class SerialLink:
         except OSError as error:
             raise self._failed(error) from None
 
+    def doubt(self) -> None:
+        """Assume that bytes of an older exchange can still come, until the line was silent."""
+        self._stale = True
+
     def _failed(self, error: OSError | DeviceError) -> DeviceError:
         """Return what to raise, and see to it that the next request does not suffer from it."""
+        self._stale = True
         if isinstance(error, OSError) and not isinstance(error, serial.SerialTimeoutException):
             self.close()
             return LostError(f"port lost, unplugged? {why(error)}")
-        self._stale = True
         if isinstance(error, DeviceError):
             return error
         return NoAnswerError(f"could not send within {self._timeout_s:g} s")

@@ -140,13 +140,8 @@ def test_a_device_that_cannot_confirm_is_sent_the_value_several_times():
 def test_what_this_process_lacks_is_not_taken_for_the_device(number):
     """Another process may be able to drive it."""
     amplifier = Amplifier()
-    try:
-        try:
-            raise OSError(number, "none left")
-        except OSError as error:
-            raise DeviceError(f"cannot connect: {error}") from None
-    except DeviceError as error:
-        amplifier.error = error
+    amplifier.error = DeviceError("cannot connect")
+    amplifier.error.__context__ = OSError(number, "none left")
     with pytest.raises(LocalError):
         driven(amplifier)
 

@@ -18,10 +18,9 @@ from hilctl_drivers.emulator.faults import parse_fault
 from hilctl_drivers.emulator.options import EmulatorOptions
 from hilctl_drivers.profile import shipped_profiles
 from hilctl_drivers.serial.device import SerialDac
-from hilctl_drivers.serial.last_write import SerialLastWrite
 from hilctl_drivers.serial.setup import SerialOptions
 from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
-from tests.fakes import FakeHost, ShiftedClock, SteppingClock, emulated, logged
+from tests.fakes import FakeHost, ShiftedClock, emulated, logged
 
 pytestmark = pytest.mark.slow  # the board's FIFO runs empty in real time
 
@@ -41,7 +40,6 @@ class Board:
         self._log = log
         made = {**emulator.options, "timeout_s": TIMEOUT_S, "fifo_blocks": FIFO_BLOCKS, **options}
         self.device = SerialDac(SerialOptions.model_validate(made))
-        self.device.wire.last_write = SerialLastWrite(SteppingClock(0.2), lambda seconds: None)
         self.sent = 0
 
     def open(self):

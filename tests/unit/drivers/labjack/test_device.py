@@ -1,6 +1,7 @@
 """``modbus_stream`` against an emulated LabJack in this process, in a time that tests make pass."""
 
 import struct
+from contextlib import nullcontext
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -13,7 +14,7 @@ from hilctl_drivers.labjack.device import ModbusStream
 from hilctl_drivers.labjack.setup import ModbusStreamOptions
 from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
 from hilctl_drivers.wire.links import NoAnswerError
-from tests.fakes import FaultyLink, InProcess, InProcessLink, logged
+from tests.fakes import FaultyLink, InProcess, InProcessLink, logged, made_safe
 
 RATE_HZ = 10_000.0
 BLOCK = 100
@@ -485,8 +486,8 @@ def test_one_message_stops_the_stream_and_writes_the_safe_value(driven):
     assert not made.clock.running
 
 
-def test_stream_that_is_started_late_is_stopped_again(driven):
-    """The message that starts it timed out, and comes after the safe value."""
+def test_stream_that_is_started_late_is_stopped_by_the_next_attempt(driven):
+    """The message that starts it timed out, and is executed after the safe value."""
     made = driven(link=FaultyLink)
     made.open()
     made.hold(4.0, FIFO_BLOCKS - 1)
@@ -495,10 +496,12 @@ def test_stream_that_is_started_late_is_stopped_again(driven):
     with pytest.raises(DeviceError, match="no answer"):
         made.hold(4.0, 1)
     made.device.make_safe(0.0)
-    made.stall(60.0)
+    made.stall(0.5)
     made.link.deliver()
+    assert made.clock.running
+    made.device.make_safe(0.0)
+    made.stall(60.0)
     made.emulated.device.tick(made.time.now_ns)
-    assert max(each["current_a"] for each in made.events()) == pytest.approx(4.0)
     assert made.emulated.rig.current_a == pytest.approx(0.0, abs=1e-9)
     assert not made.clock.running
 
@@ -513,7 +516,7 @@ def test_stream_that_was_silent_is_made_safe_when_it_is_back(driven, silence_s):
     made.link.silent_until_s = back_s
     with pytest.raises(DeviceError):
         made.hold(2.0, 1)
-    made.device.make_safe(0.0)
+    made_safe(made.device, 0.0)
     written = [each for each in made.events() if each["event"] == "write"]
     assert 0.0 <= written[0]["monotonic_ns"] * 1e-9 - back_s < 0.2
     assert made.emulated.rig.current_a == pytest.approx(0.0, abs=1e-9)
@@ -532,12 +535,13 @@ def test_watchdog_that_is_shorter_than_the_start_is_refused(driven):
 @pytest.mark.parametrize(
     ("running", "held_v", "holds"), [(0, 1.0, True), (1, 1.0, False), (0, 2.0, False)]
 )
-def test_safe_is_a_stream_that_stands_and_an_output_that_holds(
+def test_safe_is_a_stopped_stream_and_an_output_that_holds(
     driven, monkeypatch, running, held_v, holds
 ):
-    """Each alone is not: a stream that goes on writes over it with its next scan."""
-    last_write = driven().device._last_write
-    encoded = last_write._setup.output.format.encode(held_v)
+    """Each alone is not: a running stream writes over the output with its next scan."""
+    safe_write = driven().device._safe_write
+    encoded = safe_write._setup.output.format.encode(held_v)
     answer = SimpleNamespace(call=lambda frames: [stream.u32(running), encoded])
-    monkeypatch.setattr("hilctl_drivers.labjack.last_write.ModbusFeedback", lambda *_: answer)
-    assert last_write._holds(SimpleNamespace(link=None), 1.0) == holds
+    monkeypatch.setattr("hilctl_drivers.labjack.safe_write.ModbusFeedback", lambda *_: answer)
+    with nullcontext() if holds else pytest.raises(DeviceError):
+        safe_write._check_held(SimpleNamespace(link=None), 1.0)

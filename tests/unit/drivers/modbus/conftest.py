@@ -10,7 +10,6 @@ import pytest
 
 from hilctl_drivers.emulator.options import EmulatorOptions
 from hilctl_drivers.emulator.setup import Emulator, build
-from hilctl_drivers.modbus import last_write
 from hilctl_drivers.modbus.device import ModbusDac
 from hilctl_drivers.modbus.setup import ModbusOptions
 from hilctl_drivers.profile import shipped_profiles
@@ -56,16 +55,15 @@ class ServedPair:
     def device(self, **changes) -> ModbusDac:
         options = {**self.emulator.options, "timeout_s": PATIENT_S, **changes}
         time = VirtualTime()
-        return ModbusDac(ModbusOptions.model_validate(options), sleep=time.sleep, clock=time)
+        return ModbusDac(ModbusOptions.model_validate(options), clock=time)
 
     def events(self) -> list[dict]:
         return logged(self.log)
 
 
 @pytest.fixture
-def serve(tmp_path, monkeypatch) -> Iterator[Callable[..., ServedPair]]:
+def serve(tmp_path) -> Iterator[Callable[..., ServedPair]]:
     """Return a function that serves two devices on a clock that stands still."""
-    monkeypatch.setattr(last_write, "ANSWER_S", PATIENT_S)
     started: list[tuple[ServedPair, threading.Thread]] = []
 
     def start(profile: str, reader: str, **options) -> ServedPair:
@@ -110,7 +108,7 @@ class DrivenModbus:
     def another(self, **changes) -> ModbusDac:
         """Return a device on the same emulated one, with other options."""
         options = ModbusOptions.model_validate({**self._options, **changes})
-        return ModbusDac(options, self._connect, self.time.sleep, self.time)
+        return ModbusDac(options, self._connect, self.time)
 
     def _connect(self, peer):
         self.peers.append(peer)

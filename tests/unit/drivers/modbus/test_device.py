@@ -13,7 +13,6 @@ from hilctl.base.errors import DeviceError, InputError
 from hilctl_drivers.emulator.faults import parse_fault
 from hilctl_drivers.emulator.options import EmulatorOptions
 from hilctl_drivers.emulator.setup import Emulator, build
-from hilctl_drivers.modbus import last_write
 from hilctl_drivers.modbus.device import ModbusDac
 from hilctl_drivers.modbus.setup import ModbusOptions
 from hilctl_drivers.profile import load_profile, shipped_profiles
@@ -81,16 +80,15 @@ class Served:
         where = {"host": host, "tcp_port": int(port)} if port else {"serial_port": host}
         given = {**options, "timeout_s": 5.0, **where, **changes}
         time = VirtualTime()
-        return ModbusDac(ModbusOptions.model_validate(given), sleep=time.sleep, clock=time)
+        return ModbusDac(ModbusOptions.model_validate(given), clock=time)
 
     def events(self) -> list[dict]:
         return logged(self.log)
 
 
 @pytest.fixture
-def serve(tmp_path, monkeypatch) -> Iterator[Callable[..., Served]]:
+def serve(tmp_path) -> Iterator[Callable[..., Served]]:
     """Return a function that serves an emulated device on a clock that stands still."""
-    monkeypatch.setattr(last_write, "ANSWER_S", 20.0)  # a busy machine answers within it
     started: list[tuple[Served, threading.Thread]] = []
 
     def start(profile: str, **options) -> Served:
@@ -125,7 +123,7 @@ def exchange(device: ModbusDac, value: float) -> float:
 def made(**changes) -> ModbusDac:
     time = VirtualTime()
     options = ModbusOptions.model_validate({**T7, "host": "h", **changes})
-    return ModbusDac(options, sleep=time.sleep, clock=time)
+    return ModbusDac(options, clock=time)
 
 
 class TestOptions:

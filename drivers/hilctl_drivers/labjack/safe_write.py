@@ -1,13 +1,14 @@
-"""The write that makes the output of a LabJack safe, streaming or not."""
+"""One attempt to make the output of a LabJack safe, streaming or not."""
 
+from hilctl.base.errors import DeviceError
 from hilctl_drivers.labjack.frames import ModbusFeedback, ReadFrame, WriteFrame
 from hilctl_drivers.labjack.stream import ENABLE, u32
-from hilctl_drivers.modbus.last_write import ModbusLastWrite
+from hilctl_drivers.modbus.safe_write import ModbusSafeWrite
 from hilctl_drivers.modbus.session import ModbusSession
 from hilctl_drivers.wire.errors import Refused
 
 
-class StreamLastWrite(ModbusLastWrite):
+class StreamSafeWrite(ModbusSafeWrite):
     """Stops the stream and writes the output in one message; what is queued is dropped."""
 
     def _put(self, session: ModbusSession, value: float) -> None:
@@ -20,9 +21,11 @@ class StreamLastWrite(ModbusLastWrite):
         except Refused:  # a stream that does not run can't be stopped
             feedback.call([write])
 
-    def _holds(self, session: ModbusSession, value: float) -> bool:
+    def _check_held(self, session: ModbusSession, value: float) -> None:
         output = self._setup.output
         feedback = ModbusFeedback(session.link, self._setup.writer.unit)
         target = ReadFrame(self._setup.writer.address(output), output.words)
         running, held = feedback.call([ReadFrame(ENABLE, 2), target])
-        return running == u32(0) and self._agrees(output.format.decode(held), value)
+        if running != u32(0):
+            raise DeviceError("the stream was stopped, but still runs")
+        self._check(output.format.decode(held), value)

@@ -1,0 +1,101 @@
+"""One attempt to write the safe value to a Modbus device, confirmed by reading it back."""
+
+from collections.abc import Callable
+from typing import TypeAlias
+
+from hilctl.base.errors import DeviceError, UnconfirmedError
+from hilctl_drivers.modbus.session import ModbusSession
+from hilctl_drivers.modbus.setup import ModbusPeer, ModbusSetup
+from hilctl_drivers.modbus.watchdog import ModbusGuard
+from hilctl_drivers.wire.safe_exchange import SafeExchange
+from hilctl_drivers.wire.serial_port import SerialLink
+
+Connect: TypeAlias = Callable[[ModbusPeer], ModbusSession]
+"""Makes a session on a new link."""
+
+
+class ModbusSafeWrite:
+    """Writes the output of a device, one attempt a call.
+
+    Args:
+        setup: What the experiment says of the device.
+        connect: Makes a session on a new link.
+    """
+
+    def __init__(self, setup: ModbusSetup, connect: Connect) -> None:
+        self._setup = setup
+        self._connect = connect
+        self._guard = ModbusGuard(setup)
+        self._exchange = SafeExchange()
+        self._session: ModbusSession | None = None
+
+    def attempt(self, peer: ModbusPeer, value: float, opened: ModbusSession | None = None) -> None:
+        """Write the output and have the device confirm it; the link is closed afterwards.
+
+        Args:
+            peer: The device; best with an address that no name server must be asked for.
+            value: In the output's unit.
+            opened: A session on an open serial line; None to open a connection.
+
+        Raises:
+            UnconfirmedError: It was written; the device has no way to confirm it.
+            DeviceError: It was not confirmed.
+        """
+        if opened is None and self._session is not None:
+            opened = self._session  # which knows whether answers are outstanding on the line
+        session = opened or self._connect(peer)
+        link = session.link
+        try:
+            # No self-test, no init steps, no reader: none of them may cost the safe value.
+            if isinstance(link, SerialLink):
+                self._session = session
+                self._exchange.attempt(
+                    link,
+                    lambda: link.send_now(self._frame(session, value)),
+                    lambda: self._write(session, value),
+                )
+            else:
+                # A new connection: no answer to an older command can come on it.
+                link.open()
+                self._write(session, value)
+        finally:
+            link.close()
+
+    def confirmable(self, link_is_serial: bool) -> bool:
+        """Return whether the device can confirm a value."""
+        output = self._setup.output
+        if output.readback_register is not None:
+            return True
+        # The correct reply to function 6 equals the request: a line that echoes gives it too.
+        return not (link_is_serial and output.function == 6)
+
+    def _frame(self, session: ModbusSession, value: float) -> bytes:
+        """Return the request that writes the output."""
+        output = self._setup.output
+        pdu = session.output_pdu(output, output.format.encode(value))
+        return session.prepare(pdu).request()
+
+    def _write(self, session: ModbusSession, value: float) -> None:
+        self._guard.write_through(session, lambda: self._put(session, value))
+        if not self.confirmable(isinstance(session.link, SerialLink)):
+            raise UnconfirmedError(
+                "the value was sent; the reply to function 6 is no evidence on a serial line, and "
+                "the output cannot be read back"
+            )
+        self._check_held(session, value)
+
+    def _put(self, session: ModbusSession, value: float) -> None:
+        """Write the output once."""
+        output = self._setup.output
+        session.put_out(output, output.format.encode(value))
+
+    def _check_held(self, session: ModbusSession, value: float) -> None:
+        """Raise unless the output holds the value, if it can be read back."""
+        found = session.held(self._setup.output)
+        if found is not None:
+            self._check(found, value)
+
+    def _check(self, found: float, value: float) -> None:
+        output = self._setup.output
+        if not abs(found - value) <= max(output.step, 1e-6 * (output.max - output.min)):
+            raise DeviceError(f"{value:g} {output.unit} was written, but {found:g} was read back")
