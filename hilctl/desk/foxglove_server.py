@@ -6,6 +6,7 @@ there; therefore it is only where it is asked for.
 """
 
 import logging
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -33,6 +34,7 @@ PORT = 8765
 """Where the applications look for a server unless they are given another port."""
 _FRAME_S = 1.0 / 30.0
 _STATUS_FRAMES = 15
+_STOP_S = 1.0
 _BACKLOG = 4096  # messages for one client, about a second of them; the oldest are dropped
 
 
@@ -80,7 +82,10 @@ class FoxgloveServer:
                 number += 1
                 self._sleep(max(_FRAME_S / 4.0, began_s + _FRAME_S - self._clock()))
         finally:
-            self._server.stop()
+            # In a thread: the library waits for clients that do not read.
+            stopping = threading.Thread(target=self._server.stop, daemon=True)
+            stopping.start()
+            stopping.join(_STOP_S)
 
     def feed(self, name: str | None) -> RunFeed | None:
         """Return the feed of a run, see :meth:`hilctl.desk.feeds.RunFeeds.feed`."""

@@ -6,6 +6,7 @@ standard input; its first line of output is the address. It ends with its run.
 
 import asyncio
 import os
+import select
 import signal
 import subprocess
 import sys
@@ -22,6 +23,7 @@ from hilctl.run.run_folder import RunFolder
 
 _NICE = 5
 _LAST_S = 1.5
+_START_S = 30.0
 
 
 class ShowsRuns(Protocol):
@@ -126,20 +128,38 @@ def served_beside() -> Iterator[str]:
         start_new_session=True,  # a Ctrl-C in the terminal is the supervisor's to handle
         text=True,
     )
-    with process:
-        assert process.stdin is not None
-        assert process.stdout is not None
+    try:
+        yield _url_of(process)
+        with suppress(subprocess.TimeoutExpired):  # it tells its pages of the end first
+            process.wait(2.0 * _LAST_S)
+    finally:
+        _end(process)
+
+
+def _url_of(process: "subprocess.Popen[str]") -> str:
+    """Tell the server whose run it serves; return its address."""
+    assert process.stdin is not None
+    assert process.stdout is not None
+    with suppress(BrokenPipeError):  # seen by the address that does not come
         process.stdin.write(f"{os.getpid()}\n")
         process.stdin.flush()
-        try:
-            url = process.stdout.readline().strip()
-            if not url:
-                raise RunError("the server of the live page could not be started")
-            yield url
-            with suppress(subprocess.TimeoutExpired):  # it lets its pages hear of the end first
-                process.wait(2.0 * _LAST_S)
-        finally:
-            process.terminate()
+    ready, _, _ = select.select([process.stdout], [], [], _START_S)
+    url = process.stdout.readline().strip() if ready else ""
+    if not url:
+        raise RunError("the server of the live page could not be started")
+    return url
+
+
+def _end(process: "subprocess.Popen[str]") -> None:
+    """End the server, also one that is stopped or hangs."""
+    process.terminate()
+    with suppress(subprocess.TimeoutExpired):
+        process.wait(_LAST_S)
+    process.kill()
+    for stream in (process.stdin, process.stdout):
+        if stream is not None:
+            with suppress(OSError):
+                stream.close()
 
 
 def main() -> None:

@@ -33,6 +33,7 @@ _BUDGET_S = 0.3
 _LONGEST_S = 20.0
 _STILL_S = 10.0
 _PAUSE_S = 0.002
+_DEATH_S = 1.0
 SUPERVISORS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, STOP_SIGNAL)
 """Signals that may be sent to all of a run's processes, and are the supervisor's to follow."""
 
@@ -99,7 +100,7 @@ class ChangeWorker:
         traceback: TracebackType | None,
     ) -> None:
         self._process.kill()  # it holds nothing
-        self._process.join()
+        self._process.join(_DEATH_S)
         self._connection.close()
 
     def begin(self, wanted: WantedChange) -> None:

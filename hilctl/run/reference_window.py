@@ -30,6 +30,7 @@ from hilctl.run.shared_page import Field, SharedPage
 
 _PIECE = 1 << 16
 _POLL_S = 0.02
+_DEATH_S = 1.0
 
 
 class WindowFiller:
@@ -136,7 +137,7 @@ class ReferenceProcess:
     ) -> None:
         if self._needed:
             self._process.kill()  # it holds nothing
-            self._process.join()
+            self._process.join(_DEATH_S)
             self._connection.close()
 
     def begin(self, folder: RunFolder, page: SharedPage) -> None:

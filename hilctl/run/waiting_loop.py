@@ -15,6 +15,8 @@ from contextlib import contextmanager, suppress
 PLAIN, CHECKING = b"p", b"c"
 """First byte of a job: whether what it holds needs no checks in the loop's process."""
 _MOST_LOCKS = 64
+_GIVE_S = 5.0
+_DEATH_S = 1.0
 _ERRORS = 2
 _WITH_ERRORS, _WITHOUT = b"e", b"-"
 # No search for garbage among what is imported: it takes a tenth of the time, and finds none.
@@ -45,7 +47,10 @@ class WaitingLoop:
             job: See :meth:`hilctl.run.job.Job.to_bytes`.
             inherits: Descriptors of locks that it is to hold.
         """
-        with self._socket, suppress(BrokenPipeError, ConnectionResetError):  # it died: seen later
+        self._socket.settimeout(_GIVE_S)
+        # One that died is seen later, and so is one that hangs: it is killed when it does not
+        # become ready.
+        with self._socket, suppress(BrokenPipeError, ConnectionResetError, TimeoutError):
             errors = [_ERRORS] if _is_open(_ERRORS) else []
             first = _WITH_ERRORS if errors else _WITHOUT
             # With the first byte: the loop holds the locks before it can know what to do.
@@ -59,7 +64,8 @@ class WaitingLoop:
         """Let it end, as there is no job for it."""
         self._socket.close()
         self._process.kill()  # it may still import, and holds nothing
-        self._process.wait()
+        with suppress(subprocess.TimeoutExpired):
+            self._process.wait(_DEATH_S)
 
 
 def received_job(descriptor: int) -> bytes:

@@ -10,6 +10,7 @@ import threading
 import time
 from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -34,6 +35,16 @@ def test_logs_of_hilctl_are_what_they_were():
     before = root.level, root.handlers[:]
     FoxgloveServer(first, port=0).run(lambda server: True)
     assert (root.level, root.handlers) == before
+
+
+def test_clients_that_do_not_read_do_not_keep_it_from_ending(monkeypatch):
+    monkeypatch.setattr("hilctl.desk.foxglove_server._STOP_S", 0.01)
+    server, go_on = FoxgloveServer(first, port=0), threading.Event()
+    library, server._server = server._server, SimpleNamespace(stop=lambda: go_on.wait(60.0))
+    server.run(lambda server: True)
+    assert not go_on.is_set()
+    go_on.set()
+    library.stop()
 
 
 def first(runs):

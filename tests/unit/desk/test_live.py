@@ -1,8 +1,16 @@
 """The server's process."""
 
+import os
+import signal
+import subprocess
+import sys
 from types import SimpleNamespace
 
-from hilctl.desk.live import UntilEnded
+import pytest
+
+from hilctl.base.errors import RunError
+from hilctl.desk import live
+from hilctl.desk.live import UntilEnded, served_beside
 
 
 def server(feed):
@@ -29,3 +37,41 @@ def test_another_run_makes_it_go_on():
     over(server(SimpleNamespace(ended=False)))
     now[0] = 5.0
     assert not over(server(SimpleNamespace(ended=True)))
+
+
+@pytest.fixture
+def beside(monkeypatch):
+    """Return a function that has a program take the server's place; and the processes."""
+    started, popen = [], subprocess.Popen
+
+    def take_place(code):
+        def start(command, **settings):
+            started.append(popen([sys.executable, "-c", code], **settings))
+            return started[-1]
+
+        names = {name: getattr(subprocess, name) for name in ("PIPE", "TimeoutExpired")}
+        monkeypatch.setattr(live, "subprocess", SimpleNamespace(Popen=start, **names))
+        monkeypatch.setattr(live, "_LAST_S", 0.05)
+        monkeypatch.setattr(live, "_START_S", 0.05)
+        return started
+
+    yield take_place
+    for process in started:
+        process.kill()
+        process.wait()
+
+
+def test_a_server_that_is_stopped_does_not_keep_the_run_from_ending(beside, monkeypatch):
+    started = beside("print('http://here', flush=True); input(); input()")
+    monkeypatch.setattr(live, "_START_S", 60.0)
+    with served_beside() as url:
+        assert url == "http://here"
+        os.kill(started[0].pid, signal.SIGSTOP)
+    assert started[0].wait(60) == -signal.SIGKILL
+
+
+def test_a_server_that_gives_no_address_does_not_keep_the_run_from_being_refused(beside):
+    started = beside("input(); input()")
+    with pytest.raises(RunError), served_beside():
+        pass
+    assert started[0].wait(60) < 0

@@ -2,6 +2,7 @@
 
 import os
 import socket
+import subprocess
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -22,13 +23,16 @@ class FakeProcess:
     def kill(self):
         self.ended.append("kill")
 
-    def wait(self):
+    def wait(self, timeout_s):
         self.ended.append("wait")
 
 
 @pytest.fixture
 def waiting(monkeypatch):
-    monkeypatch.setattr(module, "subprocess", SimpleNamespace(Popen=FakeProcess, DEVNULL=-3))
+    doubles = SimpleNamespace(
+        Popen=FakeProcess, DEVNULL=-3, TimeoutExpired=subprocess.TimeoutExpired
+    )
+    monkeypatch.setattr(module, "subprocess", doubles)
     return WaitingLoop()
 
 
@@ -76,6 +80,12 @@ def test_a_loop_that_died_is_seen_later(waiting):
     """What could not be sent is no error here: the supervisor asks how it ended."""
     os.close(waiting._process.stdin)
     assert waiting.give(b"p{}", []) is waiting._process
+
+
+def test_a_loop_that_hangs_takes_no_job_and_is_seen_later(waiting, monkeypatch):
+    """It does not read: the supervisor must still hear the user."""
+    monkeypatch.setattr(module, "_GIVE_S", 0.01)
+    assert waiting.give(bytes(10**7), []) is waiting._process
 
 
 def test_where_no_job_comes_there_is_none():
