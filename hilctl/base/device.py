@@ -46,8 +46,8 @@ class DeviceInfo:
         watchdog_command: Where the device's own watchdog puts the output when the host falls
             silent, in ``command_unit``; None where it has none, or is not to use it.
         watchdog_reason: Why that is not the experiment's safe value; empty where it is.
-        safe_note: What stands behind the safe value where a message with it takes longer than 0.2 s
-            to get there, in words; empty where it does not.
+        safe_note: What is wrong with the safe value of this device, in words: a message with it
+            takes longer than 0.2 s, or the device cannot confirm it; empty if nothing is.
         details: Anything worth keeping with a recording (serial numbers, physical parameters).
     """
 
