@@ -89,6 +89,7 @@ class FakeInfo:
 
     measures_command: bool = False
     in_order: bool = False
+    confirms: bool = True
 
 
 @dataclass

@@ -31,7 +31,7 @@ from hilctl.loop.interlocks import Interlocks, Trip
 from hilctl.loop.limiter import Limiter
 from hilctl.loop.pacer import Lateness, Pacer
 from hilctl.loop.plan import Code, Outcome, Plan
-from hilctl.loop.safe_output import SafeGoal, describe, drive_to_safe
+from hilctl.loop.safe_output import OutputState, SafeGoal, describe, drive_to_safe
 from hilctl.loop.tuning import Tuner
 from hilctl.loop.usual import UsualTicks
 
@@ -148,7 +148,8 @@ class Loop:
         except DeviceError as error:
             return self._lost_device(error)
         self._record_adapted(ended=True)
-        return Outcome(self._code, self._reason, self._ended_at, "confirmed", self._dropped)
+        output: OutputState = "confirmed" if self._device.info.confirms else "sent"
+        return Outcome(self._code, self._reason, self._ended_at, output, self._dropped)
 
     def _tick(self) -> bool:
         """Run usual ticks and then another one; return whether the safe value is reached in it."""

@@ -61,14 +61,6 @@ class ModbusSafeWrite:
         finally:
             link.close()
 
-    def confirmable(self, link_is_serial: bool) -> bool:
-        """Return whether the device can confirm a value."""
-        output = self._setup.output
-        if output.readback_register is not None:
-            return True
-        # The correct reply to function 6 equals the request: a line that echoes gives it too.
-        return not (link_is_serial and output.function == 6)
-
     def _frame(self, session: ModbusSession, value: float) -> bytes:
         """Return the request that writes the output."""
         output = self._setup.output
@@ -77,11 +69,8 @@ class ModbusSafeWrite:
 
     def _write(self, session: ModbusSession, value: float) -> None:
         self._guard.write_through(session, lambda: self._put(session, value))
-        if not self.confirmable(isinstance(session.link, SerialLink)):
-            raise UnconfirmedError(
-                "the value was sent; the reply to function 6 is no evidence on a serial line, and "
-                "the output cannot be read back"
-            )
+        if self._setup.unconfirmed:
+            raise UnconfirmedError(f"the value was sent, but {self._setup.unconfirmed}")
         self._check_held(session, value)
 
     def _put(self, session: ModbusSession, value: float) -> None:

@@ -195,6 +195,19 @@ class ModbusSetup:
             return False
         return self.writer.profile.exchange != "none" and self.output.readback_register is not None
 
+    @property
+    def unconfirmed(self) -> str:
+        """Why a value that was written cannot be confirmed, in words; empty if it can."""
+        if self.output.readback_register is not None or self.output.function != 6:
+            return ""
+        if self.writer.host:
+            return ""
+        # The correct reply equals the request, and is what a line that echoes gives.
+        return (
+            "the device cannot confirm it: on a serial line the reply to function 6 may be an echo,"
+            " and the output cannot be read back"
+        )
+
     def wire(self, one_transaction: bool) -> WireTime:
         """Return what a sample costs on the wire."""
         profile, name = self.writer.profile, self.options.output
@@ -248,6 +261,8 @@ class ModbusSetup:
             watchdog_command=options.watchdog_command,
             watchdog_reason=options.watchdog_reason,
             in_order=options.serial_port is not None,
+            confirms=not self.unconfirmed,
+            safe_note=self.unconfirmed,
             details=details,
         )
 

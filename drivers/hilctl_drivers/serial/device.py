@@ -127,13 +127,15 @@ def _info(setup: SerialSetup, wire: SerialWire) -> DeviceInfo:
         holds=setup.holds,
         watchdog_command=options.watchdog_command,
         watchdog_reason=options.watchdog_reason,
-        safe_note=_safe_note(setup, wire.longest_message_s),
+        safe_note="; ".join(filter(None, (_late_note(setup, wire), wire.unconfirmed))),
         in_order=True,
+        confirms=not wire.unconfirmed,
         details=details,
     )
 
 
-def _safe_note(setup: SerialSetup, longest_s: float) -> str:
+def _late_note(setup: SerialSetup, wire: SerialWire) -> str:
+    longest_s = wire.longest_message_s
     if longest_s <= _PROMPT_S:
         return ""
     timeout_s = setup.options.watchdog_timeout_s

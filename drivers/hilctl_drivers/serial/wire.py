@@ -19,6 +19,7 @@ class SerialWire(ABC):
         measures: Whether :meth:`exchange` fills ``measured``.
         longest_message_s: Longest until the safe value is there, after an exchange that is under
             way; 0 where that is too short to be worth a word.
+        unconfirmed: Why a value that was written cannot be confirmed, in words; empty if it can.
 
     Args:
         setup: What the experiment says of it.
@@ -31,6 +32,7 @@ class SerialWire(ABC):
     fifo_depth = 0
     measures = False
     longest_message_s = 0.0
+    unconfirmed = ""
 
     def __init__(self, setup: SerialSetup) -> None:
         self._setup = setup

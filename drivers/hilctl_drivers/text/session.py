@@ -95,9 +95,24 @@ class AsciiSession:
             raise Mismatch(f"{text}: not an answer to this: {reply!r}")
         return found
 
+    def query(self, text: str, pattern: str) -> re.Match[str]:
+        """Ask a question, see :meth:`ask`; a reply that repeats it is no answer.
+
+        Raises:
+            Mismatch: The line echoes, and perhaps nothing is connected.
+            DeviceError: As for :meth:`ask`.
+        """
+        found = self.ask(text, pattern)
+        if found.string == text:
+            raise Mismatch(
+                f"{text}: came back unchanged: the line echoes what is sent; set link.echo in the "
+                "profile if the device answers after that"
+            )
+        return found
+
     def number(self, query: Query) -> float:
         """Ask for a number."""
-        return parse_number(self.ask(self.text(query.ask), query.pattern)[1])
+        return parse_number(self.query(self.text(query.ask), query.pattern)[1])
 
     def command(self, text: str, reply: Reply | str) -> None:
         """Send a line that is answered as ``reply`` says, or not at all."""
@@ -133,7 +148,7 @@ class AsciiSession:
         if query == "none":
             return
         text = self.text(query.ask)
-        reply = self.ask(text, ".*")[0]
+        reply = self.query(text, ".*")[0]
         if not re.fullmatch(query.pattern, reply, re.ASCII):
             raise Refused(f"{text} says {reply}", reply)
 
@@ -147,7 +162,7 @@ class AsciiSession:
         if test == "none":
             return
         text = self.text(test.ask)
-        reply = self.ask(text, ".*")[0]
+        reply = self.query(text, ".*")[0]
         if not re.fullmatch(test.pattern, reply, re.ASCII):
             raise DeviceError(f"{text} must be answered like {test.example!r}, got {reply!r}")
 
@@ -156,7 +171,7 @@ class AsciiSession:
         watchdog = self._profile.watchdog
         if watchdog == "none" or watchdog.tripped == "none":
             return False
-        reply = self.ask(self.text(watchdog.tripped.ask), ".*")[0]
+        reply = self.query(self.text(watchdog.tripped.ask), ".*")[0]
         return re.fullmatch(watchdog.tripped.pattern, reply, re.ASCII) is not None
 
     def _step(self, step: AsciiStep, values: dict[str, float]) -> None:

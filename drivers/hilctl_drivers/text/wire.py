@@ -1,5 +1,7 @@
 """A device that speaks lines of text, sample by sample; its sensor may stand behind another one."""
 
+import re
+
 from hilctl.base.arrays import F64
 from hilctl.base.errors import InputError, UnconfirmedError
 from hilctl_drivers.profile_parts import Range
@@ -12,6 +14,11 @@ from hilctl_drivers.text.timing import exchange_time, feed_time, query_time
 from hilctl_drivers.wire.errors import WatchdogTripped
 from hilctl_drivers.wire.links import naming
 from hilctl_drivers.wire.timing import RateLimit, WireTime, check_feeds
+
+_NO_EVIDENCE = (
+    "the device cannot confirm it: it does not answer, or repeats what it is sent, and its profile "
+    "has neither readback nor error_query"
+)
 
 
 class AsciiWire(SerialWire):
@@ -45,6 +52,7 @@ class AsciiWire(SerialWire):
         # Half duplex: what was asked last is answered before the safe value can go out.
         write = exchange_time(self._profile, setup.options.output, None)
         self.longest_message_s = self._sample_time().answered_s + write.answered_s
+        self.unconfirmed = self._unconfirmed()
 
     def rates(self, block: int) -> RateLimit:
         """See :meth:`~hilctl_drivers.serial.wire.SerialWire.rates`."""
@@ -198,10 +206,18 @@ class AsciiWire(SerialWire):
         elif self._profile.error_query != "none":
             self._writer.check_errors()
         elif not answered:
-            raise UnconfirmedError(
-                "the value was sent; the device does not answer it, and has no readback and no "
-                "error_query in its profile"
-            )
+            raise UnconfirmedError(f"the value was sent, but {_NO_EVIDENCE}")
+
+    def _unconfirmed(self) -> str:
+        """Return why a value cannot be confirmed; empty if it can."""
+        reply = self._output.reply
+        if self._output.readback != "none" or self._profile.error_query != "none":
+            return ""
+        if reply == "none" or _without_numbers(reply.example) == _without_numbers(
+            self._command(0.0)
+        ):
+            return _NO_EVIDENCE
+        return ""
 
     def _clear_trip(self) -> None:
         """End a trip of an earlier run, at the safe value."""
@@ -237,6 +253,10 @@ class AsciiWire(SerialWire):
         self._ticks += 1
         if self._ticks % self._feed_every == 0:
             self._run("feed")
+
+
+def _without_numbers(text: str) -> str:
+    return re.sub(r"[-+.\d]+", "#", text)
 
 
 def _value(source: AsciiInput, number: float) -> float:

@@ -216,6 +216,12 @@ def test_lost_device_is_made_safe():
     assert rig.host.closed
 
 
+def test_an_end_that_the_device_cannot_confirm_is_not_called_safe():
+    rig = Rig(np.full(100, 2.0), device=FakeDevice(info=FakeInfo(confirms=False)))
+    outcome = rig.run()
+    assert (outcome.code, outcome.output, outcome.safe) == ("completed", "sent", False)
+
+
 def test_a_command_without_answer_may_be_executed_after_the_safe_value():
     """The output is set then, and not yet confirmed: the guardian watches it further."""
     rig = Rig(np.full(1000, 2.0), device=FakeDevice(break_at=60))

@@ -1,0 +1,324 @@
+"""The safe write at devices of a few lines: that echo, are dead, or answer an older command late.
+
+``make_safe`` returns if and only if the device itself confirmed the value.
+"""
+
+import os
+import pty
+import select
+import threading
+import tty
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import pytest
+
+from hilctl.base.errors import DeviceError, UnconfirmedError
+from hilctl_drivers.modbus.device import ModbusDac
+from hilctl_drivers.modbus.pdu import rtu_adu
+from hilctl_drivers.modbus.setup import ModbusOptions
+from hilctl_drivers.profile import shipped_profiles
+from hilctl_drivers.serial.device import SerialDac
+from hilctl_drivers.serial.setup import SerialOptions
+
+TIMEOUT_S = 0.05
+RATE_HZ = 10.0
+OLD, SAFE = 4.5, 0.0
+
+TEXT = """\
+vendor: nobody
+model: a board with lines
+source: [this test]
+verified: "no"
+link: {{kind: ascii, baud: 115200, terminator: "\\n", reply_terminator: "\\n"}}
+address: none
+exchange: none
+turnaround_s: 0.001
+max_rate_hz: 200.0
+outputs:
+  OUT: {{write: "V {{value:.5f}}", reply: {reply}, {readback} unit: V, min: -10.0, max: 10.0}}
+inputs:
+  IN: {{ask: "X?", pattern: "([-+]?[0-9.]+)", example: "1.25000", unit: V, min: -10.0, max: 10.0}}
+{errors}
+watchdog: none
+"""
+REGISTERS = """\
+vendor: nobody
+model: registers on a line
+source: [this test]
+verified: "no"
+link: {{kind: rtu, baud: 115200}}
+address_base: 0
+exchange: none
+turnaround_s: 0.001
+max_rate_hz: 100.0
+outputs:
+  OUT: {{address: 0, type: int16, scale: 0.001, unit: V, min: -10.0, max: 10.0,
+        function: {function}, readback: {readback}}}
+inputs:
+  IN: {{address: 2, type: int16, scale: 0.001, unit: V, min: -10.0, max: 10.0}}
+watchdog: none
+"""
+OK = "{pattern: OK, example: OK}"
+REPEATS = '{pattern: "V .*", example: "V 1.25000"}'
+READBACK = 'readback: {ask: "V?", pattern: "([-+]?[0-9.]+)", example: "1.25000"},'
+LOOSE = 'readback: {ask: "V0?", pattern: "[^0-9]*([0-9.]+).*", example: "1.25000"},'
+ERRORS = 'error_query: {ask: "E?", pattern: "0.*", example: "0,none"}'
+
+
+class Pty:
+    """The far end of a serial line.
+
+    Args:
+        answer: Takes what has come and returns what to send, and what is left to take.
+    """
+
+    def __init__(self, answer: Callable[[bytes], tuple[bytes, bytes]]) -> None:
+        self._master, self._slave = pty.openpty()
+        tty.setraw(self._slave)
+        self.path = os.ttyname(self._slave)
+        self._answer = answer
+        self._ended = False
+        self._thread = threading.Thread(target=self._serve)
+        self._thread.start()
+
+    def _serve(self) -> None:
+        kept = b""
+        while not self._ended:
+            if select.select([self._master], [], [], 0.01)[0]:
+                reply, kept = self._answer(kept + os.read(self._master, 4096))
+                os.write(self._master, reply)
+
+    def close(self) -> None:
+        self._ended = True
+        self._thread.join()
+        os.close(self._slave)
+        os.close(self._master)
+
+
+def echo(data: bytes) -> tuple[bytes, bytes]:
+    return data, b""
+
+
+def dead(data: bytes) -> tuple[bytes, bytes]:
+    return b"", b""
+
+
+@pytest.fixture
+def line() -> Iterator[Callable[[Callable[[bytes], tuple[bytes, bytes]]], str]]:
+    """Return a function that starts a device and returns its port."""
+    made: list[Pty] = []
+
+    def start(answer):
+        made.append(Pty(answer))
+        return made[-1].path
+
+    yield start
+    for each in made:
+        each.close()
+
+
+@pytest.fixture
+def text(tmp_path, line):
+    """Return a function that makes a device which speaks lines, at a scripted one."""
+
+    def make(answer, reply, readback="", errors=""):
+        path = tmp_path / "text.yaml"
+        path.write_text(TEXT.format(reply=reply, readback=readback, errors=errors))
+        return SerialDac(SerialOptions.model_validate(_options(path, line(answer))))
+
+    return make
+
+
+@pytest.fixture
+def registers(tmp_path, line):
+    """Return a function that makes a Modbus RTU device, at a scripted one."""
+
+    def make(answer, function, readback):
+        path = tmp_path / "registers.yaml"
+        path.write_text(REGISTERS.format(function=function, readback=readback))
+        return ModbusDac(ModbusOptions.model_validate(_options(path, line(answer))))
+
+    return make
+
+
+def _options(path, port, **changes):
+    return {
+        "profile": str(path),
+        "serial_port": port,
+        "output": "OUT",
+        "input": "IN",
+        "amplifier": {"gain_a_per_v": 1.0},
+        "sensor": {"um_per_v": 10.0},
+        "watchdog": "none",
+        "timeout_s": TIMEOUT_S,
+        **changes,
+    }
+
+
+@pytest.mark.parametrize("answer", [dead, echo])
+@pytest.mark.parametrize("reply", ["none", REPEATS])
+def test_lines_without_evidence_are_sent_and_not_confirmed(text, answer, reply):
+    """Whether there is no device, or one that cannot say: `check` and the error name it."""
+    device = text(answer, reply)
+    assert "cannot confirm" in device.info.safe_note
+    unconfirmed = reply == "none" or answer is echo
+    with pytest.raises(UnconfirmedError if unconfirmed else DeviceError, match="to make safe, OUT"):
+        device.make_safe(SAFE)
+
+
+@pytest.mark.parametrize(
+    ("reply", "more"),
+    [(OK, {}), ("none", {"readback": READBACK}), (REPEATS, {"readback": LOOSE}),
+     ("none", {"errors": ERRORS}), (REPEATS, {"errors": ERRORS})],
+)  # fmt: skip
+@pytest.mark.parametrize("answer", [dead, echo])
+def test_lines_with_evidence_can_be_confirmed_and_are_not_by_an_echo(text, answer, reply, more):
+    device = text(answer, reply, **more)
+    assert device.info.safe_note == ""
+    with pytest.raises(DeviceError) as caught:
+        device.make_safe(SAFE)
+    assert not isinstance(caught.value, UnconfirmedError)
+
+
+@pytest.mark.parametrize("answer", [dead, echo])
+@pytest.mark.parametrize("function", [6, 16])
+@pytest.mark.parametrize("readback", ["same", "none"])
+def test_registers_on_a_line_that_echoes_are_not_confirmed(registers, answer, function, readback):
+    """The reply to function 6 equals the request; an answer to function 3 is none that a line has.
+
+    That a value was sent and cannot be confirmed is said only where nothing would confirm it.
+    """
+    device = registers(answer, function, readback)
+    unconfirmed = (function, readback) == (6, "none")
+    assert bool(device.info.safe_note) == unconfirmed
+    with pytest.raises(DeviceError) as caught:
+        device.make_safe(SAFE)
+    assert isinstance(caught.value, UnconfirmedError) == (unconfirmed and answer is echo)
+
+
+def test_a_reply_to_function_6_is_evidence_over_tcp(tmp_path):
+    path = tmp_path / "registers.yaml"
+    path.write_text(REGISTERS.format(function=6, readback="none"))
+    options = _options(path, None, host="127.0.0.1")
+    assert ModbusDac(ModbusOptions.model_validate(options)).info.safe_note == ""
+
+
+@pytest.mark.parametrize("answer", [dead, echo])
+def test_frames_are_not_confirmed_by_an_echo(tmp_path, line, answer):
+    board = shipped_profiles()["cobs_board"].read_text()
+    path = tmp_path / "board.yaml"
+    path.write_text(board.replace("boot_wait_s: 2.0", "boot_wait_s: 0.0"))
+    options = _options(path, line(answer), output="DAC", input="ADC")
+    with pytest.raises(DeviceError) as caught:
+        SerialDac(SerialOptions.model_validate(options)).make_safe(SAFE)
+    assert not isinstance(caught.value, UnconfirmedError)
+
+
+class LateDevice:
+    """Answers in order; from the first command that is not safe on, only once more have come.
+
+    Args:
+        split: Takes bytes; returns whole messages and the rest.
+        command: Returns the value that a message sets; None where it sets none.
+        answer: Returns the answer to a message.
+        waits_for: How many messages come before the late one is executed.
+        forgets: Whether those are lost.
+    """
+
+    def __init__(self, split, command, answer, waits_for, *, forgets):
+        self._split, self._command, self._reply = split, command, answer
+        self._left, self._forgets = waits_for, forgets
+        self._held: list[bytes] = []
+        self.value = 0.0
+        self.is_late = False
+
+    def __call__(self, data: bytes) -> tuple[bytes, bytes]:
+        messages, rest = self._split(data)
+        sent = b""
+        for message in messages:
+            if self.is_late or self._command(message) == OLD:
+                self.is_late = True
+                self._held.append(message)
+                if len(self._held) > self._left:
+                    sent += self._catch_up()
+            else:
+                sent += self._execute(message)
+        return sent, rest
+
+    def _catch_up(self) -> bytes:
+        due = self._held[:1] if self._forgets else self._held
+        self._held, self._left, self.is_late = [], 1 << 30, False
+        # What is forgotten is lost for good, and the old command is executed.
+        return b"".join(self._execute(message) for message in due)
+
+    def _execute(self, message: bytes) -> bytes:
+        value = self._command(message)
+        if value is not None:
+            self.value = value
+        return self._reply(message, self.value)
+
+
+def lines(data):
+    *whole, rest = data.split(b"\n")
+    return [each + b"\n" for each in whole], rest
+
+
+def set_by_line(message):
+    return float(message[2:]) if message.startswith(b"V ") else None
+
+
+def answer_line(message, value):
+    return b"OK\n" if message.startswith(b"V ") else f"{value:.5f}\n".encode()
+
+
+def requests(data):
+    whole = []
+    while len(data) >= 8:
+        size = 9 + data[6] if data[1] == 16 else 8
+        if len(data) < size:
+            break
+        whole.append(data[:size])
+        data = data[size:]
+    return whole, data
+
+
+def set_by_request(message):
+    if message[1] in {6, 16}:
+        return int.from_bytes(message[-4:-2], "big", signed=True) * 1e-3
+    return None
+
+
+def answer_request(message, value):
+    if message[1] == 3:
+        return rtu_adu(1, b"\x03\x02" + round(value * 1e3).to_bytes(2, "big", signed=True))
+    return rtu_adu(1, message[1:6])
+
+
+@pytest.mark.parametrize("forgets", [False, True])
+@pytest.mark.parametrize("waits_for", range(1, 12))
+@pytest.mark.parametrize("kind", ["OK", "readback", 6, 16])
+def test_the_late_answer_to_an_older_command_confirms_nothing(
+    text, registers, kind, waits_for, forgets
+):
+    """Whenever it comes, and whether or not the device has kept what was sent meanwhile."""
+    if isinstance(kind, str):
+        late = LateDevice(lines, set_by_line, answer_line, waits_for, forgets=forgets)
+        device = text(late, OK, READBACK if kind == "readback" else "")
+    else:
+        late = LateDevice(requests, set_by_request, answer_request, waits_for, forgets=forgets)
+        device = registers(late, kind, "same")
+    device.open(RATE_HZ, 1)
+    with pytest.raises(DeviceError):
+        device.exchange(0, np.array([OLD]), np.empty(1), np.empty(1))
+    assert late.is_late
+    for _ in range(30):
+        try:
+            device.make_safe(SAFE)
+        except DeviceError:
+            continue
+        break
+    assert not late.is_late
+    assert late.value == SAFE
+    device.make_safe(-1.0)
+    assert late.value == -1.0
