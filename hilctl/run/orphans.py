@@ -80,14 +80,14 @@ def _left_behind(
             break
     page = ring.page
     outcome = page.outcome() or died
-    if page.get(Field.PHASE) == Phase.FAILED:
+    if page.observe(Field.PHASE) == Phase.FAILED:
         outcome = replace(died, reason=page.read_text(PageText.ERROR))
     if page.outcome() is None and (made_safe := page.made_safe()) is not None:
         did = "the guardian put the output at its safe value"
         if not made_safe.confirmed:
             did = f"the guardian could not confirm the safe value: {made_safe.error}"
         outcome = replace(outcome, reason=f"{outcome.reason}; {did}", safe=made_safe.confirmed)
-    if page.get(Field.PHASE) != Phase.ENDED:
+    if page.observe(Field.PHASE) != Phase.ENDED:
         last = batches[-1].heads[-1] if batches else None
         next_sample = 0 if last is None else int(last[Head.FIRST_SAMPLE]) + ring.block
         if (unanswered := ring.unanswered(next_sample)) is not None:

@@ -147,7 +147,7 @@ class Supervisor:
         # GO last: the loop then reads its start time, and would take an old heartbeat for silence.
         page.put(Field.SUPERVISOR_HEARTBEAT_NS, time.monotonic_ns())
         page.put(Field.START_NS, start_ns)
-        page.put(Field.GO, 1)
+        page.publish(Field.GO, 1)
         return safety
 
     def _begin(self, recorder: Recorder, page: SharedPage) -> int:
