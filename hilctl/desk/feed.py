@@ -76,7 +76,7 @@ class RunFeed:
         self.missed = 0
         self.ended = False
         self._disk: DiskRoom | None = None
-        self._next_block, self._next_event = max(0, self._page.get(Field.HEAD) - 1), 0
+        self._next_block, self._next_event = max(0, self._page.observe(Field.HEAD) - 1), 0
         self._next_sample, self._next_note = -1, 0
         self._looked_s = -math.inf
 
@@ -99,7 +99,7 @@ class RunFeed:
             # Asked first: of a run that is over, nothing can come after that.
             self.ended = not self.folder.alive
             self._disk = _disk_room(Path(self.folder.card.recording))
-        if self._page.get(Field.PHASE) < Phase.RUNNING:
+        if self._page.observe(Field.PHASE) < Phase.RUNNING:
             return False
         self._begin()
         batch, self._next_block = self._ring.look(self._next_block)

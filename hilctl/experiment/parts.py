@@ -55,7 +55,7 @@ class Timing(Strict):
     Attributes:
         late_policy: For devices paced by this machine: ``skip`` whole ticks and keep the phase,
             ``catch_up`` with a burst, or ``slip`` the phase. Devices with a sample clock of their
-            own always catch up: their FIFO takes the burst.
+            own always catch up: their FIFO takes the burst. Before the waveform no tick is skipped.
         late_after: A tick counts as late when it wakes this many tick periods after it was due.
         max_late_s: A tick later than this ends the run.
         max_consecutive_late: So many late ticks one after the other end the run; 0 for any number.

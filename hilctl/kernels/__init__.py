@@ -13,6 +13,7 @@ does not notice a callee that changed in another file. Units live one level abov
     dynamics.py  field lag, structure and delay, and their inverses
     modes.py     further modes of the structure, and their inverse
     tick.py      a tick's kernels one after another, called by their addresses
+    atomics.py   numbers in shared memory that say of other data that they are there
     limit.py     peak and slew limits of a command
     interlock.py what ends a run, looked at in every sample
     packed.py    messages of a recording's chunk, and their packed lists

@@ -50,7 +50,6 @@ class _Phase(Enum):
     HOLDING = "holds the safe value until the last answer has come"
 
 
-_BEFORE = (_Phase.STARTING, _Phase.CONDITIONING)
 _AFTER = (_Phase.LEAVING, _Phase.HOLDING)
 _FOLLOWING = _Phase.FOLLOWING  # looked up once: in Python 3.11 that is a call
 
@@ -119,11 +118,9 @@ class Loop:
         ramp_samples = -(-self._limiter.ramp_samples // block) * block
         self._before = before = Beginning(conditioning, ramp_samples)
         self._end = before.waveform_at + self._plan.samples
-        if ramp_samples:
-            self._phase = _Phase.STARTING
-            self._pacer.policy = self._plan.ramp_policy
-        elif conditioning is not None:
-            self._phase = _Phase.CONDITIONING
+        if before.waveform_at:
+            self._phase = _Phase.STARTING if ramp_samples else _Phase.CONDITIONING
+            self._pacer.policy = self._plan.start_policy
         return before.waveform_at
 
     def run(self, start_ns: int) -> Outcome:
@@ -165,9 +162,10 @@ class Loop:
         if feedback is not None and feedback.against:
             self._leave("fault", "feedback_sign", feedback.against)
         if self._phase is _Phase.STARTING and self._next_sample >= self._before.condition_at:
-            self._begin(_Phase.CONDITIONING if self._plan.conditioning else _Phase.FOLLOWING)
+            self._phase = _Phase.CONDITIONING
+            self._record_condition()
         if self._phase is _Phase.CONDITIONING and self._next_sample >= self._before.waveform_at:
-            self._begin(_Phase.FOLLOWING)
+            self._follow_from_here()
             self._take_offset_out()
             if self._plan.adaptation is not None:
                 self._plan.adaptation.take_noise(self._before.noise_um)
@@ -218,14 +216,7 @@ class Loop:
 
     def _wait(self) -> int:
         """Wait for the tick; return the samples that were skipped before it."""
-        block_samples, most = self._plan.block, None
-        if (
-            self._phase is not _FOLLOWING and self._phase in _BEFORE
-        ):  # their last tick is not skipped: what comes next waits
-            before = self._before
-            ends = before.condition_at if self._phase is _Phase.STARTING else before.waveform_at
-            most = (ends - self._next_sample) // block_samples - 1
-        skipped = self._pacer.wait(most) * block_samples
+        skipped = self._pacer.wait() * self._plan.block
         if not skipped:
             return 0
         # Before the block is claimed: its number and the state kept with it are those after it.
@@ -273,15 +264,12 @@ class Loop:
         window = self._plan.window
         return window is None or window.has(stop - self._before.waveform_at)
 
-    def _begin(self, phase: _Phase) -> None:
-        """Go on to a phase, unless skipped ticks have left the output elsewhere."""
-        self._phase = phase
+    def _follow_from_here(self) -> None:
+        """Enter the waveform; its first tick still waits for a whole period."""
+        self._phase = _Phase.FOLLOWING
+        if self._pacer.policy == "spaced":
+            self._pacer.postpone()
         self._pacer.policy = self._plan.late_policy
-        if not self._limiter.at_rest:
-            reason = "the way to the safe value before the waveform was late: timing not kept"
-            self._leave("fault", "late", reason)
-        elif phase is _Phase.CONDITIONING:
-            self._record_condition()
 
     def _record_condition(self) -> None:
         event = self._before.condition_event()
@@ -298,8 +286,6 @@ class Loop:
 
     def _take_offset_out(self) -> None:
         """Take out how far the sensor stands from the model; beyond the limit the run ends."""
-        if self._phase is not _Phase.FOLLOWING:
-            return
         text, values, refused = self._before.take_offset_out()
         if refused:
             self._leave("fault", OFFSET, text)

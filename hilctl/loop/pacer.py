@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 if TYPE_CHECKING:
     from hilctl.base.device import Clock
 
-LatePolicy: TypeAlias = Literal["skip", "catch_up", "slip", "follow"]
+LatePolicy: TypeAlias = Literal["skip", "catch_up", "slip", "follow", "spaced"]
 
 USUAL_MISSED_SHARE = 0.01
 """Share of ticks that may be skipped, where no other is given."""
@@ -153,7 +153,10 @@ class Pacer:
         policy: What happens when a tick wakes a whole period late or more; may be changed between
             ticks. ``follow`` is for devices whose exchange waits for their own clock: there is no
             other wait, and the deadlines follow that clock, so that a late tick is one that came
-            later than usual.
+            later than usual. ``spaced`` is for the start of a run: each tick waits for a whole
+            period after the tick before it has ended, and the schedule shifts by what that takes.
+            No tick is skipped, and two writes are never less than a period apart, however long an
+            exchange took and whenever in it the device moved its output.
         rules: What counts as late.
     """
 
@@ -182,15 +185,16 @@ class Pacer:
         """Make the first tick due at ``start_ns``."""
         self._origin_ns = start_ns
 
-    def wait(self, most: int | None = None) -> int:
-        """Sleep until the next tick.
+    def postpone(self) -> None:
+        """Shift the schedule so that the next tick is due a whole period from now, or later."""
+        due_ns = self._origin_ns + round((self.tick + 1) * self._period_ns)
+        earliest_ns = self._clock.now_ns() + math.ceil(self._period_ns)
+        self._origin_ns += max(0, earliest_ns - due_ns)
 
-        Args:
-            most: Most ticks that may be skipped; the phase slips by what is more. None for any.
-
-        Returns:
-            How many ticks were skipped before it.
-        """
+    def wait(self) -> int:
+        """Sleep until the next tick; return how many ticks were skipped before it."""
+        if self.policy == "spaced" and self.tick >= 0:
+            self.postpone()
         self.tick += 1
         self.deadline_ns = self._origin_ns + round(self.tick * self._period_ns)
         if self.policy == "follow" and self.tick:
@@ -202,15 +206,12 @@ class Pacer:
         # Nothing to count, as a rule: late means over a limit, and the worst is soon seen.
         if self.late_ns > self._least_counted_ns or self.late_run:
             self._count()
-        if self.late_ns < self._period_ns or self.policy in {"catch_up", "follow"}:
+        if self.late_ns < self._period_ns or self.policy in {"catch_up", "follow", "spaced"}:
             return 0
         if self.policy == "slip":
             self._origin_ns += self.late_ns
             return 0
         skipped = int(self.late_ns / self._period_ns)
-        if most is not None and skipped > most:
-            self._origin_ns += round((skipped - most) * self._period_ns)
-            skipped = most
         self.tick += skipped
         self.counters.skipped_ticks += skipped
         # The tick that runs now is a later one than that which was waited for.

@@ -57,8 +57,9 @@ class Plan:
         limits: What commands are held to.
         interlocks: What the interlocks need to know of the rig.
         interlock_settings: What they are set to.
-        late_policy: What happens when a tick wakes late.
-        ramp_policy: The same on the ramps before and after the waveform.
+        late_policy: What happens when a tick wakes late in the waveform.
+        start_policy: The same on the ramp and in the conditioning before it.
+        ramp_policy: The same on the safe ramp after it.
         late_rules: From when a tick counts as late, and when lateness ends the run.
         feedback: Corrects the compensator's input; None where nothing does.
         adaptation: Adapts the compensator's model; None where nothing does.
@@ -77,6 +78,7 @@ class Plan:
     interlocks: InterlockContext
     interlock_settings: InterlockSettings = field(default_factory=InterlockSettings)
     late_policy: LatePolicy = "skip"
+    start_policy: LatePolicy = "spaced"
     ramp_policy: LatePolicy = "skip"
     late_rules: LateRules = field(default_factory=LateRules)
     feedback: Controller | None = None

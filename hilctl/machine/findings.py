@@ -25,7 +25,7 @@ def preemption(machine: Machine) -> Finding:
     version = machine.text("/proc/version") or ""
     if machine.text("/sys/kernel/realtime") == "1" or "PREEMPT_RT" in version:
         return Finding("kernel", "ok", "PREEMPT_RT")
-    remedy = "install a PREEMPT_RT kernel (Debian: linux-image-rt-amd64)"
+    remedy = "install a PREEMPT_RT kernel (Debian: linux-image-rt-amd64, or -arm64)"
     if "PREEMPT_DYNAMIC" in version:
         chosen = re.search(r"\((\w+)\)", machine.text(_DYNAMIC) or "")
         asked = re.search(r"\bpreempt=(\w+)", machine.text("/proc/cmdline") or "")

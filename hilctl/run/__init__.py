@@ -2,7 +2,7 @@
 
 start.py           from an experiment file to a finished run
 step.py            one run of several, and by what its recording is known
-architecture.py    processors that a run may be on
+architecture.py    systems that a run may be on
 job.py             what was checked as it goes to the loop's process
 assemble.py        from a checked experiment to the plan of its loop
 supervisor.py      starts loop, guardian and recorder; started_run.py  sees to them to the end

@@ -49,6 +49,7 @@ def assemble(
     config, info = parts.config, parts.device.info
     rate_hz = config.sample_rate_hz
     policy = _late_policy(config, info) if paced else "catch_up"
+    host_paced = paced and not info.buffered and not info.latency_blocks
     compensator = Compensator(parts.model, rate_hz)
     compensator.warm_up()
     if state is not None:
@@ -64,8 +65,9 @@ def assemble(
         interlocks=replace(interlock_context(config, info), heat_a2=heat_a2),
         interlock_settings=config.limits,
         late_policy=policy,
+        start_policy="spaced" if host_paced else policy,
         # By time, not by ticks: a device that takes its time for each would be at it for long.
-        ramp_policy=policy if not paced or info.buffered or info.latency_blocks else "skip",
+        ramp_policy="skip" if host_paced else policy,
         late_rules=_late_rules(config, window.samples if window else reference.size)
         if paced
         else LateRules(),

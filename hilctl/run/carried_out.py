@@ -57,7 +57,7 @@ def carry_out(data: bytes, all_compiled: Callable[[], None]) -> int:
 def _failed(page: SharedPage, text: str, phase: Phase = Phase.FAILED) -> int:
     # The text first: the phase says that it is there.
     page.write_text(PageText.ERROR, text)
-    page.put(Field.PHASE, phase)
+    page.publish(Field.PHASE, phase)
     return 1
 
 
@@ -118,9 +118,9 @@ def run_job(
         page.put(Field.WAVEFORM_AT, waveform_at)
         page.write_text(PageText.SET_UP, json.dumps([step_facts(steps), refusals(steps)]))
         # After the text, which the supervisor reads then.
-        page.put(Field.PHASE, Phase.READY)
+        page.publish(Field.PHASE, Phase.READY)
         start_ns = _await_go(page, host)
-        page.put(Field.PHASE, Phase.RUNNING)
+        page.publish(Field.PHASE, Phase.RUNNING)
         before = ProcessUsage.now()
         outcome = loop.run(start_ns)
         page.leave_usage(ProcessUsage.now().since(before))
@@ -144,7 +144,7 @@ def run_job(
 
 def _await_go(page: SharedPage, host: RingHost) -> int:
     """Return when the first tick is due."""
-    while not page.get(Field.GO):
+    while not page.observe(Field.GO):
         if not host.supervised():
             # The loop ends in its first tick then: by its ramp, where the output is not at rest.
             return host.clock.now_ns()

@@ -207,7 +207,7 @@ def _newest(
     until = clock() + _STILL_S
     while clock() < until:
         newest = ring.newest_state()
-        if newest is None and at_least == 0 and not ring.page.get(Field.HEAD):
+        if newest is None and at_least == 0 and not ring.page.observe(Field.HEAD):
             return 0, None
         # Blocks may be on their way for a while: the change before must be among those seen.
         if newest is not None and newest[0] >= at_least:

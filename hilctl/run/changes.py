@@ -135,7 +135,7 @@ class Changes:
             return
         page = self._page
         # Only after the loop has taken it may the change before be written over.
-        if page.get(Field.TUNE_WANTED) != page.get(Field.TUNE_TAKEN):
+        if page.get(Field.TUNE_WANTED) != page.observe(Field.TUNE_TAKEN):
             return
         self._note_taken()
         if self._current is None and self._waiting:
@@ -216,7 +216,7 @@ class Changes:
         page.put(Field.TUNE_SAMPLES, tuning.samples)
         page.put(Field.TUNE_BEGINS_AT, tuning.begins_at)
         # Last: the loop reads the numbers above as soon as it sees a new count.
-        page.put(Field.TUNE_WANTED, page.get(Field.TUNE_WANTED) + 1)
+        page.publish(Field.TUNE_WANTED, page.get(Field.TUNE_WANTED) + 1)
         self.gain, self.offset, self._placed = tuning.gain, tuning.offset, tuning
         self._inverse_share = tuning.inverse_share
         self._heat_a2 = max(self._heat_a2, found.heat_a2)

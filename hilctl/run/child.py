@@ -55,17 +55,17 @@ class LoopChild:
         """
         page = self._page
         deadline = time.monotonic() + _READY_TIMEOUT_S
-        while page.get(Field.PHASE) == Phase.STARTING and not self.ended:
+        while page.observe(Field.PHASE) == Phase.STARTING and not self.ended:
             if stopped():
                 raise RunError("stopped before the start; nothing has moved")
             if time.monotonic() > deadline:
                 raise RunError(f"the loop was not ready within {_READY_TIMEOUT_S:g} s")
             time.sleep(0.005)
-        if page.get(Field.PHASE) == Phase.REFUSED:
+        if page.observe(Field.PHASE) == Phase.REFUSED:
             raise InputError(page.read_text(PageText.ERROR))
-        if page.get(Field.PHASE) == Phase.FAILED:
+        if page.observe(Field.PHASE) == Phase.FAILED:
             raise RunError(page.read_text(PageText.ERROR))
-        if page.get(Field.PHASE) != Phase.READY:
+        if page.observe(Field.PHASE) != Phase.READY:
             raise RunError(f"the loop process died before the start: {self._death()}")
 
     @property
@@ -90,7 +90,7 @@ class LoopChild:
 
     def death(self) -> str:
         """Return why it could not say how it ended."""
-        if self._page.get(Field.PHASE) == Phase.FAILED:
+        if self._page.observe(Field.PHASE) == Phase.FAILED:
             return self._page.read_text(PageText.ERROR)
         return f"the loop process died: {self._death()}"
 

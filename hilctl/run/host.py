@@ -96,13 +96,15 @@ class RingHost:
     def closing(self) -> None:
         """Say that the loop is over, and that the device may take its time."""
         self._numbers[_HEARTBEAT_NS] = self.clock.now_ns()
-        self._numbers[Field.PHASE] = Phase.CLOSING
+        self._page.publish(Field.PHASE, Phase.CLOSING)
 
     def tuning(self) -> Tuning | None:
         """Return a change of the reference that is wanted, new, and due to begin."""
         numbers, page = self._numbers, self._page
-        wanted, now = numbers[_TUNE_WANTED], numbers[_NEXT_SAMPLE]
-        if wanted == numbers[_TUNE_TAKEN] or now < numbers[_TUNE_BEGINS_AT]:
+        if numbers[_TUNE_WANTED] == numbers[_TUNE_TAKEN]:
+            return None
+        wanted, now = page.observe(Field.TUNE_WANTED), numbers[_NEXT_SAMPLE]
+        if now < numbers[_TUNE_BEGINS_AT]:
             return None
         tuning = Tuning(
             page.get_float(Field.TUNE_GAIN),
@@ -114,7 +116,7 @@ class RingHost:
         )
         numbers[_TUNE_TAKEN_AT] = now
         # Taken only once it has been read: the supervisor may write the next one from here on.
-        numbers[_TUNE_TAKEN] = wanted
+        page.publish(Field.TUNE_TAKEN, wanted)
         return tuning
 
     def supervised(self) -> bool:
@@ -137,5 +139,5 @@ class SharedWindow:
     def has(self, stop: int) -> bool:
         """Return whether all samples before ``stop`` are there."""
         if stop > self._ready:
-            self._ready = self._page.get(Field.REFERENCE_READY)
+            self._ready = self._page.observe(Field.REFERENCE_READY)
         return stop <= self._ready

@@ -101,12 +101,12 @@ def _left_behind(
             break
     page = ring.page
     outcome = page.outcome() or died
-    if page.get(Field.PHASE) == Phase.FAILED:
+    if page.observe(Field.PHASE) == Phase.FAILED:
         outcome = replace(died, reason=page.read_text(PageText.ERROR))
     if not page.ended_safely() and (result := page.safe_result()) is not None:
         did = f"guardian: {describe(result.output, result.error)}"
         outcome = replace(outcome, reason=f"{outcome.reason}; {did}", output=result.output)
-    if page.get(Field.PHASE) != Phase.ENDED:
+    if page.observe(Field.PHASE) != Phase.ENDED:
         last = batches[-1].heads[-1] if batches else None
         next_sample = 0 if last is None else int(last[Head.FIRST_SAMPLE]) + ring.block
         if (unanswered := ring.unanswered(next_sample)) is not None:

@@ -178,6 +178,6 @@ def _work(
         while filler.ready < filler.samples and os.getppid() == supervisor:
             if filler.fill(page.get(Field.NEXT_SAMPLE)):
                 # The samples first: the number says that they are there.
-                page.put(Field.REFERENCE_READY, filler.ready)
+                page.publish(Field.REFERENCE_READY, filler.ready)
             else:
                 time.sleep(_POLL_S)

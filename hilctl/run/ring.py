@@ -11,7 +11,8 @@ counted as dropped, and the next one that fits says how many samples are missing
 
 Each slot carries its own sequence number: negative while the block is on its way, positive, and
 written after everything else in it, when it is whole. The consumer takes a slot only when the
-number is the one it expects.
+number is the one it expects. The cursors are published and observed, in order with the blocks; see
+:mod:`hilctl.kernels.atomics`.
 """
 
 import math
@@ -77,7 +78,8 @@ class SampleRing:
         self.page = SharedPage(self._map)
         if self.page.get(Field.MAGIC) != _MAGIC:
             raise ValueError(f"{path}: is not a hilctl ring")
-        self._numbers = self.page.numbers
+        self._numbers, self._integers = self.page.numbers, self.page.integers
+        self._publish, self._observe = self.page.publishes, self.page.observes
         self.slots, self.block = self.page.get(Field.SLOTS), self.page.get(Field.BLOCK)
         self._spare = self.page.get(Field.SPARE)
         state_size = self.page.get(Field.STATE_SIZE)
@@ -143,7 +145,7 @@ class SampleRing:
         The same one again until :meth:`sending` has been called with it.
         """
         number = self._numbers[_SENT]
-        if due and number - self._numbers[_TAIL] < self.slots:
+        if due and number - self._observe(self._integers, _TAIL) < self.slots:
             slot = number % self.slots
         else:
             slot, number = self.slots + self._spares_used % self._spare, -1
@@ -193,7 +195,7 @@ class SampleRing:
         numbers = self._numbers
         if block.number >= 0:
             block.head[_SEQUENCE] = -block.number - 1
-            numbers[_SENT] = block.number + 1
+            self._publish(self._integers, _SENT, block.number + 1)
         numbers[_ENDED_AT] = block.head[_FIRST_SAMPLE] + self.block
         # Last: from here on the loop may be silent for as long as the device keeps it waiting.
         numbers[_EXCHANGING] = 1
@@ -203,15 +205,14 @@ class SampleRing:
         self._numbers[_EXCHANGING] = 0
         if block.number < 0:
             return False
-        # The sequence number last: it says that all the rest is there.
         block.head[_SEQUENCE] = block.number + 1
-        self._numbers[_HEAD] = block.number + 1
+        self._publish(self._integers, _HEAD, block.number + 1)
         return True
 
     def batches(self) -> Iterator[Batch]:
         """Take out the blocks that are there now, some at a time; see :meth:`pop`."""
         # As many as there are now: on a busy machine there always is another one by then.
-        waiting = min(max(self.page.get(Field.HEAD) - self._tail, 0), self.slots)
+        waiting = min(max(self.page.observe(Field.HEAD) - self._tail, 0), self.slots)
         until = self._tail + waiting
         while (left := until - self._tail) > 0 and (batch := self.pop(left)) is not None:
             yield batch
@@ -224,16 +225,15 @@ class SampleRing:
         Args:
             most: How many at most.
         """
-        there = min(max(self.page.get(Field.HEAD) - self._tail, 0), self.slots)
+        there = min(max(self.page.observe(Field.HEAD) - self._tail, 0), self.slots)
         if there == 0:
             return None
         first = self._tail % self.slots
         few = max(1, _BATCH_SAMPLES // self._area.columns.shape[2])
         count = min(there, self.slots - first, few, there if most is None else most)
         batch = self._area.rows(slice(first, first + count))
-        # HEAD may be seen before the block that it counts: the sequence numbers decide.
         wrong = np.flatnonzero(~_whole(batch.heads, self._tail))
-        if wrong.size:  # not yet visible, or damaged: what stands before it is good
+        if wrong.size:  # damaged: what stands before it is good
             count = int(wrong[0])
             if count == 0:
                 return None
@@ -252,7 +252,7 @@ class SampleRing:
         Returns:
             How many there were.
         """
-        there = min(max(self.page.get(Field.HEAD) - self._tail, 0), self.slots)
+        there = min(max(self.page.observe(Field.HEAD) - self._tail, 0), self.slots)
         passed = 0
         while passed < there:
             slot = (self._tail + passed) % self.slots
@@ -270,7 +270,7 @@ class SampleRing:
             with it; None before the first, and where the loop was quicker than the look.
         """
         for _ in range(_LOOKS):
-            number = self.page.get(Field.HEAD) - 1
+            number = self.page.observe(Field.HEAD) - 1
             if number < 0:
                 return None
             slot = number % self.slots
@@ -278,7 +278,7 @@ class SampleRing:
             state = state.copy()
             # Looked at again: the loop may have begun a new block in this slot meanwhile.
             sequence = self._area.heads[slot, Head.SEQUENCE]
-            if sequence == number + 1 and self.page.get(Field.SENT) - number < self.slots:
+            if sequence == number + 1 and self.page.observe(Field.SENT) - number < self.slots:
                 return first, state
         return None
 
@@ -289,11 +289,11 @@ class SampleRing:
             Those that still stand there whole, perhaps none, and the number after the last of all;
             what is missing between was overwritten, or damaged.
         """
-        head = self.page.get(Field.HEAD)
-        numbers = _numbers(max(since, self.page.get(Field.CLEANED), head - self.slots), head)
+        head = self.page.observe(Field.HEAD)
+        numbers = _numbers(max(since, self.page.observe(Field.CLEANED), head - self.slots), head)
         batch = self._area.rows(numbers % self.slots)
         # Looked at again: of what is given back meanwhile, a part may be clean already.
-        whole = numbers >= self.page.get(Field.CLEANED)
+        whole = numbers >= self.page.observe(Field.CLEANED)
         whole &= batch.heads[:, Head.SEQUENCE] == numbers + 1
         return batch if whole.all() else batch.rows(np.flatnonzero(whole)), max(head, since)
 
@@ -307,13 +307,13 @@ class SampleRing:
         self._safe = self._tail
         until = max(self._released, self._tail - keep)
         # Said first: who looks on must not take a block that is cleaned under its copy for whole.
-        self.page.put(Field.CLEANED, until)
+        self.page.publish(Field.CLEANED, until)
         # Cleaned here and not in the tick; before the room is given, or the loop would be in it.
         first, count = self._released % self.slots, until - self._released
         self._clean(slice(first, min(first + count, self.slots)))
         self._clean(slice(0, max(0, first + count - self.slots)))
         self._released = until
-        self.page.put(Field.TAIL, until)
+        self.page.publish(Field.TAIL, until)
         # They stay in the ring; this process maps again what it looks at, some at a time, and does
         # not have all of it in its memory as soon as it has been round once.
         self._map.madvise(mmap.MADV_DONTNEED)
@@ -334,8 +334,8 @@ class SampleRing:
             The blocks in order, every sample with :attr:`~hilctl.base.samples.Flag.UNANSWERED`, or
             None. The last may not have reached the device.
         """
-        sent = self.page.get(Field.SENT)
-        numbers = _numbers(max(self.page.get(Field.HEAD), sent - self.slots), sent)
+        sent = self.page.observe(Field.SENT)
+        numbers = _numbers(max(self.page.observe(Field.HEAD), sent - self.slots), sent)
         slots: I64 = numbers % self.slots
         heads = self._area.heads[slots]
         under_way = heads[:, Head.SEQUENCE] == -numbers - 1

@@ -1,15 +1,20 @@
 """What loop, supervisor and guardian pass to each other in shared memory: numbers, texts, events.
 
-Each number has one writer, and is written whole. Nobody ever waits for the other.
+Each number has one writer, and is written whole. Nobody ever waits for the other. A number that
+says that others, a text, events or blocks are there is published and observed, in order with them;
+see :mod:`hilctl.kernels.atomics`.
 
-The guardian imports this: nothing of the loop may be imported here before it is needed, as it
-brings numba along.
+The guardian imports this: nothing of the loop or of the kernels may be imported here before it is
+needed, as it brings numba along. The guardian itself neither publishes nor observes: it looks at
+single numbers, and the supervisor takes its text only once that is whole JSON.
 """
 
 import json
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, astuple, dataclass
 from enum import IntEnum
+from functools import cached_property
 from mmap import mmap
 from typing import TYPE_CHECKING
 
@@ -208,7 +213,8 @@ class SharedPage:
 
     def __init__(self, memory: mmap) -> None:
         self._map = memory
-        self._integers: I64 = np.frombuffer(memory, dtype=np.int64, count=_PAGE // 8)
+        self.integers: I64 = np.frombuffer(memory, dtype=np.int64, count=_PAGE // 8)
+        """All numbers, int64[n]."""
         self.numbers = memoryview(memory)[:_PAGE].cast("q")
         """The same numbers as Python's own: three times as fast to read and write singly."""
         self._floats: F64 = np.frombuffer(memory, dtype=np.float64, count=_PAGE // 8)
@@ -216,11 +222,35 @@ class SharedPage:
 
     def get(self, field: Field) -> int:
         """Return a number."""
-        return int(self._integers[field])
+        return int(self.integers[field])
 
     def put(self, field: Field, value: int) -> None:
         """Set a number."""
-        self._integers[field] = value
+        self.integers[field] = value
+
+    @cached_property
+    def publishes(self) -> Callable[[I64, int, int], None]:
+        """:func:`hilctl.kernels.atomics.publish`, for the page's numbers."""
+        from hilctl.kernels.atomics import publish
+        from hilctl.kernels.jit import entry
+
+        return entry(publish)
+
+    @cached_property
+    def observes(self) -> Callable[[I64, int], int]:
+        """:func:`hilctl.kernels.atomics.observe`, for the page's numbers."""
+        from hilctl.kernels.atomics import observe
+        from hilctl.kernels.jit import entry
+
+        return entry(observe)
+
+    def publish(self, field: Field, value: int) -> None:
+        """Set a number that says of others that they are there, after them."""
+        self.publishes(self.integers, field, value)
+
+    def observe(self, field: Field) -> int:
+        """Return a number that says of others that they are there, before they are read."""
+        return self.observes(self.integers, field)
 
     def get_float(self, field: Field) -> float:
         """Return a number that is no whole one."""
@@ -265,13 +295,13 @@ class SharedPage:
         """Leave how the run ended for the supervisor."""
         self.write_text(PageText.OUTCOME, json.dumps(asdict(outcome)))
         # The text first: the phase says that it is there.
-        self.put(Field.PHASE, Phase.ENDED)
+        self.publish(Field.PHASE, Phase.ENDED)
 
     def outcome(self) -> "Outcome | None":
         """Return how the loop said that the run ended; None where it said nothing."""
         from hilctl.loop.plan import Outcome
 
-        if self.get(Field.PHASE) != Phase.ENDED:
+        if self.observe(Field.PHASE) != Phase.ENDED:
             return None
         with suppress(ValueError, TypeError):  # damaged
             return Outcome(**json.loads(self.read_text(PageText.OUTCOME)))
@@ -314,12 +344,12 @@ class SharedPage:
     def push_event(self, event: Event) -> None:
         """Leave an event; where there is no room it is counted as lost."""
         head = self.get(Field.EVENT_HEAD)
-        if head - self.get(Field.EVENT_TAIL) >= _EVENT_SLOTS:
-            self._integers[Field.EVENTS_LOST] += 1
+        if head - self.observe(Field.EVENT_TAIL) >= _EVENT_SLOTS:
+            self.integers[Field.EVENTS_LOST] += 1
             return
         self._write(_EVENTS_AT + head % _EVENT_SLOTS * _EVENT_BYTES, _EVENT_BYTES, _packed(event))
         # Last: an event that is counted is whole.
-        self.put(Field.EVENT_HEAD, head + 1)
+        self.publish(Field.EVENT_HEAD, head + 1)
 
     def look_at_events(self, since: int) -> tuple[list[Event], int]:
         """Return the events from number ``since`` on that still stand there; takes nothing out.
@@ -327,12 +357,12 @@ class SharedPage:
         Returns:
             The events, and the number after the last of all.
         """
-        head, found = self.get(Field.EVENT_HEAD), []
+        head, found = self.observe(Field.EVENT_HEAD), []
         for number in range(max(since, head - _EVENT_SLOTS), head):
             raw = self._read(_EVENTS_AT + number % _EVENT_SLOTS * _EVENT_BYTES, _EVENT_BYTES)
             # Looked at again: the loop may have begun a new one in a slot that was released.
-            kept = self.get(Field.EVENT_TAIL) <= number
-            if kept or self.get(Field.EVENT_HEAD) < number + _EVENT_SLOTS:
+            kept = self.observe(Field.EVENT_TAIL) <= number
+            if kept or self.observe(Field.EVENT_HEAD) < number + _EVENT_SLOTS:
                 with suppress(ValueError, TypeError):  # damaged: the recorder counts it
                     found.append(Event(**json.loads(raw)))
         return found, max(head, since)
@@ -345,35 +375,35 @@ class SharedPage:
         head = self.get(Field.NOTE_HEAD)
         self._write(_NOTES_AT + head % _NOTE_SLOTS * _EVENT_BYTES, _EVENT_BYTES, _packed(event))
         # Last: a note that is counted is whole.
-        self.put(Field.NOTE_HEAD, head + 1)
+        self.publish(Field.NOTE_HEAD, head + 1)
 
     def look_at_notes(self, since: int) -> tuple[list[Event], int]:
         """Return the notes from number ``since`` on that still stand there, and the next number."""
-        head, found = self.get(Field.NOTE_HEAD), []
+        head, found = self.observe(Field.NOTE_HEAD), []
         for number in range(max(since, head - _NOTE_SLOTS), head):
             raw = self._read(_NOTES_AT + number % _NOTE_SLOTS * _EVENT_BYTES, _EVENT_BYTES)
             # Looked at again: a new one may have been begun in its slot.
-            if self.get(Field.NOTE_HEAD) < number + _NOTE_SLOTS:
+            if self.observe(Field.NOTE_HEAD) < number + _NOTE_SLOTS:
                 with suppress(ValueError, TypeError):
                     found.append(Event(**json.loads(raw)))
         return found, max(head, since)
 
     def pop_events(self) -> list[Event]:
         """Take the events that came since; they keep their room until they are released."""
-        head, found = self.get(Field.EVENT_HEAD), []
+        head, found = self.observe(Field.EVENT_HEAD), []
         first = max(self._event_tail, head - _EVENT_SLOTS)
         for number in range(first, head):
             raw = self._read(_EVENTS_AT + number % _EVENT_SLOTS * _EVENT_BYTES, _EVENT_BYTES)
             try:
                 found.append(Event(**json.loads(raw)))
             except (ValueError, TypeError):
-                self._integers[Field.EVENTS_LOST] += 1  # damaged
+                self.integers[Field.EVENTS_LOST] += 1  # damaged
         self._event_tail = head
         return found
 
     def release_events(self) -> None:
         """Give the room of all events that were taken back to the loop: they are safe elsewhere."""
-        self.put(Field.EVENT_TAIL, self._event_tail)
+        self.publish(Field.EVENT_TAIL, self._event_tail)
 
     def take_events_again(self) -> None:
         """Let all events that were taken and not released be taken once more."""

@@ -292,4 +292,4 @@ def _go(page: SharedPage, start_ns: int) -> None:
     page.put(Field.SUPERVISOR_HEARTBEAT_NS, time.monotonic_ns())
     page.put(Field.START_NS, start_ns)
     # Last: the loop then reads its start time, and would take an old heartbeat for silence.
-    page.put(Field.GO, 1)
+    page.publish(Field.GO, 1)

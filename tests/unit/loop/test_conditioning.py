@@ -97,14 +97,13 @@ class TestLoop:
         assert outcome.ended_at < 60
         assert np.abs(np.diff(commands[13:])).max() <= LIMITS.ramp_per_s / RATE_HZ + 1e-12
 
-    def test_skipped_ticks_leave_the_waveform_where_it_is(self):
-        """The cycle goes on by time; the waveform has all of its samples."""
-        clock = FakeClock(stall_ns={20: 15_000_000, 123: 30_000_000})
-        rig = Rig(sine(50), conditioning=conditioning(block=1), clock=clock, late={})
+    def test_late_ticks_skip_none_of_it(self):
+        """The schedule shifts; cycle and waveform have all of their samples."""
+        clock = FakeClock(stall_ns={20: 15_000_000, 123: 30_000_000, 139: 5_000_000})
+        rig = Rig(sine(50), conditioning=conditioning(block=1), clock=clock)
         assert rig.run().code == "completed"
-        at = rig.firsts.index(rig.waveform_at)
-        assert rig.firsts[at : at + 50] == list(range(140, 190))
-        assert len(rig.firsts[:at]) < 140
+        assert rig.firsts == list(range(len(rig.firsts)))
+        assert rig.device.commands[:190] == [*CYCLE, *sine(50)]
 
 
 class TestOffset:

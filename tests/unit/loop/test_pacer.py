@@ -99,14 +99,42 @@ def test_skip_leaves_out_ticks_and_keeps_the_phase():
     assert paced.counters.skipped_ticks == 3
 
 
-@pytest.mark.parametrize(("most", "skipped"), [(0, 0), (2, 2), (3, 3), (9, 3)])
-def test_what_may_not_be_skipped_slips(most, skipped):
-    """The grid moves by whole periods, so that the rest of the stall is late as ever."""
-    paced = pacer(FakeClock(5_000, {2: 3_200_000}))
-    assert [paced.wait(most) for _ in range(4)] == [0, 0, skipped, 0]
-    assert paced.deadline_ns == 10_000 + 6 * PERIOD_NS
-    assert paced.tick == 3 + skipped
-    assert paced.counters.skipped_ticks == skipped
+@pytest.mark.parametrize("policy", ["skip", "spaced"])
+def test_a_spaced_tick_comes_a_period_after_the_one_before_it_ended(policy):
+    """Whether it woke late, or what it did took long; nothing is skipped then."""
+    clock = FakeClock(5_000, {2: 3_200_000})
+    paced, woke_ns, ended_ns = pacer(clock, policy), [], []
+    for took_ns in (100_000, 0, 300_000, 2_500_000, 0, 0):
+        paced.wait()
+        woke_ns.append(clock.now)
+        clock.now += took_ns
+        ended_ns.append(clock.now)
+    apart_ns = [woke - ended for woke, ended in zip(woke_ns[1:], ended_ns, strict=False)]
+    assert (min(apart_ns) >= PERIOD_NS) == (policy == "spaced")
+    assert (paced.tick == 5) == (paced.counters.skipped_ticks == 0) == (policy == "spaced")
+
+
+def test_a_spaced_schedule_counts_late_wakeups():
+    """What it shifts by is no lateness; a wake-up after the shifted deadline is."""
+    clock = FakeClock(5_000, {2: 3_200_000})
+    paced = pacer(clock, "spaced")
+    for _ in range(4):
+        paced.wait()
+        clock.now += 400_000
+    assert (paced.counters.late_ticks, paced.counters.worst_ns) == (1, 3_200_000)
+    assert (paced.late_ns, paced.deadline_ns) == (0, 10_000 + 3 * 1_400_000 + 3_200_000)
+
+
+@pytest.mark.parametrize(("now_ns", "due_ns"), [(10_000, 1_010_000), (400_000, 1_400_000)])
+def test_a_postponed_tick_is_due_in_a_period(now_ns, due_ns):
+    """The ticks after it are a period apart, as before."""
+    clock = FakeClock(5_000)
+    paced = pacer(clock)
+    paced.wait()
+    clock.now = now_ns
+    paced.postpone()
+    assert (paced.wait(), paced.deadline_ns) == (0, due_ns)
+    assert (paced.wait(), paced.deadline_ns) == (0, due_ns + PERIOD_NS)
 
 
 @pytest.mark.parametrize("late_ns", [1_000_000, 3_200_000, 250_000_000])

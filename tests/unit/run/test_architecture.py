@@ -1,38 +1,36 @@
-"""Computers that a run may be on."""
+"""Systems that a run may be on."""
+
+from types import SimpleNamespace
 
 import pytest
 
 from hilctl.base.errors import InputError
+from hilctl.run import architecture
 from hilctl.run.architecture import require_real_time_machine
 from hilctl.run.detached import start_detached
 from hilctl.run.start import checked_experiment, start_run
 
 
-@pytest.mark.parametrize("machine", ["x86_64", "AMD64"])
-def test_a_processor_that_keeps_the_order_of_writes_may_run(machine):
-    require_real_time_machine(machine)
-
-
-@pytest.mark.parametrize("machine", ["aarch64", "riscv64", ""])
-def test_any_other_is_refused_in_one_line(machine):
-    with pytest.raises(InputError, match=r"x86-64 processor so far.*report, replay") as refused:
-        require_real_time_machine(machine)
-    assert "\n" not in str(refused.value)
+@pytest.mark.parametrize("machine", ["x86_64", "aarch64", "riscv64"])
+def test_linux_may_run_on_any_processor(monkeypatch, machine):
+    monkeypatch.setattr("platform.machine", lambda: machine)
+    require_real_time_machine()
 
 
 @pytest.mark.parametrize("system", ["darwin", "win32"])
-def test_another_system_is_refused_in_one_line(system):
+def test_another_system_is_refused_in_one_line(monkeypatch, system):
+    monkeypatch.setattr(architecture, "sys", SimpleNamespace(platform=system))
     with pytest.raises(InputError, match=f"needs Linux, this is {system}: report, replay") as no:
-        require_real_time_machine("x86_64", system)
+        require_real_time_machine()
     assert "\n" not in str(no.value)
 
 
 def test_runs_are_refused_before_the_file_is_read(monkeypatch, tmp_path):
-    monkeypatch.setattr("platform.machine", lambda: "aarch64")
+    monkeypatch.setattr(architecture, "sys", SimpleNamespace(platform="darwin"))
     absent = tmp_path / "absent.yaml"
-    with pytest.raises(InputError, match="this one is aarch64"):
+    with pytest.raises(InputError, match="needs Linux"):
         start_run(absent, [], None, overwrite=False, on_progress=print)
-    with pytest.raises(InputError, match="this one is aarch64"):
+    with pytest.raises(InputError, match="needs Linux"):
         start_detached(absent, [], None, [])
     with pytest.raises(InputError, match=r"absent\.yaml"):  # an experiment can be checked
         checked_experiment(absent, [])

@@ -343,3 +343,31 @@ def test_what_is_safe_is_not_taken_again_though_it_stays(tmp_path):
     ring.pop()
     ring.take_again()
     assert ring.pop().heads[:, Head.FIRST_SAMPLE].tolist() == [6]
+
+
+def test_cursors_are_published_after_what_they_say(tmp_path, monkeypatch):
+    """Whoever observes them reads whole blocks, and writes into clean slots."""
+    ring, seen = make(tmp_path), []
+
+    def publishing(page):
+        publish = page.publishes
+
+        def spied(numbers, field, value):
+            heads, flags = ring.area.heads[:, Head.SEQUENCE], ring.area.flags[:, 0]
+            seen.append((Field(field), value, heads.max().item(), heads.min().item(), flags.max()))
+            publish(numbers, field, value)
+
+        return spied
+
+    monkeypatch.setattr(ring, "_publish", publishing(ring.page))
+    monkeypatch.setattr(ring.page, "publishes", publishing(ring.page))
+    assert push(ring, 3)
+    assert ring.pop() is not None
+    ring.release()
+    assert seen == [
+        (Field.SENT, 1, 0, -1, 3),
+        (Field.HEAD, 1, 1, 0, 3),
+        (Field.EVENT_TAIL, 0, 1, 0, 3),
+        (Field.CLEANED, 1, 1, 0, 3),
+        (Field.TAIL, 1, 1, 0, 0),
+    ]

@@ -1,0 +1,90 @@
+"""Numbers in shared memory that say of other data that they are there: published, and observed.
+
+A process that writes data and then a number that says so needs the number to be seen last; the
+process that reads the number needs to read the data after it. x86-64 keeps both orders by itself.
+ARM64 keeps neither: a block of samples could be taken out of the ring before it is whole. Python
+has no means for that, so this is the one place where kernels use instructions of LLVM: a store with
+release order and a load with acquire order. They also keep what comes after a store, and before a
+load, on its own side: a reader that copies data and then looks whether they still stood has them
+copied by then, and a writer that says that data are about to change has said so before they do.
+
+A number that says nothing of other data needs none of it: eight bytes in their place are written
+and read whole.
+"""
+
+from collections.abc import Callable
+from typing import Any, TypeAlias, cast
+
+from numba import config, types
+from numba.core.typing.templates import Signature
+from numba.extending import intrinsic
+
+from hilctl.base.arrays import I64
+from hilctl.kernels.jit import kernel
+
+_Typed: TypeAlias = tuple[Any, Callable[..., Any]]
+_BYTES = 8
+
+
+def _place(context: Any, builder: Any, array: Any, values: Any) -> Any:
+    """Return a pointer to the number at an index of an array."""
+    made = context.make_array(array)(context, builder, values[0])
+    return builder.gep(made.data, [values[1]])
+
+
+def _typed_store(_context: Any, numbers: Any, index: Any, value: Any) -> _Typed:
+    def generate(context: Any, builder: Any, typed: Any, values: Any) -> Any:
+        place = _place(context, builder, typed.args[0], values)
+        builder.store_atomic(values[2], place, "release", _BYTES)
+        builder.fence("seq_cst")
+        return context.get_dummy_value()
+
+    return Signature(types.void, (numbers, index, value), None), generate
+
+
+def _typed_load(_context: Any, numbers: Any, index: Any) -> _Typed:
+    def generate(context: Any, builder: Any, typed: Any, values: Any) -> Any:
+        builder.fence("acquire")
+        place = _place(context, builder, typed.args[0], values)
+        return builder.load_atomic(place, "acquire", _BYTES)
+
+    return Signature(types.int64, (numbers, index), None), generate
+
+
+def _plain_store(numbers: I64, index: int, value: int) -> None:
+    numbers[index] = value
+
+
+def _plain_load(numbers: I64, index: int) -> int:
+    return int(numbers[index])
+
+
+_numba: Any = config
+# Without the compiler, as for a debugger, the order is that of the processor.
+_store: Callable[[I64, int, int], None] = _plain_store
+_load: Callable[[I64, int], int] = _plain_load
+if not _numba.DISABLE_JIT:
+    _store, _load = cast("Any", intrinsic(_typed_store)), cast("Any", intrinsic(_typed_load))
+
+
+@kernel("void(int64[::1], int64, int64)")
+def publish(numbers: I64, index: int, value: int) -> None:
+    """Set a number after all that was written before, and before all that will be.
+
+    Args:
+        numbers: int64[n] in shared memory.
+        index: Place of the number, not checked.
+        value: The number.
+    """
+    _store(numbers, index, value)
+
+
+@kernel("int64(Array(int64, 1, 'C', readonly=True), int64)")
+def observe(numbers: I64, index: int) -> int:
+    """Return a number, read after all that was read before, and before all that will be.
+
+    Args:
+        numbers: int64[n] in shared memory, may be mapped for reading only.
+        index: Place of the number, not checked.
+    """
+    return _load(numbers, index)
