@@ -90,8 +90,9 @@ class RecordingConfig(Strict):
         flush_s: Longest time that a sample stays out of the file; until then the ring keeps it.
         scope_rate_hz: Highest rate of the ``/scope`` topic.
         ring_s: Seconds of samples that the ring between loop and recorder holds.
-        on_failure: What a run does that can't be recorded any more, for a full or a slow disk:
-            ``stop`` by its safe ramp, or ``go_on`` and count what is lost.
+        on_failure: What a run does when the disk has accepted nothing for half of ``ring_s``:
+            ``stop`` by its safe ramp, or ``go_on`` and count what is lost once the ring is full.
+            Refused writes are retried all the while.
     """
 
     folder: str = RECORDINGS

@@ -26,6 +26,7 @@ from hilctl.base.locks import is_locked, take_lock
 from hilctl.base.private import private_folder, user_folders
 
 _CARD = "run.json"
+_KEPT = "kept"
 _PEER = struct.Struct("3i")  # process, user and group, as in unix(7)
 _REFUSED_ONES = 1000  # so many may ask a lock's socket who holds it
 
@@ -101,6 +102,15 @@ class RunFolder:
         """Whether supervisor or loop lives."""
         return _is_locked(self.path / "run.lock")
 
+    def keep(self) -> None:
+        """Let the folder outlive its run: the ring holds what the recording lacks."""
+        (self.path / _KEPT).touch()
+
+    @property
+    def kept(self) -> bool:
+        """Whether the folder is to outlive its run."""
+        return (self.path / _KEPT).exists()
+
     def remove(self) -> None:
         """Remove it and all that is in it."""
         # The card first: whoever looks in between must not take what is left for a dead run.
@@ -167,7 +177,7 @@ def runs() -> list[RunFolder]:
 def run_folder(
     experiment: str, recording: Path, started: float
 ) -> Iterator[tuple[RunFolder, list[int]]]:
-    """Make a run's folder and hold its locks; remove it in the end.
+    """Make a run's folder and hold its locks; remove it in the end unless it is to be kept.
 
     Yields:
         The folder, and descriptors of the locks that the loop is to inherit.
@@ -180,17 +190,22 @@ def run_folder(
     with ExitStack() as stack:
         try:
             path = _new_folder(base / f"{experiment}-{number}")
-            stack.callback(shutil.rmtree, path, ignore_errors=True)
             card = RunCard(path.name, experiment, recorded, number, started)
             folder = RunFolder(path, card)
+            stack.callback(_clear_away, folder)
             shared = stack.enter_context(_locked(path / "run.lock"))
             stack.enter_context(_locked(path / "supervisor.lock"))
             # Under the locks: a folder with a card and without locks is a dead run to others.
-            stack.callback(folder.remove)
+            stack.callback(_clear_away, folder)
             (path / _CARD).write_text(json.dumps(asdict(card)), encoding="utf-8")
         except OSError as error:
             raise RunError(f"{base}: no run's folder can be made: {error.strerror}") from None
         yield folder, [shared]
+
+
+def _clear_away(folder: RunFolder) -> None:
+    if not folder.kept:
+        folder.remove()
 
 
 def _new_folder(path: Path) -> Path:

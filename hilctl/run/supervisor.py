@@ -107,7 +107,9 @@ class Supervisor:
             started = StartedRun(self._checked, ring, child, safety, recording)
             self._attend(started, server, requests)
             safety.close()
-            return self._result(started, recorder, ring)
+            if recorder.error:
+                folder.keep()  # recovery takes the rest from its ring
+            return self._result(started, recorder, ring, folder)
 
     def _start(
         self,
@@ -230,12 +232,18 @@ class Supervisor:
             hint = "less recording.ring_s needs less of it"
             raise RunError(f"{folder.ring}: no memory: {error.strerror}; {hint}") from None
 
-    def _result(self, started: StartedRun, recorder: Recorder, ring: SampleRing) -> RunResult:
+    def _result(
+        self, started: StartedRun, recorder: Recorder, ring: SampleRing, folder: RunFolder
+    ) -> RunResult:
         outcome = started.outcome
         assert outcome is not None
         requested = self._stop_signal == STOP_SIGNAL
         stop_signal = signal.SIGTERM if requested else self._stop_signal
-        cut = f"; {recorder.missing} samples are lost: {recorder.error}" if recorder.error else ""
+        cut = ""
+        if recorder.error:
+            cut = f"; {recorder.missing} samples are not in the recording: {recorder.error}; "
+            cut += f"what memory holds of them is kept in {folder.path}: once the disk accepts it, "
+            cut += "any hilctl command adds it"
         broke = f"; the supervisor broke: {started.broke}" if started.broke else ""
         moved = "".join(f"; {note}" for note in recorder.notes)
         unasked = outcome.code == "stopped" and not stop_signal

@@ -1,12 +1,14 @@
 """What is written can be read by what it is said to be."""
 
+import errno
 import os
 
 import pytest
 
 from hilctl.base.events import Event
 from hilctl.recording.reader import read
-from hilctl.recording.writer import OutputFile
+from hilctl.recording.writer import OutputFile, PendingFile
+from tests.fakes import FailingFile
 
 
 @pytest.fixture
@@ -58,6 +60,70 @@ class FullDisk:
 
     def close(self):
         raise OSError(28, "No space left on device")
+
+
+@pytest.fixture
+def pending(tmp_path):
+    """A file that keeps what it could not write, and the disk below it."""
+    path = tmp_path / "run.mcap"
+    path.touch()
+    with FailingFile(path) as disk:
+        yield PendingFile(disk), disk, path
+
+
+@pytest.mark.parametrize("number", [errno.EIO, errno.ENOSPC])
+def test_a_write_that_fails_is_written_by_the_next_flush(pending, number):
+    file, disk, path = pending
+    file.write(b"first")
+    file.flush()
+    disk.write_errors = [number]
+    file.write(b"second")
+    with pytest.raises(OSError, match=os.strerror(number)):
+        file.flush()
+    assert file.problem == os.strerror(number)
+    file.write(b"third")
+    assert file.tell() == 16
+    file.flush()
+    assert (file.problem, path.read_bytes()) == ("", b"firstsecondthird")
+
+
+def test_half_a_write_is_written_again_from_its_first_byte(pending):
+    file, disk, path = pending
+    file.write(b"first")
+    file.flush()
+    disk.room = 8
+    file.write(memoryview(b"second"))
+    with pytest.raises(OSError, match="No space left"):
+        file.flush()
+    assert path.read_bytes() == b"firstsec"
+    disk.room = 100
+    file.flush()
+    assert path.read_bytes() == b"firstsecond"
+
+
+def test_what_is_abandoned_is_as_the_last_flush_left_it(pending):
+    file, disk, path = pending
+    file.write(b"first")
+    file.flush()
+    disk.room = 8
+    file.write(b"second")
+    with pytest.raises(OSError, match="No space left"):
+        file.flush()
+    file.abandon()
+    assert path.read_bytes() == b"first"
+    assert disk.closed
+
+
+def test_a_file_that_nobody_flushes_does_not_grow_in_memory(pending):
+    """And a refused write is no error of the writer above it, which has to stay whole."""
+    file, disk, path = pending
+    disk.write_errors = [errno.EIO]
+    file.write(bytes(2 << 20))
+    assert file.problem
+    assert path.stat().st_size == 0
+    file.write(b"more")
+    assert not file.problem
+    assert path.stat().st_size == file.tell() == (2 << 20) + 4
 
 
 def test_a_claimed_file_is_given_back_on_a_full_disk_too(tmp_path):

@@ -77,7 +77,10 @@ class Neighbours:
             begin=self.begin, give_back=lambda: self.note("given back"),
         )  # fmt: skip
         self.outcome, self.broke = Outcome("completed", "waveform completed", 100, True, 0), ""
-        self.folder = SimpleNamespace(ring=folder / "ring", socket=folder / "socket")
+        self.folder = SimpleNamespace(
+            path=folder, ring=folder / "ring", socket=folder / "socket",
+            keep=lambda: self.note("folder kept"),
+        )  # fmt: skip
         self.said = []
         for name, double in {
             "time": self.time,
@@ -350,7 +353,6 @@ def wrong(stage, **changes):
 @pytest.mark.parametrize(
     ("changes", "code", "reason"),
     [
-        ({"error": "no room"}, "fault", "waveform completed; 5 samples are lost: no room"),
         ({"broke": "a bug"}, "fault", "waveform completed; the supervisor broke: a bug"),
         ({"notes": ["it was renamed"]}, "fault", "waveform completed; it was renamed"),
         ({"outcome": Outcome("stopped", "gone", 1, True, 0)}, "fault", "gone"),
@@ -363,6 +365,15 @@ def test_how_it_ended(stage, changes, code, reason):
     result = stage.run()
     assert (result.code, result.reason, result.stop_signal) == (code, reason, 0)
     assert result.safe == stage.outcome.safe
+
+
+def test_a_folder_whose_ring_holds_what_the_file_lacks_is_kept(stage):
+    stage.recorder.error = "no room"
+    result = stage.run()
+    assert result.code == "fault"
+    assert "no room" in result.reason
+    assert str(stage.folder.path) in result.reason
+    assert stage.log.index("folder kept") < stage.log.index("folder removed")
 
 
 @pytest.mark.parametrize(
