@@ -7,6 +7,7 @@ than that.
 
 import errno
 import json
+import os
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -124,15 +125,17 @@ class PendingFile:
 
     Args:
         raw: Unbuffered file, opened for writing.
+        sync: Whether every flush waits until the disk itself has the bytes.
 
     Attributes:
         problem: Why the last attempt to write failed; empty if it succeeded.
     """
 
-    def __init__(self, raw: FileIO) -> None:
-        self._raw = raw
+    def __init__(self, raw: FileIO, *, sync: bool = False) -> None:
+        self._raw, self._sync_always = raw, sync
         self._pending: list[bytes] = []
-        self._pending_bytes = self._written = 0
+        self._pending_bytes = self._written = self._synced = 0
+        self._lost: OSError | None = None
         self.problem = ""
 
     def write(self, data: bytes | bytearray | memoryview) -> int:
@@ -148,12 +151,19 @@ class PendingFile:
         """Return the size of the file, pending bytes included."""
         return self._written + self._pending_bytes
 
-    def flush(self) -> None:
+    def flush(self, *, sync: bool = False) -> None:
         """Hand all pending bytes to the kernel.
 
+        Args:
+            sync: Whether to wait until the disk itself has the whole file.
+
         Raises:
-            OSError: The disk refuses them; they stay pending.
+            OSError: The disk refuses them; they stay pending. Or it has lost earlier bytes, which
+                the kernel reports with the first sync after it: then every flush fails.
         """
+        if self._lost is not None:
+            raise self._lost
+        sync = sync or self._sync_always
         data = b"".join(self._pending)
         self._pending = [data]
         try:
@@ -161,13 +171,27 @@ class PendingFile:
             done = 0
             while done < len(data):
                 done += self._raw.write(data[done:] if done else data)
+            if sync:
+                self._sync()
         except OSError as error:
             self.problem = error.strerror or str(error)
             raise
         # Only now: half a chunk is written again from its first byte.
         self._written += len(data)
+        self._synced = self._written if sync else self._synced
         self._drop_pending()
         self.problem = ""
+
+    def _sync(self) -> None:
+        try:
+            os.fsync(self._raw.fileno())
+        except OSError as error:
+            error.strerror = f"not brought to the disk: {error.strerror}"
+            # The kernel reports a failed write-back once and does not say which bytes it was.
+            # Pending ones are written again; earlier ones are no longer in memory.
+            if self._written > self._synced:
+                self._lost = error
+            raise
 
     def _drop_pending(self) -> None:
         self._pending, self._pending_bytes = [], 0
@@ -179,7 +203,7 @@ class PendingFile:
             OSError: It cannot be truncated.
         """
         self._raw.truncate(0)
-        self._written = 0
+        self._written = self._synced = 0
         self._drop_pending()
 
     def abandon(self) -> None:
@@ -211,6 +235,7 @@ class OutputFile:
     Args:
         path: Where to record.
         overwrite: Whether an existing file may be replaced.
+        sync: See :class:`PendingFile`.
 
     Attributes:
         stream: The file.
@@ -220,7 +245,7 @@ class OutputFile:
         OSError: It can't be written, or another run is recording to it.
     """
 
-    def __init__(self, path: Path, *, overwrite: bool) -> None:
+    def __init__(self, path: Path, *, overwrite: bool, sync: bool = False) -> None:
         self._path = path
         self._ours = not path.exists()
         if overwrite and not self._ours and not path.is_file():
@@ -228,7 +253,7 @@ class OutputFile:
         # Not "wb": what stands there is emptied only once the run starts, and under the lock.
         raw = path.open("r+b" if overwrite and not self._ours else "xb", buffering=0)
         lock(raw)
-        self.stream = PendingFile(raw)
+        self.stream = PendingFile(raw, sync=sync)
 
     def begin(self) -> PendingFile:
         """Empty the file and return it; may be called again to begin anew."""

@@ -61,6 +61,7 @@ def put_back(path: Path, descriptor: int) -> tuple[Path, str]:
             lock(copy)
             shutil.copyfileobj(content, copy)
             copy.flush()
+            os.fsync(copy.fileno())
             # The file's own descriptor: whoever holds the file goes on, and sees no difference.
             os.dup2(copy.fileno(), descriptor, inheritable=False)
     except OSError:

@@ -11,7 +11,7 @@ import numpy as np
 
 from hilctl.base.errors import InputError
 from hilctl.base.events import ADAPTED, Event
-from hilctl.base.files import already_there
+from hilctl.base.files import already_there, sync_folder
 from hilctl.base.remedy import reason
 from hilctl.base.samples import Batch, Head, Samples
 from hilctl.experiment.check import Checked
@@ -63,7 +63,7 @@ class Recorder:
         self._run: RunFacts | None = None
         self._figures: EndFigures | None = None
         try:
-            self._file = OutputFile(path, overwrite=overwrite)
+            self._file = OutputFile(path, overwrite=overwrite, sync=config.recording.sync)
         except FileExistsError:
             raise already_there(path, "give another --output, or --overwrite") from None
         except OSError as error:
@@ -205,7 +205,7 @@ class Recorder:
     def finish(
         self, end: Mapping[str, str], ended_at: int, patience_s: float = _PATIENCE_S
     ) -> bool:
-        """Write how the run ended, and close the file.
+        """Write how the run ended, bring the file to the disk, and close it.
 
         Args:
             end: Facts of the end, with ``code`` and ``reason``.
@@ -213,7 +213,8 @@ class Recorder:
             patience_s: How long to retry while the disk refuses it.
 
         Returns:
-            Whether the recording is complete. Otherwise the file is as the last flush left it.
+            Whether the recording is complete and on the disk. Otherwise the file is as the last
+            flush left it.
         """
         self._next_sample = max(self._next_sample, ended_at)
         self.flush()  # it sees to a file that was taken away, for the last time
@@ -238,6 +239,8 @@ class Recorder:
         try:
             self._file.stream.flush()
             self._stays()
+            self._file.stream.flush(sync=True)
+            sync_folder(self.path.parent)
             self._file.stream.close()
         except OSError as error:
             self._problem = self._cannot(error.strerror)

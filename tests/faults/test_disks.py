@@ -55,8 +55,8 @@ class Faulty(FileIO):
         return super().write(data)
 
 class Pending(writer.PendingFile):
-    def __init__(self, raw):
-        super().__init__(Faulty(os.dup(raw.fileno()), "wb"))
+    def __init__(self, raw, **options):
+        super().__init__(Faulty(os.dup(raw.fileno()), "wb"), **options)
 
 writer.PendingFile = Pending
 sys.argv = ["hilctl", *sys.argv[1:]]

@@ -114,6 +114,52 @@ def test_what_is_abandoned_is_as_the_last_flush_left_it(pending):
     assert disk.closed
 
 
+class LossyDisk:
+    """``os.fsync`` of a disk that loses, once, what it was not yet asked to keep."""
+
+    def __init__(self, path):
+        self.path, self.kept, self.fails = path, 0, False
+
+    def __call__(self, descriptor):
+        if self.fails:
+            self.fails = False
+            with self.path.open("r+b") as stream:
+                stream.seek(self.kept)
+                stream.write(bytes(self.path.stat().st_size - self.kept))
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        self.kept = self.path.stat().st_size
+
+
+def test_bytes_that_a_failed_sync_lost_are_written_again(pending, monkeypatch):
+    file, disk, path = pending
+    file = PendingFile(disk, sync=True)
+    monkeypatch.setattr(os, "fsync", lossy := LossyDisk(path))
+    file.write(b"first")
+    file.flush()
+    lossy.fails = True
+    file.write(b"second")
+    with pytest.raises(OSError, match="not brought to the disk: Input/output error"):
+        file.flush()
+    assert path.read_bytes() == b"first" + bytes(6)
+    file.flush()
+    assert path.read_bytes() == b"firstsecond"
+    assert lossy.kept == 11
+
+
+def test_bytes_that_are_no_longer_in_memory_are_lost_for_good(pending, monkeypatch):
+    """The kernel reports it once: a later sync that succeeds must not hide it."""
+    file, _, path = pending
+    monkeypatch.setattr(os, "fsync", lossy := LossyDisk(path))
+    file.write(b"first")
+    file.flush()
+    file.write(b"second")
+    lossy.fails = True
+    for _ in range(2):
+        with pytest.raises(OSError, match="not brought to the disk"):
+            file.flush(sync=True)
+    assert "not brought to the disk" in file.problem
+
+
 def test_a_file_that_nobody_flushes_does_not_grow_in_memory(pending):
     """And a refused write is no error of the writer above it, which has to stay whole."""
     file, disk, path = pending

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.writer import MCAP0_MAGIC
 
 from hilctl.base.errors import InputError
 from hilctl.base.events import Event
@@ -45,8 +46,8 @@ def begun(checked, monkeypatch, tmp_path):
     disks = []
 
     class Output(OutputFile):
-        def __init__(self, path, *, overwrite):
-            super().__init__(path, overwrite=overwrite)
+        def __init__(self, path, **options):
+            super().__init__(path, **options)
             self.stream.close()
             disks.append(FailingFile(path))
             self.stream = PendingFile(disks[-1])
@@ -109,6 +110,36 @@ def test_a_disk_that_stays_full_leaves_the_file_as_the_last_flush_did(begun):
     assert (made.samples, made.missing, made.next_sample) == (200, 250, 450)
     assert made.path.stat().st_size == size
     assert read(made.path).samples.index.size == 200
+
+
+def test_a_recording_counts_as_complete_once_it_is_on_the_disk(begun, monkeypatch):
+    """The whole file, and the folder with its name."""
+    made, _ = begun
+    synced = []
+
+    def fsync(descriptor):
+        path = Path(f"/proc/self/fd/{descriptor}").readlink()
+        synced.append((path, made.path.read_bytes().endswith(MCAP0_MAGIC)))
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    made.batch(batch(0, 20))
+    made.flush()
+    assert synced == []
+    assert made.finish(END, 200)
+    assert synced == [(made.path, True), (made.path.parent, True)]
+
+
+def test_a_disk_that_can_not_keep_the_recording_is_an_error(begun, monkeypatch):
+    made, _ = begun
+
+    def fsync(descriptor):
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    made.batch(batch(0, 20))
+    made.flush()
+    assert not made.finish(END, 200, patience_s=0.0)
+    assert "not brought to the disk: Input/output error" in made.error
 
 
 def test_a_bug_ends_the_recording_as_it_was_flushed(begun):

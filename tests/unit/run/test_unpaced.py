@@ -45,8 +45,8 @@ def test_a_refused_write_costs_nothing(tmp_path, monkeypatch, pending_bytes, wri
     disks = []
 
     class Refused(PendingFile):
-        def __init__(self, raw):
-            super().__init__(disk := FailingFile(raw.name))
+        def __init__(self, raw, **options):
+            super().__init__(disk := FailingFile(raw.name), **options)
             raw.close()
             disk.write_errors = [None] * writes_before + [errno.EIO]
             disks.append(disk)
