@@ -1,5 +1,7 @@
 """Doubles that tests of several rooms share: clocks, devices, hosts and links."""
 
+import errno
+import io
 import json
 import math
 import os
@@ -514,3 +516,26 @@ class PackageMcapWriter:
         for k, data in enumerate(rows.split()):
             time_ns = int(times_ns[k])
             self._writer.add_message(channel, time_ns, data, time_ns, sequence + k)
+
+
+class FailingFile(io.FileIO):
+    """A file on a disk that refuses writes, or to bring them to the disk.
+
+    Attributes:
+        room: Bytes that there is room for; a write beyond is cut, the next one refused.
+        write_errors: Error numbers of the next writes, in order; None for one that is accepted.
+    """
+
+    def __init__(self, path, mode="r+b"):
+        super().__init__(path, mode)
+        self.room = 10**9
+        self.write_errors = []
+
+    def write(self, data):
+        number = self.write_errors.pop(0) if self.write_errors else None
+        if number is not None:
+            raise OSError(number, os.strerror(number))
+        fits = self.room - self.tell()
+        if len(data) and fits <= 0:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return super().write(data[:fits])

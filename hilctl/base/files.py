@@ -77,6 +77,22 @@ def read_text(path: Path, max_bytes: int = MAX_TEXT_BYTES) -> str:
         raise InputError(f"{path}: can't be read: {why}") from None
 
 
+def sync_folder(path: Path) -> None:
+    """Bring a folder to the disk: only then is the name of a new file there.
+
+    Raises:
+        OSError: The disk refuses it.
+    """
+    folder = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(folder)
+    except OSError as error:
+        if error.errno not in {errno.EINVAL, errno.ENOTSUP}:  # a file system without it
+            raise
+    finally:
+        os.close(folder)
+
+
 class AtomicFile:
     """A file that stands under its name whole or not at all; one not committed leaves nothing.
 
@@ -122,11 +138,7 @@ class AtomicFile:
             self._beside.replace(self.final)
         else:
             self._link()
-        folder = os.open(self.final.parent, os.O_RDONLY)
-        try:
-            os.fsync(folder)  # the name is on the disk only once its folder is
-        finally:
-            os.close(folder)
+        sync_folder(self.final.parent)
 
     def _link(self) -> None:
         try:

@@ -202,7 +202,7 @@ def prepared(folder: Path, host: SeriesHost) -> Iterator[None]:
     with held_folder(folder, host.sleep_s):
         await_runs(folder, host.sleep_s)
         for orphan in recover_orphans():
-            host.on_note(f"{orphan.name} had died: {orphan.text}")
+            host.on_note(f"{orphan.name} was not recorded to its end: {orphan.text}")
         for text in make_whole(folder):
             host.on_note(text)
         yield

@@ -88,14 +88,18 @@ class RecordingConfig(Strict):
     Attributes:
         folder: Folder for recordings without a name of their own, relative to where hilctl runs.
         flush_s: Longest time that a sample stays out of the file; until then the ring keeps it.
+        sync: Whether every flush waits until the disk itself has the samples, so that a power cut
+            takes no more than ``flush_s``. At the end of a run that is always so.
         scope_rate_hz: Highest rate of the ``/scope`` topic.
         ring_s: Seconds of samples that the ring between loop and recorder holds.
-        on_failure: What a run does that can't be recorded any more, for a full or a slow disk:
-            ``stop`` by its safe ramp, or ``go_on`` and count what is lost.
+        on_failure: What a run does when the disk has accepted nothing for half of ``ring_s``:
+            ``stop`` by its safe ramp, or ``go_on`` and count what is lost once the ring is full.
+            Refused writes are retried all the while.
     """
 
     folder: str = RECORDINGS
     flush_s: Annotated[float, Field(gt=0.0, le=10.0)] = 2.0
+    sync: bool = False
     scope_rate_hz: Annotated[float, Field(gt=0.0, le=1000.0)] = 1000.0
     ring_s: Annotated[float, Field(ge=1.0, le=60.0)] = 10.0
     on_failure: Literal["stop", "go_on"] = "stop"

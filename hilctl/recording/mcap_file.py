@@ -9,7 +9,7 @@ import struct
 import zlib
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
-from typing import BinaryIO, TypeAlias
+from typing import Protocol, TypeAlias
 
 import numpy as np
 import zstandard
@@ -63,6 +63,19 @@ _PACKED_BYTES = 1 << 16
 _FIRST_ROOM_BYTES = CHUNK_BYTES + (1 << 20)
 
 
+class Sink(Protocol):
+    """A binary file that a recording is written to."""
+
+    def write(self, data: bytes | bytearray | memoryview, /) -> int:
+        """Append bytes; return how many."""
+
+    def tell(self) -> int:
+        """Return the size so far."""
+
+    def flush(self) -> None:
+        """Hand what was written to the kernel."""
+
+
 class McapWriter:
     """Writes one file.
 
@@ -74,7 +87,7 @@ class McapWriter:
 
     def __init__(
         self,
-        stream: BinaryIO,
+        stream: Sink,
         *,
         chunk_bytes: int = CHUNK_BYTES,
         compression: Compression = SAMPLES,

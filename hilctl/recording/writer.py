@@ -7,18 +7,19 @@ than that.
 
 import errno
 import json
+import os
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from io import FileIO
 from pathlib import Path
-from typing import BinaryIO
 
 from hilctl import __version__
 from hilctl.base.events import Event
 from hilctl.base.samples import Batch
 from hilctl.base.segments import Segment
 from hilctl.recording.locks import lock
-from hilctl.recording.mcap_file import McapWriter
+from hilctl.recording.mcap_file import McapWriter, Sink
 from hilctl.recording.messages import MessageMaker, RecordingLayout, Topics
 
 
@@ -51,7 +52,7 @@ class RecordingWriter:
         run: Facts of the run.
     """
 
-    def __init__(self, stream: BinaryIO, run: RunFacts) -> None:
+    def __init__(self, stream: Sink, run: RunFacts) -> None:
         self._writer = McapWriter(stream)
         self._topics = Topics(self._writer)
         self._maker = MessageMaker(run.layout)
@@ -113,6 +114,119 @@ class RecordingWriter:
             self._topics.add(message)
 
 
+_MOST_PENDING_BYTES = 1 << 20
+
+
+class PendingFile:
+    """A file whose writes wait in memory until the disk accepts them.
+
+    :meth:`write` never fails, so an MCAP writer is never left halfway. A failed :meth:`flush`
+    loses nothing: the next one starts again where the last complete one ended.
+
+    Args:
+        raw: Unbuffered file, opened for writing.
+        sync: Whether every flush waits until the disk itself has the bytes.
+
+    Attributes:
+        problem: Why the last attempt to write failed; empty if it succeeded.
+    """
+
+    def __init__(self, raw: FileIO, *, sync: bool = False) -> None:
+        self._raw, self._sync_always = raw, sync
+        self._pending: list[bytes] = []
+        self._pending_bytes = self._written = self._synced = 0
+        self._lost: OSError | None = None
+        self.problem = ""
+
+    def write(self, data: bytes | bytearray | memoryview) -> int:
+        """Append bytes; the next :meth:`flush` hands them to the kernel, if not this call."""
+        self._pending.append(bytes(data))
+        self._pending_bytes += len(data)
+        if self._pending_bytes > _MOST_PENDING_BYTES:  # a run without a ring never flushes
+            with suppress(OSError):  # they stay pending, and `problem` says why
+                self.flush()
+        return len(data)
+
+    def tell(self) -> int:
+        """Return the size of the file, pending bytes included."""
+        return self._written + self._pending_bytes
+
+    def flush(self, *, sync: bool = False) -> None:
+        """Hand all pending bytes to the kernel.
+
+        Args:
+            sync: Whether to wait until the disk itself has the whole file.
+
+        Raises:
+            OSError: The disk refuses them; they stay pending. Or it has lost earlier bytes, which
+                the kernel reports with the first sync after it: then every flush fails.
+        """
+        if self._lost is not None:
+            raise self._lost
+        sync = sync or self._sync_always
+        data = b"".join(self._pending)
+        self._pending = [data]
+        try:
+            self._raw.seek(self._written)
+            done = 0
+            while done < len(data):
+                done += self._raw.write(data[done:] if done else data)
+            if sync:
+                self._sync()
+        except OSError as error:
+            self.problem = error.strerror or str(error)
+            raise
+        # Only now: half a chunk is written again from its first byte.
+        self._written += len(data)
+        self._synced = self._written if sync else self._synced
+        self._drop_pending()
+        self.problem = ""
+
+    def _sync(self) -> None:
+        try:
+            os.fsync(self._raw.fileno())
+        except OSError as error:
+            error.strerror = f"not brought to the disk: {error.strerror}"
+            # The kernel reports a failed write-back once and does not say which bytes it was.
+            # Pending ones are written again; earlier ones are no longer in memory.
+            if self._written > self._synced:
+                self._lost = error
+            raise
+
+    def _drop_pending(self) -> None:
+        self._pending, self._pending_bytes = [], 0
+
+    def clear(self) -> None:
+        """Empty the file.
+
+        Raises:
+            OSError: It cannot be truncated.
+        """
+        self._raw.truncate(0)
+        self._written = self._synced = 0
+        self._drop_pending()
+
+    def abandon(self) -> None:
+        """Close the file as the last complete :meth:`flush` left it."""
+        with suppress(OSError):  # recovery copes with half a chunk as well
+            self._raw.truncate(self._written)
+        with suppress(OSError):
+            self._raw.close()
+
+    @property
+    def closed(self) -> bool:
+        """Whether it is closed."""
+        return self._raw.closed
+
+    def fileno(self) -> int:
+        """Return the file's descriptor."""
+        return self._raw.fileno()
+
+    def close(self) -> None:
+        """Close the file; pending bytes are dropped."""
+        self._raw.close()
+
+
 class OutputFile:
     """A recording's file, claimed before the start and given back if the run never starts.
 
@@ -121,30 +235,34 @@ class OutputFile:
     Args:
         path: Where to record.
         overwrite: Whether an existing file may be replaced.
+        sync: See :class:`PendingFile`.
+
+    Attributes:
+        stream: The file.
 
     Raises:
         FileExistsError: It exists and ``overwrite`` is False.
         OSError: It can't be written, or another run is recording to it.
     """
 
-    def __init__(self, path: Path, *, overwrite: bool) -> None:
+    def __init__(self, path: Path, *, overwrite: bool, sync: bool = False) -> None:
         self._path = path
         self._ours = not path.exists()
         if overwrite and not self._ours and not path.is_file():
             raise OSError(errno.EINVAL, "Not a regular file", str(path))
         # Not "wb": what stands there is emptied only once the run starts, and under the lock.
-        self.stream: BinaryIO = path.open("r+b" if overwrite and not self._ours else "xb")
-        lock(self.stream)
+        raw = path.open("r+b" if overwrite and not self._ours else "xb", buffering=0)
+        lock(raw)
+        self.stream = PendingFile(raw, sync=sync)
 
-    def begin(self) -> BinaryIO:
-        """Empty the file and return it, open for writing; may be called again to begin anew."""
-        self.stream.seek(0)
-        self.stream.truncate(0)
+    def begin(self) -> PendingFile:
+        """Empty the file and return it; may be called again to begin anew."""
+        self.stream.clear()
         return self.stream
 
     def give_back(self) -> None:
         """Close the file unwritten; remove it unless it stood there before."""
-        with suppress(OSError):  # closing writes what a full disk has refused before
+        with suppress(OSError):
             self.stream.close()
         if self._ours:
             self._path.unlink(missing_ok=True)

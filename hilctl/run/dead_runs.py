@@ -17,5 +17,5 @@ def finish_dead_runs() -> None:
     for orphan in recover_orphans():
         kept = f"its samples are kept in {orphan.kept}; the next command tries again"
         done = f"recovered into {orphan.recording}"
-        _log.warning("%s had died: %s", orphan.name, orphan.text)
+        _log.warning("%s was not recorded to its end: %s", orphan.name, orphan.text)
         _log.warning("%s", kept if orphan.kept else done)

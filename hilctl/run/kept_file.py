@@ -4,39 +4,38 @@ import os
 import shutil
 from contextlib import suppress
 from pathlib import Path
-from typing import BinaryIO
 
 from hilctl.recording.locks import lock
 
 
-def is_emptied(stream: BinaryIO, had_bytes: int) -> bool:
+def is_emptied(descriptor: int, had_bytes: int) -> bool:
     """Return whether somebody has cut an open recording short.
 
     What is written after that stands behind a hole, which makes the size what it was: then the
     file begins with zeros, as no recording does.
 
     Args:
-        stream: The recording.
+        descriptor: Of the recording.
         had_bytes: Its size when it was flushed last.
 
     Raises:
         OSError: It can't be looked at.
     """
-    if os.fstat(stream.fileno()).st_size < had_bytes:
+    if os.fstat(descriptor).st_size < had_bytes:
         return True
-    with Path(f"/proc/self/fd/{stream.fileno()}").open("rb", buffering=0) as content:
+    with Path(f"/proc/self/fd/{descriptor}").open("rb", buffering=0) as content:
         return content.read(1) == b"\0"
 
 
-def put_back(path: Path, stream: BinaryIO) -> tuple[Path, str]:
+def put_back(path: Path, descriptor: int) -> tuple[Path, str]:
     """See to it that an open file, flushed, stands under its name.
 
     A file that was renamed gets its name back beside the new one. Of one that was deleted the
-    content is copied, and ``stream`` goes on in the copy.
+    content is copied, and ``descriptor`` then leads to the copy.
 
     Args:
         path: Its name.
-        stream: The file, open for writing.
+        descriptor: Of the file, open for writing.
 
     Returns:
         Where it is now, and what was done, for people; empty where nothing had to be.
@@ -44,11 +43,11 @@ def put_back(path: Path, stream: BinaryIO) -> tuple[Path, str]:
     Raises:
         OSError: It can't be put back.
     """
-    own = os.fstat(stream.fileno())
+    own = os.fstat(descriptor)
     with suppress(FileNotFoundError):
         if os.path.samestat(own, path.stat()):
             return path, ""
-    opened = Path(f"/proc/self/fd/{stream.fileno()}")  # leads to the file whatever its name
+    opened = Path(f"/proc/self/fd/{descriptor}")  # leads to the file whatever its name
     if own.st_nlink:
         now = opened.readlink()
         try:
@@ -57,12 +56,17 @@ def put_back(path: Path, stream: BinaryIO) -> tuple[Path, str]:
             return now, f"was renamed to {now}, and stays there"
         return path, f"was renamed to {now}; it has its name back beside that one"
     free = _free(path)
-    with opened.open("rb") as content, free.open("xb") as copy:
-        lock(copy)
-        shutil.copyfileobj(content, copy)
-        copy.flush()
-        # The stream's own descriptor: whoever holds the stream goes on, and sees no difference.
-        os.dup2(copy.fileno(), stream.fileno(), inheritable=False)
+    try:
+        with opened.open("rb") as content, free.open("xb") as copy:
+            lock(copy)
+            shutil.copyfileobj(content, copy)
+            copy.flush()
+            os.fsync(copy.fileno())
+            # The file's own descriptor: whoever holds the file goes on, and sees no difference.
+            os.dup2(copy.fileno(), descriptor, inheritable=False)
+    except OSError:
+        free.unlink(missing_ok=True)  # half a copy; the next attempt makes another
+        raise
     return free, f"was deleted; all that was in it is in {free}"
 
 

@@ -1,8 +1,7 @@
-"""The recording side of a run: claims the file, writes batches, survives a full disk."""
+"""The recording side of a run: claims the file, writes batches, retries what a disk refuses."""
 
 import time
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
@@ -12,7 +11,7 @@ import numpy as np
 
 from hilctl.base.errors import InputError
 from hilctl.base.events import ADAPTED, Event
-from hilctl.base.files import already_there
+from hilctl.base.files import already_there, sync_folder
 from hilctl.base.remedy import reason
 from hilctl.base.samples import Batch, Head, Samples
 from hilctl.experiment.check import Checked
@@ -28,12 +27,14 @@ from hilctl.run.metadata import run_facts
 
 _SAMPLES_BEFORE = 50
 _SPARE = 20
+_PATIENCE_S = 5.0
+_RETRY_S = 0.05
 
 
 class Recorder:
     """Records one run into one file.
 
-    A write that fails ends the recording, not the draining: what comes after is counted as lost.
+    Nothing is lost by a write that fails: it stays in memory, and the next flush tries again.
 
     Args:
         checked: The experiment.
@@ -46,11 +47,11 @@ class Recorder:
 
     def __init__(self, checked: Checked, path: Path, *, overwrite: bool) -> None:
         self.path = path
-        self.error = ""
         self.notes: list[str] = []
         """What was done to the file while it was written, for people."""
         self.adapted: Mapping[str, float] = {}
         """Values of the newest event of adaptation."""
+        self._failed = self._problem = ""
         self._next_sample = 0
         self._flushed = self._had_bytes = 0
         self._checked = checked
@@ -62,7 +63,7 @@ class Recorder:
         self._run: RunFacts | None = None
         self._figures: EndFigures | None = None
         try:
-            self._file = OutputFile(path, overwrite=overwrite)
+            self._file = OutputFile(path, overwrite=overwrite, sync=config.recording.sync)
         except FileExistsError:
             raise already_there(path, "give another --output, or --overwrite") from None
         except OSError as error:
@@ -90,8 +91,8 @@ class Recorder:
             self._start_anew(self._run)
         except OSError as error:
             raise self._unwritable(error) from None
-        self.flush()  # what was taken away since it was claimed is noticed before anything moves
-        if self.error:
+        # What was taken away since it was claimed is noticed before anything moves.
+        if not self.flush():
             raise InputError(self.error)
 
     def _start_anew(self, run: RunFacts) -> None:
@@ -104,8 +105,7 @@ class Recorder:
         self._file.give_back()
 
     def batch(self, batch: Batch) -> None:
-        """Write a batch, or count it as lost where the file can't be written any more."""
-        # Before it is written: what a failing write loses is counted all the same.
+        """Write a batch."""
         self._next_sample = int(batch.heads[-1, Head.FIRST_SAMPLE]) + batch.flags.shape[1]
         self._tail.add(batch)
         self._heat.follow(batch.samples())
@@ -123,38 +123,67 @@ class Recorder:
         led_there = replace(event, before=self._tail.up_to(event.sample))
         self._write(partial(self._begun.event, led_there))
 
+    @property
+    def error(self) -> str:
+        """Why the file cannot be written at present; empty if it can."""
+        refused = self._file.stream.problem
+        return self._failed or self._problem or (self._cannot(refused) if refused else "")
+
     def fail(self, why: str) -> None:
-        """End the recording for a reason of its own; what comes after is counted as lost."""
-        self.error = self.error or f"{self.path}: can't be written: {why}"
+        """End the recording for good; the file stays as the last flush left it."""
+        self._failed = self._failed or self._cannot(why)
+
+    def _cannot(self, why: str | None) -> str:
+        return f"{self.path}: can't be written: {why}"
 
     def flush(self) -> bool:
         """Hand all that was written to the kernel, and see to it that the file is still there.
 
         Returns:
-            Whether all since the flush before is in the file; False where somebody has emptied it,
-            so that the recording begins anew: then these samples are to be written once more.
+            Whether all of it is in the file. Otherwise it is kept for the next flush.
         """
-        kept = True
+        if self._failed:
+            return False
         try:
-            # Before the flush: what it writes would hide that the file is shorter than it was.
-            if not self.error and is_emptied(self._file.stream, self._had_bytes):
-                kept = False
-                self._begin_anew()
-            self._write(self._begun.flush)
-            if not self.error:
-                # After the flush: should a later write fail, no more than this is sure to be there.
-                self._flushed = self._begun.samples
-                self._had_bytes = self._file.stream.tell()
-                self.path, done = put_back(self.path, self._file.stream)
-                if done:
-                    self._note("recording_moved", f"the recording {done}")
+            self._begun.flush()
+            # Should a later write fail, no more than this is sure to be there.
+            self._flushed = self._begun.samples
+            self._had_bytes = self._file.stream.tell()
+            done = self._stays()
+        except OSError as error:
+            self._problem = self._problem or self._cannot(error.strerror)
+            return False
+        if self._problem:
+            text = f"written again, nothing is lost: {self._problem}"
+            self._record("warning", "recording_retried", text)
+            self._problem = ""
+        if done:
+            self._note("recording_moved", done)
+        return True
+
+    def _stays(self) -> str:
+        """See to it that the file stands under its name; return what was done for it."""
+        try:
+            self.path, done = put_back(self.path, self._file.stream.fileno())
         except OSError as error:
             self._flushed = 0  # it stands under no name: nobody can read what is in it
-            self.fail(f"somebody has taken it away: {error.strerror}")
-        return kept
+            error.strerror = f"somebody has taken it away: {error.strerror}"
+            raise
+        return f"the recording {done}" if done else ""
 
-    def _begin_anew(self) -> None:
-        """Begin again in a file that somebody has emptied, as nothing in it can be read."""
+    def begin_anew(self) -> bool:
+        """Begin again if somebody has emptied the file, because nothing in it can be read.
+
+        Returns:
+            Whether that was so: then all samples since the last flush have to be written again.
+        """
+        # Before a flush: what it writes would hide that the file is shorter than it was.
+        try:
+            emptied = is_emptied(self._file.stream.fileno(), self._had_bytes)
+        except OSError:  # the next write tells
+            return False
+        if self._failed or not emptied:
+            return False
         assert self._run is not None
         lost = self._flushed
         self._start_anew(self._run)
@@ -162,38 +191,66 @@ class Recorder:
         self._flushed = self._had_bytes = 0
         text = f"somebody has emptied the recording: {lost} samples that were in it are lost"
         self._note("recording_emptied", text)
+        return True
 
     def _note(self, code: str, text: str) -> None:
-        event = Event(max(0, self._next_sample - 1), "error", code, text, time_ns=self._unix_ns())
         self.notes.append(text)
+        self._record("error", code, text)
+
+    def _record(self, level: str, code: str, text: str) -> None:
+        sample = max(0, self._next_sample - 1)
+        event = Event(sample, level, code, text, time_ns=self._unix_ns())
         self._write(partial(self._begun.event, event))
 
-    def finish(self, end: Mapping[str, str], ended_at: int) -> None:
-        """Write how the run ended, and close the file.
+    def finish(
+        self, end: Mapping[str, str], ended_at: int, patience_s: float = _PATIENCE_S
+    ) -> bool:
+        """Write how the run ended, bring the file to the disk, and close it.
 
         Args:
             end: Facts of the end, with ``code`` and ``reason``.
             ended_at: Index after the last sample.
+            patience_s: How long to retry while the disk refuses it.
+
+        Returns:
+            Whether the recording is complete and on the disk. Otherwise the file is as the last
+            flush left it.
         """
         self._next_sample = max(self._next_sample, ended_at)
         self.flush()  # it sees to a file that was taken away, for the last time
-        now_ns = self._unix_ns()
         level = "info" if end["code"] == "completed" else "error"
-        last = max(0, ended_at - 1)
+        now_ns = self._unix_ns()
         facts = {**end, **self._gathered.facts(), "ended": iso_time(now_ns)}
         facts[HEAT_FACT] = repr(self._heat.heat_a2)
-        event = Event(last, level, "run_ended", end["reason"], time_ns=now_ns)
+        event = Event(max(0, ended_at - 1), level, "run_ended", end["reason"], time_ns=now_ns)
         self._write(partial(self._begun.event, event))
         self._write(partial(self._begun.finish, facts, ended_at))
-        if self.error:
-            with suppress(OSError):  # the disk's refusal is known already
-                self._file.stream.close()
-        # Closing writes what is still buffered: a full disk may show only here.
-        self._write(self._file.stream.close)
+        until_s = time.monotonic() + patience_s
+        while not (closed := self._closed()) and not self._failed and time.monotonic() < until_s:
+            time.sleep(_RETRY_S)
+        if not closed:
+            self._file.stream.abandon()
+        return closed
+
+    def _closed(self) -> bool:
+        """Close the finished file; return whether all of it is there."""
+        if self._failed:
+            return False
+        try:
+            self._file.stream.flush()
+            self._stays()
+            self._file.stream.flush(sync=True)
+            sync_folder(self.path.parent)
+            self._file.stream.close()
+        except OSError as error:
+            self._problem = self._cannot(error.strerror)
+            return False
+        self._problem = ""
+        return True
 
     @property
     def samples(self) -> int:
-        """Samples written; where the file could not be written to its end, those flushed before."""
+        """Samples written; while the file cannot be written, those flushed before."""
         return self._flushed if self.error else self._begun.samples
 
     @property
@@ -203,7 +260,7 @@ class Recorder:
 
     @property
     def missing(self) -> int:
-        """Samples known to be missing: counted in the recording, or lost because it was cut."""
+        """Samples known to be missing: counted in the recording, or not written to it yet."""
         return self._next_sample - self._flushed if self.error else self._begun.missing
 
     @property
@@ -217,12 +274,8 @@ class Recorder:
         return self._figures
 
     def _write(self, write: Callable[[], None]) -> None:
-        if self.error:
-            return
-        try:
+        if not self._failed:
             write()
-        except OSError as error:
-            self.error = f"{self.path}: can't be written: {error.strerror}"
 
     def _facts(self, start_unix_ns: int, set_up: Mapping[str, str], waveform_at: int) -> RunFacts:
         loaded = self._checked.loaded

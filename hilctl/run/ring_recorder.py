@@ -1,7 +1,7 @@
 """From the ring into the recording, in a thread of its own: only it waits for the disk.
 
-Samples stay in the ring until the file has them. So a disk that stands still costs nothing as long
-as the ring has room, and nobody who watches over the coil waits for it.
+Samples stay in the ring until the file has them. So a disk that stands still or refuses a write
+costs nothing as long as the ring has room, and nobody who watches over the coil waits for it.
 """
 
 import threading
@@ -81,7 +81,7 @@ class RingRecorder:
         return not self._thread.is_alive()
 
     def stalled_s(self) -> float:
-        """Return for how long the ring has not been given room back."""
+        """Return for how long nothing in the ring has come to be safe in the file."""
         return time.monotonic() - self._released_s
 
     def _run(self) -> None:
@@ -98,12 +98,13 @@ class RingRecorder:
 
     def _work(self) -> None:
         self._drain()
-        if self.stalled_s() >= self._flush_s:
-            # Room is given back only once the file has what stood there.
-            if self.recorder.flush():
-                self._ring.release(keep=self._ring.slots // _KEPT)
-            else:
-                self._ring.take_again()
+        if self.stalled_s() < self._flush_s:
+            return
+        if self.recorder.begin_anew():
+            self._ring.take_again()
+        # Room is given back only once the file has what stood there.
+        elif self.recorder.flush():
+            self._ring.release(keep=self._ring.slots // _KEPT)
             self._released_s = time.monotonic()
 
     def _drain(self) -> bool:
@@ -133,7 +134,7 @@ class RingRecorder:
         outcome, page, recorder = self._outcome, self._ring.page, self.recorder
         assert outcome is not None
         self._drain_all()
-        if not recorder.flush():
+        if recorder.begin_anew():
             self._ring.take_again()
             self._drain_all()
         while self._ring.skip_damaged():  # no more will come: take what stands behind them

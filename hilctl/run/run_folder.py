@@ -110,14 +110,14 @@ class RunFolder:
         """Whether supervisor or loop lives."""
         return _is_locked(self.path / "run.lock")
 
+    def keep(self) -> None:
+        """Let the folder outlive its supervisor: a guardian is active, or the ring holds samples."""
+        (self.path / _KEPT).touch()
+
     @property
     def kept(self) -> bool:
-        """Whether a guardian drives the output to its safe value after the supervisor's end."""
+        """Whether the folder is to outlive its supervisor."""
         return (self.path / _KEPT).exists()
-
-    def keep(self) -> None:
-        """Keep it when the supervisor ends: its guardian is still active, and removes it."""
-        (self.path / _KEPT).touch()
 
     def remove(self) -> None:
         """Remove it and all that is in it."""
@@ -185,7 +185,7 @@ def runs() -> list[RunFolder]:
 def run_folder(
     experiment: str, recording: Path, started: float, holds: Sequence[str] = ()
 ) -> Iterator[tuple[RunFolder, list[int]]]:
-    """Make a run's folder and hold its locks; remove it in the end.
+    """Make a run's folder and hold its locks; remove it in the end unless it is to be kept.
 
     Yields:
         The folder, and descriptors of the locks that the loop is to inherit.
@@ -200,16 +200,20 @@ def run_folder(
             path = _new_folder(base / f"{experiment}-{number}")
             card = RunCard(path.name, experiment, recorded, number, started, tuple(holds))
             folder = RunFolder(path, card)
-            removal = stack.enter_context(ExitStack())
-            removal.callback(folder.remove)
+            stack.callback(_clear_away, folder)
             shared = stack.enter_context(_locked(path / "run.lock"))
             stack.enter_context(_locked(path / "supervisor.lock"))
             # Under the locks: a folder with a card and without locks is a dead run to others.
-            stack.callback(lambda: removal.pop_all() if folder.kept else removal.close())
+            stack.callback(_clear_away, folder)
             (path / _CARD).write_text(json.dumps(asdict(card)), encoding="utf-8")
         except OSError as error:
             raise RunError(f"{base}: no run's folder can be made: {error.strerror}") from None
         yield folder, [shared]
+
+
+def _clear_away(folder: RunFolder) -> None:
+    if not folder.kept:
+        folder.remove()
 
 
 def _new_folder(path: Path) -> Path:

@@ -114,13 +114,13 @@ class StartedRun:
             self._recording.end(self.outcome, lost_loop=result is not None and said is None)
 
     def _pass_stop_on(self, stop_signal: int) -> None:
-        page, recorder = self._page, self._recording.recorder
+        page = self._page
         must_record = self._config.recording.on_failure == "stop"
         if stop_signal:
             page.put(Field.STOP, STOPS[signal.Signals(stop_signal)])
         elif self.broke:
             page.put(Field.STOP, Stop.SUPERVISOR_BROKE)
-        elif recorder.error and must_record:
-            page.put(Field.STOP, Stop.RECORDER_FAILED)
         elif must_record and self._recording.stalled_s() > self._config.recording.ring_s / 2.0:
-            page.put(Field.STOP, Stop.RECORDER_STALLED)
+            # Not at the first error: until the ring is half full, nothing is lost by a retry.
+            failed = bool(self._recording.recorder.error)
+            page.put(Field.STOP, Stop.RECORDER_FAILED if failed else Stop.RECORDER_STALLED)

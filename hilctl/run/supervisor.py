@@ -116,9 +116,10 @@ class Supervisor:
             _go(ring.page, start_ns)
             self._attend(started, server, requests)
             ring.page.put(Field.RECORDED, int(not recorder.error))
-            if kept := safety.close(lambda: self._stop_signal != 0):
-                folder.keep()
-            return self._result(started, recorder, ring, kept=kept)
+            guarded = safety.close(lambda: self._stop_signal != 0)
+            if guarded or recorder.error:
+                folder.keep()  # its guardian is active, or recovery takes the rest from its ring
+            return self._result(started, recorder, ring, folder, guarded=guarded)
 
     def _start(
         self,
@@ -258,13 +259,23 @@ class Supervisor:
             raise RunError(f"{folder.ring}: no memory: {error.strerror}; {hint}") from None
 
     def _result(
-        self, started: StartedRun, recorder: Recorder, ring: SampleRing, *, kept: bool
+        self,
+        started: StartedRun,
+        recorder: Recorder,
+        ring: SampleRing,
+        folder: RunFolder,
+        *,
+        guarded: bool,
     ) -> RunResult:
         outcome = started.outcome
         assert outcome is not None
         requested = self._stop_signal == STOP_SIGNAL
         stop_signal = signal.SIGTERM if requested else self._stop_signal
-        cut = f"; {recorder.missing} samples are lost: {recorder.error}" if recorder.error else ""
+        cut = ""
+        if recorder.error:
+            cut = f"; {recorder.missing} samples are not in the recording: {recorder.error}; "
+            cut += f"what memory holds of them is kept in {folder.path}: once the disk accepts it, "
+            cut += "any hilctl command adds it"
         broke = f"; the supervisor broke: {started.broke}" if started.broke else ""
         moved = "".join(f"; {note}" for note in recorder.notes)
         unasked = outcome.code == "stopped" and not stop_signal
@@ -277,7 +288,7 @@ class Supervisor:
             code=code,
             reason=outcome.reason + broke + moved + cut,
             output_state=outcome.output,
-            guardian_active=kept,
+            guardian_active=guarded,
             stop_signal=stop_signal if code == "stopped" else 0,
             samples=recorder.samples,
             missing=recorder.missing,

@@ -171,9 +171,12 @@ def _run(checked: Checked, recorder: Recorder) -> tuple[Outcome, Lateness]:
         paced=False,
         heat_a2=checked.heat_a2,
     )
-    host = BatchHost(
-        plan, on_batch=recorder.batch, on_event=recorder.event, stop=lambda: recorder.error
-    )
+
+    def refused() -> str:
+        """Return why the file cannot be written, retried once, or an empty text."""
+        return recorder.error if recorder.error and not recorder.flush() else ""
+
+    host = BatchHost(plan, on_batch=recorder.batch, on_event=recorder.event, stop=refused)
     try:
         loop, waveform_at = _opened(plan, loaded.device, host, loaded.config.safe.at_start)
         recorder.begin(time.time_ns(), {"paced": "false"}, waveform_at)

@@ -14,6 +14,8 @@ import yaml
 
 from hilctl.analysis.replay import replay
 from hilctl.recording.reader import read
+from hilctl.run.dead_runs import finish_dead_runs
+from hilctl.run.run_folder import runs
 
 RATE_HZ = 5000
 SECONDS = 4.0
@@ -35,31 +37,39 @@ EXPERIMENT = {
     "limits": {"peak_current_a": 5.0, "slew_a_per_s": 1000.0, "stroke_um": [-60.0, 60.0]},
     "safe": {"value": 0.0, "ramp_s": 0.2},
 }
-SLOW = """
-import sys, time
-from hilctl.run import recorder
+FAULTY = """
+import os, sys, time
+from io import FileIO
+from hilctl.recording import writer
 from hilctl import cli
 
-class SlowFile(recorder.OutputFile):
-    '''A file on a disk that stands still once for as long as it is told, at its second MB or so.'''
+class Faulty(FileIO):
+    '''A file on a disk with one fault, once it holds some bytes.'''
 
-    def begin(self):
-        stream, self.stalled = super().begin(), False
-        write = stream.write
-        def slow(data):
-            if not self.stalled and stream.tell() > {at_bytes}:
-                self.stalled = True
-                time.sleep({stall_s})
-            return write(data)
-        class Slow:
-            def __getattr__(self, name):
-                return slow if name == "write" else getattr(stream, name)
-        return Slow()
+    due = True
 
-recorder.OutputFile = SlowFile
+    def write(self, data):
+        if self.due and self.tell() > {at_bytes}:
+            self.due = False
+            {fault}
+        return super().write(data)
+
+class Pending(writer.PendingFile):
+    def __init__(self, raw, **options):
+        super().__init__(Faulty(os.dup(raw.fileno()), "wb"), **options)
+
+writer.PendingFile = Pending
 sys.argv = ["hilctl", *sys.argv[1:]]
 sys.exit(cli.main())
 """
+EIO = FAULTY.format(at_bytes=100_000, fault="raise OSError(5, 'Input/output error')")
+
+
+def stall(seconds: float) -> str:
+    """Return a program whose disk stands still once for so long."""
+    return FAULTY.format(at_bytes=200_000, fault=f"time.sleep({seconds})")
+
+
 OTHER_CLOCK = """
 import datetime, os, time
 from pathlib import Path
@@ -111,14 +121,50 @@ def await_size(process, output: Path, size: int = 100_000) -> None:
         time.sleep(0.02)
 
 
+def limit_files(process, size: int) -> None:
+    """Let no file of a process grow beyond ``size`` bytes."""
+    resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (size, resource.RLIM_INFINITY))
+
+
+def assert_whole(recording, printed) -> None:
+    """Every sample is in the recording, once, and replays bit for bit."""
+    index = recording.samples.index
+    assert np.array_equal(index, np.arange(index.size))
+    assert (recording.dropped, printed["dropped"]) == (0, 0)
+    assert printed["recorded_samples"] == index.size
+    assert replay(recording).identical
+
+
+@pytest.mark.parametrize("on_failure", ["stop", "go_on"])
+def test_one_refused_write_loses_nothing(tmp_path, on_failure):
+    printed = end(start(tmp_path, code=EIO, on_failure=on_failure), 0)
+    assert printed["reason"] == "waveform completed"
+    recording = read(tmp_path / "run.mcap")
+    assert_whole(recording, printed)
+    assert recording.samples.index.size >= round(SECONDS * RATE_HZ)
+    assert [each.code for each in recording.events] == ["recording_retried", "run_ended"]
+
+
+@pytest.mark.parametrize("on_failure", ["stop", "go_on"])
+def test_disk_that_is_full_for_a_while_loses_nothing(tmp_path, on_failure):
+    process = start(tmp_path, on_failure=on_failure, ring_s=8.0)
+    await_size(process, tmp_path / "run.mcap")
+    limit_files(process, 200_000)
+    time.sleep(1.0)
+    limit_files(process, resource.RLIM_INFINITY)
+    printed = end(process, 0)
+    assert printed["reason"] == "waveform completed"
+    assert_whole(read(tmp_path / "run.mcap"), printed)
+
+
 @pytest.mark.parametrize(
     ("on_failure", "whole"), [("stop", False), ("go_on", True)], ids=["stop", "go_on"]
 )
-def test_full_disk(tmp_path, on_failure, whole):
-    """The run ramps down, or goes on to its end; every sample is in the file or counted as lost."""
-    process = start(tmp_path, on_failure=on_failure, ring_s=4.0)
+def test_disk_that_stays_full(tmp_path, on_failure, whole):
+    """The run ramps down, or goes on to its end; the next command adds what the file lacks."""
+    process = start(tmp_path, on_failure=on_failure, ring_s=5.0 if whole else 3.0)
     await_size(process, tmp_path / "run.mcap")
-    resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (300_000, 300_000))
+    limit_files(process, 200_000)
     printed = end(process, 3)
     assert printed["code"] == "fault"
     assert printed["output_safe"]
@@ -126,17 +172,22 @@ def test_full_disk(tmp_path, on_failure, whole):
     assert printed["reason"].startswith("waveform completed") == whole
     recorded = read(tmp_path / "run.mcap").samples.index
     assert np.array_equal(recorded, np.arange(recorded.size))
-    # Of the chunk that was cut by the full disk a reader may save some more.
     assert recorded.size >= printed["recorded_samples"] > 1000
-    assert f"; {printed['dropped']} samples are lost: " in printed["reason"]
     total = printed["recorded_samples"] + printed["dropped"]
     waveform = round(SECONDS * RATE_HZ)
     assert (waveform <= total <= waveform + RAMP_SAMPLES) if whole else total < waveform
+    (left,) = runs()
+    assert str(left.path) in printed["reason"]
+    finish_dead_runs()
+    recording = read(tmp_path / "run.mcap")
+    assert_whole(recording, {"dropped": 0, "recorded_samples": total})
+    assert recording.end["code"] == ("completed" if whole else "stopped")
+    assert not runs()
 
 
 def test_disk_that_stands_still_longer_than_the_ring_ends_the_run(tmp_path):
     """The loop ramps down before there is no room left: nothing is lost."""
-    process = start(tmp_path, code=SLOW.format(at_bytes=200_000, stall_s=2.0), on_failure="stop")
+    process = start(tmp_path, code=stall(2.0), on_failure="stop")
     printed = end(process, 3)
     assert printed["reason"] == "stopped because the disk keeps the recording waiting"
     assert printed["output_safe"]
@@ -149,7 +200,7 @@ def test_disk_that_stands_still_longer_than_the_ring_ends_the_run(tmp_path):
 
 def test_run_that_goes_on_counts_what_a_slow_disk_lost(tmp_path):
     """The ring keeps a second, the rest is gone: the numbers say how much, and the file where."""
-    process = start(tmp_path, code=SLOW.format(at_bytes=200_000, stall_s=2.5), on_failure="go_on")
+    process = start(tmp_path, code=stall(2.5), on_failure="go_on")
     printed = end(process, 0)
     assert printed["reason"] == "waveform completed"
     recording = read(tmp_path / "run.mcap")
@@ -164,12 +215,12 @@ def test_run_that_goes_on_counts_what_a_slow_disk_lost(tmp_path):
     assert replay(recording).identical
 
 
-def test_short_stall_loses_nothing(tmp_path):
+@pytest.mark.parametrize(("seconds", "ring_s"), [(0.3, 4.0), (3.0, 10.0)])
+def test_stall_that_the_ring_bridges_loses_nothing(tmp_path, seconds, ring_s):
     """What the ring can take is no fault."""
-    process = start(tmp_path, code=SLOW.format(at_bytes=200_000, stall_s=0.3), ring_s=4.0)
-    printed = end(process, 0)
-    assert (printed["dropped"], printed["reason"]) == (0, "waveform completed")
-    assert replay(read(tmp_path / "run.mcap")).identical
+    printed = end(start(tmp_path, code=stall(seconds), ring_s=ring_s), 0)
+    assert printed["reason"] == "waveform completed"
+    assert_whole(read(tmp_path / "run.mcap"), printed)
 
 
 def test_wall_clock_that_is_set_changes_nothing(tmp_path):

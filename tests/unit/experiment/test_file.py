@@ -56,6 +56,7 @@ timing:
 recording:
   folder: runs
   flush_s: 0.5
+  sync: true
   scope_rate_hz: 500.0
   ring_s: 20.0
   on_failure: go_on
@@ -139,6 +140,7 @@ class TestAccepted:
         assert config.recording.model_dump() == {
             "folder": "runs",
             "flush_s": 0.5,
+            "sync": True,
             "scope_rate_hz": 500.0,
             "ring_s": 20.0,
             "on_failure": "go_on",
@@ -173,6 +175,7 @@ class TestAccepted:
         assert config.recording.model_dump() == {
             "folder": "recordings",
             "flush_s": 2.0,
+            "sync": False,
             "scope_rate_hz": 1000.0,
             "ring_s": 10.0,
             "on_failure": "stop",

@@ -1,12 +1,14 @@
 """What is written can be read by what it is said to be."""
 
+import errno
 import os
 
 import pytest
 
 from hilctl.base.events import Event
 from hilctl.recording.reader import read
-from hilctl.recording.writer import OutputFile
+from hilctl.recording.writer import OutputFile, PendingFile
+from tests.fakes import FailingFile
 
 
 @pytest.fixture
@@ -58,6 +60,116 @@ class FullDisk:
 
     def close(self):
         raise OSError(28, "No space left on device")
+
+
+@pytest.fixture
+def pending(tmp_path):
+    """A file that keeps what it could not write, and the disk below it."""
+    path = tmp_path / "run.mcap"
+    path.touch()
+    with FailingFile(path) as disk:
+        yield PendingFile(disk), disk, path
+
+
+@pytest.mark.parametrize("number", [errno.EIO, errno.ENOSPC])
+def test_a_write_that_fails_is_written_by_the_next_flush(pending, number):
+    file, disk, path = pending
+    file.write(b"first")
+    file.flush()
+    disk.write_errors = [number]
+    file.write(b"second")
+    with pytest.raises(OSError, match=os.strerror(number)):
+        file.flush()
+    assert file.problem == os.strerror(number)
+    file.write(b"third")
+    assert file.tell() == 16
+    file.flush()
+    assert (file.problem, path.read_bytes()) == ("", b"firstsecondthird")
+
+
+def test_half_a_write_is_written_again_from_its_first_byte(pending):
+    file, disk, path = pending
+    file.write(b"first")
+    file.flush()
+    disk.room = 8
+    file.write(memoryview(b"second"))
+    with pytest.raises(OSError, match="No space left"):
+        file.flush()
+    assert path.read_bytes() == b"firstsec"
+    disk.room = 100
+    file.flush()
+    assert path.read_bytes() == b"firstsecond"
+
+
+def test_what_is_abandoned_is_as_the_last_flush_left_it(pending):
+    file, disk, path = pending
+    file.write(b"first")
+    file.flush()
+    disk.room = 8
+    file.write(b"second")
+    with pytest.raises(OSError, match="No space left"):
+        file.flush()
+    file.abandon()
+    assert path.read_bytes() == b"first"
+    assert disk.closed
+
+
+class LossyDisk:
+    """``os.fsync`` of a disk that loses, once, what it was not yet asked to keep."""
+
+    def __init__(self, path):
+        self.path, self.kept, self.fails = path, 0, False
+
+    def __call__(self, descriptor):
+        if self.fails:
+            self.fails = False
+            with self.path.open("r+b") as stream:
+                stream.seek(self.kept)
+                stream.write(bytes(self.path.stat().st_size - self.kept))
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        self.kept = self.path.stat().st_size
+
+
+def test_bytes_that_a_failed_sync_lost_are_written_again(pending, monkeypatch):
+    file, disk, path = pending
+    file = PendingFile(disk, sync=True)
+    monkeypatch.setattr(os, "fsync", lossy := LossyDisk(path))
+    file.write(b"first")
+    file.flush()
+    lossy.fails = True
+    file.write(b"second")
+    with pytest.raises(OSError, match="not brought to the disk: Input/output error"):
+        file.flush()
+    assert path.read_bytes() == b"first" + bytes(6)
+    file.flush()
+    assert path.read_bytes() == b"firstsecond"
+    assert lossy.kept == 11
+
+
+def test_bytes_that_are_no_longer_in_memory_are_lost_for_good(pending, monkeypatch):
+    """The kernel reports it once: a later sync that succeeds must not hide it."""
+    file, _, path = pending
+    monkeypatch.setattr(os, "fsync", lossy := LossyDisk(path))
+    file.write(b"first")
+    file.flush()
+    file.write(b"second")
+    lossy.fails = True
+    for _ in range(2):
+        with pytest.raises(OSError, match="not brought to the disk"):
+            file.flush(sync=True)
+    assert "not brought to the disk" in file.problem
+
+
+def test_a_file_that_nobody_flushes_does_not_grow_in_memory(pending):
+    """And a refused write is no error of the writer above it, which has to stay whole."""
+    file, disk, path = pending
+    disk.write_errors = [errno.EIO]
+    file.write(bytes(2 << 20))
+    assert file.problem
+    assert path.stat().st_size == 0
+    file.write(b"more")
+    assert not file.problem
+    assert path.stat().st_size == file.tell() == (2 << 20) + 4
 
 
 def test_a_claimed_file_is_given_back_on_a_full_disk_too(tmp_path):

@@ -16,6 +16,6 @@ def test_what_was_done_is_logged(monkeypatch, caplog):
     monkeypatch.setattr("hilctl.run.run_folder.runs", lambda: [SimpleNamespace(alive=False)])
     finish_dead_runs()
     assert caplog.messages == [
-        "sine-7 had died: supervisor and loop died",
+        "sine-7 was not recorded to its end: supervisor and loop died",
         "recovered into a.mcap",
     ]

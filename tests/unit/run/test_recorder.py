@@ -1,43 +1,27 @@
-"""The recorder of a run whose file can't be written to its end: every sample is counted once."""
+"""The recorder of a run whose disk refuses writes: every sample is recorded or counted, once."""
 
-import io
+import errno
+import os
 import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.writer import MCAP0_MAGIC
 
 from hilctl.base.errors import InputError
+from hilctl.base.events import Event
 from hilctl.base.samples import Batch, Head
 from hilctl.recording.reader import read
+from hilctl.recording.writer import OutputFile, PendingFile
 from hilctl.run import recorder
 from hilctl.run.recorder import Recorder, Tail, steady_unix_ns
 from hilctl.run.start import checked_experiment
+from tests.fakes import FailingFile
 
 EXPERIMENT = Path(__file__).parents[3] / "configs" / "demo.yaml"
 BLOCK = 10
 END = {"code": "completed", "reason": "waveform completed"}
-
-
-class Disk(io.BytesIO):
-    """A file in memory that refuses to grow beyond ``room`` bytes."""
-
-    room = 10**9
-
-    def write(self, data: bytes) -> int:
-        if self.tell() + len(data) > self.room:
-            raise OSError(28, "No space left on device")
-        return super().write(data)
-
-
-class DiskFile:
-    """What the recorder takes for its file."""
-
-    def __init__(self) -> None:
-        self.stream = Disk()
-
-    def begin(self) -> Disk:
-        return self.stream
 
 
 def batch(first: int, blocks: int, dropped: int = 0) -> Batch:
@@ -58,33 +42,116 @@ def checked():
 
 @pytest.fixture
 def begun(checked, monkeypatch, tmp_path):
-    """Return a recorder that has begun, and the disk that it writes to."""
-    file = DiskFile()
-    monkeypatch.setattr(recorder, "OutputFile", lambda path, overwrite: file)
-    monkeypatch.setattr(recorder, "is_emptied", lambda stream, had_bytes: False)
-    monkeypatch.setattr(recorder, "put_back", lambda path, stream: (path, ""))
+    """A recorder that has begun, and the disk that it writes to."""
+    disks = []
+
+    class Output(OutputFile):
+        def __init__(self, path, **options):
+            super().__init__(path, **options)
+            self.stream.close()
+            disks.append(FailingFile(path))
+            self.stream = PendingFile(disks[-1])
+
+    monkeypatch.setattr(recorder, "OutputFile", Output)
     made = Recorder(checked, tmp_path / "run.mcap", overwrite=False)
     made.begin(10**18, {})
-    return made, file.stream
+    yield made, disks[0]
+    disks[0].close()
 
 
-def test_what_was_not_flushed_is_lost_with_the_rest(begun, tmp_path):
-    """The chunk that did not fit and all that comes after it are missing; the rest is read."""
+@pytest.mark.parametrize("number", [errno.EIO, errno.ENOSPC])
+def test_a_refused_write_loses_neither_samples_nor_events(begun, number):
+    made, disk = begun
+    made.batch(batch(0, 20))
+    assert made.flush()
+    disk.write_errors = [number]
+    made.batch(batch(200, 20))
+    made.event(Event(399, "error", "stroke", "beyond its limit"))
+    assert not made.flush()
+    assert os.strerror(number) in made.error
+    assert (made.samples, made.missing, made.next_sample) == (200, 200, 400)
+    made.batch(batch(400, 20))
+    assert made.flush()
+    assert (made.error, made.samples, made.missing) == ("", 600, 0)
+    assert made.finish(END, 600)
+    recording = read(made.path)
+    assert np.array_equal(recording.samples.index, np.arange(600))
+    assert [each.code for each in recording.events] == ["stroke", "recording_retried", "run_ended"]
+    assert recording.dropped == 0
+
+
+def test_a_disk_that_has_room_again_at_the_very_end_gets_all(begun, monkeypatch):
+    """The last writes are retried until the disk accepts them."""
     made, disk = begun
     made.batch(batch(0, 20))
     made.flush()
-    content = disk.getvalue()
+    disk.room = disk.tell() + 100
+    monkeypatch.setattr(recorder.time, "sleep", lambda _: setattr(disk, "room", 10**9))
+    made.batch(batch(200, 20))
+    assert made.finish(END, 400)
+    assert (made.error, made.samples, made.missing) == ("", 400, 0)
+    recording = read(made.path)
+    assert recording.samples.index.size == 400
+    assert recording.end["code"] == "completed"
+
+
+def test_a_disk_that_stays_full_leaves_the_file_as_the_last_flush_did(begun):
+    """Without half a chunk: what is not in it is still in the ring."""
+    made, disk = begun
+    made.batch(batch(0, 20))
+    made.flush()
+    size = made.path.stat().st_size
     disk.room = disk.tell() + 100
     made.batch(batch(200, 20))
-    assert (made.samples, made.missing, made.error) == (400, 0, "")
+    assert not made.flush()
+    assert made.path.stat().st_size == size + 100
+    assert not made.finish(END, 450, patience_s=0.0)
+    assert "No space left on device" in made.error
+    assert (made.samples, made.missing, made.next_sample) == (200, 250, 450)
+    assert made.path.stat().st_size == size
+    assert read(made.path).samples.index.size == 200
+
+
+def test_a_recording_counts_as_complete_once_it_is_on_the_disk(begun, monkeypatch):
+    """The whole file, and the folder with its name."""
+    made, _ = begun
+    synced = []
+
+    def fsync(descriptor):
+        path = Path(f"/proc/self/fd/{descriptor}").readlink()
+        synced.append((path, made.path.read_bytes().endswith(MCAP0_MAGIC)))
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    made.batch(batch(0, 20))
     made.flush()
-    assert "can't be written: No space left on device" in made.error
-    assert (made.samples, made.missing, made.next_sample) == (200, 200, 400)
-    made.batch(batch(450, 5, dropped=50))
-    assert (made.samples, made.missing, made.next_sample) == (200, 300, 500)
-    made.finish(END, 500)
-    (tmp_path / "cut.mcap").write_bytes(content)
-    assert read(tmp_path / "cut.mcap").samples.index.size == made.samples
+    assert synced == []
+    assert made.finish(END, 200)
+    assert synced == [(made.path, True), (made.path.parent, True)]
+
+
+def test_a_disk_that_can_not_keep_the_recording_is_an_error(begun, monkeypatch):
+    made, _ = begun
+
+    def fsync(descriptor):
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    made.batch(batch(0, 20))
+    made.flush()
+    assert not made.finish(END, 200, patience_s=0.0)
+    assert "not brought to the disk: Input/output error" in made.error
+
+
+def test_a_bug_ends_the_recording_as_it_was_flushed(begun):
+    made, _ = begun
+    made.batch(batch(0, 20))
+    made.flush()
+    made.batch(batch(200, 20))
+    made.fail("ZeroDivisionError: a bug")
+    assert not made.flush()
+    assert not made.finish(END, 400)
+    assert (made.samples, made.missing) == (200, 200)
+    assert read(made.path).samples.index.size == 200
 
 
 def test_gaps_are_counted_while_all_is_well(begun):
@@ -94,17 +161,6 @@ def test_gaps_are_counted_while_all_is_well(begun):
     made.batch(batch(50, 3, dropped=30))
     made.flush()
     assert (made.samples, made.missing, made.next_sample) == (50, 30, 80)
-
-
-def test_full_disk_at_the_very_end_is_told(begun):
-    """A recording without its end facts is an error, though every sample is in it."""
-    made, disk = begun
-    made.batch(batch(0, 20))
-    made.flush()
-    disk.room = disk.tell()
-    made.finish(END, 200)
-    assert "No space left" in made.error
-    assert (made.samples, made.missing) == (200, 0)
 
 
 def test_times_go_on_when_the_wall_clock_is_set(monkeypatch):
@@ -175,9 +231,10 @@ def test_a_recording_that_is_emptied_begins_anew(checked, tmp_path):
     made.begin(10**18, {})
     made.batch(batch(0, 20))
     assert made.flush()
+    assert not made.begin_anew()
     made.path.open("wb").close()
     made.batch(batch(200, 20))
-    assert not made.flush()
+    assert made.begin_anew()
     made.batch(batch(200, 20))
     assert made.flush()
     made.finish(END, 400)
@@ -204,10 +261,22 @@ def test_a_recording_that_can_not_be_put_back_is_an_error(on_a_disk):
     assert on_a_disk.flush()
     assert (on_a_disk.samples, on_a_disk.missing) == (200, 0)
     shutil.rmtree(on_a_disk.path.parent)
-    on_a_disk.flush()
-    on_a_disk.finish(END, 200)
+    assert not on_a_disk.flush()
+    assert not on_a_disk.finish(END, 200, patience_s=0.0)
     assert "somebody has taken it away: No such file or directory" in on_a_disk.error
     assert (on_a_disk.samples, on_a_disk.missing) == (0, 200)
+
+
+def test_a_folder_that_comes_back_gets_the_recording(on_a_disk):
+    """As that of a network drive does."""
+    on_a_disk.begin(10**18, {})
+    on_a_disk.batch(batch(0, 20))
+    shutil.rmtree(on_a_disk.path.parent)
+    assert not on_a_disk.flush()
+    on_a_disk.path.parent.mkdir()
+    assert on_a_disk.finish(END, 200)
+    assert read(on_a_disk.path).samples.index.size == 200
+    assert (on_a_disk.error, on_a_disk.missing) == ("", 0)
 
 
 def test_a_recording_that_is_taken_away_before_the_start_is_refused(on_a_disk):

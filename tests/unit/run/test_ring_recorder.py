@@ -22,7 +22,7 @@ class Recorder:
         self.firsts, self.events, self.finished, self.errors = [], [], None, []
         self.disk = threading.Event()
         self.disk.set()
-        self.emptied = self.broken = False
+        self.emptied = self.broken = self.refused = False
 
     @property
     def next_sample(self):
@@ -36,10 +36,13 @@ class Recorder:
     def event(self, event):
         self.events.append(event.code)
 
+    def begin_anew(self):
+        emptied, self.emptied = self.emptied, False
+        return emptied
+
     def flush(self):
         assert self.disk.wait(30.0)
-        kept, self.emptied = not self.emptied, False
-        return kept
+        return not self.refused
 
     def fail(self, why):
         self.errors.append(why)
@@ -108,6 +111,28 @@ def test_what_an_emptied_file_has_lost_is_written_once_more(ring, recording):
     recording._work()
     assert recording.recorder.firsts == [0, 1, 0, 1]
     assert ring.page.get(Field.TAIL) == 1
+
+
+def test_what_the_disk_refuses_stays_in_the_ring(ring, recording, monkeypatch):
+    """Written once all the same, and given room for as soon as the disk accepts it."""
+    now_s = 100.0
+    monkeypatch.setattr(module.time, "monotonic", lambda: now_s)
+    recording._released_s = now_s
+    recording.recorder.refused = True
+    ring.page.push_event(Event(0, "info", "of_the_loop", ""))
+    exchange(ring, 3)
+    recording._work()
+    now_s = 103.0
+    exchange(ring, 2)
+    recording._work()
+    assert ring.page.get(Field.TAIL) == ring.page.get(Field.EVENT_TAIL) == 0
+    assert recording.stalled_s() == 3.0
+    recording.recorder.refused = False
+    recording._work()
+    assert recording.recorder.firsts == [0, 1, 2, 3, 4]
+    assert recording.recorder.events == ["of_the_loop"]
+    assert (ring.page.get(Field.TAIL), ring.page.get(Field.EVENT_TAIL)) == (4, 1)
+    assert recording.stalled_s() == 0.0
 
 
 def test_events_of_both_sides_come_after_the_samples(ring, recording):

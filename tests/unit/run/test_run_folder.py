@@ -35,6 +35,17 @@ def test_run_is_seen_while_it_lives_and_gone_afterwards(tmp_path):
     assert list(base_folder().iterdir()) == []
 
 
+def test_a_folder_that_is_kept_is_a_dead_run_to_the_next_command(tmp_path):
+    with made(tmp_path) as (folder, _):
+        folder.keep()
+    assert runs() == [folder]
+    assert not folder.alive
+    with taken_over(folder) as ours:
+        assert ours
+    folder.remove()
+    assert runs() == []
+
+
 def test_dead_run_is_taken_over_once(tmp_path):
     """Of several who want to recover a run, one gets it; a living run nobody."""
     with made(tmp_path) as (folder, _), taken_over(folder) as ours:

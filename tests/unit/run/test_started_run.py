@@ -56,6 +56,10 @@ def test_the_heartbeat_is_written_and_the_loop_looked_at(run, monkeypatch):
     assert run.started.outcome is None
 
 
+def refuse(run):
+    run.recording.recorder.error, run.stalled = "full", 5.1
+
+
 def break_off(run):
     run.started.break_off(ZeroDivisionError("a bug"))
 
@@ -63,7 +67,7 @@ def break_off(run):
 @pytest.mark.parametrize(
     ("cause", "stop"),
     [
-        (lambda run: setattr(run.recording.recorder, "error", "full"), Stop.RECORDER_FAILED),
+        (refuse, Stop.RECORDER_FAILED),
         (lambda run: setattr(run, "stalled", 5.1), Stop.RECORDER_STALLED),
         (break_off, Stop.SUPERVISOR_BROKE),
     ],
@@ -74,6 +78,12 @@ def test_a_stop_is_passed_on(run, cause, stop):
     cause(run)
     run.started.attend(0)
     assert run.page.get(Field.STOP) == stop
+
+
+def test_a_write_that_is_refused_stops_nothing_while_the_ring_has_room(run):
+    run.recording.recorder.error, run.stalled = "full", 4.9
+    run.started.attend(0)
+    assert run.page.get(Field.STOP) == 0
 
 
 @pytest.mark.parametrize(

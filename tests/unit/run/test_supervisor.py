@@ -82,8 +82,9 @@ class Neighbours:
             "",
         )
         self.folder = SimpleNamespace(
-            ring=folder / "ring", socket=folder / "socket", keep=lambda: self.note("kept")
-        )
+            path=folder, ring=folder / "ring", socket=folder / "socket",
+            keep=lambda: self.note("folder kept"),
+        )  # fmt: skip
         self.said, self.resumed, self.kept = [], [], False
         for name, double in {
             "time": self.time,
@@ -262,7 +263,7 @@ def test_a_run_that_does_not_start_leaves_the_device_to_the_earlier_guardian(sta
 def test_the_folder_is_kept_for_a_guardian_that_is_still_active(stage):
     stage.kept = True
     assert stage.run().guardian_active
-    assert stage.log.index("kept") < stage.log.index("folder removed")
+    assert stage.log.index("folder kept") < stage.log.index("folder removed")
 
 
 def test_a_guardian_that_does_not_get_ready_is_not_waited_for(stage):
@@ -400,7 +401,6 @@ def wrong(stage, **changes):
 @pytest.mark.parametrize(
     ("changes", "code", "reason"),
     [
-        ({"error": "no room"}, "fault", "waveform completed; 5 samples are lost: no room"),
         ({"broke": "a bug"}, "fault", "waveform completed; the supervisor broke: a bug"),
         ({"notes": ["it was renamed"]}, "fault", "waveform completed; it was renamed"),
         ({"outcome": Outcome("stopped", "gone", 1, "confirmed", 0)}, "fault", "gone"),
@@ -413,6 +413,15 @@ def test_how_it_ended(stage, changes, code, reason):
     result = stage.run()
     assert (result.code, result.reason, result.stop_signal) == (code, reason, 0)
     assert result.safe == stage.outcome.safe
+
+
+def test_a_folder_whose_ring_holds_what_the_file_lacks_is_kept(stage):
+    stage.recorder.error = "no room"
+    result = stage.run()
+    assert result.code == "fault"
+    assert "no room" in result.reason
+    assert str(stage.folder.path) in result.reason
+    assert stage.log.index("folder kept") < stage.log.index("folder removed")
 
 
 @pytest.mark.parametrize(

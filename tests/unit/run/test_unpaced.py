@@ -1,5 +1,6 @@
 """A run as fast as it goes: blocks in whole batches, virtual time, and only on simulations."""
 
+import errno
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,11 +13,14 @@ from hilctl.analysis.report import summarize
 from hilctl.base.errors import InputError
 from hilctl.base.events import Event
 from hilctl.base.samples import Flag, Head
+from hilctl.recording import writer
 from hilctl.recording.facts import END_FIGURES
 from hilctl.recording.reader import read
+from hilctl.recording.writer import PendingFile
 from hilctl.run.assemble import assemble
 from hilctl.run.start import checked_experiment
 from hilctl.run.unpaced import BatchHost, SampleClock, run_in_memory, run_unpaced
+from tests.fakes import FailingFile
 
 UNCOMPENSATED = Path(__file__).parents[3] / "configs" / "terfenol_sine_6a_uncompensated.yaml"
 SHORT = ["waveform.duration_s=0.25", "waveform.frequency_hz=100"]
@@ -33,6 +37,29 @@ def test_time_passes_in_sleeps_only():
     clock.sleep_until_ns(500)
     clock.sleep_until_ns(200)
     assert clock.now_ns() == 500
+
+
+@pytest.mark.parametrize(("pending_bytes", "writes_before"), [(0, 12), (1 << 20, 1)])
+def test_a_refused_write_costs_nothing(tmp_path, monkeypatch, pending_bytes, writes_before):
+    """Whether it is refused during the run or at its end."""
+    disks = []
+
+    class Refused(PendingFile):
+        def __init__(self, raw, **options):
+            super().__init__(disk := FailingFile(raw.name), **options)
+            raw.close()
+            disk.write_errors = [None] * writes_before + [errno.EIO]
+            disks.append(disk)
+
+    monkeypatch.setattr(writer, "PendingFile", Refused)
+    monkeypatch.setattr(writer, "_MOST_PENDING_BYTES", pending_bytes)
+    checked = checked_experiment(UNCOMPENSATED, SHORT)
+    result = run_unpaced(checked, tmp_path / "run.mcap")
+    assert not disks[0].write_errors
+    assert (result.code, result.missing) == ("completed", 0)
+    recording = read(result.path)
+    assert recording.samples.index.size == result.samples > 0
+    assert recording.end["code"] == "completed"
 
 
 @pytest.mark.parametrize("latency", [0, 3])
