@@ -83,9 +83,9 @@ def main() -> None:
             _refuse(error)
         except KeyboardInterrupt:
             raise SystemExit(128 + signal.SIGINT) from None
-        except (OSError, MemoryError, ImportError, SystemError) as error:
+        except (OSError, EOFError, MemoryError, ImportError, SystemError) as error:
             print_origin()
-            _refuse(RunError(_machine_refused(error)))
+            _refuse(RunError(machine_refused(error)))
 
 
 @contextmanager
@@ -131,13 +131,15 @@ def quick(name: str, words: Sequence[str]) -> int:
     return list_recordings(words)
 
 
-def _machine_refused(error: Exception) -> str:
+def machine_refused(error: Exception) -> str:
     """Say what this machine could not give."""
     if isinstance(error, FileNotFoundError) and error.filename is None:
         return "the folder that it is started in has been deleted: change to another one"
     if isinstance(error, OSError):
         where = f"{error.filename}: " if error.filename is not None else ""
         return f"{where}{reason(error)}"
+    if isinstance(error, EOFError):
+        return f"data ended unexpectedly: {error}"
     if isinstance(error, MemoryError):
         return f"not enough memory{f': {error}' if str(error) else ''}"
     if isinstance(error, ModuleNotFoundError) and error.name in OF_LINUX:

@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from hilctl.base.errors import InputError
-from hilctl.cli import OF_LINUX, QUICK, quick
+from hilctl.base.errors import InputError, RunError
+from hilctl.cli import OF_LINUX, QUICK, machine_refused, quick
 
 
 class CommandEntry(NamedTuple):
@@ -163,6 +163,18 @@ class CommandTable(TyperGroup):
         """Return the name of the command that is called, the command, and its arguments."""
         name, line, rest = super().resolve_command(ctx, args)
         return name, line and load(line.name or ""), rest
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run the command.
+
+        Raises:
+            RunError: Data ended unexpectedly. typer would report that as Ctrl-D at a prompt, for
+                which a prompt itself raises ``typer.Abort``.
+        """
+        try:
+            return super().invoke(ctx)
+        except EOFError as error:
+            raise RunError(machine_refused(error)) from error
 
 
 class _Quick(TyperCommand):

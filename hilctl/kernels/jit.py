@@ -122,17 +122,26 @@ class _Kept(FunctionCache):
         What is compiled already needs only numba's runtime to be linked with, and the compiler does
         the rest where it comes to that.
         """
-        try:
-            guarded, load_kept = self._guard_against_spurious_io_errors, self._load_overload
-        except AttributeError:  # a numba that has it otherwise
-            return super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
-        rtsys.initialize(target_context)
-        with guarded():
-            kept = load_kept(sig, target_context)  # type: ignore[no-untyped-call]
-            if kept is None and _Elsewhere.compile is not None:
-                _Elsewhere.compile(self._py_func.__module__, self._py_func.__qualname__)
-                kept = load_kept(sig, target_context)  # type: ignore[no-untyped-call]
-            return kept
+        kept = self._read(sig, target_context)
+        if kept is None and _Elsewhere.compile is not None:
+            _Elsewhere.compile(self._py_func.__module__, self._py_func.__qualname__)
+            kept = self._read(sig, target_context)
+        return kept
+
+    def _read(self, sig: Any, target_context: Any) -> Any:
+        # A file that a power loss has cut raises anything at all. With an empty index instead of
+        # the damaged one the kernel is compiled again, and its files are replaced.
+        with suppress(Exception):
+            try:
+                guarded, load_kept = self._guard_against_spurious_io_errors, self._load_overload
+            except AttributeError:  # a numba that has it otherwise
+                return super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
+            rtsys.initialize(target_context)
+            with guarded():
+                return load_kept(sig, target_context)  # type: ignore[no-untyped-call]
+            return None
+        self.flush()  # type: ignore[no-untyped-call]
+        return None
 
 
 class _Kernel(CPUDispatcher):

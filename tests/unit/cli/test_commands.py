@@ -101,6 +101,21 @@ def test_memory_that_has_run_out_is_said_once(in_here, monkeypatch, error, remar
     assert sys.unraisablehook == heard.append
 
 
+@pytest.mark.parametrize("name", ["check", "report"])
+def test_data_that_end_unexpectedly_are_not_taken_for_ctrl_d(in_here, monkeypatch, name):
+    """Neither by typer nor as a traceback by the commands that go past it."""
+
+    def ended() -> None:
+        raise EOFError("Ran out of input")
+
+    monkeypatch.setattr("hilctl.cli.reading.read_recording", lambda *_: ended())
+    monkeypatch.setattr("hilctl.cli.running.check", ended)
+    code, _, stderr = in_here(name)
+    assert code == 3
+    assert stderr.startswith("hilctl: ")
+    assert "Ran out of input" in stderr
+
+
 def test_a_group_of_commands_runs_its_own(in_here):
     """``devices`` is one, with ``probe`` in it."""
     code, _, stderr = in_here("devices", "probe", "absent.yaml")

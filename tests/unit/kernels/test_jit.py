@@ -205,6 +205,36 @@ def test_compiled_where_the_working_folder_has_been_deleted(tmp_path, monkeypatc
         Path.cwd()
 
 
+def emptied(whole: bytes) -> bytes:
+    return b""
+
+
+def halved(whole: bytes) -> bytes:
+    return whole[: len(whole) // 2]
+
+
+def zeroed(whole: bytes) -> bytes:
+    return bytes(len(whole))
+
+
+def random_bytes(whole: bytes) -> bytes:
+    return np.random.default_rng(4).bytes(len(whole))
+
+
+@pytest.mark.parametrize("suffix", ["nbi", "nbc"])
+@pytest.mark.parametrize("damage", [emptied, halved, zeroed, random_bytes])
+def test_damaged_cache_file_is_replaced(in_memory, suffix, damage):
+    assert jit.kernel("float64(float64)")(double)(1.5) == 3.0
+    (file,) = in_memory.rglob(f"*.{suffix}")
+    file.write_bytes(damage(file.read_bytes()))
+    again = jit.kernel("float64(float64)")(double)
+    assert again(1.5) == 3.0
+    assert sum(again.stats.cache_misses.values()) == 1
+    repaired = jit.kernel("float64(float64)")(double)
+    assert repaired(1.5) == 3.0
+    assert sum(repaired.stats.cache_hits.values()) == 1
+
+
 def test_mistake_in_a_kernel_is_said(in_memory):
     """What has nothing to do with the cache is not passed over."""
     wrong = jit.kernel("float64(unicode_type)")(double)
