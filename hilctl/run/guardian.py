@@ -30,6 +30,7 @@ from hilctl.experiment.device import made_device
 from hilctl.machine.linux import LinuxProcess
 from hilctl.machine.realtime import be_quick
 from hilctl.run.hang_watch import HangWatch, SilenceLimits, is_stopped
+from hilctl.run.run_folder import keep_removed
 from hilctl.run.safe_action import SafeAction
 from hilctl.run.shared_page import SIZE, Field, GuardianPhase, PageText, Phase, SharedPage
 
@@ -149,6 +150,7 @@ def main(words: list[str]) -> int:
     """Guard one run; the exit code is 0 where the job could be read and the device made."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)  # it ends with the loop, and not before
+    supervisor = os.getppid()
     job = GuardianJob.from_json(Path(words[0]).read_text(encoding="utf-8"))
     page = _page(job.ring)
     try:
@@ -163,6 +165,8 @@ def main(words: list[str]) -> int:
     be_quick(job.priority, process)
     prepare = partial(be_quick, job.priority, process)
     Guardian(page, device, job, int(words[1]), prepare).watch()
+    if os.getppid() != supervisor:
+        keep_removed()
     return 0
 
 

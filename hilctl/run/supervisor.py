@@ -99,6 +99,8 @@ class Supervisor:
                 requests = Requests(self._checked, folder, ring.page, recording, worker)
                 server = stack.enter_context(ControlServer(folder.socket, requests.answer))
                 child = LoopChild(self._checked, folder, ring, locks + own, self._silence_s)
+                # Open to the end: watchers find it even if the folder is removed.
+                stack.enter_context(folder.description.open("rb"))
             except BaseException:
                 recorder.give_back()
                 raise

@@ -77,7 +77,10 @@ class Neighbours:
             begin=self.begin, give_back=lambda: self.note("given back"),
         )  # fmt: skip
         self.outcome, self.broke = Outcome("completed", "waveform completed", 100, True, 0), ""
-        self.folder = SimpleNamespace(ring=folder / "ring", socket=folder / "socket")
+        self.folder = SimpleNamespace(
+            ring=folder / "ring", socket=folder / "socket", description=folder / "description.json"
+        )
+        self.folder.description.touch()
         self.said = []
         for name, double in {
             "time": self.time,
