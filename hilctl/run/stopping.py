@@ -8,6 +8,8 @@ from hilctl.run.run_folder import RunFolder
 
 STOP_SIGNAL = signal.SIGUSR1
 """What a supervisor takes for ``hilctl stop``."""
+JOB_CONTROL = (signal.SIGTSTP, signal.SIGTTIN, signal.SIGTTOU)
+"""Signals by which a terminal suspends a process; a suspended supervisor would see no stop."""
 
 
 def request_stop(run: RunFolder) -> bool:
