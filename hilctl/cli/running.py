@@ -1,5 +1,6 @@
 """Commands about runs: start, check, safe; steering.py has those about runs that are going on."""
 
+import logging
 import signal
 import sys
 from collections.abc import Iterator
@@ -13,6 +14,8 @@ from hilctl.base.errors import HilctlError, InputError
 from hilctl.cli.compiling import compiling_shown
 from hilctl.cli.options import AsJson, ExperimentFile, LabelTexts, Overwrite, Settings, with_labels
 from hilctl.cli.output import finish_orphans, print_json
+
+_log = logging.getLogger(__name__)
 
 
 def run(
@@ -131,13 +134,21 @@ def _served(*, wanted: bool) -> Iterator[list[str]]:
 def _detach(
     experiment: Path, output: Path | None, settings: list[str], *, overwrite: bool, as_json: bool
 ) -> None:
+    from hilctl.machine.files import Machine
+    from hilctl.machine.logind import log_out
     from hilctl.run.detached import start_detached
     from hilctl.run.run_folder import facts_of
 
+    found = log_out(Machine())
+    if found.level != "ok":
+        _log.warning("a log-out %s: %s", found.text, found.remedy)
     flags = ["--overwrite"] if overwrite else []
     started = start_detached(experiment, settings, output, flags)
+    facts = {"recording": str(started.recording), "log": str(started.log)}
     if as_json:
-        print_json({**facts_of(started.run), "log": str(started.log)})
+        print_json({**(facts_of(started.run) if started.run else {}), **facts})
+    elif started.run is None:
+        print(f"the run has ended already; recording: {started.recording}; log: {started.log}")
     else:
         print(f"{started.run.card.name} runs; recording: {started.run.card.recording}")
         print("  hilctl status    hilctl set gain=0.5 --over 2    hilctl stop")

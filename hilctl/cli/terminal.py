@@ -91,8 +91,12 @@ class LineScreen:
 
 @contextmanager
 def taken_terminal() -> Iterator[TerminalScreen | LineScreen]:
-    """Take the terminal where there is one on both sides; else there are lines."""
-    if not (sys.stdin.isatty() and sys.stdout.isatty()) or os.environ.get("TERM") == "dumb":
+    """Take the terminal if input and output are one and it is not dumb; otherwise there are lines.
+
+    In the background (``hilctl run --watch &``) there are lines too: the keys are the shell's.
+    """
+    terminal = sys.stdin.isatty() and sys.stdout.isatty() and os.environ.get("TERM") != "dumb"
+    if not terminal or _in_background(sys.stdin.fileno()):
         yield LineScreen()
         return
     output = sys.stdout.styled if isinstance(sys.stdout, PlainStream) else sys.stdout
@@ -106,3 +110,10 @@ def taken_terminal() -> Iterator[TerminalScreen | LineScreen]:
         output.write(_LEAVE)
         output.flush()
         termios.tcsetattr(keyboard, termios.TCSADRAIN, before)
+
+
+def _in_background(keyboard: int) -> bool:
+    try:
+        return os.tcgetpgrp(keyboard) != os.getpgrp()
+    except OSError:  # a terminal without job control
+        return False

@@ -18,6 +18,7 @@ from hilctl.cli.watcher import Watcher
 from hilctl.desk.feed import RunFeed
 from hilctl.run.client import find_run
 from hilctl.run.run_folder import RunFolder, runs
+from hilctl.run.stopping import JOB_CONTROL
 
 _LOOK_S = 0.05
 _END_S = 2.0
@@ -74,7 +75,8 @@ def _wait(process: "subprocess.Popen[bytes]") -> None:
 def main() -> None:
     """Show the run of the supervisor whose number is the first argument, until it is over."""
     # Ctrl-C goes to all processes of a terminal: it is meant for the run, whose end is shown.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    for number in (signal.SIGINT, *JOB_CONTROL):  # and Ctrl-Z, which does not suspend the run
+        signal.signal(number, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, _exit)
     supervisor = int(sys.argv[1])
     with plain_streams():

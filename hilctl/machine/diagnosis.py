@@ -11,6 +11,7 @@ from hilctl.base.arrays import I64
 from hilctl.machine import findings, hardware
 from hilctl.machine.files import Finding, Machine
 from hilctl.machine.latency import Latency, measure
+from hilctl.machine.logind import log_out
 from hilctl.machine.settings import Realtime
 
 DEFAULT_RATE_HZ = 1000.0
@@ -92,6 +93,7 @@ def examine(machine: Machine, settings: Realtime, folder: Path) -> tuple[Finding
         hardware.latency_timers(machine),
         hardware.serial_ports(machine),
         hardware.disk_space(machine, folder),
+        log_out(machine),
     )
 
 

@@ -41,6 +41,16 @@ def carry_out(data: bytes, all_compiled: Callable[[], None]) -> int:
     """
     job = Job.from_bytes(data)
     ring = SampleRing(job.ring, at_once=True)
+    try:
+        return _carry_out(job, ring, all_compiled)
+    finally:
+        if os.getppid() != job.supervisor:
+            from hilctl.run.run_folder import keep_removed  # of no use to any other run
+
+            keep_removed()
+
+
+def _carry_out(job: Job, ring: SampleRing, all_compiled: Callable[[], None]) -> int:
     page = ring.page
     try:
         outcome = run_job(job, ring, job.parts(), all_compiled)

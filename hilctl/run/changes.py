@@ -94,7 +94,7 @@ class Changes:
         self, checked: Checked, folder: RunFolder, page: SharedPage, worker: WorksOut
     ) -> None:
         self.gain, self.offset, self._inverse_share = 1.0, 0.0, 1.0
-        self._checked, self._ring, self._page = checked, str(folder.ring), page
+        self._checked, self._folder, self._page = checked, folder, page
         self._worker = worker
         self._waiting: deque[RequestedChange] = deque()
         self._current: RequestedChange | None = None
@@ -168,7 +168,7 @@ class Changes:
     def _work_out(self, change: RequestedChange) -> None:
         rate_hz = self._checked.loaded.config.sample_rate_hz
         wanted = WantedChange(
-            ring=self._ring,
+            ring=str(self._folder.ring),
             gain=self.gain if change.gain is None else change.gain,
             offset=self.offset if change.offset is None else change.offset,
             inverse_share=_SHARES.get(change.inverse, self._inverse_share),

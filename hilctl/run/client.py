@@ -33,7 +33,7 @@ def find_run(name: str | None) -> RunFolder:
     """
     going = going_on()
     if name:  # never by chance: who ends a guardian says which one
-        going += [run for run in runs() if run.kept and run.alive and not run.supervised]
+        going += [run for run in runs() if not run.supervised and _guardian_status(run)]
     chosen = [run for run in going if run.card.name.startswith(name or "")]
     exact = [run for run in chosen if run.card.name == name]
     if len(exact or chosen) == 1:
@@ -53,25 +53,23 @@ def status_of(run: RunFolder) -> dict[str, Any]:
             return ask(run.socket, request("status"))
         except (RunError, InputError) as error:
             return {**facts_of(run), "state": "not answering", "error": str(error)}
-    if run.kept and run.alive:
-        return {**facts_of(run), "state": "setting the safe value", **_guardian_status(run)}
     state = "ramping down without its supervisor" if run.alive else "dead"
-    return {**facts_of(run), "state": state}
+    return {**facts_of(run), "state": state, **_guardian_status(run)}
 
 
 def _guardian_status(run: RunFolder) -> dict[str, Any]:
-    """Return how far the guardian of a run that has ended is."""
+    """Return how far the guardian of a run that has ended is; empty if it does not act."""
+    if not run.alive:
+        return {}
     # Imported here: a stop must not wait for numpy.
     from hilctl.loop.safe_output import describe
-    from hilctl.run.ring import SampleRing
+    from hilctl.run.ring import safe_result_of
 
-    try:
-        result = SampleRing(run.ring, look_only=True).page.safe_result()
-    except (OSError, ValueError):  # just being removed
-        result = None
+    result = safe_result_of(run)
     if result is None:
-        return {"output_state": "unknown", "error": ""}
-    return {"output_state": result.output, "error": describe(result.output, result.error)}
+        return {}
+    known = {"output_state": result.output, "error": describe(result.output, result.error)}
+    return {"state": "setting the safe value", **known}
 
 
 def stop_runs(

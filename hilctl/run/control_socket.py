@@ -20,6 +20,7 @@ from types import TracebackType
 from typing import Any, Protocol, Self
 
 from hilctl.base.errors import InputError, RunError
+from hilctl.base.private import private_folder
 from hilctl.run.protocol import MAX_BYTES, VERSION, VERSION_KEY
 
 _MAX_CLIENTS = 64
@@ -65,20 +66,9 @@ class ControlServer:
         self._answer = answer
         self._clock = clock
         self._clients: dict[int, _Client] = {}
+        self._path = path
         self._selector = selectors.DefaultSelector()
-        self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        # Not chmod after bind: for that moment others could connect.
-        before = os.umask(0o177)
-        try:
-            with _short(path) as short:
-                self._listener.bind(short)
-        except OSError as error:
-            self._listener.close()
-            raise RunError(f"{path}: can't listen: {error.strerror or error}") from None
-        finally:
-            os.umask(before)
-        self._listener.listen(_BACKLOG)
-        self._listener.setblocking(False)
+        self._listener = _listening(path)
         self._selector.register(self._listener, selectors.EVENT_READ)
 
     def __enter__(self) -> Self:
@@ -97,6 +87,8 @@ class ControlServer:
 
     def serve(self, timeout_s: float) -> None:
         """Wait for something to do, at most that long, and do it."""
+        if not self._path.exists():
+            self._listen_again()
         until = self._clock() + timeout_s
         while True:
             later = [each for each in self._clients.values() if each.later is not None]
@@ -114,6 +106,17 @@ class ControlServer:
                 self._drop(client)
             if now >= until:
                 return
+
+    def _listen_again(self) -> None:
+        """Listen at the same place after somebody has removed the socket or its folder."""
+        folder = self._path.parent
+        with suppress(OSError, RunError):  # if not now, perhaps the next time
+            private_folder(private_folder(folder.parent) / folder.name)
+            listener = _listening(self._path)
+            self._selector.unregister(self._listener)
+            self._listener.close()
+            self._listener = listener
+            self._selector.register(listener, selectors.EVENT_READ)
 
     def _accept(self) -> None:
         try:
@@ -196,6 +199,28 @@ class ControlServer:
         client.connection.close()
 
 
+def _listening(path: Path) -> socket.socket:
+    """Return a socket that listens at a path that only its owner may use.
+
+    Raises:
+        RunError: It can't.
+    """
+    listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    # Not chmod after bind: for that moment others could connect.
+    before = os.umask(0o177)
+    try:
+        with _short(path) as short:
+            listener.bind(short)
+    except OSError as error:
+        listener.close()
+        raise RunError(f"{path}: can't listen: {error.strerror or error}") from None
+    finally:
+        os.umask(before)
+    listener.listen(_BACKLOG)
+    listener.setblocking(False)
+    return listener
+
+
 @contextmanager
 def _short(path: Path) -> Iterator[str]:
     """Give a short name of a socket: the kernel takes no more than 107 bytes.
@@ -265,6 +290,8 @@ def _asked_once(path: Path, raw: bytes, timeout_s: float) -> bytes:
         connection.settimeout(timeout_s)
         with _short(path) as short:
             connection.connect(short)
+        if not _is_ours(connection):
+            raise PermissionError("another user's process listens there")
         with suppress(ConnectionResetError, BrokenPipeError):
             connection.sendall(raw)
             while not said.endswith(b"\n") and (data := connection.recv(_ANSWER_BYTES)):

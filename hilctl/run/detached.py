@@ -8,32 +8,37 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from hilctl.base.errors import InputError, RunError
+from hilctl.base.errors import HilctlError, InputError, RunError
 from hilctl.run.architecture import require_real_time_machine
+from hilctl.run.control_socket import ask
+from hilctl.run.protocol import request
 from hilctl.run.run_folder import RunFolder, runs
 from hilctl.run.start import checked_experiment, output_of
 
 _POLL_S = 0.05
+_ANSWER_S = 0.5
 _START_S = 180.0
 
 
 @dataclass(frozen=True, slots=True)
 class Detached:
-    """A run that goes on by itself.
+    """A run in the background.
 
     Attributes:
-        run: Its folder.
-        log: What it prints.
+        run: Its folder; None if it has ended already, as it should.
+        recording: Its recording.
+        log: Text that it prints.
     """
 
-    run: RunFolder
+    run: RunFolder | None
+    recording: Path
     log: Path
 
 
 def start_detached(
     experiment: Path, settings: Sequence[str], output: Path | None, flags: Sequence[str]
 ) -> Detached:
-    """Start a run in the background, and come back once it runs.
+    """Start a run in the background, and return once its loop is running.
 
     Args:
         experiment: Experiment file.
@@ -43,7 +48,7 @@ def start_detached(
 
     Raises:
         InputError: It can't be used; nothing has moved.
-        RunError: It ended before it ran; the text is what it said.
+        RunError: It did not start, or has failed; the text is its own error.
     """
     require_real_time_machine()
     checked = checked_experiment(experiment, settings)
@@ -63,7 +68,7 @@ def start_detached(
             )
     except OSError as error:
         raise InputError(f"{log}: can't be written: {error.strerror}") from None
-    return Detached(_await_running(process, log), log)
+    return Detached(_await_running(process, log), output, log)
 
 
 def free_log(output: Path) -> Path:
@@ -75,18 +80,27 @@ def free_log(output: Path) -> Path:
     return log
 
 
-def _await_running(process: "subprocess.Popen[bytes]", log: Path) -> RunFolder:
+def _await_running(process: "subprocess.Popen[bytes]", log: Path) -> RunFolder | None:
     deadline = time.monotonic() + _START_S
     while process.poll() is None:
         for run in runs():
-            if run.card.supervisor == process.pid and run.socket.exists():
+            if run.card.supervisor == process.pid and _has_started(run):
                 return run
         if time.monotonic() > deadline:
             process.terminate()
             raise RunError(f"the run did not start within {_START_S:g} s: see {log}")
         time.sleep(_POLL_S)
-    said = log.read_text(encoding="utf-8", errors="replace").strip()
     if process.returncode == 0:
-        raise RunError(f"the run was over at once: see {log}")
+        return None
+    said = log.read_text(encoding="utf-8", errors="replace").strip()
     text = said.replace("hilctl: ", "") or f"the run ended with exit code {process.returncode}"
     raise InputError(text) if process.returncode == 2 else RunError(text)
+
+
+def _has_started(run: RunFolder) -> bool:
+    try:
+        # The socket is there before the device is open; its answer only comes once the loop has.
+        state = ask(run.socket, request("status"), timeout_s=_ANSWER_S)["state"]
+    except HilctlError:
+        return False
+    return state not in {"starting", "ready"}

@@ -36,6 +36,7 @@ from hilctl.machine.linux import LinuxProcess
 from hilctl.machine.realtime import be_quick
 from hilctl.run.hang_watch import HangWatch, SilenceLimits, is_stopped
 from hilctl.run.ring import SampleRing
+from hilctl.run.run_folder import keep_removed
 from hilctl.run.safe_action import SafeAction
 from hilctl.run.shared_page import (
     Field,
@@ -244,19 +245,17 @@ def main(words: list[str]) -> int:
         done = act(page, device, goal, hung=False, prepare=prepare)
     else:
         done = Guardian(ring, device, job, int(words[1]), prepare).watch()
-    if done and not _is_running(job.supervisor):
-        # Nobody else is left to remove it; the recording was closed before the supervisor ended.
-        _discard(Path(words[0]).parent, page)
+    if os.getppid() != job.supervisor:
+        _leave_folder(Path(words[0]).parent, page)
     return 0 if done else 1
 
 
-def _is_running(process: int) -> bool:
-    return os.getppid() == process
-
-
-def _discard(folder: Path, page: SharedPage) -> None:
+def _leave_folder(folder: Path, page: SharedPage) -> None:
+    """Remove the run's folder if nothing is left to do, or see that it can be recovered."""
     if page.get(Field.RECORDED) and page.get(Field.GUARDIAN_PHASE) == GuardianPhase.DONE:
         shutil.rmtree(folder, ignore_errors=True)
+    else:
+        keep_removed()
 
 
 def _stay_in_memory(process: LinuxProcess) -> None:

@@ -15,7 +15,7 @@ from contextlib import suppress
 from hilctl.experiment.check import Checked
 from hilctl.run.guardian import GuardianJob
 from hilctl.run.hang_watch import SilenceLimits
-from hilctl.run.ring import SampleRing
+from hilctl.run.ring import SampleRing, safe_result_of
 from hilctl.run.run_folder import RunFolder, locked_run, runs
 from hilctl.run.shared_page import Field, GuardianPhase, PageText, SharedPage
 
@@ -178,7 +178,7 @@ class GuardianRelief:
 
     def __init__(self, holds: Sequence[str]) -> None:
         self.runs = [
-            run for run in runs() if run.kept and run.alive and set(holds) & set(run.card.holds)
+            run for run in runs() if set(holds) & set(run.card.holds) and safe_result_of(run)
         ]
         for run in self.runs:
             signal_guardian(run, signal.SIGKILL, _END_S)

@@ -28,8 +28,9 @@ import numpy.typing as npt
 from hilctl.base.arrays import F64, I64
 from hilctl.base.samples import ANSWERS, COLUMNS, LAST_SAMPLE, LONGEST_NS, Batch, Flag, Head
 from hilctl.loop.block import COMMAND, Block
+from hilctl.run.run_folder import RunFolder
 from hilctl.run.shared_page import SIZE as _PAGE_SIZE
-from hilctl.run.shared_page import Field, SharedPage
+from hilctl.run.shared_page import Field, SafeActionResult, SharedPage
 
 _LINE = 64
 # Plain numbers: looking up an enumeration's member takes longer than writing it.
@@ -385,3 +386,13 @@ def _sizes(slots: int, block: int, state_size: int) -> Sequence[int]:
 
 def _padded(size: int) -> int:
     return -(-size // _LINE) * _LINE
+
+
+def safe_result_of(run: RunFolder) -> SafeActionResult | None:
+    """Return how far the guardian of a run without a supervisor is; None if it does not act."""
+    if run.supervised or not run.alive:
+        return None
+    try:
+        return SampleRing(run.ring, look_only=True).page.safe_result()
+    except (OSError, ValueError):  # just being removed
+        return None

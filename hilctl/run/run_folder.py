@@ -1,23 +1,30 @@
-"""Runs on this machine: where each keeps its ring, who holds which device, and who has died.
+"""Runs on this machine: the folder of each, who holds which device, and which runs are dead.
 
-Each run has a folder in memory, owned by its user alone. Locks, not process numbers, say who lives:
-the kernel drops them with the process that held them. The loop inherits the run's and the device's
-locks, so that both stay held until the output is safe, whatever becomes of the supervisor.
+Each run has a folder in memory that only its user can use. A lock on the run's card, not a process
+number, says whether the run is alive: the kernel releases it with the last process that holds it.
+The loop and the guardian inherit it and the device's lock, so that both stay held until the output
+is safe, even if the supervisor dies.
 
-A device's lock is a name of an abstract Unix socket: it holds against every user of the machine
-(of one network namespace), and there is no file of it that one user could put in another's way.
+The folder may be removed in mid-run: systemd-logind does so when a user logs out (RemoveIPC). Its
+files stay open in the run's processes, and are found there.
+
+A device's lock is a file of the user's own, which no other user can lock. Beside it a name of an
+abstract Unix socket tells other users: anybody can bind it, so it only counts when this user or
+root has.
 """
 
-import errno
 import hashlib
 import json
+import logging
+import math
 import os
 import shutil
 import socket
 import struct
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
+from functools import cache
 from pathlib import Path
 from typing import Any, Self
 
@@ -25,15 +32,19 @@ from hilctl.base.errors import InputError, RunError
 from hilctl.base.locks import is_locked, take_lock
 from hilctl.base.private import private_folder, user_folders
 
+_log = logging.getLogger(__name__)
+
 _CARD = "run.json"
 _KEPT = "kept"
+_SUPERVISOR = "supervisor.lock"
+_REMOVED = " (deleted)"
 _PEER = struct.Struct("3i")  # process, user and group, as in unix(7)
-_REFUSED_ONES = 1000  # so many may ask a lock's socket who holds it
+_BACKLOG = 1000  # connections that ask who holds a device; they are never accepted
 
 
 @dataclass(frozen=True, slots=True)
 class RunCard:
-    """What a run says of itself to others.
+    """What other commands read of a run.
 
     Attributes:
         name: Its folder's name, unique among runs of a user.
@@ -53,9 +64,26 @@ class RunCard:
 
     @classmethod
     def from_json(cls, text: str) -> Self:
-        """Undo the JSON of the fields."""
-        fields = json.loads(text)
-        return cls(**{**fields, "holds": tuple(fields.get("holds", ()))})
+        """Return a card.
+
+        Raises:
+            ValueError: It is not one.
+        """
+        values = json.loads(text)
+        if not isinstance(values, dict):
+            raise ValueError("must be an object")  # noqa: TRY004, see Raises
+        values = {"holds": [], **values}
+        kinds = {"supervisor": int, "started": int | float, "holds": list}
+        for name in [each.name for each in fields(cls)]:
+            value, kind = values.get(name), kinds.get(name, str)
+            if not isinstance(value, kind) or isinstance(value, bool):
+                raise ValueError(f"{name} must not be {value!r}")  # noqa: TRY004, see Raises
+        if not (math.isfinite(values["started"]) and 0 < values["supervisor"] < 2**31):
+            raise ValueError("started or supervisor is out of range")
+        return cls(
+            **{each.name: values[each.name] for each in fields(cls)}
+            | {"holds": tuple(map(str, values["holds"]))}
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +101,7 @@ class RunFolder:
     @property
     def ring(self) -> Path:
         """File of the ring."""
-        return self.path / "ring"
+        return self._file("ring")
 
     @property
     def reference(self) -> Path:
@@ -87,8 +115,8 @@ class RunFolder:
 
     @property
     def description(self) -> Path:
-        """File of what the run says of itself to those who look on."""
-        return self.path / "description.json"
+        """File that describes the run to watchers."""
+        return self._file("description.json")
 
     @property
     def guardian_job(self) -> Path:
@@ -103,15 +131,15 @@ class RunFolder:
     @property
     def supervised(self) -> bool:
         """Whether the supervisor lives."""
-        return _is_locked(self.path / "supervisor.lock")
+        return _is_locked(self._file(_SUPERVISOR))
 
     @property
     def alive(self) -> bool:
         """Whether supervisor or loop lives."""
-        return _is_locked(self.path / "run.lock")
+        return _is_locked(self._file(_CARD))
 
     def keep(self) -> None:
-        """Let the folder outlive its supervisor: a guardian is active, or the ring holds samples."""
+        """Let the folder outlive its supervisor: for a guardian, or samples in the ring."""
         (self.path / _KEPT).touch()
 
     @property
@@ -121,9 +149,19 @@ class RunFolder:
 
     def remove(self) -> None:
         """Remove it and all that is in it."""
-        # The card first: whoever looks in between must not take what is left for a dead run.
+        # The card first: what is left must not be taken for a dead run. Emptied, it is not taken
+        # for the card of a run whose folder was removed by somebody else either.
+        with suppress(FileNotFoundError):
+            os.truncate(self.path / _CARD, 0)
         (self.path / _CARD).unlink(missing_ok=True)
         shutil.rmtree(self.path, ignore_errors=True)
+
+    def _file(self, name: str) -> Path:
+        """Return a file of the folder; if that was removed, a process of the run has it open."""
+        path = self.path / name
+        if path.exists() or (self.path / _CARD).exists():
+            return path
+        return _removed_files().get(path.resolve(), path)
 
 
 def base_folder() -> Path:
@@ -137,23 +175,27 @@ def base_folder() -> Path:
     return _base_folders(make=True)[0]
 
 
-def _base_folders(*, make: bool) -> list[Path]:
-    """Return the folders that runs of this user may be in; the first one made where there is none.
+def _places() -> list[Path]:
+    """Return where runs of this user may be.
 
-    All of them: where somebody takes the first place, or leaves it, running runs are found still.
+    All of them: if another user takes the first place, or leaves it, active runs are found still.
     """
-    found: list[Path] = []
-    problems: list[str] = []
     given = os.environ.get("HILCTL_RUNS")
     try:
-        places = [Path(given)] if given else user_folders()
+        return [Path(given)] if given else user_folders()
     except OSError as error:
         raise RunError(f"no folder for runs: {error.strerror}") from None
-    for place in places:
+
+
+def _base_folders(*, make: bool) -> list[Path]:
+    """Return those places that exist; the first one is made if it is missing."""
+    found: list[Path] = []
+    problems: list[str] = []
+    for place in _places():
         try:
             found.append(private_folder(place, make=make and not found))
         except OSError as error:
-            if make or _is_own(place):  # where somebody else's stands, no run of ours can be
+            if make or _is_own(place):  # a folder of another user holds no run of this one
                 problems.append(f"{place}: {error.strerror}")
     if problems and not found:
         hint = "remove it, or name another one by HILCTL_RUNS"
@@ -173,12 +215,70 @@ def runs() -> list[RunFolder]:
     Raises:
         RunError: The folder of this user's runs can't be trusted.
     """
+    cards: dict[Path, Path] = {}
+    for base in _base_folders(make=False):
+        cards |= {each / _CARD: each / _CARD for each in base.resolve().iterdir()}
+    bases = [base.resolve() for base in _places()]
+    for card, opened in _removed_files().items():
+        if card.name == _CARD and card.parent.parent in bases and not card.exists():
+            cards[card] = opened
     found = []
-    for folder in (each for base in _base_folders(make=False) for each in sorted(base.iterdir())):
-        with suppress(OSError, ValueError, TypeError):  # being made or removed at this moment
-            card = RunCard.from_json((folder / _CARD).read_text(encoding="utf-8"))
-            found.append(RunFolder(folder, card))
+    for path, readable in cards.items():
+        with suppress(OSError):  # being made or removed at this moment, or no run's folder
+            text = readable.read_text(encoding="utf-8", errors="replace")
+            try:
+                found.append(RunFolder(path.parent, RunCard.from_json(text)))
+            except ValueError as error:
+                _warn_once(path.parent.name, f"{path}: {error}")
     return sorted(found, key=lambda run: run.card.started)
+
+
+@cache
+def _warn_once(name: str, text: str) -> None:
+    _log.warning("%s; it is passed over: hilctl recover --dismiss %s removes it", text, name)
+
+
+def _removed_files(process: str = "[0-9]*") -> dict[Path, Path]:
+    """Return files of this user that were removed and that processes have open still.
+
+    Args:
+        process: Pattern of the processes' folders below ``/proc``.
+
+    Returns:
+        The name that each file had, and where it can be opened now.
+    """
+    found: dict[Path, Path] = {}
+    for opened in Path("/proc").glob(f"{process}/fd"):
+        with suppress(OSError):  # it has ended, or is not this user's
+            for link in opened.iterdir():
+                with suppress(OSError):
+                    name = str(link.readlink())
+                    if not name.endswith(_REMOVED):
+                        continue
+                    path, file = Path(name.removesuffix(_REMOVED)), link.stat()
+                    # Another user's process can have opened files of any name. A card that its
+                    # run has emptied is of a run that is over.
+                    if file.st_uid == os.geteuid() and (file.st_size or path.name != _CARD):
+                        found.setdefault(path, link)
+    return found
+
+
+def keep_removed() -> None:
+    """Leave the ring and card that this process has open in a new folder if theirs was removed.
+
+    For a process that outlives its supervisor: what it has is all that is left of the last samples,
+    and the next command recovers them from there.
+    """
+    own = _removed_files("self")
+    for card, opened in own.items():
+        folder = card.parent
+        if card.name == _CARD and folder / "ring" in own and not card.exists():
+            with suppress(OSError):  # there is no one left to report it to
+                private_folder(private_folder(folder.parent) / folder.name)
+                shutil.copyfile(own[folder / "ring"], folder / "ring")
+                shutil.copyfile(opened, folder / f"{_CARD}.new")
+                # Last: a folder with a card is a dead run, whose ring is whole.
+                (folder / f"{_CARD}.new").rename(card)
 
 
 @contextmanager
@@ -201,11 +301,13 @@ def run_folder(
             card = RunCard(path.name, experiment, recorded, number, started, tuple(holds))
             folder = RunFolder(path, card)
             stack.callback(_clear_away, folder)
-            shared = stack.enter_context(_locked(path / "run.lock"))
-            stack.enter_context(_locked(path / "supervisor.lock"))
-            # Under the locks: a folder with a card and without locks is a dead run to others.
+            unnamed = path / f"{_CARD}.new"
+            shared = stack.enter_context(_locked(unnamed))
+            stack.enter_context(_locked(path / _SUPERVISOR))
             stack.callback(_clear_away, folder)
-            (path / _CARD).write_text(json.dumps(asdict(card)), encoding="utf-8")
+            unnamed.write_text(json.dumps(asdict(card)), encoding="utf-8")
+            # Under the locks: a card without locks is a dead run to others.
+            unnamed.rename(path / _CARD)
         except OSError as error:
             raise RunError(f"{base}: no run's folder can be made: {error.strerror}") from None
         yield folder, [shared]
@@ -230,7 +332,9 @@ def _new_folder(path: Path) -> Path:
 
 @contextmanager
 def held_devices(holds: Sequence[str]) -> Iterator[list[int]]:
-    """Hold what a device holds alone, against every other run on this machine.
+    """Hold what a device holds alone, against every other run of this user and of root.
+
+    A run of any other user is only warned of: whatever can be read of it could be made up.
 
     Args:
         holds: Names, as :attr:`hilctl.base.device.DeviceInfo.holds`.
@@ -240,47 +344,70 @@ def held_devices(holds: Sequence[str]) -> Iterator[list[int]]:
 
     Raises:
         InputError: Another run holds one of them; the message names it.
-        RunError: The kernel refuses a lock.
+        RunError: A lock's file can't be made.
     """
     with ExitStack() as stack:
         # In one order for all: else two runs might each get one of two, and both be refused.
-        yield [stack.enter_context(_held(name)) for name in sorted(set(holds))]
+        names = sorted(set(holds))
+        yield [lock for name in names for lock in stack.enter_context(_held(name))]
 
 
 @contextmanager
-def _held(name: str) -> Iterator[int]:
-    try:
-        lock = socket.socket(socket.AF_UNIX)
-    except OSError as error:
-        raise RunError(f"{name}: can't be locked: {error.strerror}") from None
-    with lock:
+def _held(name: str) -> Iterator[list[int]]:
+    digest = hashlib.sha256(os.fsencode(name)).hexdigest()
+    address = b"\0hilctl/device/" + digest.encode()
+    with ExitStack() as stack:
+        folder = base_folder() / "devices"
         try:
-            lock.bind(_lock_address(name))
-            lock.listen(_REFUSED_ONES)
+            private_folder(folder)
+            locks = [stack.enter_context(_locked(folder / f"{digest}.lock"))]
+        except BlockingIOError:
+            holder = _holder(address)
+            raise _in_use(name, holder if _is_trusted(holder) else None) from None
         except OSError as error:
-            if error.errno != errno.EADDRINUSE:
-                raise RunError(f"{name}: can't be locked: {error.strerror}") from None
-            raise InputError(
-                f"{name} is in use by {_holder(name)}: wait for its end, or stop it first"
-            ) from None
-        yield lock.fileno()
+            raise RunError(f"{folder}: {name} can't be locked: {error.strerror}") from None
+        told = stack.enter_context(socket.socket(socket.AF_UNIX))
+        try:
+            told.bind(address)
+            told.listen(_BACKLOG)
+            locks.append(told.fileno())
+        except OSError:
+            holder = _holder(address)
+            if _is_trusted(holder):
+                raise _in_use(name, holder) from None
+            _log.warning(
+                "%s may be in use by %s as well: only one program must drive a device",
+                name,
+                _text_of(holder),
+            )
+        yield locks
 
 
-def _lock_address(name: str) -> bytes:
-    """Return the abstract address that stands for a name of any length."""
-    return b"\0hilctl/device/" + hashlib.sha256(os.fsencode(name)).hexdigest().encode()
-
-
-def _holder(name: str) -> str:
-    """Say who holds a lock, by what the kernel knows of its socket."""
+def _holder(address: bytes) -> tuple[int, int] | None:
+    """Return process and user that have bound an address; None if the kernel doesn't tell."""
     with socket.socket(socket.AF_UNIX) as asking:
         asking.setblocking(False)  # it never answers; the kernel does
         try:
-            asking.connect(_lock_address(name))
-            peer = asking.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _PEER.size)
-        except OSError:  # let go of at this moment, or asked for by too many
-            return "another run"
-    process, user, _ = _PEER.unpack(peer)
+            asking.connect(address)
+            raw = asking.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _PEER.size)
+        except OSError:  # released at this moment, not listening, or asked by too many
+            return None
+    process, user, _ = _PEER.unpack(raw)
+    return process, user
+
+
+def _is_trusted(holder: tuple[int, int] | None) -> bool:
+    return holder is not None and holder[1] in {0, os.geteuid()}
+
+
+def _in_use(name: str, holder: tuple[int, int] | None) -> InputError:
+    return InputError(f"{name} is in use by {_text_of(holder)}: wait for its end, or stop it first")
+
+
+def _text_of(holder: tuple[int, int] | None) -> str:
+    if holder is None:
+        return "another run"
+    process, user = holder
     for run in runs():
         if run.card.supervisor == process:
             return f"run {run.card.experiment} (process {process}, recording {run.card.recording})"
@@ -309,7 +436,7 @@ def locked_run(run: RunFolder) -> Iterator[int]:
     Raises:
         BlockingIOError: One of them lives.
     """
-    with _locked(run.path / "run.lock") as descriptor:
+    with _locked(run.path / _CARD) as descriptor:
         yield descriptor
 
 
@@ -321,7 +448,7 @@ def taken_over(run: RunFolder) -> Iterator[bool]:
         Whether it is held: False where one of them lives, or somebody else was first.
     """
     try:
-        descriptor = os.open(run.path / "run.lock", os.O_RDWR)
+        descriptor = os.open(run.path / _CARD, os.O_RDWR)
     except FileNotFoundError:
         yield False
         return

@@ -8,35 +8,38 @@ from hilctl.run.run_folder import RunFolder
 
 STOP_SIGNAL = signal.SIGUSR1
 """What a supervisor takes for ``hilctl stop``."""
+JOB_CONTROL = (signal.SIGTSTP, signal.SIGTTIN, signal.SIGTTOU)
+"""Signals by which a terminal suspends a process; a suspended supervisor would see no stop."""
 
 
 def request_stop(run: RunFolder) -> bool:
-    """Request a run to end by its safe ramp; return whether there was a supervisor to take it.
+    """Request a run to end by its safe ramp; return whether there was a process to take it.
 
-    The guardian of a run that has ended is ended at once.
+    A guardian that still acts after the end of a run is ended at once.
 
     Raises:
         RunError: The kernel refuses.
     """
-    if run.kept:
-        return _end_guardian(run)
     try:
         process = os.pidfd_open(run.card.supervisor)
         try:
             # After the process was opened: while its lock is held the number can't be another's.
-            if not run.supervised:
-                return False
-            signal.pidfd_send_signal(process, STOP_SIGNAL)
+            if run.supervised:
+                signal.pidfd_send_signal(process, STOP_SIGNAL)
+                return True
         finally:
             os.close(process)
     except ProcessLookupError:
-        return False
+        pass
     except OSError as error:
         raise RunError(f"{run.card.name}: can't be stopped: {error.strerror}") from None
-    return True
+    return _end_guardian(run)
 
 
 def _end_guardian(run: RunFolder) -> bool:
+    if not run.alive:
+        return False
+    # Imported here: a stop must not wait for numpy.
     from hilctl.run.guardian_process import signal_guardian
 
     return signal_guardian(run, signal.SIGTERM)

@@ -7,6 +7,7 @@ are seen to, whatever else goes wrong here.
 import json
 import logging
 import signal
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -33,7 +34,7 @@ from hilctl.run.run_folder import RunFolder, held_devices, run_folder
 from hilctl.run.safety import Safety, guardian_starter
 from hilctl.run.shared_page import Field, PageText, SharedPage
 from hilctl.run.started_run import STOPS, StartedRun
-from hilctl.run.stopping import STOP_SIGNAL
+from hilctl.run.stopping import JOB_CONTROL, STOP_SIGNAL
 from hilctl.run.systemd import Notifier
 
 _log = logging.getLogger(__name__)
@@ -42,6 +43,12 @@ _POLL_S = 0.01
 _START_DELAY_NS = 50_000_000
 _START_TRIES = 3
 _GUARDIAN_READY_S = 60.0
+
+
+def _stay(number: int, frame: FrameType | None) -> None:
+    """Say why Ctrl-Z does nothing, from another thread: the terminal may not take the text."""
+    text = "Ctrl-Z can't suspend a run: end it by Ctrl-C; run --detach leaves the terminal free"
+    threading.Thread(target=_log.warning, args=(text,), daemon=True).start()
 
 
 class Supervisor:
@@ -104,6 +111,8 @@ class Supervisor:
                 requests = Requests(self._checked, folder, ring.page, recording, worker)
                 server = stack.enter_context(ControlServer(folder.socket, requests.answer))
                 child = LoopChild(self._checked, folder, ring, locks + own, self._silence_s)
+                # Open to the end: watchers find it even if the folder is removed.
+                stack.enter_context(folder.description.open("rb"))
                 run = folder, ring, child, recording
                 safety, start_ns = self._start(stack, *run, locks + own, filling)
                 started = StartedRun(self._checked, ring, child, safety, recording)
@@ -237,7 +246,9 @@ class Supervisor:
 
         # Never the default, which would end a process that is asked to stop a moment too late.
         signal.signal(STOP_SIGNAL, signal.SIG_IGN)
-        before = {number: signal.signal(number, note) for number in STOPS}
+        handlers = dict.fromkeys(JOB_CONTROL, signal.SIG_IGN) | dict.fromkeys(STOPS, note)
+        handlers[signal.SIGTSTP] = _stay
+        before = {number: signal.signal(number, each) for number, each in handlers.items()}
         try:
             yield
         finally:

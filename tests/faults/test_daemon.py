@@ -275,6 +275,51 @@ def test_refused_experiment_is_told_at_once(tmp_path):
     assert sorted(each.name for each in tmp_path.iterdir()) == ["experiment.yaml"]
 
 
+def test_a_run_is_running_when_detach_returns(tmp_path):
+    start(tmp_path)
+    try:
+        assert hilctl("status")["runs"][0]["state"] == "running"
+    finally:
+        stop_all()
+
+
+def test_a_run_that_does_not_start_is_told_as_in_the_foreground(tmp_path):
+    """Here a device that nothing answers for: the same error and exit code, and no recording."""
+    with socket.socket() as closed:
+        closed.bind(("127.0.0.1", 0))
+        port = closed.getsockname()[1]
+    section = {
+        "kind": "modbus_dac",
+        "profile": "labjack_t7",
+        "host": "127.0.0.1",
+        "tcp_port": port,
+        "output": "DAC0",
+        "input": "AIN0",
+        "amplifier": {"gain_a_per_v": 4.0, "offset_a": -10.0},
+        "sensor": {"um_per_v": 12.5},
+        "watchdog": "none",
+    }
+    path = tmp_path / "experiment.yaml"
+    changes = {"device": section, "sample_rate_hz": 100, "block": 1}
+    path.write_text(yaml.safe_dump({**EXPERIMENT, **changes}), encoding="utf-8")
+    words = ["run", path, "--output", tmp_path / "run.mcap"]
+    foreground = hilctl(*words, code=3)
+    background = hilctl(*words, "--detach", code=3)
+    assert "connection refused" in foreground
+    assert background.splitlines()[-1] == foreground.splitlines()[-1]
+    assert not (tmp_path / "run.mcap").exists()
+    assert hilctl("status")["runs"] == []
+
+
+def test_a_short_run_may_be_over_when_detach_returns(tmp_path):
+    """It is no failure."""
+    waveform = {**EXPERIMENT["waveform"], "duration_s": 0.2, "soft_start_s": 0.0, "phase_deg": 0.0}
+    path = tmp_path / "experiment.yaml"
+    path.write_text(yaml.safe_dump({**EXPERIMENT, "waveform": waveform}), encoding="utf-8")
+    done = hilctl("run", path, "--output", tmp_path / "run.mcap", "--detach")
+    assert done["recording"] == str(tmp_path / "run.mcap")
+
+
 def test_without_a_run_there_is_nothing_to_stop():
     """Stop and set say so."""
     assert "no run is going on" in hilctl("stop", code=2)

@@ -2,9 +2,11 @@
 
 import json
 import os
+import signal
 import subprocess
 import sys
 import tempfile
+import time
 from pathlib import Path
 
 import pytest
@@ -70,16 +72,56 @@ def test_the_second_user_of_a_device_is_refused(neighbour, device, run):
 
 
 @pytest.mark.long  # the other user's kernels are compiled anew
-def test_root_does_not_take_a_device_from_a_user(neighbour, device, run):
-    """Who may do anything is refused as well: the lock is the kernel's, not a file's."""
+def test_root_is_warned_of_a_device_that_a_user_has(neighbour, device, run):
+    """It is not refused: any user could say that they have it."""
     theirs = neighbour.start()
     device.log.await_events("DAC0", 40, theirs)
-    said = run(device.section, **PATIENT).refused()
-    assert f" is in use by process {theirs.pid} of nobody: wait for its end" in said
-    assert len(said.splitlines()) == 1
-    device.log.await_events("DAC0", len(device.log.events("DAC0")) + 20, theirs)
+    mine = run(device.section, **PATIENT)
+    deadline = time.monotonic() + 240.0
+    while not mine.output.exists():  # it is claimed once the device is held
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
     theirs.terminate()
     out, err = theirs.communicate(timeout=240)
     assert "Traceback" not in err
     assert json.loads(out)["output_safe"]
     assert (neighbour.folder / "theirs.mcap").stat().st_uid != os.geteuid()
+    device.log.await_events("DAC0", len(device.log.events("DAC0")) + 20, mine.process)
+    mine.process.send_signal(signal.SIGINT)
+    _, err = mine.process.communicate(timeout=240)
+    assert f"may be in use by process {theirs.pid} of nobody" in err
+
+
+SQUATTER = """
+import hashlib, socket, sys
+taken = socket.socket(socket.AF_UNIX)
+taken.bind(b"\\0hilctl/device/" + hashlib.sha256(sys.argv[1].encode()).hexdigest().encode())
+taken.listen()
+print("taken", flush=True)
+input()
+"""
+
+
+def test_a_user_who_only_takes_the_name_keeps_nobody_out(nobody, device, run, tmp_path):
+    """Neither a run nor ``hilctl safe`` is refused."""
+    section = device.section
+    name = f"tcp:{section['host']}:{section['tcp_port']}"
+    squatter = subprocess.Popen(
+        [*nobody, sys.executable, "-c", SQUATTER, name],
+        cwd="/", stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    try:
+        assert squatter.stdout.readline() == "taken\n"
+        mine = run(section, **PATIENT)
+        device.log.await_events("DAC0", 40, mine.process)
+        words = [sys.executable, "-m", "hilctl", "safe", str(tmp_path / "run.yaml")]
+        refused = subprocess.run(words, capture_output=True, text=True, timeout=240)
+        assert refused.returncode == 2, refused.stderr  # by the run, whose lock is real
+        mine.process.send_signal(signal.SIGINT)
+        _, err = mine.process.communicate(timeout=240)
+        assert f"may be in use by process {squatter.pid} of nobody" in err
+        done = subprocess.run(words, capture_output=True, text=True, timeout=240)
+        assert done.returncode == 0, done.stderr
+        assert "confirmed" in done.stdout
+    finally:
+        squatter.communicate("\n", timeout=60)

@@ -53,6 +53,15 @@ def test_keys_come_one_by_one_and_all_is_put_back(terminal):
     assert termios.tcgetattr(keyboard) == before
 
 
+def test_in_the_background_the_terminal_is_the_shells(terminal, monkeypatch):
+    """Lines are shown then, and its settings stay: taking it would suspend all of the run."""
+    before = termios.tcgetattr(module.sys.stdin.fileno())
+    monkeypatch.setattr(os, "tcgetpgrp", lambda _: os.getpgrp() + 1)
+    with taken_terminal() as screen:
+        assert not screen.interactive
+        assert termios.tcgetattr(module.sys.stdin.fileno()) == before
+
+
 @pytest.mark.parametrize(
     ("raw", "keys"),
     [(b"\x1b", "\x1b"), (b"\x1b[A", ""), (b"s", "s"), ("ü".encode(), "ü"), (b"\xff", "")],

@@ -36,7 +36,7 @@ def test_a_good_machine_has_nothing_to_mend(make_machine):
     found = examine(make_machine(), Realtime(), Path())
     assert {each.level for each in found} == {"ok"}
     assert {each.remedy for each in found} == {""}
-    assert len({each.name for each in found}) == len(found) == 13
+    assert len({each.name for each in found}) == len(found) == 14
 
 
 def test_every_trouble_has_a_remedy(make_machine):
@@ -45,6 +45,8 @@ def test_every_trouble_has_a_remedy(make_machine):
         {
             "/proc/version": "Linux version 6.1 #1 SMP PREEMPT_DYNAMIC",
             **limits("0", "8388608"),
+            "/run/systemd/system/x": "",
+            "/proc/self/status": "Uid:\t1000\t1000",
             RT: "100000",
             f"{CPU}/isolated": "",
             f"{CPU}/smt/active": "1",

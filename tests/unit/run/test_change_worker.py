@@ -13,7 +13,7 @@ from hilctl.base.samples import Head
 from hilctl.experiment.tuned import InputPeaks
 from hilctl.loop.compensator import Compensator
 from hilctl.loop.tuning import Tuner
-from hilctl.run.change_worker import ChangeWorker, WantedChange, answer_to
+from hilctl.run.change_worker import SUPERVISORS, ChangeWorker, WantedChange, answer_to
 from hilctl.run.ring import SampleRing
 from hilctl.run.shared_page import Field
 from hilctl.run.start import checked_experiment
@@ -112,7 +112,7 @@ def test_a_process_answers_and_ends_with_its_supervisor(ring, checked):
     """Signals to the whole group are the supervisor's to handle."""
     with ChangeWorker(checked) as worker:
         number = worker._process.pid
-        for sent in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1):
+        for sent in SUPERVISORS:
             worker.begin(wanted(ring))
             os.kill(number, sent)
             assert await_result(worker).tuning.gain == 0.5

@@ -1,5 +1,6 @@
 """Runs from outside: which one is meant, what it is asked, and what is not even sent."""
 
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -21,7 +22,7 @@ from tests.fakes import SteppingClock
 def run(name, *, supervised=True, alive=True):
     card = SimpleNamespace(name=name, recording="a.mcap", supervisor=1, started=0.0)
     return SimpleNamespace(
-        card=card, supervised=supervised, alive=alive, socket=f"{name}.sock", kept=False
+        card=card, supervised=supervised, alive=alive, socket=f"{name}.sock", ring=Path("none")
     )
 
 

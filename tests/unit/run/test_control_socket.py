@@ -2,6 +2,7 @@
 
 import errno
 import json
+import shutil
 import socket
 import stat
 import threading
@@ -55,6 +56,7 @@ def connect(tmp_path):
 
 def exchange(server, tmp_path, raw):
     """Send bytes, close the sending side, and return what comes back."""
+    server.serve(0.0)
     with connect(tmp_path) as client:
         client.sendall(raw)
         client.shutdown(socket.SHUT_WR)
@@ -66,6 +68,21 @@ def exchange(server, tmp_path, raw):
 def test_only_its_owner_may_use_it(server, tmp_path):
     """The socket's mode is 0600, whatever the umask."""
     assert stat.S_IMODE((tmp_path / "socket").stat().st_mode) == 0o600
+
+
+def test_it_listens_again_where_its_folder_was_removed(tmp_path):
+    """As at a log-out; not in a folder that others can write."""
+    path = tmp_path / "runs" / "sine-7" / "socket"
+    path.parent.mkdir(parents=True, mode=0o700)
+    path.parent.parent.chmod(0o700)
+    with ControlServer(path, echo, SteppingClock()) as server:
+        shutil.rmtree(path.parent.parent)
+        path.parent.parent.mkdir()
+        path.parent.parent.chmod(0o777)
+        server.serve(0.0)
+        assert not path.exists()
+        path.parent.parent.chmod(0o700)
+        assert json.loads(exchange(server, path.parent, b"hello"))["heard"] == "hello"
 
 
 def test_question_and_answer_are_one_line_each(server, tmp_path):

@@ -1,15 +1,26 @@
 """Folders and locks of runs."""
 
+import hashlib
 import json
+import math
 import os
 import shutil
+import socket
 import subprocess
 import sys
 
 import pytest
 
 from hilctl.base.errors import InputError, RunError
-from hilctl.run.run_folder import base_folder, held_devices, run_folder, runs, taken_over
+from hilctl.run import run_folder as run_folder_module
+from hilctl.run.run_folder import (
+    base_folder,
+    held_devices,
+    keep_removed,
+    run_folder,
+    runs,
+    taken_over,
+)
 
 
 @pytest.fixture(autouse=True)
@@ -51,8 +62,7 @@ def test_dead_run_is_taken_over_once(tmp_path):
     with made(tmp_path) as (folder, _), taken_over(folder) as ours:
         assert not ours
     folder.path.mkdir()
-    for name in ("run.lock", "run.json"):
-        (folder.path / name).touch()
+    (folder.path / "run.json").touch()
     with taken_over(folder) as first, taken_over(folder) as second:
         assert (first, second) == (True, False)
     folder.remove()
@@ -76,6 +86,70 @@ def test_half_made_folders_are_passed_over(tmp_path):
     for text in ("{", "[]", json.dumps({"name": "x"})):
         (broken / "run.json").write_text(text)
         assert runs() == []
+
+
+GOOD = {"name": "x", "experiment": "x", "recording": "/x.mcap", "supervisor": 7, "started": 1.5}
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"started": "x"},
+        {"started": True},
+        {"started": math.nan},
+        {"supervisor": 0},
+        {"supervisor": 2**40},
+        {"supervisor": 7.5},
+        {"name": None},
+        {"recording": ["/x.mcap"]},
+    ],
+    ids=str,
+)
+def test_a_card_with_a_wrong_value_is_passed_over_with_one_warning(tmp_path, caplog, wrong):
+    """The other runs are still found."""
+    card = base_folder() / "broken" / "run.json"
+    card.parent.mkdir()
+    card.write_text(json.dumps({**GOOD, **wrong}))
+    with made(tmp_path) as (folder, _):
+        assert runs() == [folder]
+        assert runs() == [folder]
+    (warned,) = caplog.messages
+    assert str(card) in warned
+    card.write_text(json.dumps(GOOD))
+    assert [run.card.name for run in runs()] == ["x"]
+
+
+def test_run_whose_folder_was_removed_is_found_until_it_ends(tmp_path):
+    """As systemd-logind removes it when the user logs out; its files are open in the run."""
+    with made(tmp_path) as (folder, _):
+        (folder.path / "ring").write_text("samples")
+        with folder.ring.open() as ring:
+            shutil.rmtree(base_folder())
+            assert runs() == [folder]
+            assert folder.alive
+            assert folder.supervised
+            assert folder.ring.read_text() == ring.read()
+            folder.path.parent.mkdir(mode=0o700)
+            folder.path.mkdir()  # for a new socket
+            assert runs() == [folder]
+    assert runs() == []
+    assert not folder.alive
+
+
+def test_what_a_process_has_of_a_removed_folder_is_kept(tmp_path):
+    """The loop outlives its supervisor, and leaves the samples where the next command looks."""
+    with made(tmp_path) as (folder, _):
+        (folder.path / "ring").write_text("samples")
+        with folder.ring.open():
+            keep_removed()  # nothing was removed
+            assert folder.alive
+            shutil.rmtree(base_folder())
+            keep_removed()
+            (found,) = runs()
+            assert found.card == folder.card
+            assert (folder.path / "ring").read_text() == "samples"
+            with taken_over(found) as ours:
+                assert ours
 
 
 def test_finished_run_never_looks_dead(tmp_path, monkeypatch):
@@ -210,6 +284,39 @@ def test_holder_without_a_run_is_named_by_the_kernel():
         held_devices((name,)),
     ):
         pass
+
+
+@pytest.mark.parametrize("listening", [True, False])
+def test_another_user_can_not_lock_this_one_out(monkeypatch, caplog, listening):
+    """Anybody can bind the name; it is warned of, and the lock of this user's runs still holds."""
+    name = f"{NAME}squatted"
+    address = b"\0hilctl/device/" + hashlib.sha256(name.encode()).hexdigest().encode()
+    asked = run_folder_module._holder
+
+    def holder(address):
+        found = asked(address)
+        return found and (found[0], 2**31 - 1)  # a user without a name
+
+    monkeypatch.setattr(run_folder_module, "_holder", holder)
+    with socket.socket(socket.AF_UNIX) as squatter:
+        squatter.bind(address)
+        if listening:
+            squatter.listen()
+        with held_devices((name,)):
+            (warned,) = caplog.messages
+            assert name in warned
+            assert (f"process {os.getpid()} of user {2**31 - 1}" in warned) == listening
+            with pytest.raises(InputError, match="in use by another run"), held_devices((name,)):
+                pass
+
+
+def test_a_device_stays_held_when_the_folder_is_removed():
+    """As at a log-out: the name in the kernel is left, and it is this user's."""
+    name = f"{NAME}removed"
+    with held_devices((name,)):
+        shutil.rmtree(base_folder())
+        with pytest.raises(InputError, match="in use by process"), held_devices((name,)):
+            pass
 
 
 def test_refused_run_lets_go_of_what_it_had():

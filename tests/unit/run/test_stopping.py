@@ -31,7 +31,7 @@ def process():
 
 def run(number, *, supervised=True):
     card = SimpleNamespace(name="a", supervisor=number)
-    return SimpleNamespace(card=card, supervised=supervised, kept=False)
+    return SimpleNamespace(card=card, supervised=supervised, alive=False)
 
 
 def test_the_supervisor_gets_the_signal(process):
@@ -52,7 +52,7 @@ def test_the_lock_is_looked_at_once_the_process_is_held(process, monkeypatch):
 
     class Going:
         card = SimpleNamespace(name="a", supervisor=process.pid)
-        kept = False
+        alive = False
 
         @property
         def supervised(self):

@@ -6,6 +6,7 @@ All neighbours are doubles that note what is asked of them; whole runs are in ``
 import json
 import os
 import signal
+import threading
 from contextlib import contextmanager
 from types import SimpleNamespace
 
@@ -83,8 +84,9 @@ class Neighbours:
         )
         self.folder = SimpleNamespace(
             path=folder, ring=folder / "ring", socket=folder / "socket",
-            keep=lambda: self.note("folder kept"),
+            description=folder / "description.json", keep=lambda: self.note("folder kept"),
         )  # fmt: skip
+        self.folder.description.touch()
         self.said, self.resumed, self.kept = [], [], False
         for name, double in {
             "time": self.time,
@@ -391,6 +393,27 @@ def test_the_first_signal_is_the_one_that_stops_it(stage, number):
     assert result.code == "stopped"
     assert signal.getsignal(signal.SIGINT) == before
     assert signal.getsignal(STOP_SIGNAL) == signal.SIG_IGN
+
+
+def test_a_terminal_can_not_suspend_it(stage, caplog):
+    """Ctrl-Z is answered; afterwards signals are as they were."""
+    numbers = (signal.SIGTSTP, signal.SIGTTIN, signal.SIGTTOU)
+    before = [signal.getsignal(number) for number in numbers]
+
+    def press():
+        for number in numbers:
+            assert signal.getsignal(number) != signal.SIG_DFL  # it would suspend the test
+            os.kill(os.getpid(), number)
+
+    stage.on_attend[1] = press
+    result = stage.run()
+    for thread in threading.enumerate():  # it is said by a thread
+        if thread is not threading.current_thread() and thread.daemon:
+            thread.join(5.0)
+    assert (result.code, result.stop_signal) == ("completed", 0)
+    assert len(caplog.messages) == 1
+    assert "Ctrl-Z" in caplog.text
+    assert [signal.getsignal(number) for number in numbers] == before
 
 
 def wrong(stage, **changes):

@@ -1,0 +1,69 @@
+"""A run whose files in memory are removed, as systemd-logind does when a user logs out."""
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from hilctl.recording.reader import read
+from hilctl.run.orphans import recover_orphans
+from hilctl.run.run_folder import base_folder, runs
+from tests.faults.test_daemon import await_state, hilctl, start, stop_all
+
+
+@pytest.fixture
+def logged_out(tmp_path):
+    """A run in the background after a log-out: its recording."""
+    recording = start(tmp_path)
+    shutil.rmtree(base_folder())
+    yield recording
+    stop_all()
+
+
+def test_it_is_still_found_changed_watched_and_stopped(logged_out):
+    """Every command works; the recording lacks nothing."""
+    assert await_state("running")["recording"] == str(logged_out)
+    assert hilctl("set", "gain=0.5", "--over", "0.1")["gain"] == 0.5
+    hilctl("mark", "logged in again")
+    (ended,) = hilctl("stop", "--all")["runs"]
+    assert ended["ended"]
+    recording = read(logged_out)
+    assert recording.end["reason"] == "stopped by hilctl stop"
+    assert "mark" in {event.code for event in recording.events}
+    assert recording.dropped == 0
+    assert hilctl("status")["runs"] == []
+
+
+def test_a_supervisor_that_crashes_afterwards_loses_no_sample(logged_out):
+    """The loop ramps down, and keeps what nobody has recorded where the next command finds it."""
+    await_state("running")
+    (run,) = runs()
+    os.kill(run.card.supervisor, signal.SIGKILL)
+    deadline = time.monotonic() + 60.0
+    while run.alive or not any(base_folder().glob("*/run.json")):
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    (orphan,) = recover_orphans()
+    assert orphan.safe
+    recording = read(logged_out)
+    assert recording.end["reason"] == "stopped because the supervisor died"
+    assert recording.end["recorded_samples"] == str(recording.samples.index.size)
+    assert recording.dropped == 0
+    assert abs(recording.samples.command[-1]) < 0.01  # the ramp is there to its end
+    assert runs() == []
+
+
+def test_it_can_be_watched(logged_out):
+    await_state("running")
+    command = [sys.executable, "-m", "hilctl", "watch"]
+    with subprocess.Popen(
+        command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as watching:
+        assert watching.stdout.readline()
+        watching.terminate()
+        _, err = watching.communicate(timeout=60)
+    assert "Traceback" not in err
