@@ -4,6 +4,7 @@ import gc
 import hashlib
 import logging
 import os
+import signal
 import sys
 import tempfile
 from functools import cache, lru_cache
@@ -17,6 +18,8 @@ from hilctl.base.private import memory_folder
 from hilctl.base.yaml import document
 from hilctl.experiment import registry
 from hilctl.kernels.jit import is_kernel, load
+from hilctl.run.guardian_process import signal_guardian
+from hilctl.run.run_folder import runs
 from hilctl_drivers import profile
 
 ROOT = Path(__file__).parents[1]
@@ -169,8 +172,15 @@ def module_runs(session_runs, memory, request):
 
 @pytest.fixture(autouse=True)
 def own_runs(module_runs, memory, monkeypatch, request):
-    """Keep each test's runs apart from those of other tests and of this user."""
-    monkeypatch.setenv("HILCTL_RUNS", str(runs_folder(memory, request.node.nodeid)))
+    """Keep each test's runs apart from those of other tests and of this user.
+
+    A guardian that still drives a device when the test is over is ended.
+    """
+    folder = runs_folder(memory, request.node.nodeid)
+    monkeypatch.setenv("HILCTL_RUNS", str(folder))
+    yield
+    for run in runs() if folder.exists() else []:
+        signal_guardian(run, signal.SIGKILL)
 
 
 def runs_folder(memory, nodeid):

@@ -10,7 +10,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 
 from hilctl.experiment.check import Checked
 from hilctl.run.guardian import GuardianJob
@@ -76,21 +76,24 @@ class GuardianProcess:
         self._page = page
         page.put(Field.GUARDIAN_PHASE, GuardianPhase.STARTING)
         page.put(Field.GUARDIAN_HEARTBEAT_NS, 0)
-        pidfd = None if loop is None else os.pidfd_open(loop)
-        watched = [] if pidfd is None else [pidfd]
-        try:
+        self._log = folder.guardian_log
+        with ExitStack() as stack:
+            watched = []
+            if loop is not None:
+                watched.append(os.pidfd_open(loop))
+                stack.callback(os.close, watched[0])
             self._process = subprocess.Popen(
                 [
                     *(sys.executable, "-P", "-m", "hilctl.run.guardian"),
-                    *(str(folder.guardian_job), "act" if pidfd is None else str(pidfd)),
+                    *(str(folder.guardian_job), str(watched[0]) if watched else "act"),
                 ],
                 stdin=subprocess.DEVNULL,
+                # Not those of the supervisor: what reads them would wait for the guardian's end.
+                stdout=subprocess.DEVNULL,
+                stderr=stack.enter_context(self._log.open("wb")),
                 start_new_session=True,
                 pass_fds=(*inherits, *watched),
             )
-        finally:
-            if pidfd is not None:
-                os.close(pidfd)
 
     @property
     def pid(self) -> int:
@@ -115,8 +118,12 @@ class GuardianProcess:
     @property
     def error(self) -> str:
         """Why it could not start or go on."""
-        failed = self.phase == GuardianPhase.FAILED
-        return (self._page.read_text(PageText.GUARDIAN) if failed else "") or "it died"
+        if self.phase == GuardianPhase.FAILED:
+            return self._page.read_text(PageText.GUARDIAN)
+        with suppress(OSError):
+            *_, last = self._log.read_text(encoding="utf-8", errors="replace").splitlines() or [""]
+            return f"it died: {last}" if last else "it died"
+        return "it died"
 
     def kill(self, wait_s: float = _DEATH_S) -> None:
         """Kill it.

@@ -124,6 +124,11 @@ class RunFolder:
         return self.path / "guardian.json"
 
     @property
+    def guardian_log(self) -> Path:
+        """File of what the guardian writes to its standard error."""
+        return self.path / "guardian.log"
+
+    @property
     def socket(self) -> Path:
         """Socket that the supervisor answers at."""
         return self.path / "socket"

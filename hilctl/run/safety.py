@@ -148,7 +148,9 @@ class Safety:
         over = now_ns - self._trouble_ns > self._patience_ns
         # A loop that was killed in a call takes a while to be gone.
         gone = ended or self._action is not None
-        if result is not None and ((result.final and gone) or over):
+        # Nothing is gained by waiting until a value that is set has held: a guardian watches it.
+        settled = result is not None and (result.final or result.output == "set")
+        if result is not None and ((settled and gone) or over):
             self.result, self.by = result, by
 
     def _reached(self) -> tuple[str, SafeActionResult | None]:

@@ -187,7 +187,7 @@ def test_both_processes_dead_is_told_and_recovered(tmp_path):
     run.process.communicate()
     (orphan,) = recover_orphans()
     assert not orphan.safe
-    assert "NOT known to be safe" in orphan.text
+    assert "NOT confirmed to be safe" in orphan.text
     recording = read(run.output)
     assert contiguous(recording)
     assert recording.end["reason"] == "supervisor and loop died"

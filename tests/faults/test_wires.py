@@ -4,6 +4,7 @@ import os
 import signal
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 
@@ -66,20 +67,17 @@ def test_tcp_fault_ends_the_run_safely(emulate, run, fault):
     printed = started.end()
     writes = device.log.writes("DAC0")
     assert printed["code"] == "fault"
-    assert printed["output_safe"] is True
+    # The command that was not answered may still be executed: the guardian watches for it.
+    assert (printed["output_state"], printed["guardian_active"]) == ("set", True)
     said = printed["reason"]
     assert said.startswith(f"modbus_dac labjack_t7 at {device.address}: ")
     assert TCP_FAULTS[fault] in said
     assert "write DAC0, read AIN0" in said
     assert "\n" not in said
     assert writes[-1]["current_a"] == pytest.approx(0.0, abs=1e-5)
-    # What is carried out late comes between two writes of the safe value, unless the first of them
-    # is late itself on a busy machine.
-    between = fault.startswith("late") and abs(writes[-3]["current_a"]) < 1e-5
-    tail = 3 if between else 1
-    waited_s = writes[-tail]["unix_s"] - writes[-tail - 1]["unix_s"]
-    assert waited_s < 2.0 * TIMEOUT_S
-    started.assert_put_out(writes[1:], tail=tail)  # the first, at opening, repeats what it held
+    waits_s = np.diff([each["unix_s"] for each in writes])
+    assert waits_s.max() < 2.0 * TIMEOUT_S
+    started.assert_put_out(writes[1:])  # the first, at opening, repeats what it held
 
 
 def test_pulled_cable_leaves_it_to_the_watchdog(emulate, run):
@@ -95,7 +93,7 @@ def test_pulled_cable_leaves_it_to_the_watchdog(emulate, run):
     assert trip["current_a"] == pytest.approx(0.0, abs=1e-5)
     silent_s = (trip["monotonic_ns"] - writes[-1]["monotonic_ns"]) * 1e-9
     assert 0.99 * WATCHDOG_S < silent_s < 2.0 * WATCHDOG_S
-    started.assert_put_out(writes[1:], tail=0)
+    started.assert_put_out(writes[1:])
 
 
 @pytest.mark.parametrize(
@@ -122,7 +120,7 @@ def test_rtu_fault_ends_the_run(emulate, run, profile, fault, words, safe):
     assert words in printed["reason"]
     if safe:
         assert writes[-1]["current_a"] == 0.0
-    started.assert_put_out(writes[1:], tail=int(safe))
+    started.assert_put_out(writes[1:])
 
 
 def test_killed_loop_is_made_safe_by_the_supervisor(emulate, run):
@@ -133,7 +131,7 @@ def test_killed_loop_is_made_safe_by_the_supervisor(emulate, run):
     os.kill(started.loop_pid(), signal.SIGKILL)
     printed = started.end()
     assert "the loop process died: killed by SIGKILL" in printed["reason"]
-    assert printed["output_safe"] is True
+    assert printed["output_state"] in {"confirmed", "set"}  # set if it was killed in an exchange
     assert device.log.writes("DAC0")[-1]["current_a"] == pytest.approx(0.0, abs=1e-5)
 
 
