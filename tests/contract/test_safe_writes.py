@@ -322,3 +322,73 @@ def test_the_late_answer_to_an_older_command_confirms_nothing(
     assert late.value == SAFE
     device.make_safe(-1.0)
     assert late.value == -1.0
+
+
+class Refusing:
+    """Executes all messages but those that ``refuses`` says; counts commands."""
+
+    def __init__(self, split, command, answer, refuse, value=3.0):
+        self._split, self._command, self._reply, self._refuse = split, command, answer, refuse
+        self.value, self.commands = value, []
+
+    def __call__(self, data):
+        messages, rest = self._split(data)
+        sent = b""
+        for message in messages:
+            value = self._command(message)
+            refusal = self._refuse(message)
+            if value is not None:
+                self.commands.append(value)
+                self.value = self.value if refusal else value
+            sent += refusal or self._reply(message, self.value)
+        return sent, rest
+
+
+def exception(function):
+    def refuse(message):
+        refused = message[1] == function
+        return rtu_adu(1, bytes([function | 0x80, 1])) if refused else b""
+
+    return refuse
+
+
+@pytest.mark.parametrize("function", [6, 16])
+def test_registers_that_refuse_the_safe_value_are_not_opened(registers, function):
+    """The message is tried with what the output holds, which is not what it is set to later."""
+    device = Refusing(requests, set_by_request, answer_request, exception(function))
+    with pytest.raises(DeviceError, match=rf"OUT, register 0: function {function} refused"):
+        registers(device, function, "same").open(RATE_HZ, 1)
+    assert device.commands == [3.0]
+    assert device.value == 3.0
+
+
+def refuse_line(message):
+    return b"ERR\n" if message.startswith(b"V ") else b""
+
+
+@pytest.mark.parametrize(("value", "tried"), [(3.0, True), (12.0, False)])
+def test_lines_that_refuse_the_safe_value_are_not_opened(text, value, tried):
+    """Unless the output is where no command can put it: then it is left there."""
+    scripted = Refusing(lines, set_by_line, answer_line, refuse_line, value)
+    device = text(scripted, OK, READBACK)
+    if tried:
+        with pytest.raises(DeviceError, match=r"V 3\.00000.* not an answer"):
+            device.open(RATE_HZ, 1)
+    else:
+        device.open(RATE_HZ, 1)
+        device.close()
+    assert scripted.commands == ([value] if tried else [])
+
+
+@pytest.mark.parametrize(("value", "commands"), [(1.25, [1.25]), (1.2500049, [])])
+def test_a_value_that_the_command_would_round_is_not_written(text, value, commands):
+    """It would move the output, if only by a step."""
+
+    def answer(message, held):
+        return b"OK\n" if message.startswith(b"V ") else f"{held:.7f}\n".encode()
+
+    scripted = Refusing(lines, set_by_line, answer, lambda message: b"", value)
+    device = text(scripted, OK, READBACK)
+    device.open(RATE_HZ, 1)
+    device.close()
+    assert scripted.commands == commands

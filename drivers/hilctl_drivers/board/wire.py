@@ -119,9 +119,16 @@ class BoardWire(SerialWire):
         """Set the watchdog, and end a trip of an earlier run at the safe value."""
         state = self._session.state()
         self._arm()
-        if state is not None and state.tripped:
-            # At once: a board that comes back to a command from before must not keep it.
-            self._session.put_out(self._safe)
+        if state is None:
+            return
+        # At once: a board that comes back to a command from before must not keep it.
+        value = self._safe if state.tripped else state.output
+        low, high = self._setup.output.limits
+        if low <= value <= high:
+            try:  # the message of the safe value, with what the output holds
+                self._session.put_out(value)
+            except DeviceError as error:
+                raise DeviceError(f"the safe value cannot be written by SAFE: {error}") from None
 
     def _arm(self) -> None:
         """Set the watchdog as the experiment wants it, which clears a trip."""

@@ -104,6 +104,7 @@ class ModbusStream(DacDevice):
         addresses = base.writer.address(base.output), base.writer.address(base.input)
         stream.prepare(sample_rate_hz, *addresses)
         setup.check_capacity(block, stream.capacity)
+        self._safe_write.try_out(session)
         # Armed last: the steps above may take longer than its time-out.
         self._guard.arm(session, sample_rate_hz / block)
         self._stream = stream

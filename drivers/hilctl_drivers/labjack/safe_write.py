@@ -11,10 +11,9 @@ from hilctl_drivers.wire.errors import Refused
 class StreamSafeWrite(ModbusSafeWrite):
     """Stops the stream and writes the output in one message; what is queued is dropped."""
 
-    def _put(self, session: ModbusSession, value: float) -> None:
-        output = self._setup.output
+    def _put(self, session: ModbusSession, data: bytes) -> None:
         feedback = ModbusFeedback(session.link, self._setup.writer.unit)
-        write = WriteFrame(self._setup.writer.address(output), output.format.encode(value))
+        write = WriteFrame(self._setup.writer.address(self._setup.output), data)
         # The stream first: it would write over the safe value with its next scan.
         try:
             feedback.call([WriteFrame(ENABLE, u32(0)), write])

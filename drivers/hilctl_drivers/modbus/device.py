@@ -79,8 +79,9 @@ class ModbusDac(DacDevice):
     def _open(self, sample_rate_hz: float, block: int) -> None:
         """Self-test, init steps, one reading of the input, watchdog; see :class:`DacDevice`.
 
-        Whether it can read and write in one transaction is tried by writing what the output holds
-        already. Only then is it known what rate it can keep.
+        Whether it can read and write in one transaction, and whether it takes the message of the
+        safe value, is tried by writing what the output holds already. Only then is it known what
+        rate it can keep.
         """
         del block
         # Kept before it is opened: after a step that fails, _release must find it.
@@ -91,6 +92,7 @@ class ModbusDac(DacDevice):
         self._guard.end_trip(pair.writer)
         pair.set_up()
         swap, self.one_transaction = pair.find_swap()
+        self._safe_write.try_out(pair.writer)
         rates = self._setup.rates(self.one_transaction)
         how = "one transaction" if self.one_transaction else "a read and a write"
         replace(rates, note=f"{how} a sample; {rates.note}").check(sample_rate_hz)

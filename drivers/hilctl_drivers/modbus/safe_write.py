@@ -61,6 +61,29 @@ class ModbusSafeWrite:
         finally:
             link.close()
 
+    def try_out(self, session: ModbusSession) -> None:
+        """Write what the output holds, with the message that writes the safe value.
+
+        Nothing moves. An output that cannot be read, or is out of range, is left alone.
+
+        Raises:
+            DeviceError: The device refuses the message, or does not answer.
+        """
+        output, register = self._setup.output, self._setup.output.readback_register
+        if register is None:
+            return
+        data = session.read_bytes(register)
+        value = register.format.decode(data)
+        if not output.min <= value <= output.max:
+            return
+        if register.format != output.format:
+            data = output.format.encode(value)
+        try:
+            self._put(session, data)
+        except DeviceError as error:
+            name = f"{self._setup.options.output}, register {output.address}"
+            raise DeviceError(f"the safe value cannot be written to {name}: {error}") from None
+
     def _frame(self, session: ModbusSession, value: float) -> bytes:
         """Return the request that writes the output."""
         output = self._setup.output
@@ -68,15 +91,15 @@ class ModbusSafeWrite:
         return session.prepare(pdu).request()
 
     def _write(self, session: ModbusSession, value: float) -> None:
-        self._guard.write_through(session, lambda: self._put(session, value))
+        data = self._setup.output.format.encode(value)
+        self._guard.write_through(session, lambda: self._put(session, data))
         if self._setup.unconfirmed:
             raise UnconfirmedError(f"the value was sent, but {self._setup.unconfirmed}")
         self._check_held(session, value)
 
-    def _put(self, session: ModbusSession, value: float) -> None:
-        """Write the output once."""
-        output = self._setup.output
-        session.put_out(output, output.format.encode(value))
+    def _put(self, session: ModbusSession, data: bytes) -> None:
+        """Write the output's register bytes once."""
+        session.put_out(self._setup.output, data)
 
     def _check_held(self, session: ModbusSession, value: float) -> None:
         """Raise unless the output holds the value, if it can be read back."""

@@ -1,9 +1,10 @@
 """A device that speaks lines of text, sample by sample; its sensor may stand behind another one."""
 
 import re
+from string import Formatter
 
 from hilctl.base.arrays import F64
-from hilctl.base.errors import InputError, UnconfirmedError
+from hilctl.base.errors import DeviceError, InputError, UnconfirmedError
 from hilctl_drivers.profile_parts import Range
 from hilctl_drivers.serial.setup import SerialSetup
 from hilctl_drivers.serial.wire import SerialWire, check_stands
@@ -92,6 +93,7 @@ class AsciiWire(SerialWire):
             with naming(self._reader_name):
                 self._reader.check_selftest()
                 self._reader.run(self._reader_profile.init)
+        self._try_out_safe_value()
         self._feed_every = 0
         if watchdog != "none" and self._setup.options.watchdog != "none":
             # The safe value before the time-out: once it counts, it must know where to go.
@@ -207,6 +209,26 @@ class AsciiWire(SerialWire):
             self._writer.check_errors()
         elif not answered:
             raise UnconfirmedError(f"the value was sent, but {_NO_EVIDENCE}")
+
+    def _try_out_safe_value(self) -> None:
+        """Set the output to what it holds, with the command of the safe value; nothing moves.
+
+        An output that cannot be read is left alone, as is a value that the command would round.
+        """
+        value = self.output()
+        low, high = self._output.limits
+        if value is None or not low <= value <= high:
+            return
+        fields = Formatter().parse(self._output.write)
+        spec = next(spec for _, field, spec, _ in fields if field == "value")
+        if float(format(value + 0.0, spec or "")) != value:
+            return
+        text = self._command(value + 0.0)
+        try:
+            self._write(value + 0.0)
+            self._writer.check_errors()
+        except DeviceError as error:
+            raise DeviceError(f"the safe value cannot be set with {text}: {error}") from None
 
     def _unconfirmed(self) -> str:
         """Return why a value cannot be confirmed; empty if it can."""

@@ -143,19 +143,17 @@ class TestReader:
         named = rf"modbus_dac icp_m7024 at .*: reader icp_m7017, unit 2 at .*: .*{said}.* \(to wri"
         with pytest.raises(DeviceError, match=named):
             exchange(device, 1.0)
-        assert served.events() == []
+        assert [each["current_a"] for each in served.events()] == pytest.approx([0.0], abs=1e-3)
         with pytest.raises(DeviceError, match="not open"):
             exchange(device, 1.0)
         device.make_safe(0.0)
         assert served.events()[-1]["current_a"] == pytest.approx(0.0, abs=1e-3)
 
     def test_errors_of_the_one_that_drives_are_not_the_readers(self, serve):
-        """A write that is refused is told of the device itself."""
+        """A write that is refused is told of the device itself, at opening."""
         served = serve("icp_m7024", "icp_m7017", lacking=frozenset({6}))
-        device = served.device()
-        device.open(5.0, 1)
-        with pytest.raises(DeviceError, match="exception 1") as refused:
-            exchange(device, 1.0)
+        with pytest.raises(DeviceError, match="function 6 refused with exception 1") as refused:
+            served.device().open(5.0, 1)
         assert "reader" not in str(refused.value)
 
     def test_both_lines_are_let_go_of(self, serve):
