@@ -507,7 +507,9 @@ class PackageMcapWriter:
     """
 
     def __init__(self, stream, **options):
-        self._writer = Writer(stream, **{"compression": CompressionType.ZSTD, **options})
+        self._writer = Writer(
+            stream, **{"compression": CompressionType.ZSTD, "enable_data_crcs": True, **options}
+        )
 
     def __getattr__(self, name):
         return getattr(self._writer, name)

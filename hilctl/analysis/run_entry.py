@@ -83,7 +83,7 @@ def entry_of(file: Path, path: str, size_bytes: int, mtime_ns: int) -> Entry:
         return entry | {"problem": str(error).removeprefix(f"{file}: ")}
     except ValueError as error:
         return entry | {"problem": f"metadata hilctl.run: {error}"}
-    entry |= {"state": ends.state, "problem": None}
+    entry |= {"state": ends.state, "problem": ends.problem or None}
     entry |= {name: _converted(kind, ends.run.get(name)) for name, kind in _RUN.items()}
     entry |= {name: _converted(kind, ends.end.get(name)) for name, kind in _END.items()}
     entry |= _of_segments(segments, entry["sample_rate_hz"])

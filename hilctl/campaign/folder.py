@@ -122,7 +122,7 @@ def make_whole(folder: Path) -> list[str]:
     done = []
     for path in sorted(folder.glob("*.mcap")):
         try:
-            if read_ends(path).state == "unfinished":
+            if read_ends(path).state in {"unfinished", "damaged"}:
                 done.append(f"{path}: {recover_recording(path).reason}")
         except DataError:
             done += _put_aside(path)

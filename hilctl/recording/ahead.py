@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 import zstandard
 from mcap.opcode import Opcode
+from mcap.writer import MCAP0_MAGIC as MAGIC
 
 from hilctl.base.arrays import U8
 from hilctl.recording.allowance import LARGEST_CHUNK_BYTES
@@ -63,6 +64,7 @@ class _Batch:
         chunks: Those of them that are chunks.
         indexes: int64[r, 3], see :func:`hilctl.kernels.packed.are_indexes`.
         data: uint8[n], what the chunks hold; None where one is damaged.
+        crc: Checksum of all bytes of the file before them; None where not all were read.
     """
 
     start: int
@@ -70,6 +72,7 @@ class _Batch:
     chunks: Sequence[_Chunk] = ()
     indexes: Sequence[tuple[int, int, int]] = ()
     data: U8 | None = None
+    crc: int | None = None
 
     @property
     def stop(self) -> int:
@@ -142,6 +145,13 @@ class ReadAhead:
         here = 0 <= first <= self._batch.raw.size - size
         return self._batch.raw[first : first + size].tobytes() if here else None
 
+    def crc(self, stop: int) -> int | None:
+        """Return the checksum of all bytes up to some place; None where it is not at hand."""
+        before, batch = self._batch.crc, self._batch
+        if before is None or not 0 <= stop - batch.start <= batch.raw.size:
+            return None
+        return zlib.crc32(batch.raw[: stop - batch.start].data, before)
+
     def _begin(self, at: int) -> bool:
         """Begin at another place; return False of a file that has been begun too often."""
         if self._starts == _MOST_STARTS:
@@ -167,6 +177,7 @@ class _Walk:
 
     def __init__(self, file: FileIO, at: int, *, first: bool) -> None:
         self._file, self._at, self._first = file, at, first
+        self._crc = zlib.crc32(MAGIC) if at == len(MAGIC) else None
 
     def next_batch(self) -> _Batch:
         """Return the next batch; of no bytes where no whole record follows."""
@@ -179,7 +190,9 @@ class _Walk:
         chunks, indexes, end = _records(raw.data, 1 if self._first else _MOST_CHUNKS)
         self._at, self._first = start + end, self._first and not chunks
         data = _inflated(raw.data, chunks)
-        return _Batch(start, raw[:end], chunks, indexes, data)
+        before = self._crc
+        self._crc = None if before is None else zlib.crc32(raw[:end].data, before)
+        return _Batch(start, raw[:end], chunks, indexes, data, before)
 
     def _read(self, size: int) -> U8:
         raw = np.empty(size, dtype=np.uint8)

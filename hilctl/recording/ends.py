@@ -13,6 +13,7 @@ from mcap.writer import MCAP0_MAGIC as MAGIC
 
 from hilctl.base.errors import DataError
 from hilctl.base.remedy import reason
+from hilctl.recording.facts import CHECKSUM_FACT, unsealed
 from hilctl.recording.locks import is_being_recorded
 from hilctl.recording.records import FRAME, LARGEST_BYTES, parse
 
@@ -30,12 +31,16 @@ class RecordingEnds:
         run: Facts of its start.
         end: Facts of its end; empty where the file is not finished.
         state: ``finished``; ``recording`` where a run is writing to it; ``unfinished`` where it was
-            cut short. What lies between the ends is not known to be sound.
+            cut short; ``damaged`` where a checksum of the facts is wrong or the way to them is
+            lost: then facts that are not known to be right are left out. What lies between the ends
+            is not known to be sound.
+        problem: What is damaged; else empty.
     """
 
     run: Mapping[str, str]
     end: Mapping[str, str]
     state: str
+    problem: str = ""
 
 
 def read_ends(path: Path) -> RecordingEnds:
@@ -59,8 +64,16 @@ def _ends(stream: FileIO) -> RecordingEnds:
     if not stat.S_ISREG(found.st_mode):
         raise DataError("is not a file")
     file = _Bytes(stream.fileno(), found.st_size)
-    run, end = _run_facts(file), _end_facts(file)
-    if end is not None:
+    metadata, end_metadata = _run_metadata(file), _end_metadata(file)
+    run, right = unsealed("hilctl.run", metadata)
+    if not right:
+        return RecordingEnds({}, {}, "damaged", "metadata hilctl.run: its checksum is wrong")
+    if end_metadata is not None:
+        end, right = unsealed("hilctl.end", end_metadata)
+        if not right:
+            return RecordingEnds(run, {}, "damaged", "metadata hilctl.end: its checksum is wrong")
+        if not end and CHECKSUM_FACT in metadata:  # who writes the one writes the other
+            return RecordingEnds(run, {}, "damaged", "its index is damaged")
         return RecordingEnds(run, end, "finished")
     return RecordingEnds(run, {}, "recording" if is_being_recorded(stream) else "unfinished")
 
@@ -102,7 +115,7 @@ class _Bytes:
             start += length
 
 
-def _run_facts(file: _Bytes) -> Mapping[str, str]:
+def _run_metadata(file: _Bytes) -> Mapping[str, str]:
     if file.at(0, len(MAGIC)) != MAGIC:
         raise DataError("is not an MCAP file, or its start is lost")
     for record, _ in zip(file.records(len(MAGIC), file.size), range(_MOST_BEFORE), strict=False):
@@ -111,7 +124,7 @@ def _run_facts(file: _Bytes) -> Mapping[str, str]:
     raise DataError("holds no run of hilctl (metadata hilctl.run is missing)")
 
 
-def _end_facts(file: _Bytes) -> Mapping[str, str] | None:
+def _end_metadata(file: _Bytes) -> Mapping[str, str] | None:
     """Return the facts of the end by way of footer and index; None where those are not there."""
     footer_at = file.size - _FOOTER_BYTES
     if file.at(file.size - len(MAGIC), len(MAGIC)) != MAGIC:

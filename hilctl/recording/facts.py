@@ -1,5 +1,8 @@
 """Names of facts in a recording that more than one module goes by; importing it costs nothing."""
 
+import json
+import zlib
+from collections.abc import Mapping
 from typing import TypeAlias
 
 HOLDS_FACT = "holds"
@@ -24,5 +27,28 @@ OVERRIDES_FACT = "overrides"
 RECORDINGS = "recordings"
 """Folder of recordings, relative to where hilctl runs, where no other is given."""
 
+CHECKSUM_FACT = "crc32"
+"""Fact of every metadata record: CRC-32 of its name and its other facts, as hexadecimal digits."""
+
 LabelValue: TypeAlias = str | int | float
 """A label says text or a number."""
+
+
+def sealed(name: str, facts: Mapping[str, str]) -> dict[str, str]:
+    """Return the facts of a metadata record with their checksum."""
+    return {**facts, CHECKSUM_FACT: _checksum(name, facts)}
+
+
+def unsealed(name: str, metadata: Mapping[str, str]) -> tuple[dict[str, str], bool]:
+    """Return the facts of a metadata record, and whether their checksum is right.
+
+    A record of an older hilctl has none, and passes.
+    """
+    facts = dict(metadata)
+    says = facts.pop(CHECKSUM_FACT, None)
+    return facts, says in {None, _checksum(name, facts)}
+
+
+def _checksum(name: str, facts: Mapping[str, str]) -> str:
+    packed = json.dumps([name, sorted(facts.items())])
+    return f"{zlib.crc32(packed.encode()):08x}"

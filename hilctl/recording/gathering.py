@@ -23,6 +23,7 @@ from hilctl.recording.checks import (
 )
 from hilctl.recording.chunks import Messages
 from hilctl.recording.data import TICK_COLUMNS, Recording, ReplayStart, Ticks
+from hilctl.recording.facts import unsealed
 from hilctl.recording.salvage import Salvage
 from hilctl.recording.segments import segments_of
 from hilctl.recording.stretch import Stretch
@@ -80,9 +81,9 @@ class Gathering:
                 self._message(record)
             case Metadata(name="hilctl.run"):
                 self._refuse_late("metadata hilctl.run")
-                self._run = dict(record.metadata)
+                self._run, _ = unsealed(record.name, record.metadata)  # salvage tells of damage
             case Metadata(name="hilctl.end"):
-                self._end = dict(record.metadata)
+                self._end, _ = unsealed(record.name, record.metadata)
             case Attachment() if record.name in _TEXTS:
                 self._refuse_late(record.name)
                 try:

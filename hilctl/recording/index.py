@@ -12,6 +12,7 @@ from mcap.records import AttachmentIndex, Channel, Footer, McapRecord, Metadata,
 from mcap.writer import MCAP0_MAGIC as MAGIC
 
 from hilctl.recording.checks import RATES_HZ, number_of
+from hilctl.recording.facts import unsealed
 from hilctl.recording.records import FRAME, parse
 from hilctl.recording.stretch import Stretch
 
@@ -92,7 +93,10 @@ def _run_facts(stream: BinaryIO, index: AttachmentIndex | MetadataIndex) -> dict
     stream.seek(index.offset)
     raw = stream.read(min(index.length, _MOST_BYTES))
     record = parse(raw[0], raw[FRAME.size :]) if len(raw) > FRAME.size else None
-    return dict(record.metadata) if isinstance(record, Metadata) else {}
+    if not isinstance(record, Metadata):
+        return {}
+    facts, right = unsealed(record.name, record.metadata)
+    return facts if right else {}
 
 
 def _summary(stream: BinaryIO) -> Iterator[McapRecord | _ChunkPlace] | None:

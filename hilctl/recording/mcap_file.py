@@ -93,6 +93,7 @@ class McapWriter:
         compression: Compression = SAMPLES,
     ) -> None:
         self._stream = stream
+        self._data_crc = 0
         self._chunk_bytes = chunk_bytes
         self._compressor = zstandard.ZstdCompressor(compression_params=compression)
         self._room = _Room()
@@ -110,8 +111,13 @@ class McapWriter:
 
     def start(self, profile: str, library: str) -> None:
         """Write the head of the file."""
-        self._stream.write(MCAP0_MAGIC)
-        self._stream.write(_bytes(Header(profile, library)))
+        self._put(MCAP0_MAGIC)
+        self._put(_bytes(Header(profile, library)))
+
+    def _put(self, part: bytes | bytearray) -> None:
+        """Write bytes of the data section."""
+        self._stream.write(part)
+        self._data_crc = zlib.crc32(part, self._data_crc)
 
     def register_schema(self, name: str, encoding: str, data: bytes) -> int:
         """Enter a schema; return its number."""
@@ -146,7 +152,7 @@ class McapWriter:
         )  # fmt: skip
         self._attachments.append(index)
         self._statistics.attachment_count += 1
-        self._stream.write(written)
+        self._put(written)
 
     def add_metadata(self, name: str, data: Mapping[str, str]) -> None:
         """Write metadata."""
@@ -155,7 +161,7 @@ class McapWriter:
             MetadataIndex(length=len(written), name=name, offset=self._stream.tell())
         )
         self._statistics.metadata_count += 1
-        self._stream.write(written)
+        self._put(written)
 
     def add_message(
         self, channel: int, logged_ns: int, data: bytes, published_ns: int, sequence: int
@@ -228,7 +234,7 @@ class McapWriter:
         )  # fmt: skip
         self._chunk = _OpenChunk(self._room)
         for part in (head, compressed, indexes):
-            self._stream.write(part)
+            self._put(part)
         self._chunk_indexes.add(_bytes(index))
 
     def _count(self, closing: "_OpenChunk") -> tuple[int, int]:
@@ -250,7 +256,7 @@ class McapWriter:
     def finish(self) -> None:
         """Close the chunk in work, and write index and foot of the file."""
         self._close_chunk()
-        self._stream.write(_bytes(DataEnd(0)))
+        self._stream.write(_bytes(DataEnd(self._data_crc)))
         start = end = self._stream.tell()
         crc, offsets = 0, bytearray()
         groups: tuple[tuple[int, Iterable[bytes]], ...] = (

@@ -30,8 +30,8 @@ class Recovered:
 
     Attributes:
         path: The sound file.
-        original: Where the bytes as they were are kept; None where the file was sound, so that
-            nothing was written.
+        original: Where the bytes as they were are kept; None where nothing could be repaired, so
+            that nothing was written.
         reason: What was wrong and what is lost, in one line.
         samples: Samples in the sound file.
         added_samples: Those of them that were not in the old file.
@@ -50,7 +50,7 @@ class Recovered:
     @property
     def sound(self) -> bool:
         """Whether the file was sound."""
-        return self.original is None
+        return self.original is None and not self.damages
 
     def to_mapping(self) -> dict[str, Any]:
         """Return the fields as plain values."""
@@ -103,8 +103,8 @@ def recover_recording(
             survey = _survey(path, stream)
             more = list(_not_in_file(extra, survey.next_sample))
             events = [event for event in events if _is_one(event)]
-            if survey.salvage.sound and not more:
-                return _sound(path, survey)
+            if not survey.salvage.repairable and not more:
+                return _left_alone(path, survey)
             layout = _check(path, survey, more)
             with closing(Replacement(path, output)) as replacement:
                 saved = Resaved(replacement.stream, survey)
@@ -143,10 +143,12 @@ def _is_one(event: Event) -> bool:
     return 0 <= event.sample < LAST_SAMPLE and 0 <= event.time_ns <= MAX_UNIX_NS
 
 
-def _sound(path: Path, survey: Survey) -> Recovered:
-    missing = survey.next_sample - survey.samples
+def _left_alone(path: Path, survey: Survey) -> Recovered:
+    missing, damages = survey.next_sample - survey.samples, tuple(survey.salvage.damages)
     text = "sound: nothing to recover"
-    return Recovered(path, None, text, survey.samples, 0, missing, ())
+    if damages:
+        text = f"{survey.salvage.describe()}; this cannot be repaired, all else is sound"
+    return Recovered(path, None, text, survey.samples, 0, missing, damages)
 
 
 def _check(path: Path, survey: Survey, more: list[Batch]) -> RecordingLayout | None:

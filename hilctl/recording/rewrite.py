@@ -10,6 +10,7 @@ from hilctl.base.events import Event
 from hilctl.base.samples import Batch
 from hilctl.recording import schema
 from hilctl.recording.checks import SoundMessages, count_of
+from hilctl.recording.facts import CHECKSUM_FACT, sealed, unsealed
 from hilctl.recording.mcap_file import McapWriter
 from hilctl.recording.messages import MessageMaker, RecordingLayout, Topics, event_message
 from hilctl.recording.salvage import Salvage
@@ -30,6 +31,7 @@ class Survey:
         salvage: What is wrong with it.
         run: Facts of the run, empty where they are lost.
         end: Facts of its end, empty where they are lost or were never written.
+        end_is_right: Whether their checksum is.
         samples: Samples in it.
         last_time_ns: Unix time of the last message or attachment, in ns.
         records: Metadata and messages that are whole.
@@ -44,6 +46,7 @@ class Survey:
         self.salvage = Salvage(stream, self._sound)
         self.run: dict[str, str] = {}
         self.end: dict[str, str] = {}
+        self.end_is_right = True
         self.samples = 0
         self.last_time_ns = 0
         self.records = 0
@@ -53,9 +56,9 @@ class Survey:
     def _take(self, record: McapRecord) -> None:
         match record:
             case Metadata(name="hilctl.run"):
-                self.run = dict(record.metadata)
+                self.run, _ = unsealed(record.name, record.metadata)
             case Metadata(name="hilctl.end"):
-                self.end = dict(record.metadata)
+                self.end, self.end_is_right = unsealed(record.name, record.metadata)
             case Attachment():
                 self.last_time_ns = max(self.last_time_ns, record.log_time)
             case Message():
@@ -183,7 +186,10 @@ class Resaved:
             "missing_samples": str(self.missing),
             "recovered": reason,
         }
-        self._writer.add_metadata("hilctl.end", {**facts, **counted})
+        metadata = sealed("hilctl.end", {**facts, **counted})
+        if not self._survey.end_is_right:  # a right checksum would hide it from all who come after
+            metadata[CHECKSUM_FACT] = "wrong before recovery"
+        self._writer.add_metadata("hilctl.end", metadata)
         self._writer.finish()
         return reason
 

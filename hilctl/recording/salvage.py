@@ -22,6 +22,7 @@ from mcap.records import (
     Header,
     McapRecord,
     Message,
+    Metadata,
     Statistics,
 )
 from mcap.writer import MCAP0_MAGIC as MAGIC
@@ -30,10 +31,12 @@ from hilctl.recording.ahead import ChunkRun, ReadAhead
 from hilctl.recording.allowance import Allowance
 from hilctl.recording.checks import SoundMessages
 from hilctl.recording.chunks import Contents, Messages, contents
+from hilctl.recording.facts import unsealed
 from hilctl.recording.records import FRAME, LARGEST_BYTES, parse
 from hilctl.recording.torn import next_likely, own_channels, tail_kind, take_chunk
 
 _INDEX_KINDS = {Opcode.MESSAGE_INDEX, Opcode.DATA_END, Opcode.FOOTER}
+_CRC_BYTES = 1 << 20
 _KNOWN = {opcode.value for opcode in Opcode}
 
 
@@ -45,15 +48,19 @@ class Damage:
         start: Offset of its first byte.
         size: Bytes.
         what: ``torn chunk``, ``damaged chunk``, ``damaged record``, ``index`` (nothing of the run
-            is lost with it), ``zeros``, ``unreadable bytes``, ``message of no channel``, or what
-            is wrong with a message that hilctl can't have written.
+            is lost with it), ``zeros``, ``unreadable bytes``, ``message of no channel``,
+            ``data section with a wrong checksum`` (where nothing else is found to be wrong: header
+            or times of chunks), ``metadata NAME with a wrong checksum``, or what is wrong with a
+            message that hilctl can't have written.
         saved: Messages saved from it.
+        lasting: Whether no rewriting repairs it.
     """
 
     start: int
     size: int
     what: str
     saved: int = 0
+    lasting: bool = False
 
     def __str__(self) -> str:
         saved = f", {self.saved} messages of it saved without a checksum" if self.saved else ""
@@ -117,6 +124,11 @@ class Salvage:
         """Whether nothing is damaged and nothing missing."""
         return self.finished and not self.damages
 
+    @property
+    def repairable(self) -> bool:
+        """Whether anything is missing, or damaged so that rewriting the file repairs it."""
+        return not self.finished or not all(damage.lasting for damage in self.damages)
+
     def describe(self) -> str:
         """Return what is wrong with the file, in one line."""
         serious = [damage for damage in self.damages if damage.what != "index"]
@@ -125,7 +137,8 @@ class Salvage:
         if not serious:
             return "its index is damaged or cut"
         more = f" and {len(serious) - 2} more" if len(serious) > 2 else ""
-        return ", ".join(str(damage) for damage in serious[:2]) + more
+        wrong = "; any fact in it may be wrong" if any(each.lasting for each in serious) else ""
+        return ", ".join(str(damage) for damage in serious[:2]) + more + wrong
 
     def records(self) -> Iterator[McapRecord]:
         """Yield header, metadata, attachments, schemas, channels and messages in order.
@@ -250,11 +263,33 @@ class Salvage:
             self.allowance.message(found.inside.unread)
             return list(found.inside.records)
         if self._data_ended or isinstance(record, DataEnd):
+            if isinstance(record, DataEnd):
+                self._check_data(at, record)
             self._take_summary(record)
             return []
         if isinstance(record, Header):
             self.header = record
+        if isinstance(record, Metadata) and not unsealed(record.name, record.metadata)[1]:
+            what = f"metadata {record.name} with a wrong checksum"
+            self.damages.append(Damage(at, found.end - at, what, lasting=True))
         return [record]
+
+    def _check_data(self, at: int, end: DataEnd) -> None:
+        """Compare the checksum of all bytes before the end of the data, where there is one."""
+        explained = not all(damage.lasting for damage in self.damages)
+        if end.data_section_crc and not explained and self._crc(at) != end.data_section_crc:
+            self._note(0, at, "data section with a wrong checksum")
+
+    def _crc(self, stop: int) -> int:
+        """Return the checksum of all bytes up to some place."""
+        found = self._ahead.crc(stop) if self._ahead else None
+        if found is not None:
+            return found
+        crc = 0
+        self._stream.seek(0)
+        for start in range(0, stop, _CRC_BYTES):
+            crc = zlib.crc32(self._stream.read(min(_CRC_BYTES, stop - start)), crc)
+        return crc
 
     def _take_summary(self, record: McapRecord) -> None:
         self._data_ended = True

@@ -18,6 +18,7 @@ from hilctl import __version__
 from hilctl.base.events import Event
 from hilctl.base.samples import Batch
 from hilctl.base.segments import Segment
+from hilctl.recording.facts import sealed
 from hilctl.recording.locks import lock
 from hilctl.recording.mcap_file import McapWriter, Sink
 from hilctl.recording.messages import MessageMaker, RecordingLayout, Topics
@@ -63,7 +64,7 @@ class RecordingWriter:
         self._writer.start(profile="", library=f"hilctl {__version__}")
         segments = json.dumps([segment.to_mapping() for segment in run.segments])
         facts = {**run.facts, **run.layout.to_facts(), "segments": segments}
-        self._writer.add_metadata("hilctl.run", facts)
+        self._writer.add_metadata("hilctl.run", sealed("hilctl.run", facts))
         start_unix_ns = run.layout.start_unix_ns
         self._attach("experiment.yaml", run.experiment_yaml, start_unix_ns)
         if run.model_yaml:
@@ -101,7 +102,7 @@ class RecordingWriter:
         """
         self._late_missing = ended_at - self.samples
         counted = {"recorded_samples": str(self.samples), "missing_samples": str(self.missing)}
-        self._writer.add_metadata("hilctl.end", {**end, **counted})
+        self._writer.add_metadata("hilctl.end", sealed("hilctl.end", {**end, **counted}))
         self._writer.finish()
 
     def event(self, event: Event) -> None:

@@ -19,6 +19,7 @@ from hilctl.recording.checks import (
     number_of,
     sound_blocks,
 )
+from hilctl.recording.facts import sealed, unsealed
 from hilctl.recording.messages import RecordingLayout
 from hilctl.recording.reader import read
 from hilctl.recording.recover import recover_recording
@@ -66,8 +67,9 @@ def _copy(writer, record, change):
         case Channel():
             writer.register_channel(record.topic, record.message_encoding, record.schema_id)
         case Metadata():
-            change(record.name, record.metadata)
-            writer.add_metadata(record.name, record.metadata)
+            facts, _ = unsealed(record.name, record.metadata)
+            change(record.name, facts)
+            writer.add_metadata(record.name, sealed(record.name, facts))
         case Attachment():
             writer.add_attachment(0, 0, record.name, record.media_type, record.data)
 

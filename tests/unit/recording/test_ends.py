@@ -91,6 +91,27 @@ def test_no_damage_of_the_last_bytes_is_taken_for_an_end(tmp_path):
         assert ends.end in ({}, run.end)
 
 
+def test_no_flipped_bit_leaves_wrong_facts(tmp_path, make):
+    path = tmp_path / "run.mcap"
+    with path.open("wb") as stream:
+        make.write(stream, [make.batch(0, 4)])
+    whole, right = path.read_bytes(), read_ends(path)
+    head = whole.index(b"model.yaml")
+    states = set()
+    for at in [*range(head), *range(len(whole) - 900, len(whole))]:
+        path.write_bytes(whole[:at] + bytes([whole[at] ^ 4]) + whole[at + 1 :])
+        try:
+            ends = read_ends(path)
+        except DataError:
+            continue
+        states.add(ends.state)
+        for found, written in ((ends.run, right.run), (ends.end, right.end)):
+            # All of them or none; one more where the name of the checksum itself is hit.
+            assert not found or written.items() <= found.items()
+        assert ends.state != "finished" or (ends.run and ends.end)
+    assert states == {"finished", "damaged", "unfinished"}
+
+
 @pytest.mark.parametrize(
     ("content", "problem"),
     [

@@ -17,8 +17,11 @@ from mcap.reader import NonSeekingReader, SeekingReader
 from mcap.writer import CompressionType, IndexType
 
 from hilctl.base.errors import DataError, HilctlError
+from hilctl.recording import reader
+from hilctl.recording.ends import read_ends
 from hilctl.recording.reader import read
 from hilctl.recording.recover import recover_recording
+from hilctl.recording.rewrite import Survey
 from tests.fakes import PackageMcapWriter
 
 PEERS = Path(__file__).parents[2] / "peers"
@@ -128,6 +131,72 @@ def test_cut_at_every_kind_of_boundary(sound, tmp_path):
                 recover_recording(path)
             assert path.read_bytes() == sound.data[:cut]
     assert {sound.before(cut) for cut in boundaries(sound)} <= counts
+
+
+def test_no_flipped_bit_leaves_a_file_sound(sound):
+    """In every frame, all facts, and at random places between."""
+    rng = np.random.default_rng(3)
+    places = set(rng.integers(0, len(sound.data), 60).tolist())
+    for opcode, start, end in sound.records:
+        places |= {start, start + 5, end - 1}
+        if opcode == METADATA:
+            places |= set(range(start, end, 37))
+    for at in sorted(places):
+        damaged = bytearray(sound.data)
+        damaged[at] ^= 1 << int(rng.integers(8))
+        try:
+            survey = Survey(io.BytesIO(damaged))
+        except DataError:
+            continue
+        assert not survey.salvage.sound, at
+
+
+@pytest.mark.parametrize("name", ["hilctl.run", "hilctl.end"])
+def test_a_flipped_bit_in_the_facts_is_told_by_all_who_read_them(sound, tmp_path, caplog, name):
+    """Recovery can't repair it, and does not hide it by a right checksum."""
+    facts = [start for opcode, start, _ in sound.records if opcode == METADATA]
+    text, start = (b"200.0", facts[0]) if name == "hilctl.run" else (b"completed", facts[1])
+    at = sound.data.index(text, start)
+    path = tmp_path / "run.mcap"
+    path.write_bytes(sound.data[:at] + b"4" + sound.data[at + 1 :])
+    for _ in range(2):
+        read(path)
+        assert f"metadata {name} with a wrong checksum" in caplog.text
+        caplog.clear()
+        ends = read_ends(path)
+        assert ends.state == "damaged"
+        assert name in ends.problem
+        assert name == "hilctl.end" or not ends.run
+        assert ends.end == {}
+        recovered = recover_recording(path)
+        assert not recovered.sound
+    assert recovered.original is None  # the second time there is nothing to repair
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+@pytest.mark.parametrize("long_bytes", [0, 1 << 30])
+def test_a_bit_that_no_other_checksum_covers_is_noticed(
+    sound, tmp_path, caplog, monkeypatch, long_bytes
+):
+    """The time of a chunk, also where the file is read ahead."""
+    monkeypatch.setattr(reader, "LONG_BYTES", long_bytes)
+    start = [start for opcode, start, _ in sound.records if opcode == CHUNK][-1]
+    damaged = bytearray(sound.data)
+    damaged[start + 9] ^= 1
+    path = tmp_path / "run.mcap"
+    path.write_bytes(damaged)
+    read(path)
+    assert "data section with a wrong checksum" in caplog.text
+    assert not recover_recording(path).sound
+    assert recover_recording(path).sound
+
+
+def test_a_file_without_checksums_is_sound(sound, tmp_path):
+    """0 means that there is none: so older recordings have it."""
+    (end,) = [start for opcode, start, _ in sound.records if opcode == DATA_END]
+    path = tmp_path / "run.mcap"
+    path.write_bytes(sound.data[: end + 9] + bytes(4) + sound.data[end + 13 :])
+    assert recover_recording(path).sound
 
 
 @pytest.mark.slow
