@@ -118,15 +118,17 @@ class AtomicFile:
             OSError: It can't be written to its end.
         """
         self.secure()
+        self.stream.close()  # Windows moves and links no open file
         if self._overwrite:
             self._beside.replace(self.final)
         else:
             self._link()
-        folder = os.open(self.final.parent, os.O_RDONLY)
-        try:
-            os.fsync(folder)  # the name is on the disk only once its folder is
-        finally:
-            os.close(folder)
+        with suppress(PermissionError):  # Windows opens no folder
+            folder = os.open(self.final.parent, os.O_RDONLY)
+            try:
+                os.fsync(folder)  # the name is on the disk only once its folder is
+            finally:
+                os.close(folder)
 
     def _link(self) -> None:
         try:

@@ -158,6 +158,9 @@ def check(experiment: ExperimentFile, settings: Settings = None, as_json: AsJson
 
 def safe(experiment: ExperimentFile, settings: Settings = None, as_json: AsJson = False) -> None:
     """Put a device at its safe value by hand, where no run holds it."""
+    from hilctl.run.architecture import require_linux
+
+    require_linux()
     from hilctl.run.by_hand import put_safe
 
     put = put_safe(experiment, settings or [])

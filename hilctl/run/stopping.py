@@ -6,8 +6,11 @@ import signal
 from hilctl.base.errors import RunError
 from hilctl.run.run_folder import RunFolder
 
-STOP_SIGNAL = signal.SIGUSR1
+# Windows has neither, and no runs; recordings are read there with what runs are made of.
+STOP_SIGNAL: signal.Signals = getattr(signal, "SIGUSR1", signal.SIGTERM)
 """What a supervisor takes for ``hilctl stop``."""
+HANG_UP: signal.Signals = getattr(signal, "SIGHUP", signal.SIGTERM)
+"""What a process gets when its terminal goes away."""
 
 
 def request_stop(run: RunFolder) -> bool:
