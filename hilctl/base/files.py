@@ -83,7 +83,10 @@ def sync_folder(path: Path) -> None:
     Raises:
         OSError: The disk refuses it.
     """
-    folder = os.open(path, os.O_RDONLY)
+    try:
+        folder = os.open(path, os.O_RDONLY)
+    except PermissionError:  # Windows opens no folder
+        return
     try:
         os.fsync(folder)
     except OSError as error:
@@ -134,6 +137,7 @@ class AtomicFile:
             OSError: It can't be written to its end.
         """
         self.secure()
+        self.stream.close()  # Windows moves and links no open file
         if self._overwrite:
             self._beside.replace(self.final)
         else:

@@ -8,6 +8,10 @@ except ImportError:  # Windows: runs need Linux, so there is nobody to be kept o
     fcntl = None  # type: ignore[assignment]
 
 
+HAS_LOCKS = fcntl is not None
+"""Whether the system has such locks; one without them (Windows) replaces no open file."""
+
+
 def take_lock(held: int | IO[bytes], *, shared: bool = False) -> None:
     """Lock an open file or folder until it is closed; nothing where the system has no such locks.
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from mcap.writer import MCAP0_MAGIC
 
 from hilctl.base.errors import ConfigError, DataError, InputError
-from hilctl.base.locks import take_lock
+from hilctl.base.locks import HAS_LOCKS, take_lock
 from hilctl.base.yaml.document import load_document
 from hilctl.campaign.steps import CampaignSteps, base_problem, settings_of
 from hilctl.experiment.parts import RecordingConfig
@@ -61,7 +61,8 @@ def held_folder(
     made = [each for each in (folder, *folder.parents) if not each.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        held = os.open(folder, os.O_RDONLY)
+        # Windows opens no folder and has no locks: there is nothing to hold.
+        held = os.open(folder if HAS_LOCKS else os.devnull, os.O_RDONLY)
     except OSError as error:
         raise InputError(f"{folder}: can't be made: {error.strerror}") from None
     try:

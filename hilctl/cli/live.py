@@ -32,6 +32,9 @@ def live(
     as_json: AsJson = False,
 ) -> None:
     """Serve a page that shows runs as they go on, until Ctrl-C or the end of RUN."""
+    from hilctl.run.architecture import require_linux
+
+    require_linux()
     from hilctl.desk.live import ShowsRuns, UntilEnded, serve_foxglove, serve_runs
     from hilctl.run.client import find_run
     from hilctl.run.run_folder import RunFolder

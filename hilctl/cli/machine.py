@@ -24,6 +24,9 @@ def doctor(
     as_json: AsJson = False,
 ) -> None:
     """Say what keeps this machine from real time, and measure whether it keeps a rate."""
+    from hilctl.run.architecture import require_linux
+
+    require_linux()
     from hilctl.cli.console import print_rich
     from hilctl.cli.machine_view import measuring, render
     from hilctl.experiment.load import load_experiment
@@ -93,6 +96,9 @@ def show(
 @devices_app.command()
 def probe(experiment: ExperimentFile, settings: Settings = None, as_json: AsJson = False) -> None:
     """Read an experiment's device and judge it; nothing moves."""
+    from hilctl.run.architecture import require_linux
+
+    require_linux()
     from hilctl.cli.probe_view import print_probed
     from hilctl.run.probe import probe as read_device
 

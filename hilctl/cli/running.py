@@ -56,10 +56,10 @@ def run(
 @contextmanager
 def _loop_ahead(experiment: Path) -> Iterator[None]:
     """Have the loop's process import while this one does, where there may be a run."""
-    from hilctl.run.architecture import require_real_time_machine
+    from hilctl.run.architecture import require_linux
     from hilctl.run.waiting_loop import started_ahead
 
-    require_real_time_machine()
+    require_linux()
     if not experiment.is_file():
         yield  # and is refused in words
         return
@@ -170,6 +170,9 @@ def check(experiment: ExperimentFile, settings: Settings = None, as_json: AsJson
 def safe(experiment: ExperimentFile, settings: Settings = None, as_json: AsJson = False) -> None:
     """Put a device at its safe value by hand, where no run holds it."""
     from hilctl.loop.safe_output import describe
+    from hilctl.run.architecture import require_linux
+
+    require_linux()
     from hilctl.run.by_hand import put_safe
 
     put = put_safe(experiment, settings or [])

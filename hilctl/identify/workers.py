@@ -68,7 +68,10 @@ _worker = _Worker()
 
 @cache
 def _threads() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(len(os.sched_getaffinity(0)), "hilctl-fit")
+    usable = (
+        os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else range(os.cpu_count() or 1)
+    )
+    return ThreadPoolExecutor(len(usable), "hilctl-fit")
 
 
 @contextmanager

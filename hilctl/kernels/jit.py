@@ -238,7 +238,7 @@ def _in_some_folder() -> Iterator[None]:
     try:
         Path.cwd()
     except FileNotFoundError:
-        gone = os.open(".", os.O_PATH)
+        gone = os.open(".", os.O_RDONLY)
         os.chdir("/")
         try:
             yield

@@ -8,6 +8,7 @@ import ctypes
 import errno
 import gc
 import os
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -34,9 +35,12 @@ class LinuxProcess:
     """This process, on Linux with glibc; see :class:`hilctl.machine.realtime.System`."""
 
     def __init__(self) -> None:
-        self._libc = ctypes.CDLL(None, use_errno=True)
         self._latency_file: int | None = None
         self._cpus_before: set[int] | None = None
+
+    @cached_property
+    def _libc(self) -> ctypes.CDLL:
+        return ctypes.CDLL(None, use_errno=True)
 
     def _call(self, name: str, *arguments: int) -> None:
         function: Any = getattr(self._libc, name)

@@ -50,8 +50,8 @@ def read_ends(path: Path) -> RecordingEnds:
         DataError: The file can't be read, is not an MCAP file, or does not begin with a run.
     """
     try:
-        # Not to wait for whoever writes to a pipe of that name.
-        with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb", buffering=0) as stream:
+        _check_is_file(path)  # first: opening a pipe waits for its writer
+        with path.open("rb", buffering=0) as stream:
             return _ends(stream)
     except OSError as error:
         raise DataError(f"{path}: can't be read: {reason(error)}") from None
@@ -59,11 +59,13 @@ def read_ends(path: Path) -> RecordingEnds:
         raise DataError(f"{path}: {error}") from None
 
 
-def _ends(stream: FileIO) -> RecordingEnds:
-    found = os.fstat(stream.fileno())
-    if not stat.S_ISREG(found.st_mode):
+def _check_is_file(path: Path) -> None:
+    if not stat.S_ISREG(path.stat().st_mode):
         raise DataError("is not a file")
-    file = _Bytes(stream.fileno(), found.st_size)
+
+
+def _ends(stream: FileIO) -> RecordingEnds:
+    file = _Bytes(stream)
     metadata, end_metadata = _run_metadata(file), _end_metadata(file)
     run, right = unsealed("hilctl.run", metadata)
     if not right:
@@ -81,13 +83,17 @@ def _ends(stream: FileIO) -> RecordingEnds:
 class _Bytes:
     """A file of which head and tail are read once."""
 
-    def __init__(self, descriptor: int, size: int) -> None:
-        self._descriptor = descriptor
-        self.size = size
-        self._tail_at = max(0, size - _TAIL_BYTES)
-        self._parts = {0: os.pread(descriptor, _HEAD_BYTES, 0)}
-        if size > _HEAD_BYTES:
-            self._parts[self._tail_at] = os.pread(descriptor, _TAIL_BYTES, self._tail_at)
+    def __init__(self, stream: FileIO) -> None:
+        self._stream = stream
+        self.size = os.fstat(stream.fileno()).st_size
+        self._parts = {0: self._read(0, _HEAD_BYTES)}
+        if self.size > _HEAD_BYTES:
+            tail_at = self.size - _TAIL_BYTES
+            self._parts[tail_at] = self._read(tail_at, _TAIL_BYTES)
+
+    def _read(self, start: int, size: int) -> bytes:
+        self._stream.seek(start)
+        return self._stream.read(size)
 
     def at(self, start: int, size: int) -> bytes:
         """Return bytes of the file; fewer at its end, none of a place or size that can't be."""
@@ -96,7 +102,7 @@ class _Bytes:
         for at, part in self._parts.items():
             if at <= start and start + size <= at + len(part):
                 return part[start - at : start - at + size]
-        return os.pread(self._descriptor, size, start)
+        return self._read(start, size)
 
     def records(self, start: int, stop: int) -> Iterator[McapRecord]:
         """Yield whole records, up to the first that is none or is of messages."""

@@ -15,6 +15,7 @@ import numpy as np
 
 from hilctl.base.errors import DataError, InputError
 from hilctl.base.events import Event
+from hilctl.base.locks import HAS_LOCKS
 from hilctl.base.samples import LAST_SAMPLE, Batch, Head
 from hilctl.recording.checks import MAX_UNIX_NS, SoundMessages, sound_blocks
 from hilctl.recording.locks import lock
@@ -112,6 +113,8 @@ def recover_recording(
                 if layout:
                     saved.add(more, events, layout)
                 reason = saved.finish(end, ended_at if ended_at < LAST_SAMPLE else 0)
+                if not HAS_LOCKS:
+                    stream.close()
                 kept = replacement.put()
     except FileNotFoundError as error:
         raise DataError(f"{error.filename or path}: no such file or folder") from None

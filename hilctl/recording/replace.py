@@ -28,7 +28,7 @@ class Replacement:
         self._file = AtomicFile(self._old if output is None else output, overwrite=output is None)
         self.final = self._file.final
         self.stream = self._file.stream
-        os.fchmod(self.stream.fileno(), self._old.stat().st_mode)
+        Path(self.stream.name).chmod(self._old.stat().st_mode)
 
     def put(self) -> Path:
         """Move the new file, safe on the disk, to its place; return where the old one is now.

@@ -7,7 +7,15 @@ from hilctl.base.errors import InputError
 WORKS_ANYWHERE = "report, replay, export, identify, compare, check and learn --fast work here"
 
 
-def require_real_time_machine() -> None:
-    """Raise InputError on a system other than Linux."""
-    if sys.platform != "linux":
-        raise InputError(f"a run needs Linux, this is {sys.platform}: {WORKS_ANYWHERE}")
+def require_linux(system: str | None = None) -> None:
+    """Refuse a system other than Linux.
+
+    Args:
+        system: The system's name, as in ``sys.platform``; this one's where None.
+
+    Raises:
+        InputError: It is another.
+    """
+    system = sys.platform if system is None else system
+    if system != "linux":
+        raise InputError(f"a run needs Linux, this is {system}: {WORKS_ANYWHERE}")

@@ -26,7 +26,7 @@ from hilctl.loop.host import StraightLine, Tuning
 from hilctl.loop.tuning import Tuner
 from hilctl.run.ring import SampleRing
 from hilctl.run.shared_page import Field
-from hilctl.run.stopping import JOB_CONTROL, STOP_SIGNAL
+from hilctl.run.stopping import HANG_UP, JOB_CONTROL, STOP_SIGNAL
 
 _NICE = 5
 _BUDGET_S = 0.3
@@ -34,7 +34,7 @@ _LONGEST_S = 20.0
 _STILL_S = 10.0
 _PAUSE_S = 0.002
 _DEATH_S = 1.0
-SUPERVISORS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, STOP_SIGNAL, *JOB_CONTROL)
+SUPERVISORS = (signal.SIGINT, signal.SIGTERM, HANG_UP, STOP_SIGNAL, *JOB_CONTROL)
 """Signals that may be sent to all of a run's processes, and are the supervisor's to follow."""
 
 

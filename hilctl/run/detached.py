@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hilctl.base.errors import HilctlError, InputError, RunError
-from hilctl.run.architecture import require_real_time_machine
+from hilctl.run.architecture import require_linux
 from hilctl.run.control_socket import ask
 from hilctl.run.protocol import request
 from hilctl.run.run_folder import RunFolder, runs
@@ -50,7 +50,7 @@ def start_detached(
         InputError: It can't be used; nothing has moved.
         RunError: It did not start, or has failed; the text is its own error.
     """
-    require_real_time_machine()
+    require_linux()
     checked = checked_experiment(experiment, settings)
     output = output_of(checked, output)
     log = free_log(output)

@@ -27,9 +27,10 @@ from hilctl.experiment.parts import EndCommand
 from hilctl.recording.ends import read_ends
 from hilctl.recording.facts import END_FIGURES
 from hilctl.run.result import EndCommandResult, RunResult
+from hilctl.run.stopping import HANG_UP
 
 _SAID = 300
-_SIGNALS = (signal.SIGTERM, signal.SIGHUP)
+_SIGNALS = (signal.SIGTERM, HANG_UP)
 SUFFIX = ".on_end.json"
 """Of the file beside a recording that says what became of the programs."""
 

@@ -10,7 +10,7 @@ from hilctl.base.errors import InputError
 from hilctl.base.remedy import reason
 from hilctl.experiment.check import Checked, check
 from hilctl.experiment.load import load_experiment
-from hilctl.run.architecture import require_real_time_machine
+from hilctl.run.architecture import require_linux
 from hilctl.run.end_commands import with_end_commands
 from hilctl.run.result import Progress, RunResult
 from hilctl.run.waiting_loop import started_ahead
@@ -73,7 +73,7 @@ def start_run(
         InputError: Nothing has moved, and no file is left.
         RunError: The device could not be opened; nothing has moved, and no file is left.
     """
-    require_real_time_machine()
+    require_linux()
     with started_ahead():
         return _run(path, settings, output, overwrite, on_progress, heat_a2)
 

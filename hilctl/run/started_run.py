@@ -18,12 +18,12 @@ from hilctl.run.ring import SampleRing
 from hilctl.run.ring_recorder import RingRecorder
 from hilctl.run.safety import Safety
 from hilctl.run.shared_page import Field, Stop
-from hilctl.run.stopping import STOP_SIGNAL
+from hilctl.run.stopping import HANG_UP, STOP_SIGNAL
 
 STOPS = {
     signal.SIGINT: Stop.CTRL_C,
     signal.SIGTERM: Stop.SIGTERM,
-    signal.SIGHUP: Stop.SIGHUP,
+    HANG_UP: Stop.SIGHUP,
     STOP_SIGNAL: Stop.REQUEST,
 }
 

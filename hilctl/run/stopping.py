@@ -6,9 +6,14 @@ import signal
 from hilctl.base.errors import RunError
 from hilctl.run.run_folder import RunFolder
 
-STOP_SIGNAL = signal.SIGUSR1
+# Windows has neither, and no runs; recordings are read there with what runs are made of.
+STOP_SIGNAL: signal.Signals = getattr(signal, "SIGUSR1", signal.SIGTERM)
 """What a supervisor takes for ``hilctl stop``."""
-JOB_CONTROL = (signal.SIGTSTP, signal.SIGTTIN, signal.SIGTTOU)
+HANG_UP: signal.Signals = getattr(signal, "SIGHUP", signal.SIGTERM)
+"""What a process gets when its terminal goes away."""
+JOB_CONTROL: tuple[signal.Signals, ...] = tuple(
+    getattr(signal, name) for name in ("SIGTSTP", "SIGTTIN", "SIGTTOU") if hasattr(signal, name)
+)
 """Signals by which a terminal suspends a process; a suspended supervisor would see no stop."""
 
 

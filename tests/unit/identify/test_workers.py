@@ -11,7 +11,7 @@ from hilctl.base.errors import InputError
 from hilctl.identify.data.records import SteadyLoop
 from hilctl.identify.fit_model import fit_model
 from hilctl.identify.settings import FitSettings
-from hilctl.identify.workers import beside_each_other, workers
+from hilctl.identify.workers import _threads, beside_each_other, workers
 from hilctl.models.published import exponential_integrated
 
 Loops = Callable[..., list[SteadyLoop]]
@@ -25,6 +25,14 @@ def loops(loops_of: Loops) -> list[SteadyLoop]:
         beta_1=0.15, d_p=8.0, alpha_2=0.1, beta_2=0.4, d_n=8.0, plays=6, deadbands_a_side=4,
     )  # fmt: skip
     return loops_of(omega, GRID)
+
+
+def test_threads_need_no_affinity(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Only Linux says which CPUs a process may use."""
+    monkeypatch.delattr(os, "sched_getaffinity", raising=False)
+    _threads.cache_clear()
+    assert beside_each_other(abs, [-1, -2]) == [1, 2]
+    _threads.cache_clear()
 
 
 def test_short_parts_run_beside_each_other_and_keep_their_order():

@@ -8,6 +8,7 @@ import pytest
 from mcap.writer import Writer
 
 from hilctl.base.errors import DataError
+from hilctl.recording import ends as ends_module
 from hilctl.recording.ends import read_ends
 from hilctl.recording.reader import read
 
@@ -35,13 +36,13 @@ def test_neither_samples_nor_a_long_index_are_read(tmp_path, monkeypatch):
         writer.add_metadata("hilctl.end", {"code": "completed"})
         writer.finish()
     read_bytes = []
-    pread = os.pread
+    read = ends_module._Bytes._read
 
-    def counted(descriptor, size, at):
+    def counted(file, start, size):
         read_bytes.append(size)
-        return pread(descriptor, size, at)
+        return read(file, start, size)
 
-    monkeypatch.setattr(os, "pread", counted)
+    monkeypatch.setattr(ends_module._Bytes, "_read", counted)
     ends = read_ends(path)
     assert (ends.run, ends.end) == ({"name": "long"}, {"code": "completed"})
     assert path.stat().st_size > 500_000

@@ -6,7 +6,7 @@ import pytest
 
 from hilctl.base.errors import InputError
 from hilctl.run import architecture
-from hilctl.run.architecture import require_real_time_machine
+from hilctl.run.architecture import require_linux
 from hilctl.run.detached import start_detached
 from hilctl.run.start import checked_experiment, start_run
 
@@ -14,14 +14,14 @@ from hilctl.run.start import checked_experiment, start_run
 @pytest.mark.parametrize("machine", ["x86_64", "aarch64", "riscv64"])
 def test_linux_may_run_on_any_processor(monkeypatch, machine):
     monkeypatch.setattr("platform.machine", lambda: machine)
-    require_real_time_machine()
+    require_linux()
 
 
 @pytest.mark.parametrize("system", ["darwin", "win32"])
 def test_another_system_is_refused_in_one_line(monkeypatch, system):
     monkeypatch.setattr(architecture, "sys", SimpleNamespace(platform=system))
     with pytest.raises(InputError, match=f"needs Linux, this is {system}: report, replay") as no:
-        require_real_time_machine()
+        require_linux()
     assert "\n" not in str(no.value)
 
 
