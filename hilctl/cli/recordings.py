@@ -101,7 +101,7 @@ def identify(
     from hilctl.cli.progress import shown_progress
 
     del list_settings
-    check_page(html, overwrite=overwrite)
+    check_page(html, overwrite=overwrite, inputs=[*files, *(validate or [])])
     table = {
         "table.unit": unit,
         "table.command_column": _column(command_column),
