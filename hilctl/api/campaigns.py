@@ -62,8 +62,9 @@ def characterise(
         InputError: Something can't be used or written; nothing has moved.
         RunError: A step ended by a fault; those before it stand.
     """
-    from hilctl.base.files import check_writable
+    from hilctl.base.files import check_no_input, check_writable
     from hilctl.characterise.session import Campaign, CampaignHost
+    from hilctl.experiment.load import inputs_of
     from hilctl.run.step import paced, unpaced
 
     file, chosen = Path(output), runs_folder(output, folder)
@@ -73,8 +74,12 @@ def characterise(
     host = CampaignHost(run=unpaced if fast else paced, on_progress=on_progress, on_step=on_step)
     measured = Campaign(Path(experiment), texts_of(settings), chosen, highest_hz, host)
     if not dry_run:
-        check_writable(file, overwrite=overwrite)
-        check_writable(page, overwrite=overwrite or any(chosen.glob("*.mcap")))
+        inputs = inputs_of(Path(experiment), texts_of(settings))
+        check_writable(file, overwrite=overwrite, inputs=inputs)
+        again = overwrite or any(chosen.glob("*.mcap"))
+        check_writable(page, overwrite=again, inputs=inputs)
+        for path in chosen.glob("*.mcap"):
+            check_no_input(path, inputs)
         finish_dead_runs()
     on_plan(measured.plan)
     if dry_run:
@@ -144,9 +149,11 @@ def run_steps(
     on_plan: "Callable[[SeriesPlan], None]",
 ) -> "SeriesResult | None":
     """Run the steps of a campaign, wherever they come from; see :func:`campaign`."""
+    from hilctl.base.files import check_no_input
     from hilctl.campaign.fast import run_fast
     from hilctl.campaign.folder import campaign_folder
     from hilctl.campaign.session import prepared, run_series
+    from hilctl.experiment.load import inputs_of
 
     if scheduler != "none" and not fast:
         rule = "for fast runs only; those that keep real time follow each other"
@@ -154,6 +161,9 @@ def run_steps(
     chosen = folder or campaign_folder(steps)
     with nullcontext() if dry_run else prepared(chosen, host):
         plan = _plan(steps, chosen, host, fast=fast)
+        inputs = inputs_of(steps.experiment, steps.settings)
+        for suffix in (".csv", ".parquet", ".html"):
+            check_no_input(chosen / f"{steps.config.name}{suffix}", inputs)
         on_plan(plan)
         if dry_run:
             return None

@@ -8,7 +8,7 @@ import time
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
-from hilctl.base.errors import RunError
+from hilctl.base.errors import InputError, RunError
 from hilctl.run.client import find_run, mark_run, set_run, status_of, stop_runs
 from hilctl.run.protocol import InverseState
 from hilctl.run.run_folder import RunFolder
@@ -100,8 +100,12 @@ class RunConnection:
             window_s: Time that each frame shows.
 
         Raises:
+            InputError: One of them is no time.
             RunError: The run has ended.
         """
+        for name, value, least in (("every_s", every_s, 0.0), ("window_s", window_s, 1e-3)):
+            if not least <= value <= 1e5:
+                raise InputError(f"{name}: must be from {least:g} to 100000 s: got {value:g}")
         from hilctl.desk.feed import RunFeed
         from hilctl.desk.subscription import frames_of
 

@@ -126,11 +126,16 @@ def compare(
     """
     from hilctl.base.files import check_writable
     from hilctl.comparison import compare as library
+    from hilctl.experiment.load import inputs_of
 
+    inputs = [*paths_of(recordings), *map(Path, models)]
+    if experiment is not None:
+        inputs += inputs_of(Path(experiment), texts_of(settings))
     if html is not None:
-        check_writable(Path(html), overwrite=overwrite)
+        check_writable(Path(html), overwrite=overwrite, inputs=inputs)
     if save is not None:
-        library.check_free(models or list(library.COMPARED), Path(save), overwrite=overwrite)
+        kinds = models or list(library.COMPARED)
+        library.check_free(kinds, Path(save), overwrite=overwrite, inputs=inputs)
     finish_dead_runs()
 
     request = library.ComparisonRequest(

@@ -160,7 +160,8 @@ def report_runs(
     from hilctl.base.files import check_writable
 
     if html is not None:
-        check_writable(Path(html), overwrite=overwrite)
+        inputs = [] if model is None else [Path(model)]
+        check_writable(Path(html), overwrite=overwrite, inputs=inputs)
     series = _series(runs, model, on_progress)
     if html is not None:
         from hilctl.series.page import write_series

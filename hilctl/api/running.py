@@ -108,13 +108,17 @@ def learn(
     Raises:
         InputError: Something can't be used or written; nothing has moved.
     """
-    from hilctl.base.files import check_writable
+    from hilctl.base.files import check_no_input, check_writable
     from hilctl.experiment.correction import write_correction
+    from hilctl.experiment.load import inputs_of
     from hilctl.learning.session import Session
     from hilctl.run.step import paced, unpaced
 
     file, chosen = Path(output), runs_folder(output, folder)
-    check_writable(file, overwrite=overwrite)
+    inputs = inputs_of(Path(experiment), texts_of(settings))
+    check_writable(file, overwrite=overwrite, inputs=inputs)
+    for path in chosen.glob("run-*.*"):
+        check_no_input(path, inputs)
     if not overwrite and any(chosen.glob("run-*.mcap")):
         raise InputError(f"{chosen}: holds runs already: give another --folder, or --overwrite")
     session = Session(Path(experiment), texts_of(settings), chosen, unpaced if fast else paced)

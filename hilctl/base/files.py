@@ -3,7 +3,7 @@
 import errno
 import os
 import secrets
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
@@ -175,9 +175,26 @@ class AtomicFile:
         self.close()
 
 
+RECORDING_MAGIC = b"\x89MCAP0\r\n"
+"""First bytes of an MCAP file."""
+
+
+def begins_as_recording(path: Path) -> bool:
+    """Return whether a file begins as a recording does: an empty one might become one.
+
+    Raises:
+        OSError: It can't be read.
+    """
+    with path.open("rb") as stream:
+        head = stream.read(len(RECORDING_MAGIC))
+    return head == RECORDING_MAGIC[: len(head)]
+
+
 @contextmanager
 def _written(path: Path, *, overwrite: bool) -> Iterator[AtomicFile]:
     try:
+        if overwrite and path.is_file() and path.stat().st_size and begins_as_recording(path):
+            raise InputError(f"{path}: is a recording, and nothing else replaces it: name another")
         with AtomicFile(path, overwrite=overwrite) as file:
             yield file
     except FileExistsError:
@@ -217,11 +234,29 @@ def write_text(path: Path, text: str, *, overwrite: bool) -> None:
     write_file(path, lambda stream: stream.write(text.encode()), overwrite=overwrite)
 
 
-def check_writable(path: Path, *, overwrite: bool) -> None:
+def check_writable(path: Path, *, overwrite: bool, inputs: Iterable[Path] = ()) -> None:
     """Refuse a file that could not be written, before work is done that would be in vain.
 
+    Args:
+        path: The file.
+        overwrite: Whether a file of that name may be replaced.
+        inputs: Files that are read for it; they are never replaced.
+
     Raises:
-        InputError: What :func:`write_file` would raise now.
+        InputError: It is one of them, or what :func:`write_file` would raise now.
     """
+    check_no_input(path, inputs)
     with _written(path, overwrite=overwrite):
         pass  # not committed: nothing of it is left
+
+
+def check_no_input(path: Path, inputs: Iterable[Path]) -> None:
+    """Refuse an output that is an input.
+
+    Raises:
+        InputError: It is one.
+    """
+    for each in inputs:
+        with suppress(OSError):  # one that is not there is not the other
+            if path.samefile(each):
+                raise InputError(f"{path}: is read by the same command: give another name")

@@ -1,5 +1,6 @@
 """The command that compares models."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -75,11 +76,11 @@ def _numbers(text: str | None) -> list[float] | None:
         raise InputError(f"--frequencies must be numbers with commas between: {text!r}") from None
 
 
-def check_page(html: Path | None, *, overwrite: bool) -> None:
+def check_page(html: Path | None, *, overwrite: bool, inputs: Sequence[Path] = ()) -> None:
     """Refuse a page that can't be written, before there is anything to put on it.
 
     Raises:
-        InputError: It exists, and may not be replaced, or it can't be written.
+        InputError: It exists, and may not be replaced, it can't be written, or it is an input.
     """
     if html is not None:
-        check_writable(html, overwrite=overwrite)
+        check_writable(html, overwrite=overwrite, inputs=inputs)

@@ -5,7 +5,8 @@ from typing import Annotated
 
 import typer
 
-from hilctl.base.files import write_text
+from hilctl.base.errors import InputError
+from hilctl.base.files import read_text, write_text
 from hilctl.cli.options import AsJson, ExperimentFile, Settings
 from hilctl.cli.output import print_json
 
@@ -59,6 +60,8 @@ def schema(
     if output is None:
         print(schema_text(), end="")
         return
+    if output.is_file() and read_text(output).strip()[:1] not in {"", "{"}:
+        raise InputError(f"{output}: is no JSON, so no schema to replace: give another name")
     write_text(output, schema_text(), overwrite=True)
 
 

@@ -6,8 +6,9 @@ from typing import Annotated
 
 import typer
 
+from hilctl.base.errors import InputError
 from hilctl.cli.comparing import check_page
-from hilctl.cli.options import AsJson, Overwrite, RecordingFile
+from hilctl.cli.options import AsJson, Overwrite
 from hilctl.cli.output import finish_orphans, print_json
 
 IdentifyInput = Annotated[
@@ -40,15 +41,36 @@ FitTexts = Annotated[
 
 
 def recover(
-    recording: RecordingFile,
+    recording: Annotated[
+        Path | None, typer.Argument(metavar="RUN", help="Recording (MCAP).")
+    ] = None,
     output: Annotated[
         Path | None, typer.Option(help="Put the whole file here, and leave RUN as it is.")
+    ] = None,
+    given_up: Annotated[
+        str | None,
+        typer.Option(
+            "--dismiss",
+            metavar="NAME",
+            help="Give up what the dead run of that name has left in memory.",
+        ),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Make a recording that was cut short whole again; the bytes as they were stay as RUN.torn."""
     from hilctl.recording.recover import recover_recording
+    from hilctl.run.run_folder import dismiss
 
+    if (recording is None) == (given_up is None) or (given_up is not None and output is not None):
+        raise InputError("recover: give a RUN to recover, or --dismiss NAME alone")
+    if given_up is not None:
+        removed = dismiss(given_up)
+        if as_json:
+            print_json({"dismissed": str(removed)})
+        else:
+            print(f"{removed}: removed")
+        return
+    assert recording is not None
     finish_orphans()
     recovered = recover_recording(recording, output=output)
     if as_json:
@@ -101,7 +123,7 @@ def identify(
     from hilctl.cli.progress import shown_progress
 
     del list_settings
-    check_page(html, overwrite=overwrite)
+    check_page(html, overwrite=overwrite, inputs=[*files, *(validate or [])])
     table = {
         "table.unit": unit,
         "table.command_column": _column(command_column),

@@ -34,7 +34,7 @@ def refine(
     from hilctl import api
     from hilctl.cli.progress import shown_progress
 
-    check_page(html, overwrite=overwrite)
+    check_page(html, overwrite=overwrite, inputs=[model, *runs, *(validate or [])])
     finish_orphans()
     with shown_progress("refine", quiet=as_json) as progress:
         found = api.refine(

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from hilctl.base.errors import InputError
-from hilctl.base.files import already_there, write_text
+from hilctl.base.files import already_there, check_no_input, write_text
 from hilctl.base.yaml.document import Document
 from hilctl.comparison.trials import (
     InverseTrial,
@@ -267,13 +267,23 @@ def _recorded(recording: Recording, settings: Sequence[str]) -> LoadedExperiment
     return resolve(document, recording.path.parent, (*plain, *settings))
 
 
-def check_free(names: Sequence[str], folder: Path, *, overwrite: bool) -> None:
+def check_free(
+    names: Sequence[str], folder: Path, *, overwrite: bool, inputs: Sequence[Path] = ()
+) -> None:
     """Refuse a folder in which a file of one of these models stands already.
+
+    Args:
+        names: Names of the models.
+        folder: The folder.
+        overwrite: Whether their files may be replaced.
+        inputs: Files that are read; they are never replaced.
 
     Raises:
         InputError: One does, and may not be replaced.
     """
     paths = [folder / f"{name}.yaml" for name in names]
+    for path in paths:
+        check_no_input(path, inputs)
     taken = [path for path in paths if path.exists()]
     if taken and not overwrite:
         raise already_there(taken[0], "give another --save, or --overwrite")

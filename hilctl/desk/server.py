@@ -27,7 +27,7 @@ from hilctl.desk.feeds import RunFeeds
 from hilctl.desk.frames import frame_of, nearest_window_s
 from hilctl.desk.signals import SIGNALS
 from hilctl.desk.static import file_response, plain_response
-from hilctl.desk.viewer import MAX_MESSAGE_BYTES, PageMessage, Viewer
+from hilctl.desk.viewer import MAX_MESSAGE_BYTES, PageMessage, Viewer, answer_text
 from hilctl.run.control_socket import ask
 from hilctl.run.run_folder import RunFolder
 from hilctl.run.stopping import request_stop
@@ -126,7 +126,7 @@ class LiveServer:
             answer = await self._followed(viewer, message)
         except HilctlError as error:
             answer = {"ok": False, "error": str(error)}
-        return json.dumps({"kind": "answer", "id": message.id, "ask": message.ask, **answer})
+        return answer_text(message, **answer)
 
     async def _followed(self, viewer: Viewer, message: PageMessage) -> dict[str, Any]:
         feed = self.feed(viewer.view.run)

@@ -5,9 +5,10 @@ sees fewer of them, and the newest. One that takes nothing for seconds is cut.
 """
 
 import asyncio
+import json
 import time
 from collections.abc import Awaitable, Callable
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, ValidationError
 from websockets.asyncio.server import ServerConnection
@@ -34,7 +35,7 @@ class PageView(Strict):
 
     run: str | None = None
     mode: ScopeMode = "cycle"
-    window_s: float = 2.0
+    window_s: Annotated[float, Field(ge=1e-3, le=1e5)] = 2.0
 
 
 class PageMessage(Strict):
@@ -44,14 +45,19 @@ class PageMessage(Strict):
         id: Number that the answer comes with.
         ask: ``view`` changes what it shows, ``stop`` ends the run by its safe ramp, ``run`` passes
             a request on to the run's control socket.
-        view: What it shows from now on.
+        view: What it shows from now on, a :class:`PageView`.
         request: The request to the run.
     """
 
     id: int
     ask: Literal["view", "stop", "run"]
-    view: PageView = PageView()
+    view: dict[str, Any] = Field(default_factory=dict)
     request: dict[str, Any] = Field(default_factory=dict)
+
+
+def answer_text(message: PageMessage, **said: Any) -> str:
+    """Return the answer to a message as JSON."""
+    return json.dumps({"kind": "answer", "id": message.id, "ask": message.ask, **said})
 
 
 class Allowance:
@@ -135,5 +141,11 @@ class Viewer:
                 await self._connection.close(1008, "not a message of the page")
                 return
             if message.ask == "view":
-                self.view = message.view
+                try:
+                    self.view = PageView.model_validate(message.view)
+                except ValidationError as error:
+                    first = error.errors(include_url=False, include_input=False)[0]
+                    text = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
+                    await self._connection.send(answer_text(message, ok=False, error=text))
+                    continue
             await self._connection.send(await self._answer(self, message))

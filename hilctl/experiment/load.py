@@ -63,6 +63,35 @@ def load_experiment(path: Path, settings: Sequence[str] = ()) -> LoadedExperimen
     return resolve(load_document(path), path.parent, from_here)
 
 
+def input_files(document: Document, path: Path) -> list[Path]:
+    """Return the files of an experiment: its own, and those that its keys name.
+
+    Args:
+        document: The experiment.
+        path: Its file.
+    """
+    found = [path]
+    for key in sorted(FILE_KEYS):
+        value: object = document.data
+        for name in key.split("."):
+            value = value.get(name) if isinstance(value, dict) else None
+        if isinstance(value, str):  # a shipped profile is a name, and no file
+            found.append(path.parent / value)
+    return found
+
+
+def inputs_of(path: Path, settings: Sequence[str] = ()) -> list[Path]:
+    """Return the files that a run of an experiment file reads, see :func:`load_experiment`.
+
+    Raises:
+        InputError: The file can't be read, or a setting can't be used.
+    """
+    document = load_document(path)
+    for setting in settings:
+        document.set(named_from(path.parent, setting))
+    return input_files(document, path)
+
+
 def named_from(folder: Path, setting: str) -> str:
     """Return a setting with the file that it names in the working folder named from another one.
 

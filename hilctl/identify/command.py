@@ -110,7 +110,7 @@ def identify_files(
         InputError: A file or a setting can't be used; nothing is written.
     """
     if output is not None:
-        check_writable(output, overwrite=overwrite)
+        check_writable(output, overwrite=overwrite, inputs=[*paths, *validate])
     with workers(scheduler) as run:
         lag = _lag(paths, settings, run, progress)
         records, recorded = load_records(paths, settings, lag)

@@ -16,6 +16,7 @@ from pathlib import Path
 
 from hilctl import __version__
 from hilctl.base.events import Event
+from hilctl.base.files import begins_as_recording
 from hilctl.base.samples import Batch
 from hilctl.base.segments import Segment
 from hilctl.recording.facts import sealed
@@ -243,7 +244,7 @@ class OutputFile:
 
     Raises:
         FileExistsError: It exists and ``overwrite`` is False.
-        OSError: It can't be written, or another run is recording to it.
+        OSError: It can't be written, it is no recording, or another run is recording to it.
     """
 
     def __init__(self, path: Path, *, overwrite: bool, sync: bool = False) -> None:
@@ -251,6 +252,9 @@ class OutputFile:
         self._ours = not path.exists()
         if overwrite and not self._ours and not path.is_file():
             raise OSError(errno.EINVAL, "Not a regular file", str(path))
+        if overwrite and not self._ours and not begins_as_recording(path):
+            text = "Not a recording, and --overwrite replaces nothing else: name another file"
+            raise OSError(errno.EINVAL, text, str(path))
         # Not "wb": what stands there is emptied only once the run starts, and under the lock.
         raw = path.open("r+b" if overwrite and not self._ours else "xb", buffering=0)
         lock(raw)

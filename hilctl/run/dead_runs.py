@@ -15,7 +15,13 @@ def finish_dead_runs() -> None:
     from hilctl.run.orphans import recover_orphans
 
     for orphan in recover_orphans():
-        kept = f"its samples are kept in {orphan.kept}; the next command tries again"
+        if not orphan.started:
+            _log.warning("%s had died before its start: %s", orphan.name, orphan.text)
+            continue
+        kept = (
+            f"its samples are kept in {orphan.kept}; the next command tries again, and "
+            f"hilctl recover --dismiss {orphan.name} gives them up"
+        )
         done = f"recovered into {orphan.recording}"
         _log.warning("%s was not recorded to its end: %s", orphan.name, orphan.text)
         _log.warning("%s", kept if orphan.kept else done)

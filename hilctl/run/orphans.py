@@ -2,7 +2,7 @@
 
 import signal
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -11,6 +11,7 @@ from hilctl.base.events import Event
 from hilctl.base.samples import Batch, Head
 from hilctl.loop.plan import Outcome
 from hilctl.loop.safe_output import describe
+from hilctl.recording.locks import is_being_recorded
 from hilctl.recording.recover import recover_recording
 from hilctl.run.metadata import end_facts
 from hilctl.run.ring import SampleRing
@@ -28,6 +29,7 @@ class Orphan:
         safe: Whether loop or guardian have put the output at its safe value before they left.
         text: What became of it, for people.
         kept: Folder that still holds what could not be recovered; None where all of it was.
+        started: Whether its loop had started; otherwise nothing has moved, or is to be recovered.
     """
 
     name: str
@@ -35,6 +37,7 @@ class Orphan:
     safe: bool
     text: str
     kept: Path | None = None
+    started: bool = True
 
 
 def recover_orphans() -> list[Orphan]:
@@ -53,6 +56,9 @@ def recover_orphans() -> list[Orphan]:
 
 def _recover(run: RunFolder) -> Orphan:
     path = Path(run.card.recording)
+    if not _has_started(run, path):
+        _remove_claimed(path)
+        return Orphan(run.card.name, path, True, "nothing has moved", started=False)
     outcome, batches, events, end = _left_behind(run)
     where = "at its safe value" if outcome.safe else "NOT confirmed to be safe: check it"
     if _is_recorded(run):
@@ -72,6 +78,22 @@ def _is_recorded(run: RunFolder) -> bool:
         return bool(SampleRing(run.ring).page.get(Field.RECORDED))
     except (OSError, ValueError):
         return False
+
+
+def _has_started(run: RunFolder, recording: Path) -> bool:
+    try:
+        page = SampleRing(run.ring).page
+    except (OSError, ValueError):  # it is made before anything is written to the recording
+        return not (recording.is_file() and recording.stat().st_size == 0)
+    waits = page.get(Field.PHASE) in {Phase.STARTING, Phase.READY, Phase.REFUSED}
+    return not (waits and page.get(Field.GO) == page.get(Field.SENT) == 0)
+
+
+def _remove_claimed(recording: Path) -> None:
+    """Remove the empty file that a run has claimed, unless another has claimed it since."""
+    with suppress(OSError), recording.open("rb") as stream:
+        if not stream.read(1) and not is_being_recorded(stream):
+            recording.unlink()
 
 
 def _left_behind(

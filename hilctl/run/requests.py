@@ -36,8 +36,8 @@ class SetRequest(Strict):
     """
 
     command: Literal["set"]
-    gain: float | None = None
-    offset: float | None = None
+    gain: Annotated[float, Field(ge=-1e6, le=1e6)] | None = None
+    offset: Annotated[float, Field(ge=-1e6, le=1e6)] | None = None
     inverse: Literal["in", "out"] | None = None
     over_s: Annotated[float, Field(gt=0.0, le=3600.0)] = 1.0
 

@@ -37,6 +37,7 @@ _log = logging.getLogger(__name__)
 _CARD = "run.json"
 _KEPT = "kept"
 _SUPERVISOR = "supervisor.lock"
+_DEVICES = "devices"
 _REMOVED = " (deleted)"
 _PEER = struct.Struct("3i")  # process, user and group, as in unix(7)
 _BACKLOG = 1000  # connections that ask who holds a device; they are never accepted
@@ -362,7 +363,7 @@ def _held(name: str) -> Iterator[list[int]]:
     digest = hashlib.sha256(os.fsencode(name)).hexdigest()
     address = b"\0hilctl/device/" + digest.encode()
     with ExitStack() as stack:
-        folder = base_folder() / "devices"
+        folder = base_folder() / _DEVICES
         try:
             private_folder(folder)
             locks = [stack.enter_context(_locked(folder / f"{digest}.lock"))]
@@ -467,6 +468,29 @@ def taken_over(run: RunFolder) -> Iterator[bool]:
         yield held
     finally:
         os.close(descriptor)
+
+
+def dismiss(name: str) -> Path:
+    """Remove the folder of a dead run; what was not recovered from it is lost.
+
+    Args:
+        name: Name of the run, which its folder has.
+
+    Returns:
+        The folder that was removed.
+
+    Raises:
+        InputError: There is none of that name, or the run is alive.
+    """
+    found = [each for base in _base_folders(make=False) for each in base.iterdir()]
+    for folder in found:
+        if folder.name == name and folder.name != _DEVICES:
+            if _is_locked(folder / _CARD):
+                raise InputError(f"{name}: is active: end it by hilctl stop --run {name}")
+            shutil.rmtree(folder, ignore_errors=True)
+            return folder
+    known = ", ".join(sorted(each.name for each in found if each.name != _DEVICES))
+    raise InputError(f"{name}: there is no such run ({known or 'there is none'})")
 
 
 def _is_locked(path: Path) -> bool:

@@ -7,9 +7,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from hilctl.base.errors import InputError
+from hilctl.base.files import check_no_input
 from hilctl.base.remedy import reason
 from hilctl.experiment.check import Checked, check
-from hilctl.experiment.load import load_experiment
+from hilctl.experiment.load import input_files, load_experiment
 from hilctl.run.architecture import require_linux
 from hilctl.run.end_commands import with_end_commands
 from hilctl.run.result import Progress, RunResult
@@ -39,9 +40,12 @@ def output_of(checked: Checked, output: Path | None) -> Path:
     """Return the recording to write: the one given, or a new name in the experiment's folder.
 
     Raises:
-        InputError: The folder can't be made.
+        InputError: The folder can't be made, or the run reads that file.
     """
     if output is not None:
+        loaded = checked.loaded
+        # A recording may be one of them: of a waveform, or of where the actuator stands.
+        check_no_input(output, input_files(loaded.document, loaded.folder / "experiment"))
         return output
     folder = Path(checked.loaded.config.recording.folder)
     try:

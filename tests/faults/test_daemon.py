@@ -1,6 +1,7 @@
 """Runs in the background: status, set and stop from outside, and what they may not do."""
 
 import json
+import os
 import random
 import signal
 import socket
@@ -318,6 +319,30 @@ def test_a_short_run_may_be_over_when_detach_returns(tmp_path):
     path.write_text(yaml.safe_dump({**EXPERIMENT, "waveform": waveform}), encoding="utf-8")
     done = hilctl("run", path, "--output", tmp_path / "run.mcap", "--detach")
     assert done["recording"] == str(tmp_path / "run.mcap")
+
+
+def test_a_run_that_is_killed_while_it_starts_leaves_nothing(tmp_path):
+    """The next command says so in a line, and no later one does."""
+    path = tmp_path / "experiment.yaml"
+    path.write_text(yaml.safe_dump(EXPERIMENT), encoding="utf-8")
+    command = [sys.executable, "-m", "hilctl", "run", str(path)]
+    with subprocess.Popen([*command, "--output", str(tmp_path / "run.mcap")]) as process:
+        deadline = time.monotonic() + 120.0
+        while not (found := runs()):
+            assert time.monotonic() < deadline
+            time.sleep(0.001)
+        children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+        for number in (process.pid, *map(int, children)):
+            with suppress(ProcessLookupError):
+                os.kill(number, signal.SIGKILL)
+    words = [sys.executable, "-m", "hilctl", "status"]
+    said = [
+        subprocess.run(words, capture_output=True, text=True, timeout=60).stderr.splitlines()
+        for _ in range(2)
+    ]
+    assert [len(lines) for lines in said] == [1, 0]
+    assert found[0].card.name in said[0][0]
+    assert not (tmp_path / "run.mcap").exists()
 
 
 def test_without_a_run_there_is_nothing_to_stop():

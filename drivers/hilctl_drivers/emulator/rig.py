@@ -102,11 +102,14 @@ def _spread(channel: Range, reach: float) -> tuple[float, float]:
     return gain, -0.5 * gain * (channel.max + channel.min)
 
 
+_BEGIN = b'{"event": '
+
+
 class WriteLog:
     """One JSON object a line, on disk as soon as it happened.
 
     Args:
-        path: File to write, replaced if it exists; None keeps no log.
+        path: File to write; an older log is replaced. None keeps no log.
         unix_offset_ns: What to add to the monotonic clock to get Unix time.
 
     Raises:
@@ -118,6 +121,10 @@ class WriteLog:
         self._file: IO[bytes] | None = None
         if path is not None:
             try:
+                if path.is_file():
+                    with path.open("rb") as before:
+                        if before.read(len(_BEGIN)) not in {b"", _BEGIN}:
+                            raise InputError(f"{path}: is no log of a device: give another name")
                 self._file = path.open("wb", buffering=0)
             except OSError as error:
                 raise InputError(f"{path}: can't be written: {reason(error)}") from None

@@ -85,7 +85,7 @@ def refine_files(
         InputError: A file can't be used; nothing is written.
     """
     if output is not None:
-        check_writable(output, overwrite=overwrite)
+        check_writable(output, overwrite=overwrite, inputs=[model, *paths, *validate])
     old = load_model(model)
     progress(0.0, "reading")
     both = load_runs([*paths, *validate], old)

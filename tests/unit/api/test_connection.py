@@ -1,5 +1,6 @@
 """The client for programs of one's own: what it passes on, and what it costs to import."""
 
+import math
 import subprocess
 import sys
 import time
@@ -9,7 +10,7 @@ import pytest
 
 from hilctl import api
 from hilctl.api import connection
-from hilctl.base.errors import RunError
+from hilctl.base.errors import InputError, RunError
 from tests.unit.cli.test_steering import HEAVY
 
 
@@ -44,6 +45,12 @@ def test_it_imports_nothing_heavy():
     code = f"import sys, hilctl.api; print([m for m in {HEAVY!r} if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize("times", [{"window_s": 0.0}, {"window_s": math.nan}, {"every_s": -1.0}])
+def test_frames_of_no_time_are_refused(run, times):
+    with pytest.raises(InputError, match=next(iter(times))):
+        run.frames(**times)
 
 
 def test_frames_are_those_of_the_run(run, monkeypatch):

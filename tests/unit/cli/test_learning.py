@@ -26,8 +26,9 @@ CORRECTION = Correction(
 
 
 @pytest.fixture
-def taught(monkeypatch):
+def taught(monkeypatch, tmp_path):
     """Let learning end at once, as told; return a function that says how."""
+    (tmp_path / "experiment.yaml").write_text("name: taught\n")
     monkeypatch.setattr("hilctl.cli.learning.finish_orphans", lambda: None)
 
     def ends(**how):

@@ -139,6 +139,21 @@ def test_requests_go_to_the_control_socket_and_refusals_come_back(
     assert (no["ok"], no["error"]) == (False, "no room")
 
 
+def test_a_window_of_no_length_does_not_end_the_server(description, tmp_path):
+    """It did, for every page."""
+
+    async def shown():
+        async with serving() as server, opened(server) as connection:
+            await status_of(connection)
+            refused = await answer_to(connection, ask="view", view={"mode": "roll", "window_s": 0})
+            return refused, await status_of(connection)
+
+    with going_on(description, tmp_path):
+        refused, status = asyncio.run(shown())
+    assert not refused["ok"]
+    assert status["state"] == "running"
+
+
 def test_without_a_run_a_page_says_so_and_a_stop_is_refused():
     async def seen():
         async with serving(lambda runs: None) as server, opened(server) as connection:

@@ -3,6 +3,8 @@
 import asyncio
 import json
 
+import pytest
+
 from hilctl.desk.viewer import SLOW_S, Allowance, PageView, Viewer
 
 
@@ -66,6 +68,29 @@ def test_what_is_no_message_of_the_page_ends_the_connection():
 
     for raw in ("", "{}", b"\xff\x00", message(ask="format"), message(more=1), message(id="1")):
         assert asyncio.run(closed(raw)) == (1008, [])
+
+
+BAD_TIMES = ("0", "-0.0", "-1", "1e-320", "1e308", "NaN", "Infinity", "1e999", "true", '"2"', "[]")
+
+
+@pytest.mark.parametrize("value", [*BAD_TIMES, "null", "1" + "0" * 400])
+def test_a_window_that_is_no_time_is_refused_and_changes_nothing(value):
+    """The page gets an answer, and goes on."""
+
+    async def told():
+        raw = f'{{"id": 5, "ask": "view", "view": {{"window_s": {value}}}}}'
+        connection = Connection(raw, message(id=6, ask="stop"))
+        viewer = Viewer(connection, answer)
+        await viewer.attend()
+        return viewer.view, connection
+
+    view, connection = asyncio.run(told())
+    assert view == PageView()
+    assert connection.closed is None
+    refused = json.loads(connection.sent[0])
+    assert (refused["kind"], refused["id"], refused["ok"]) == ("answer", 5, False)
+    assert refused["error"].startswith("window_s: ")
+    assert connection.sent[1] == "6 stop"
 
 
 def test_too_many_messages_end_the_connection():

@@ -190,6 +190,15 @@ def test_a_claimed_file_that_is_gone_can_be_given_back(tmp_path):
 
 def test_a_file_that_stood_there_stays(tmp_path):
     path = tmp_path / "run.mcap"
-    path.write_bytes(b"before")
-    OutputFile(path, overwrite=True).give_back()
-    assert path.read_bytes() == b"before"
+    for before in (b"", b"\x89MCAP0\r\n before"):
+        path.write_bytes(before)
+        OutputFile(path, overwrite=True).give_back()
+        assert path.read_bytes() == before
+
+
+def test_only_a_recording_is_overwritten(tmp_path):
+    path = tmp_path / "run.mcap"
+    path.write_bytes(b"name: experiment")
+    with pytest.raises(OSError, match="Not a recording"):
+        OutputFile(path, overwrite=True)
+    assert path.read_bytes() == b"name: experiment"

@@ -19,3 +19,11 @@ def test_what_was_done_is_logged(monkeypatch, caplog):
         "sine-7 was not recorded to its end: supervisor and loop died",
         "recovered into a.mcap",
     ]
+
+
+def test_a_run_that_never_started_is_one_line(monkeypatch, caplog):
+    found = [Orphan("sine-7", Path("a.mcap"), True, "nothing has moved", started=False)]
+    monkeypatch.setattr("hilctl.run.orphans.recover_orphans", lambda: found)
+    monkeypatch.setattr("hilctl.run.run_folder.runs", lambda: [SimpleNamespace(alive=False)])
+    finish_dead_runs()
+    assert len(caplog.messages) == 1

@@ -7,11 +7,12 @@ from pathlib import Path
 
 import pytest
 
+from hilctl.base.errors import InputError
 from hilctl.loop.plan import Outcome
 from hilctl.recording.reader import read
 from hilctl.run.orphans import recover_orphans
 from hilctl.run.ring import SampleRing
-from hilctl.run.run_folder import run_folder, runs
+from hilctl.run.run_folder import dismiss, run_folder, runs
 from hilctl.run.shared_page import Field, PageText, Phase, SafeActionResult
 
 GOLDEN = Path(__file__).parents[3] / "recordings" / "golden" / "terfenol_uncompensated.mcap"
@@ -102,3 +103,45 @@ def test_what_can_not_be_recovered_is_kept(dead):
     assert orphan.kept is None
     assert read(recording).samples.index.size > 0
     assert runs() == []
+
+
+def ready(folder):
+    page = SampleRing.create(folder.ring, slots=4, block=1, state_size=1).page
+    page.put(Field.PHASE, Phase.READY)
+
+
+@pytest.mark.parametrize("fill", [lambda folder: None, ready])
+def test_a_run_that_never_started_is_cleared_away(dead, fill):
+    """Killed while it starts, it leaves a recording that was claimed, or that has a head only."""
+    recording = dead(fill)
+    recording.write_bytes(b"")
+    (orphan,) = recover_orphans()
+    assert (orphan.started, orphan.kept) == (False, None)
+    assert not recording.exists()
+    assert runs() == []
+
+
+def test_what_stood_under_the_name_of_a_run_that_never_started_stays(dead):
+    recording = dead(ready)
+    before = recording.read_bytes()
+    (orphan,) = recover_orphans()
+    assert not orphan.started
+    assert recording.read_bytes() == before
+    assert runs() == []
+
+
+def test_what_can_not_be_recovered_can_be_dismissed(dead, tmp_path):
+    """By the run's name; an active run can't."""
+    dead().unlink()
+    (orphan,) = recover_orphans()
+    dismiss(orphan.name)
+    assert runs() == []
+    with pytest.raises(InputError, match="no such run"):
+        dismiss(orphan.name)
+    for name in ("..", ".", "devices"):
+        with pytest.raises(InputError, match="no such run"):
+            dismiss(name)
+    with run_folder("sine", tmp_path / "a.mcap", 12.0) as (folder, _):
+        with pytest.raises(InputError, match="is active"):
+            dismiss(folder.card.name)
+        assert runs() == [folder]
