@@ -302,8 +302,12 @@ class SerialLink:
             raise OSError(errno.EIO, os.strerror(errno.EIO))
         return data
 
-    def await_silence(self, quiet_s: float) -> None:
+    def await_silence(self, quiet_s: float, answer_s: float = 0.0) -> None:
         """Throw away what comes until nothing has come for that long.
+
+        Args:
+            quiet_s: How long, s.
+            answer_s: Longest wait for the first of it: the answer to what was sent, s.
 
         Raises:
             LostError: The port is not open, or broke.
@@ -312,6 +316,7 @@ class SerialLink:
         if self._port is None:
             raise LostError("not open")
         try:
+            self._poll.poll(math.ceil(1e3 * answer_s))
             self.drain(quiet_s)
         except (OSError, DeviceError) as error:
             raise self._failed(error) from None
