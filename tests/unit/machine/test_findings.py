@@ -36,7 +36,7 @@ def test_a_good_machine_has_nothing_to_mend(make_machine):
     found = examine(make_machine(), Realtime(), Path())
     assert {each.level for each in found} == {"ok"}
     assert {each.remedy for each in found} == {""}
-    assert len({each.name for each in found}) == len(found) == 13
+    assert len({each.name for each in found}) == len(found) == 14
 
 
 def test_every_trouble_has_a_remedy(make_machine):
@@ -52,6 +52,7 @@ def test_every_trouble_has_a_remedy(make_machine):
             "/proc/cpuinfo": "flags : fpu hypervisor",
             f"{CLOCK}/current_clocksource": "hpet",
             "/sys/bus/usb-serial/devices/ttyUSB0/latency_timer": "16",
+            "/proc/1/comm": "ModemManager",
         },
         closed=("/dev/cpu_dma_latency", "/dev/ttyUSB0"),
         free=1000,
