@@ -60,6 +60,21 @@ class DacDevice(ABC):
             raise self._error("open", str(error)) from None
         self._block = block
 
+    def arm(self) -> None:
+        """Arm the watchdog, see :meth:`hilctl.base.device.WatchdogDevice.arm`.
+
+        Raises:
+            DeviceError: Not open, or the device did not confirm; then it must be opened again.
+        """
+        if not self._block:
+            raise self._error("arm the watchdog", "not open")
+        try:
+            self._arm()
+        except DeviceError as error:
+            self._block = 0
+            self._abandon()
+            raise self._error("arm the watchdog", str(error)) from None
+
     def output(self) -> float | None:
         """Return what the open device puts out, see :meth:`hilctl.base.device.Device.output`.
 
@@ -172,6 +187,9 @@ class DacDevice(ABC):
     def _open(self, sample_rate_hz: float, block: int) -> None:
         """Connect and set up; block and rate are good. :meth:`_release` follows an error."""
 
+    def _arm(self) -> None:  # noqa: B027  simulated devices have no watchdog
+        """Arm the watchdog, if the experiment wants it. :meth:`_abandon` follows an error."""
+
     def _output(self) -> float | None:
         """Return the output of a device that is open; None where it can't be known."""
         return None
@@ -187,7 +205,7 @@ class DacDevice(ABC):
         """Exchange a block whose sizes and range are good. :meth:`_abandon` follows an error."""
 
     def _abandon(self) -> None:
-        """Give up a connection on which an exchange has failed."""
+        """Give up a connection on which arming or an exchange has failed."""
         self._release()
 
     @abstractmethod

@@ -45,6 +45,8 @@ class DeviceInfo:
             real time, and its recordings say so.
         watchdog_command: Where the device's own watchdog puts the output when the host falls
             silent, in ``command_unit``; None where it has none, or is not to use it.
+        watchdog_timeout_s: How long the host may be silent before it does; None without one.
+        arm_s: How long :meth:`WatchdogDevice.arm` takes on the wire, at most; 0 without one.
         watchdog_reason: Why that is not the experiment's safe value; empty where it is.
         safe_note: What is wrong with the safe value of this device, in words: a message with it
             takes longer than 0.2 s, or the device cannot confirm it; empty if nothing is.
@@ -71,6 +73,8 @@ class DeviceInfo:
     holds: tuple[str, ...] = ()
     simulated: bool = False
     watchdog_command: float | None = None
+    watchdog_timeout_s: float | None = None
+    arm_s: float = 0.0
     watchdog_reason: str = ""
     safe_note: str = ""
     in_order: bool = False
@@ -183,16 +187,6 @@ class WatchdogDevice(Protocol):
             DeviceError: The device did not confirm, or is not open.
         """
         ...
-
-
-def arm(device: Device) -> None:
-    """Arm a device's watchdog; do nothing for a device that has none.
-
-    Raises:
-        DeviceError: See :meth:`WatchdogDevice.arm`.
-    """
-    if isinstance(device, WatchdogDevice):
-        device.arm()
 
 
 @runtime_checkable

@@ -47,6 +47,7 @@ from hilctl.waveforms.build import Reference, build
 _log = logging.getLogger(__name__)
 
 _MANY = 50_000_000  # samples, which take some seconds
+_TICKS_A_TIMEOUT = 3  # as devices ask for at opening
 STILL_S = 0.1  # after which the stages of any actuator rest
 _REPEAT = "identify the model on such motions too, or keep the waveform to what it was found on"
 
@@ -259,6 +260,7 @@ def _device_problems(loaded: LoadedExperiment) -> list[Problem]:
         if at_start is not None and not info.command_min <= at_start <= info.command_max:
             add("safe.at_start", f"must lie within what {info.name} takes, {span}", f"{at_start:g}")
     found += _watchdog_problems(loaded)
+    found += _watchdog_time_problems(loaded)
     if config.sample_rate_hz > info.max_rate_hz:
         rule = f"must be <= {info.max_rate_hz:g}, the fastest that {info.name} can keep"
         note = f" ({info.rate_note})" if info.rate_note else ""
@@ -300,6 +302,18 @@ def _watchdog_problems(loaded: LoadedExperiment) -> list[Problem]:
     rule = f"must be the safe value, {safe:g} {unit}"
     hint = "or say in device.watchdog.reason why it is not"
     return [_problem(loaded, key, rule, f"{command:g}", hint)]
+
+
+def _watchdog_time_problems(loaded: LoadedExperiment) -> list[Problem]:
+    """Return a watchdog that would trip between being armed and the second exchange."""
+    info, tick_s = loaded.device.info, loaded.config.tick_s
+    timeout_s, least_s = info.watchdog_timeout_s, _TICKS_A_TIMEOUT * tick_s + info.arm_s
+    if timeout_s is None or timeout_s >= least_s:
+        return []
+    rule = f"must be >= {least_s:.3g}, {_TICKS_A_TIMEOUT} ticks of {tick_s:g} s"
+    if info.arm_s:
+        rule += f" and {info.arm_s:.2g} s to arm it on this line"
+    return [_problem(loaded, "device.watchdog.timeout_s", rule, f"{timeout_s:g}")]
 
 
 def _start_problems(loaded: LoadedExperiment, begun: Begun, forecast: Forecast) -> list[Problem]:

@@ -11,13 +11,14 @@ in their slots until then, and after the ramp the loop goes on at the safe value
 them has come.
 """
 
+import math
 from collections import deque
 from enum import Enum
 
 import numpy as np
 
 from hilctl.base.arrays import F64, U32
-from hilctl.base.device import Device
+from hilctl.base.device import Device, WatchdogDevice
 from hilctl.base.errors import DeviceError
 from hilctl.base.events import OFFSET, Event
 from hilctl.base.samples import Flag, Head
@@ -51,6 +52,7 @@ class _Phase(Enum):
 
 
 _AFTER = (_Phase.LEAVING, _Phase.HOLDING)
+_ARM_MARGIN_NS = 1_000_000  # arming that ends too soon costs nothing, and too late a late start
 _FOLLOWING = _Phase.FOLLOWING  # looked up once: in Python 3.11 that is a call
 
 
@@ -129,14 +131,14 @@ class Loop:
         Args:
             start_ns: When the first tick is due, by the clock.
         """
-        self._start_ns = start_ns
-        self._pacer.begin(start_ns)
         if self._phase is _Phase.STARTING:
             ramp = self._before.ramp_event(self._limiter.last, self._limiter.limits.safe)
             self._host.record_event(ramp)
         elif self._phase is _Phase.CONDITIONING:
             self._record_condition()
         try:
+            self._start_ns = start_ns = self._armed(start_ns)
+            self._pacer.begin(start_ns)
             while not self._tick():
                 pass
             self._phase = _Phase.HOLDING
@@ -147,6 +149,16 @@ class Loop:
         self._record_adapted(ended=True)
         output: OutputState = "confirmed" if self._device.info.confirms else "sent"
         return Outcome(self._code, self._reason, self._ended_at, output, self._dropped)
+
+    def _armed(self, start_ns: int) -> int:
+        """Arm the device's watchdog just before the first tick; return when that is due."""
+        device, clock = self._device, self._host.clock
+        if not isinstance(device, WatchdogDevice):
+            return start_ns
+        clock.sleep_until_ns(start_ns - math.ceil(device.info.arm_s * 1e9) - _ARM_MARGIN_NS)
+        device.arm()
+        # What takes longer than it should makes the run start later, and no tick late.
+        return max(start_ns, clock.now_ns())
 
     def _tick(self) -> bool:
         """Run usual ticks and then another one; return whether the safe value is reached in it."""

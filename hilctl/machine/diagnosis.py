@@ -92,6 +92,7 @@ def examine(machine: Machine, settings: Realtime, folder: Path) -> tuple[Finding
         hardware.clock_source(machine),
         hardware.latency_timers(machine),
         hardware.serial_ports(machine),
+        hardware.serial_daemons(machine),
         hardware.disk_space(machine, folder),
         log_out(machine),
     )

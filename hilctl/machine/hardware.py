@@ -6,6 +6,7 @@ from hilctl.machine.files import Finding, Machine
 
 _CPU = "/sys/devices/system/cpu"
 _SERIAL = ("/dev/ttyUSB*", "/dev/ttyACM*")
+_SERIAL_DAEMONS = ("ModemManager", "brltty")
 _LATENCY_TIMERS = "/sys/bus/usb-serial/devices/*/latency_timer"
 _LONG_LATENCY_MS = 1
 _LITTLE_SPACE_BYTES = 1 << 30
@@ -82,6 +83,18 @@ def serial_ports(machine: Machine) -> Finding:
         remedy = f"sudo usermod --append --groups {group} $USER, and log in anew"
         return Finding("serial ports", "bad", f"no permission for {', '.join(closed)}", remedy)
     return Finding("serial ports", "ok", ", ".join(ports) or "none plugged in")
+
+
+def serial_daemons(machine: Machine) -> Finding:
+    """Whether daemons run that open serial ports by themselves."""
+    running = {machine.text(path) for path in machine.glob("/proc/[0-9]*/comm")}
+    active = [name for name in _SERIAL_DAEMONS if name in running]
+    if not active:
+        return Finding("serial daemons", "ok", "none active")
+    verb = "read and write" if len(active) > 1 else "reads and writes"
+    text = f"{' and '.join(active)} {verb} serial ports that are plugged in"
+    remedy = f"sudo systemctl disable --now {' '.join(active)}"
+    return Finding("serial daemons", "warn", text, remedy)
 
 
 def _group_of(path: Path) -> str:

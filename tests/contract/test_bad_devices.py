@@ -254,6 +254,36 @@ class SafeElsewhere(Ideal):
         self.current_a = 0.0
 
 
+class TakesTheFirstOfARamp(Ideal):
+    """Ignores safe values after the first one of a run."""
+
+    was_safe = False
+
+    def open(self, sample_rate_hz, block):
+        super().open(sample_rate_hz, block)
+        self.was_safe = False
+
+    def make_safe(self, command):
+        if not self.was_safe:
+            self.current_a = command
+        self.was_safe = self.is_open
+
+    def close(self):
+        super().close()
+        self.was_safe = False
+
+
+class ArmedWhileItIsClosed(Ideal):
+    def arm(self):
+        pass
+
+
+class MovesWhenItIsArmed(Ideal):
+    def arm(self):
+        self.need_open()
+        self.current_a = 1.0
+
+
 class LiesAboutItsOutput(Ideal):
     """Takes what it would like to be there for what is there."""
 
@@ -548,6 +578,9 @@ MUST_FAIL = {
     SafeUntilItIsClosed: {"make_safe_works_open_or_closed"},
     SafeOnceItIsClosed: {"make_safe_works_open_or_closed"},
     SafeOnlyOnce: {"make_safe_works_open_or_closed"},
+    TakesTheFirstOfARamp: {"each_value_of_a_ramp_is_put_out"},
+    ArmedWhileItIsClosed: {"arming_moves_nothing_and_needs_an_open_device"},
+    MovesWhenItIsArmed: {"arming_moves_nothing_and_needs_an_open_device"},
     SafeElsewhere: {"make_safe_works_open_or_closed"},
     LiesAboutItsOutput: {"says_what_it_puts_out"},
     DoesNotSayWhatItKnows: {"says_what_it_puts_out"},

@@ -15,14 +15,14 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
-from hilctl.base.device import Device
+from hilctl.base.device import Device, WatchdogDevice
 from hilctl.base.errors import DeviceError
 from hilctl.experiment.registry import BUILTIN, device_class, known_devices
 from hilctl_drivers.emulator.options import EmulatorOptions
 from hilctl_drivers.emulator.setup import build
 from hilctl_drivers.modbus.profile import ModbusProfile
 from hilctl_drivers.profile import load_profile, shipped_profiles
-from tests.fakes import ManualClock, VirtualTime
+from tests.fakes import ManualClock
 
 RATE_HZ = 10_000.0
 SAMPLES = 20
@@ -77,7 +77,10 @@ class DrivenDevice:
     """Whether it knows what it puts out."""
 
     def open(self) -> None:
+        """Open and arm it, as a run does."""
         self.device.open(self.rate_hz, self.block)
+        if isinstance(self.device, WatchdogDevice):
+            self.device.arm()
         self.exchanged = 0
 
     def exchange(self, command):
@@ -177,8 +180,7 @@ def modbus(words: list[str], stack: list[Callable[[], None]]) -> DrivenDevice:
     options = _fast({**emulator.options, "timeout_s": TIMEOUT_S})
     if "reader" in options:
         options["reader"] = _fast(options["reader"])
-    time = VirtualTime()  # of what the device waits for alone
-    device = chosen(chosen.Options.model_validate(options), clock=time)
+    device = chosen(chosen.Options.model_validate(options))
     rate_hz = min(RATE_HZ, device.info.max_rate_hz)
 
     def pass_time() -> None:
@@ -372,6 +374,30 @@ def test_make_safe_works_open_or_closed(driven):
     driven.assert_stands(safe)
     driven.device.make_safe(0.0)
     driven.assert_stands(0.0)
+
+
+def test_each_value_of_a_ramp_is_put_out(driven):
+    """Safe values may follow one another, and each is confirmed by itself."""
+    driven.open()
+    driven.exchange(np.full(SAMPLES, driven.middle))
+    for share in (0.5, 0.25, 0.0):
+        driven.device.make_safe(share * driven.middle)
+        driven.assert_stands(share * driven.middle)
+
+
+def test_arming_moves_nothing_and_needs_an_open_device(driven):
+    if not isinstance(driven.device, WatchdogDevice):
+        return
+    with pytest.raises(DeviceError):
+        driven.device.arm()
+    at_rest = driven.must_be_at_rest or driven.device.info.simulated
+    held = 0.0 if at_rest else 0.5 * driven.middle
+    driven.device.make_safe(held)
+    driven.open()
+    driven.assert_stands(held)
+    driven.device.close()
+    with pytest.raises(DeviceError):
+        driven.device.arm()
 
 
 def test_says_what_it_puts_out(driven):

@@ -48,6 +48,7 @@ class DrivenStream:
 
     def open(self):
         self.device.open(RATE_HZ, BLOCK)
+        self.device.arm()
 
     def exchange(self, first, command):
         """Exchange any number of samples, a block at a time."""

@@ -21,7 +21,7 @@ from hilctl_drivers.profile import shipped_profiles
 from hilctl_drivers.serial.device import SerialDac
 from hilctl_drivers.serial.setup import SerialOptions
 
-TIMEOUT_S = 0.05
+TIMEOUT_S = 0.15
 RATE_HZ = 10.0
 OLD, SAFE = 4.5, 0.0
 
@@ -296,7 +296,7 @@ def answer_request(message, value):
 
 
 @pytest.mark.parametrize("forgets", [False, True])
-@pytest.mark.parametrize("waits_for", range(1, 12))
+@pytest.mark.parametrize("waits_for", [1, 2, 3, 5, 8])
 @pytest.mark.parametrize("kind", ["OK", "readback", 6, 16])
 def test_the_late_answer_to_an_older_command_confirms_nothing(
     text, registers, kind, waits_for, forgets

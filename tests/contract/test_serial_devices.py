@@ -105,6 +105,7 @@ class DrivenSerial:
 
     def open(self):
         self.device.open(self.rate_hz, self.block)
+        self.device.arm()
         self._sent = 0
 
     def exchange(self, command):

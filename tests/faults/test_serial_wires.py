@@ -3,6 +3,7 @@
 import os
 import re
 import signal
+import subprocess
 import time
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from hilctl_drivers.profile import shipped_profiles
 from tests.faults.conftest import PATIENT_DEVICE, PATIENT_TIMING, each_kind
 
 TIMEOUT_S = 2.0
+WITHOUT_PRIVILEGES = ["setpriv", "--inh-caps=-all", "--bounding-set=-all"]
 WATCHDOG_S = 4.0
 WAVEFORM = {
     "kind": "sine",
@@ -210,3 +212,23 @@ def test_second_run_on_the_same_port_is_refused(meet, run, tmp_path, boards, kin
     printed = first.interrupt()
     assert printed["code"] == "stopped"
     assert printed["dropped"] == printed["skipped_ticks"]  # a busy machine may be late
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only a privileged run keeps a pty to itself")
+def test_another_program_cannot_open_the_port(meet):
+    """A shell without privileges; the run is not disturbed, and afterwards the port is free."""
+    device, first, output = meet("dcon", patient=True)
+    device.log.await_events(output, 40, first.process)
+
+    def write():
+        return subprocess.run(
+            [*WITHOUT_PRIVILEGES, "sh", "-c", f"echo > {device.address}"],
+            capture_output=True,
+            text=True,
+        )
+
+    refused = write()
+    assert refused.returncode != 0
+    assert "busy" in refused.stderr
+    assert first.interrupt()["code"] == "stopped"
+    assert write().returncode == 0

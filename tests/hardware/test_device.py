@@ -23,6 +23,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
+from hilctl.base.device import WatchdogDevice
 from hilctl.base.errors import DeviceError
 from hilctl.experiment.load import LoadedExperiment, load_experiment
 from hilctl.loop.limiter import CommandLimits, Limiter
@@ -74,6 +75,8 @@ class RealDevice:
         self._open = self._was_open = True
         self._sample = 0
         self.limiter.last = starting_output(self.device, self._at_start)
+        if isinstance(self.device, WatchdogDevice):
+            self.device.arm()
 
     def close(self) -> None:
         """Close the device and leave the output as it is."""

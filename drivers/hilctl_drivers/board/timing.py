@@ -1,6 +1,6 @@
 """How long a block in binary frames takes, with the most overhead that COBS can add."""
 
-from hilctl_drivers.board.frames import exchange_sizes
+from hilctl_drivers.board.frames import WATCHDOG_REPLY, WATCHDOG_REQUEST, exchange_sizes
 from hilctl_drivers.board.profile import FrameProfile, FramesLink
 from hilctl_drivers.wire.framing import binary_framing
 from hilctl_drivers.wire.timing import WireTime
@@ -34,6 +34,17 @@ def exchange_time(profile: FrameProfile, block: int = 1) -> WireTime:
         block,
         0.0 if stream else settle_s(profile),
     )
+
+
+def arm_s(profile: FrameProfile) -> float:
+    """Return how long a WATCHDOG message and its reply take, s."""
+    link = profile.link
+    size = next(iter(profile.outputs.values())).format.size
+    framing = binary_framing(link.framing, link.crc, link.payload_max)
+    sent = framing.wire_size(WATCHDOG_REQUEST.size + size)
+    received = framing.wire_size(WATCHDOG_REPLY.size)
+    byte_s, _, gaps_s, _ = _line(link)
+    return (sent + received) * byte_s + gaps_s + profile.turnaround_s
 
 
 def settle_s(profile: FrameProfile) -> float:

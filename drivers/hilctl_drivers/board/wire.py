@@ -13,7 +13,7 @@ from hilctl.base.errors import DeviceError
 from hilctl_drivers.board import frames as board
 from hilctl_drivers.board.profile import FrameProfile, FrameStreaming
 from hilctl_drivers.board.session import BoardFacts, BoardSession, Readings
-from hilctl_drivers.board.timing import exchange_time, settle_s
+from hilctl_drivers.board.timing import arm_s, exchange_time, settle_s
 from hilctl_drivers.serial.setup import SerialSetup
 from hilctl_drivers.serial.wire import SerialWire, check_stands, refuse
 from hilctl_drivers.wire.errors import WatchdogTripped
@@ -53,6 +53,7 @@ class BoardWire(SerialWire):
         self._profile = profile
         self._session = BoardSession(profile, self._link)
         self._safe = setup.chain.output(setup.options.safe_command)
+        self.arm_s = arm_s(profile)
 
     def rates(self, block: int) -> RateLimit:
         """See :meth:`~hilctl_drivers.serial.wire.SerialWire.rates`."""
@@ -89,7 +90,7 @@ class BoardWire(SerialWire):
         try:
             self._session.put_out(value)
         except WatchdogTripped:
-            self._arm()
+            self._set_watchdog()
             self._session.put_out(value)
         state = self._session.state()
         if state is not None:
@@ -115,10 +116,15 @@ class BoardWire(SerialWire):
             )
         return facts
 
-    def _guard(self) -> None:
-        """Set the watchdog, and end a trip of an earlier run at the safe value."""
+    def arm(self) -> None:
+        """See :meth:`~hilctl_drivers.serial.wire.SerialWire.arm`."""
+        if self._setup.options.watchdog != "none":
+            self._set_watchdog()
+
+    def _try_out_safe_value(self) -> None:
+        """Set the output to what it holds by SAFE, or to the safe value after a trip."""
         state = self._session.state()
-        self._arm()
+        self._disarm()  # which ends a trip of an earlier run
         if state is None:
             return
         # At once: a board that comes back to a command from before must not keep it.
@@ -130,7 +136,7 @@ class BoardWire(SerialWire):
             except DeviceError as error:
                 raise DeviceError(f"the safe value cannot be written by SAFE: {error}") from None
 
-    def _arm(self) -> None:
+    def _set_watchdog(self) -> None:
         """Set the watchdog as the experiment wants it, which clears a trip."""
         if self._profile.watchdog != "none":
             timeout_s = self._setup.options.watchdog_timeout_s or 0.0
@@ -149,7 +155,7 @@ class BoardSingle(BoardWire):
         del block
         check_feeds(self._setup.options.watchdog_timeout_s, sample_rate_hz)
         self._connect(self._setup.link())
-        self._guard()
+        self._try_out_safe_value()
 
     def exchange(self, first_sample: int, output: F64, reading: F64, measured: F64) -> None:
         """See :meth:`~hilctl_drivers.serial.wire.SerialWire.exchange`."""
@@ -190,8 +196,7 @@ class BoardStream(BoardWire):
         check_feeds(self._setup.options.watchdog_timeout_s, sample_rate_hz / block)
         facts = self._connect(self._setup.link(extra_s=block / sample_rate_hz))
         self._check_board(facts, sample_rate_hz, block)
-        # Before the clock: from the first sample on, the board must know where to go without us.
-        self._guard()
+        self._try_out_safe_value()  # before the clock, which SAFE stops
         prefill = self._latency_blocks * block
         self._session.set_clock(sample_rate_hz, prefill)
         self._block = block

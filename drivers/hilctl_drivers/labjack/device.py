@@ -68,7 +68,6 @@ class ModbusStream(DacDevice):
         self._stream: StreamSession | None = None
         self._calibration: InputCalibration | None = None
         self._next_sample = 0
-        self._armed_s = 0.0
         self._peer = writer
         self._safe_write = StreamSafeWrite(setup.base, connect)
 
@@ -86,11 +85,12 @@ class ModbusStream(DacDevice):
         return self._setup.rates(block)
 
     def _open(self, sample_rate_hz: float, block: int) -> None:
-        """Self-test, init steps, calibration, buffers and clock, watchdog; see :class:`DacDevice`.
+        """Self-test, init steps, calibration, buffers and clock; see :class:`DacDevice`.
 
         The output does not move before enough blocks have come.
         """
         setup, base = self._setup, self._setup.base
+        self._guard.plan(sample_rate_hz / block)
         self._session = session = self._connect(base.writer)
         session.link.open()
         self._peer = base.writer.reached(session.link)
@@ -105,11 +105,12 @@ class ModbusStream(DacDevice):
         stream.prepare(sample_rate_hz, *addresses)
         setup.check_capacity(block, stream.capacity)
         self._safe_write.try_out(session)
-        # Armed last: the steps above may take longer than its time-out.
-        self._guard.arm(session, sample_rate_hz / block)
         self._stream = stream
         self._next_sample = 0
-        self._armed_s = self._clock()
+
+    def _arm(self) -> None:
+        assert self._session is not None
+        self._guard.arm(self._session)
 
     def _output(self) -> float | None:
         assert self._session is not None
@@ -138,8 +139,6 @@ class ModbusStream(DacDevice):
         if first_sample != self._next_sample:
             rule = f"samples must follow one another, {self._next_sample} is next"
             raise DeviceError(f"{rule}, got {first_sample}: open again to start at 0")
-        if first_sample == 0:
-            self._guard.check_fed(self._clock() - self._armed_s)
         gain, offset, um_per_unit, offset_um = self._factors
         # Queued before the readings are waited for: meanwhile the device must not run dry.
         stream.feed((command - offset) / gain)

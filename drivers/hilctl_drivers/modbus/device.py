@@ -6,7 +6,6 @@ read and then a write; the read may go to another device. Nothing is sent twice,
 the last reply has come.
 """
 
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from typing import ClassVar, TypeAlias
@@ -42,14 +41,12 @@ class ModbusDac(DacDevice):
         self,
         options: ModbusOptions,
         connect: Connect = ModbusPeer.session,
-        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """Describe the device; nothing is sent before :meth:`open`.
 
         Args:
             options: What the experiment says of it.
             connect: Makes a session on a new link to the device that has the output.
-            clock: Monotonic time in s.
 
         Raises:
             InputError: The profile can't be used, or options don't go with it.
@@ -64,7 +61,6 @@ class ModbusDac(DacDevice):
         self._setup = setup
         self._connect = connect
         self._peer = setup.writer
-        self._clock = clock
         self._safe_write = ModbusSafeWrite(setup, connect)
         self._factors = setup.chain.factors
         self._encode = setup.output.format.encode
@@ -77,13 +73,14 @@ class ModbusDac(DacDevice):
         """Whether a tick is one transaction; known once it is open."""
 
     def _open(self, sample_rate_hz: float, block: int) -> None:
-        """Self-test, init steps, one reading of the input, watchdog; see :class:`DacDevice`.
+        """Self-test, init steps, one reading of the input; see :class:`DacDevice`.
 
         Whether it can read and write in one transaction, and whether it takes the message of the
         safe value, is tried by writing what the output holds already. Only then is it known what
         rate it can keep.
         """
         del block
+        self._guard.plan(sample_rate_hz)
         # Kept before it is opened: after a step that fails, _release must find it.
         self._pair = pair = _Pair(self._setup, self._connect(self._setup.writer))
         pair.open()
@@ -96,20 +93,12 @@ class ModbusDac(DacDevice):
         rates = self._setup.rates(self.one_transaction)
         how = "one transaction" if self.one_transaction else "a read and a write"
         replace(rates, note=f"{how} a sample; {rates.note}").check(sample_rate_hz)
-        # Armed last: the steps above may take longer than its time-out.
-        self._guard.arm(pair.writer, sample_rate_hz)
         self._feeds = self._guard.feed_every > 0
-        self._swap = self._first_of(swap, self._clock())
+        self._swap = swap
 
-    def _first_of(self, swap: Swap, armed_s: float) -> Swap:
-        """Return a swap that is preceded, the first time, by a look at the watchdog's time."""
-
-        def first(data: bytes) -> bytes:
-            self._guard.check_fed(self._clock() - armed_s)
-            self._swap = swap
-            return swap(data)
-
-        return first
+    def _arm(self) -> None:
+        assert self._pair is not None
+        self._guard.arm(self._pair.writer)
 
     def _output(self) -> float | None:
         assert self._pair is not None

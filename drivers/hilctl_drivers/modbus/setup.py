@@ -10,7 +10,7 @@ from hilctl.base.errors import InputError
 from hilctl_drivers.modbus.channels import Register
 from hilctl_drivers.modbus.profile import ModbusInput, ModbusOutput, ModbusProfile, ModbusRtuLink
 from hilctl_drivers.modbus.session import ModbusSession
-from hilctl_drivers.modbus.timing import exchange_time, feed_time, read_time
+from hilctl_drivers.modbus.timing import arm_s, exchange_time, feed_time, read_time
 from hilctl_drivers.profile import NamedProfile, check_baud, with_link
 from hilctl_drivers.wire.held import held_address, held_port
 from hilctl_drivers.wire.links import Link
@@ -259,6 +259,8 @@ class ModbusSetup:
             rate_note=rates.note,
             holds=tuple(dict.fromkeys(writer.holds + reader.holds)),
             watchdog_command=options.watchdog_command,
+            watchdog_timeout_s=options.watchdog_timeout_s,
+            arm_s=0.0 if options.watchdog == "none" else arm_s(writer.profile, options.output),
             watchdog_reason=options.watchdog_reason,
             in_order=options.serial_port is not None,
             confirms=not self.unconfirmed,

@@ -58,6 +58,17 @@ def feed_time(profile: ModbusProfile) -> WireTime | None:
     return requests_time(profile, requests).feeding(waits_s)
 
 
+def arm_s(profile: ModbusProfile, output: str) -> float:
+    """Return how long arming the device's watchdog takes at most, s; 0 without a watchdog."""
+    watchdog = profile.watchdog
+    if watchdog == "none":
+        return 0.0
+    steps = (*watchdog.unlock, *watchdog.safe.get(output, ()), *watchdog.arm)
+    requests = [pdu for step in steps for pdu in _step_requests(profile, step)]
+    waits_s = sum(step.seconds for step in steps if isinstance(step, WaitStep))
+    return requests_time(profile, requests).answered_s + waits_s
+
+
 def requests_time(
     profile: ModbusProfile, requests: Sequence[bytes], settle_s: float = 0.0
 ) -> WireTime:

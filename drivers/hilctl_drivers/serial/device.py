@@ -64,6 +64,9 @@ class SerialDac(DacDevice):
         self._measured = np.zeros(block)
         self._answered = -self._info.latency_blocks
 
+    def _arm(self) -> None:
+        self._wire.arm()
+
     def _output(self) -> float | None:
         value = self._wire.output()
         return None if value is None else self._chain.command(value)
@@ -126,6 +129,8 @@ def _info(setup: SerialSetup, wire: SerialWire) -> DeviceInfo:
         measures_command=wire.measures,
         holds=setup.holds,
         watchdog_command=options.watchdog_command,
+        watchdog_timeout_s=options.watchdog_timeout_s,
+        arm_s=0.0 if options.watchdog == "none" else wire.arm_s,
         watchdog_reason=options.watchdog_reason,
         safe_note="; ".join(filter(None, (_late_note(setup, wire), wire.unconfirmed))),
         in_order=True,

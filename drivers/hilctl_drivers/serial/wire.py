@@ -19,6 +19,7 @@ class SerialWire(ABC):
         measures: Whether :meth:`exchange` fills ``measured``.
         longest_message_s: Longest until the safe value is there, after an exchange that is under
             way; 0 where that is too short to be worth a word.
+        arm_s: Longest that :meth:`arm` takes on the wire.
         unconfirmed: Why a value that was written cannot be confirmed, in words; empty if it can.
 
     Args:
@@ -33,6 +34,7 @@ class SerialWire(ABC):
     measures = False
     longest_message_s = 0.0
     unconfirmed = ""
+    arm_s = 0.0
 
     def __init__(self, setup: SerialSetup) -> None:
         self._setup = setup
@@ -49,6 +51,14 @@ class SerialWire(ABC):
 
         Raises:
             DeviceError: It can't be reached, is another device, or can't keep this rate or block.
+        """
+
+    @abstractmethod
+    def arm(self) -> None:
+        """Arm the watchdog, if the experiment wants it; the output does not move.
+
+        Raises:
+            DeviceError: The device did not confirm.
         """
 
     @abstractmethod

@@ -77,6 +77,19 @@ def feed_time(profile: AsciiProfile) -> WireTime | None:
     return lines_time(profile, lines).feeding(waits_s)
 
 
+def arm_s(profile: AsciiProfile, output: str) -> float:
+    """Return how long arming the device's watchdog takes at most, s; 0 without a watchdog."""
+    watchdog = profile.watchdog
+    if watchdog == "none":
+        return 0.0
+    steps = (*watchdog.safe.get(output, ()), *watchdog.arm)
+    lines = [line for step in steps for line in _step_lines(profile, watchdog, step)]
+    if profile.error_query != "none":
+        lines.append((profile.error_query.ask, profile.error_query.example))
+    waits_s = sum(step.seconds for step in steps if isinstance(step, WaitStep))
+    return lines_time(profile, lines).answered_s + waits_s
+
+
 def lines_time(profile: AsciiProfile, lines: Sequence[Line], settle_s: float = 0.0) -> WireTime:
     """Return what lines cost with their replies, one after the other."""
     link = profile.link

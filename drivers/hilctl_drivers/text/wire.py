@@ -11,7 +11,7 @@ from hilctl_drivers.serial.wire import SerialWire, check_stands
 from hilctl_drivers.text.lines import parse_number
 from hilctl_drivers.text.profile import AsciiInput, AsciiOutput, AsciiProfile
 from hilctl_drivers.text.session import AsciiSession
-from hilctl_drivers.text.timing import exchange_time, feed_time, query_time
+from hilctl_drivers.text.timing import arm_s, exchange_time, feed_time, query_time
 from hilctl_drivers.wire.errors import WatchdogTripped
 from hilctl_drivers.wire.links import naming
 from hilctl_drivers.wire.timing import RateLimit, WireTime, check_feeds
@@ -54,6 +54,7 @@ class AsciiWire(SerialWire):
         write = exchange_time(self._profile, setup.options.output, None)
         self.longest_message_s = self._sample_time().answered_s + write.answered_s
         self.unconfirmed = self._unconfirmed()
+        self.arm_s = arm_s(self._profile, setup.options.output)
 
     def rates(self, block: int) -> RateLimit:
         """See :meth:`~hilctl_drivers.serial.wire.SerialWire.rates`."""
@@ -94,14 +95,18 @@ class AsciiWire(SerialWire):
                 self._reader.check_selftest()
                 self._reader.run(self._reader_profile.init)
         self._try_out_safe_value()
-        self._feed_every = 0
-        if watchdog != "none" and self._setup.options.watchdog != "none":
+        strict = watchdog != "none" and watchdog.kick == "strict"
+        self._feed_every = feed_every if strict else 0
+        writer.check_errors()  # after all steps: commands without a reply leave theirs there
+        self._ticks = 0
+
+    def arm(self) -> None:
+        """See :meth:`~hilctl_drivers.serial.wire.SerialWire.arm`."""
+        if self._profile.watchdog != "none" and self._setup.options.watchdog != "none":
             # The safe value before the time-out: once it counts, it must know where to go.
             self._run("safe")
             self._run("arm")
-            self._feed_every = feed_every if watchdog.kick == "strict" else 0
-        writer.check_errors()  # after all steps: commands without a reply leave theirs there
-        self._ticks = 0
+            self._writer.check_errors()  # commands without a reply leave theirs there
 
     def exchange(self, first_sample: int, output: F64, reading: F64, measured: F64) -> None:
         """See :meth:`~hilctl_drivers.serial.wire.SerialWire.exchange`."""

@@ -1,6 +1,7 @@
 """Bytes there and back; knows no protocol.
 
 links.py          the contract; tcp.py and serial_port.py keep it
+exclusive.py      a serial port refused to other programs
 safe_exchange.py  one attempt to put a safe value on a serial line
 held.py           the names by which one device is one lock
 line_settings.py  baud and parity of a line, as a profile has them

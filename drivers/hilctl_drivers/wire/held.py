@@ -1,14 +1,15 @@
 """What a device holds alone, as :attr:`hilctl.base.device.DeviceInfo.holds` has it.
 
 One device is one lock, whatever it is called. So each place has all the names that another
-experiment could know it by: a port the file that its links lead to and the number that the kernel
-knows it by, a host its name and its addresses.
+experiment could know it by: a port its path, the file that its links lead to and the number that the
+kernel knows it by, a host its name and its addresses.
 """
 
 import ipaddress
 import os
 import socket
 import stat
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from threading import Thread
@@ -21,13 +22,14 @@ _LOOPBACK = "127.0.0.1"
 def held_port(path: str) -> tuple[str, ...]:
     """Return the names of a serial port; one that is not there has that of its file alone."""
     real = Path(path).resolve()
-    try:
+    # The path as it was given too: a link of udev is gone with its device, and what still waits
+    # for that must be found.
+    names = [f"serial:{Path(path).absolute()}", f"serial:{real}"]
+    with suppress(OSError):
         status = real.stat()
-    except OSError:
-        return (f"serial:{real}",)
-    if not stat.S_ISCHR(status.st_mode):
-        return (f"serial:{real}",)
-    return f"serial:{real}", f"tty:{os.major(status.st_rdev)}:{os.minor(status.st_rdev)}"
+        if stat.S_ISCHR(status.st_mode):
+            names.append(f"tty:{os.major(status.st_rdev)}:{os.minor(status.st_rdev)}")
+    return tuple(dict.fromkeys(names))
 
 
 def held_address(host: str, port: int) -> tuple[str, ...]:

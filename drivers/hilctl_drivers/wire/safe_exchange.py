@@ -48,7 +48,7 @@ class SafeExchange:
             else:
                 send()
                 quiet_s = min(self._quiet_s, link.timeout_s)
-                link.await_silence(quiet_s)
+                link.await_silence(quiet_s, answer_s=link.timeout_s)
                 confirm()
                 # That answer may have been a late one. Another follows only if this device answers
                 # now: it answers in order, and silence came in between.

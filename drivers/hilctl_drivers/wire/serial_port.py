@@ -17,6 +17,7 @@ import serial
 
 from hilctl.base.errors import DeviceError
 from hilctl.base.remedy import PORT_REMEDIES, reason
+from hilctl_drivers.wire.exclusive import admit_others, refuse_to_others
 from hilctl_drivers.wire.links import LostError, Missing, NoAnswerError, cut, why
 
 _FIRST = 256
@@ -141,6 +142,7 @@ class SerialLink:
         self._waiting = array.array("i", [0])
         self._count_waiting: Callable[[], object] = lambda: None
         self._stale = True
+        self._exclusive = False
         self._quiet_at = 0.0
         self.low_latency = False
         """Whether the driver took the low-latency setting; without it an FTDI adapter holds bytes
@@ -204,6 +206,7 @@ class SerialLink:
         self._poll = select.poll()
         self._poll.register(self._fd, select.POLLIN)
         if boot:
+            self._exclusive = refuse_to_others(self._fd, self._path)
             self._stale = True
             self._sleep(self._settings.boot_s)
         self._quiet_at = self._clock()
@@ -298,12 +301,21 @@ class SerialLink:
 
     def _read(self) -> bytes:
         data = read(self._fd, _CHUNK)
-        if not data:
+        if data:
+            return data
+        if dict(self._poll.poll(0)).get(self._fd, 0) & ~select.POLLIN:
             raise OSError(errno.EIO, os.strerror(errno.EIO))
-        return data
+        raise DeviceError(
+            "bytes came and were gone before they could be read: another program reads this port "
+            "(lsof names it; ModemManager, brltty and terminal programs do)"
+        )
 
-    def await_silence(self, quiet_s: float) -> None:
+    def await_silence(self, quiet_s: float, answer_s: float = 0.0) -> None:
         """Throw away what comes until nothing has come for that long.
+
+        Args:
+            quiet_s: How long, s.
+            answer_s: Longest wait for the first of it: the answer to what was sent, s.
 
         Raises:
             LostError: The port is not open, or broke.
@@ -312,6 +324,7 @@ class SerialLink:
         if self._port is None:
             raise LostError("not open")
         try:
+            self._poll.poll(math.ceil(1e3 * answer_s))
             self.drain(quiet_s)
         except (OSError, DeviceError) as error:
             raise self._failed(error) from None
@@ -345,4 +358,7 @@ class SerialLink:
 
             with contextlib.suppress(termios.error):  # where the port is gone
                 port.reset_output_buffer()
+        if self._exclusive:
+            admit_others(port.fileno())
+            self._exclusive = False
         port.close()

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hilctl.base.device import DeviceInfo
-from hilctl.base.errors import DeviceError
+from hilctl.base.errors import DeviceError, UnconfirmedError
 from hilctl_drivers.device import DacDevice
 
 INFO = DeviceInfo(
@@ -30,6 +30,9 @@ class NotingDac(DacDevice):
 
     def _open(self, sample_rate_hz, block):
         self._note("open")
+
+    def _arm(self):
+        self._note("arm")
 
     def _look(self):
         self._note("look")
@@ -92,7 +95,7 @@ def test_a_rate_beyond_the_device_is_refused_before_it_is_opened():
     assert "open" not in device.calls
 
 
-@pytest.mark.parametrize("step", ["open", "exchange", "close", "put out"])
+@pytest.mark.parametrize("step", ["open", "arm", "exchange", "close", "put out"])
 def test_after_an_error_nothing_is_held(step):
     """The error names the device and what was done; it must be opened again."""
     device = NotingDac()
@@ -100,6 +103,7 @@ def test_after_an_error_nothing_is_held(step):
 
     def life():
         device.open(1000.0, 1)
+        device.arm()
         if step == "put out":
             device.make_safe(0.0)
         exchange(device, 0.0)
@@ -132,3 +136,16 @@ def test_looking_is_for_a_device_that_is_closed():
     with pytest.raises(DeviceError, match="open"):
         device.look()
     exchange(device, 0.0)
+
+
+@pytest.mark.parametrize("error", [DeviceError, UnconfirmedError])
+def test_what_cannot_be_confirmed_is_told_from_what_failed(error):
+    """The caller repeats an attempt that failed, and not one that nothing can confirm."""
+
+    class Sent(NotingDac):
+        def _put_out(self, command):
+            raise error("sent")
+
+    with pytest.raises(DeviceError, match=r"dac at /dev/x: sent \(to make safe") as caught:
+        Sent().make_safe(0.0)
+    assert type(caught.value) is error

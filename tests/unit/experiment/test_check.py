@@ -470,6 +470,20 @@ class TestWatchdog:
         (problem,) = caught.value.problems
         assert str(problem).endswith(f"device.watchdog.safe_command: {rule}")
 
+    @pytest.mark.parametrize(
+        ("timeout_s", "arm_s", "refused"),
+        [(0.1, 0.0, False), (0.1, 0.0999, True), (0.00031, 0.0, False), (0.00029, 0.0, True)],
+    )
+    def test_a_time_that_the_start_cannot_keep_is_refused(self, timeout_s, arm_s, refused) -> None:
+        """Three ticks of 0.1 ms, and what arming takes on the line."""
+        watched = {"watchdog_command": 0.0, "watchdog_timeout_s": timeout_s, "arm_s": arm_s}
+        if not refused:
+            checked(CURRENT, **watched)
+            return
+        with pytest.raises(ConfigError) as caught:
+            checked(CURRENT, **watched)
+        assert [each.key for each in caught.value.problems] == ["device.watchdog.timeout_s"]
+
 
 def within(frequency_hz: float) -> HysteresisModel:
     """Return a model that was identified at that frequency alone."""

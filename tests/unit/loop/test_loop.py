@@ -1,10 +1,13 @@
 """The loop, with a device and a clock that the test makes."""
 
+from dataclasses import dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from hilctl.base.errors import DeviceError
 from hilctl.base.samples import Flag, Head
 from hilctl.loop.compensator import Compensator
 from hilctl.loop.host import StraightLine, Tuning
@@ -236,6 +239,51 @@ def test_sample_that_the_device_did_not_answer_is_recorded():
     assert np.isnan(rig.host.column(3)[60])
     assert rig.host.flags[60][0] & Flag.UNANSWERED
     assert not rig.host.flags[59][0] & Flag.UNANSWERED
+
+
+@dataclass
+class WatchedDevice(FakeDevice):
+    """A device with a watchdog; arming takes some time of the clock, or fails."""
+
+    clock: FakeClock | None = None
+    takes_ns: int = 0
+    arm_fails: bool = False
+    armed_ns: list[int] = field(default_factory=list)
+    exchanged_ns: list[int] = field(default_factory=list)
+    info = SimpleNamespace(measures_command=False, arm_s=0.004)
+
+    def arm(self):
+        self.armed_ns.append(self.clock.now_ns())
+        if self.arm_fails:
+            raise DeviceError("fake: not armed")
+        self.clock.sleep_until_ns(self.clock.now_ns() + self.takes_ns)
+
+    def exchange(self, first_sample, command, displacement_um, measured):
+        self.exchanged_ns.append(self.clock.now_ns())
+        super().exchange(first_sample, command, displacement_um, measured)
+
+
+@pytest.mark.parametrize("takes_ns", [0, 3_000_000, 7_000_000])
+def test_the_watchdog_is_armed_just_before_the_first_exchange(takes_ns):
+    """Once, so that it is done when the first tick is due; else that is due when it is done."""
+    clock = FakeClock()
+    rig = Rig(sine(), device=WatchedDevice(clock=clock, takes_ns=takes_ns), clock=clock)
+    start_ns = 50_000_000
+    rig.loop.begin_at(0.0)
+    outcome = rig.loop.run(start_ns)
+    assert (outcome.code, rig.loop.lateness.late_ticks) == ("completed", 0)
+    assert rig.device.armed_ns == [start_ns - 5_000_000]
+    assert rig.device.exchanged_ns[0] == max(start_ns, start_ns - 5_000_000 + takes_ns)
+
+
+def test_a_watchdog_that_cannot_be_armed_ends_as_an_exchange_that_fails():
+    clock = FakeClock()
+    rig = Rig(sine(), device=WatchedDevice(clock=clock, arm_fails=True), clock=clock)
+    outcome = rig.run()
+    assert (outcome.code, outcome.reason, outcome.safe) == ("fault", "fake: not armed", True)
+    assert rig.device.made_safe == [0.0]
+    assert rig.device.commands == []
+    assert [event.code for event in rig.host.events] == ["device_lost"]
 
 
 def test_lost_device_that_stays_lost_is_said():

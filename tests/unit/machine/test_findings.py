@@ -54,6 +54,7 @@ def test_every_trouble_has_a_remedy(make_machine):
             "/proc/cpuinfo": "flags : fpu hypervisor",
             f"{CLOCK}/current_clocksource": "hpet",
             "/sys/bus/usb-serial/devices/ttyUSB0/latency_timer": "16",
+            "/proc/1/comm": "ModemManager",
         },
         closed=("/dev/cpu_dma_latency", "/dev/ttyUSB0"),
         free=1000,

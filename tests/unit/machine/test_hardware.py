@@ -78,6 +78,20 @@ def test_ftdi_latency(make_machine):
     assert "latency_timer" in remedy
 
 
+@pytest.mark.parametrize(
+    ("active", "level"),
+    [((), "ok"), (("ModemManager",), "warn"), (("brltty", "ModemManager"), "warn")],
+)
+def test_serial_daemons(make_machine, active, level):
+    """They open ports by themselves, and take bytes from a run that has one."""
+    files = {f"/proc/{number}/comm": name for number, name in enumerate(("sh", *active), start=1)}
+    found, said, remedy = check(hardware.serial_daemons, make_machine(files))
+    assert found == level
+    for name in active:
+        assert name in said
+        assert name in remedy
+
+
 def test_serial_ports(make_machine):
     """A port that this user may not open is bad, and its group named."""
     level, said, remedy = check(hardware.serial_ports, make_machine(closed=("/dev/ttyUSB0",)))

@@ -20,7 +20,7 @@ from hilctl_drivers.profile import shipped_profiles
 from hilctl_drivers.serial.device import SerialDac
 from hilctl_drivers.serial.setup import SerialOptions
 from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
-from tests.fakes import FakeHost, ShiftedClock, emulated, logged
+from tests.fakes import FakeHost, ShiftedClock, emulated, logged, made_safe
 
 pytestmark = pytest.mark.slow  # the board's FIFO runs empty in real time
 
@@ -44,6 +44,7 @@ class Board:
 
     def open(self):
         self.device.open(RATE_HZ, BLOCK)
+        self.device.arm()
         self.sent = 0
 
     def exchange(self, command):
@@ -165,7 +166,7 @@ def test_a_bad_answer_is_an_error_and_the_output_can_still_be_made_safe(board, f
     driven.open()
     with pytest.raises(DeviceError, match=text):
         driven.hold(2.0, 20)
-    driven.device.make_safe(0.0)
+    made_safe(driven.device, 0.0)
     last = driven.events()[-1]
     assert (last["event"], last["current_a"]) == ("safe", 0.0)
     driven.open()

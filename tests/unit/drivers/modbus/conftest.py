@@ -13,7 +13,7 @@ from hilctl_drivers.emulator.setup import Emulator, build
 from hilctl_drivers.modbus.device import ModbusDac
 from hilctl_drivers.modbus.setup import ModbusOptions
 from hilctl_drivers.profile import shipped_profiles
-from tests.fakes import FaultyLink, InProcess, ManualClock, VirtualTime, logged
+from tests.fakes import FaultyLink, InProcess, ManualClock, logged
 
 MESSAGE_S = 0.001
 TIMEOUT_S = 0.1
@@ -54,8 +54,7 @@ class ServedPair:
 
     def device(self, **changes) -> ModbusDac:
         options = {**self.emulator.options, "timeout_s": PATIENT_S, **changes}
-        time = VirtualTime()
-        return ModbusDac(ModbusOptions.model_validate(options), clock=time)
+        return ModbusDac(ModbusOptions.model_validate(options))
 
     def events(self) -> list[dict]:
         return logged(self.log)
@@ -108,14 +107,16 @@ class DrivenModbus:
     def another(self, **changes) -> ModbusDac:
         """Return a device on the same emulated one, with other options."""
         options = ModbusOptions.model_validate({**self._options, **changes})
-        return ModbusDac(options, self._connect, self.time)
+        return ModbusDac(options, self._connect)
 
     def _connect(self, peer):
         self.peers.append(peer)
         return peer.session(self.link)
 
     def open(self):
+        """Open and arm it, as a run does."""
         self.device.open(RATE_HZ, 1)
+        self.device.arm()
 
     def exchange(self, value):
         self.device.exchange(0, np.array([value]), np.empty(1), np.empty(1))

@@ -16,7 +16,7 @@ from hilctl_drivers.emulator.setup import Emulator, build
 from hilctl_drivers.modbus.device import ModbusDac
 from hilctl_drivers.modbus.setup import ModbusOptions
 from hilctl_drivers.profile import load_profile, shipped_profiles
-from tests.fakes import ManualClock, VirtualTime, logged
+from tests.fakes import ManualClock, logged
 
 T7 = {
     "profile": "labjack_t7",
@@ -79,8 +79,7 @@ class Served:
         host, _, port = self.emulator.address.partition(":")
         where = {"host": host, "tcp_port": int(port)} if port else {"serial_port": host}
         given = {**options, "timeout_s": 5.0, **where, **changes}
-        time = VirtualTime()
-        return ModbusDac(ModbusOptions.model_validate(given), clock=time)
+        return ModbusDac(ModbusOptions.model_validate(given))
 
     def events(self) -> list[dict]:
         return logged(self.log)
@@ -121,9 +120,8 @@ def exchange(device: ModbusDac, value: float) -> float:
 
 
 def made(**changes) -> ModbusDac:
-    time = VirtualTime()
     options = ModbusOptions.model_validate({**T7, "host": "h", **changes})
-    return ModbusDac(options, clock=time)
+    return ModbusDac(options)
 
 
 class TestOptions:
@@ -450,6 +448,7 @@ class TestWatchdog:
         served = serve("labjack_t7")
         device = served.device(T7, watchdog={"timeout_s": 2.0, "safe_command": 1.0})
         device.open(100.0, 1)
+        device.arm()
         exchange(device, 3.0)
         served.clock.pass_s(1.9)
         exchange(device, 3.0)
@@ -478,6 +477,7 @@ class TestWatchdog:
             written.clear()
             device = served.device(T7, watchdog={"timeout_s": 2.0})
             device.open(100.0, 1)
+            device.arm()
             device.close()
             assert [address for address in written if address > 61000] == watchdog_writes
 
@@ -486,6 +486,7 @@ class TestWatchdog:
         served = serve("wago_750")
         device = served.device(WAGO, watchdog={"timeout_s": 0.5})
         device.open(100.0, 1)
+        device.arm()
         exchange(device, 3.0)
         served.clock.pass_s(0.6)
         with pytest.raises(DeviceError, match="exception 4"):
@@ -494,6 +495,7 @@ class TestWatchdog:
         tripped = [event for event in served.events() if event["event"] == "watchdog"]
         assert [(each["output"], each["value"]) for each in tripped] == [("AO0", 0.0), ("AO1", 0.0)]
         device.open(100.0, 1)
+        device.arm()
         exchange(device, 2.0)
         device.close()
         served.clock.pass_s(60.0)
@@ -505,6 +507,7 @@ class TestWatchdog:
         served = serve("wago_750")
         device = served.device(WAGO, watchdog={"timeout_s": 0.5})
         device.open(100.0, 1)
+        device.arm()
         exchange(device, 3.0)
         served.clock.pass_s(0.6)
         with pytest.raises(DeviceError):

@@ -26,6 +26,7 @@ def test_a_command_from_before_a_trip_is_not_taken_for_the_output(serve):
     served = serve("wago_750", None)
     device = served.device(watchdog={"timeout_s": 0.5})
     device.open(100.0, 1)
+    device.arm()
     exchange(device, 3.0)
     device._release()
     served.clock.pass_s(0.6)

@@ -50,6 +50,7 @@ class Rig:
 
     def open(self):
         self.device.open(20.0, 1)
+        self.device.arm()
 
     def pass_s(self, seconds):
         self.clock.extra_ns += round(seconds * 1e9)
@@ -125,7 +126,7 @@ def test_bad_commands_are_refused_and_nothing_is_sent(rig, kind, bad):
         bench.exchange(bad)
     with pytest.raises(DeviceError, match="nothing was sent"):
         bench.device.make_safe(bad)
-    assert not [event for event in bench.events() if event["event"] == "write"]
+    assert {each["current_a"] for each in bench.events()} <= {0.0}  # as opening found it
     bench.exchange(1.0)
 
 
@@ -201,7 +202,7 @@ def test_exchanges_feed_the_watchdog_and_close_disarms_it(rig, kind):
     bench.device.close()
     bench.pass_s(3.0)
     bench.open()
-    assert {event["event"] for event in bench.events()} == {"write"}
+    assert "watchdog" not in {event["event"] for event in bench.events()}
 
 
 @pytest.mark.parametrize("readback", ["output", "command"])
@@ -220,6 +221,7 @@ def test_a_trip_of_an_earlier_run_ends_at_the_safe_value(rig, profiles, readback
 
     device._switch = restore
     bench.device.open(60.0, 1)
+    bench.device.arm()
     bench.exchange(3.0)
     bench.device.wire.release()
     with pytest.raises(DeviceError, match="not open"):
@@ -227,7 +229,7 @@ def test_a_trip_of_an_earlier_run_ends_at_the_safe_value(rig, profiles, readback
     bench.pass_s(21.0)
     bench.device.open(60.0, 1)
     events = [(event["event"], event["current_a"]) for event in bench.events()]
-    assert events[-3:] == [("watchdog", 0.0), ("stale", 3.0), ("write", 0.0)]
+    assert events[-4:] == [("watchdog", 0.0), ("stale", 3.0), ("write", 0.0), ("write", 0.0)]
     assert bench.device.output() == 0.0
     assert bench.exchange(1.0) < 45.0
 
@@ -299,7 +301,7 @@ def test_a_reader_that_fails_is_named(rig):
 @pytest.mark.parametrize("fault", ["silence", "corrupt", "duplicate", "wrong_id"])
 def test_a_bad_answer_to_the_safe_value_confirms_nothing(rig, kind, fault):
     """The attempt that got it fails; a later one does not."""
-    message = {"dcon": 13, "scpi": 12, "cobs": 9, "length": 9}[kind]
+    message = {"dcon": 15, "scpi": 15, "cobs": 10, "length": 10}[kind]
     timeout_s = TIMEOUT_S if fault == "silence" else PATIENT_S
     bench = rig(kind, faults=[f"{fault}@{message}"], timeout_s=timeout_s)
     bench.open()

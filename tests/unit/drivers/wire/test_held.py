@@ -79,11 +79,14 @@ def test_a_name_server_that_is_silent_is_not_waited_for(names, monkeypatch):
 
 
 def test_links_to_a_port_are_the_port(tmp_path):
-    """As those under /dev/serial/by-id; also one that leads to nothing yet."""
+    """As those under /dev/serial/by-id; also one that leads to nothing yet, or is gone."""
     (tmp_path / "ttyUSB0").touch()
     for name, target in (("usb-adapter", "ttyUSB0"), ("gone", "ttyUSB1")):
         (tmp_path / name).symlink_to(target)
-        assert held_port(str(tmp_path / name)) == (f"serial:{tmp_path.resolve()}/{target}",)
+        link, port = f"serial:{tmp_path / name}", f"serial:{tmp_path.resolve()}/{target}"
+        assert held_port(str(tmp_path / name)) == (link, port)
+        (tmp_path / name).unlink()
+        assert link in held_port(str(tmp_path / name))
 
 
 def test_a_port_is_known_by_its_number_too(monkeypatch):

@@ -1,0 +1,111 @@
+"""A device that is gone when its loop ends: its guardian goes on, and others can relieve it."""
+
+import json
+import subprocess
+import sys
+import time
+
+import pytest
+
+AWAY_S = 7.0
+PULLED_AT = 80
+MODULE = {
+    "kind": "modbus_dac",
+    "output": "OUT",
+    "input": "IN",
+    "timeout_s": 0.5,
+    "amplifier": {"gain_a_per_v": 1.0},
+    "sensor": {"um_per_v": 12.5},
+    "watchdog": "none",
+}
+
+
+def hilctl(*words):
+    """Run a command; return its exit code and the JSON that it prints."""
+    command = [sys.executable, "-m", "hilctl", *map(str, words), "--json"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=240)
+    assert "Traceback" not in done.stderr
+    return done.returncode, json.loads(done.stdout)
+
+
+def active():
+    """Return the status of every run."""
+    return hilctl("status")[1]["runs"]
+
+
+class Module:
+    """An emulated module that is pulled in mid-run, and another one that takes its place."""
+
+    def __init__(self, folder, emulate, profile):
+        self.port, self._emulate, self._profile = folder / "port", emulate, profile
+        self.port.symlink_to(emulate(profile, "--fault", f"unplug@{PULLED_AT}").address)
+
+    def come_back(self):
+        self.emulated = self._emulate(self._profile)
+        self.port.unlink()
+        self.port.symlink_to(self.emulated.address)
+
+    def writes_a(self):
+        return [each["current_a"] for each in self.emulated.log.events("OUT")]
+
+    def await_output(self, current_a, within_s):
+        deadline = time.monotonic() + within_s
+        while self.writes_a()[-1:] != [pytest.approx(current_a, abs=1e-5)]:
+            assert time.monotonic() < deadline, self.writes_a()
+            time.sleep(0.02)
+
+
+@pytest.fixture
+def abandoned(tmp_path, emulate, run, profile):
+    """Return a module that was pulled in mid-run, with the result of the run."""
+    module = Module(tmp_path, emulate, profile("rtu_module"))
+    section = {**MODULE, "profile": profile("rtu_module"), "serial_port": str(module.port)}
+    started = run(section, sample_rate_hz=100)
+    module.result = started.end()
+    module.experiment = started.output.with_suffix(".yaml")
+    return module
+
+
+def test_the_guardian_goes_on_after_the_command_and_says_so(abandoned):
+    """The command returns; the output is safe within one retry of the device's return."""
+    result = abandoned.result
+    assert (result["output_state"], result["guardian_active"]) == ("unknown", True)
+    (run,) = active()
+    assert (run["state"], run["output_state"]) == ("setting the safe value", "unknown")
+    time.sleep(AWAY_S)
+    abandoned.come_back()
+    abandoned.await_output(0.0, within_s=5.0)
+    deadline = time.monotonic() + 30.0
+    while active():  # the guardian confirms it, and leaves nothing behind
+        assert time.monotonic() < deadline
+
+
+def test_safe_by_hand_relieves_the_guardian_and_gives_back_what_it_cannot_do(abandoned):
+    returned, found = hilctl("safe", abandoned.experiment)
+    assert (returned, found["output_state"], found["guardian_active"]) == (3, "unknown", True)
+    assert [run["state"] for run in active()] == ["setting the safe value"]
+    abandoned.come_back()
+    returned, found = hilctl("safe", abandoned.experiment)
+    assert (returned, found["output_state"], found["guardian_active"]) == (0, "confirmed", False)
+    assert abandoned.writes_a()[-1] == pytest.approx(0.0, abs=1e-5)
+    assert active() == []
+
+
+def test_a_new_run_relieves_the_guardian_once_it_starts(abandoned):
+    words = ["run", abandoned.experiment, "--set", "waveform.duration_s=0.5"]
+    output = abandoned.experiment.with_name("again.mcap")
+    command = [sys.executable, "-m", "hilctl", *map(str, words), "--output", str(output)]
+    refused = subprocess.run(command, capture_output=True, text=True, timeout=240)
+    assert refused.returncode == 3
+    assert [run["state"] for run in active()] == ["setting the safe value"]
+    abandoned.come_back()
+    returned, found = hilctl(*words, "--output", output)
+    assert (returned, found["code"], found["output_state"]) == (0, "completed", "confirmed")
+    assert active() == []
+
+
+def test_the_user_can_end_the_guardian(abandoned):
+    (run,) = active()
+    returned, found = hilctl("stop", "--run", run["name"])
+    assert (returned, found["ended"]) == (0, True)
+    assert all(run["state"] != "setting the safe value" for run in active())
