@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
@@ -113,11 +114,14 @@ class Recorder:
         """
         assert self._run is not None
         facts, info = self._run.facts, self._checked.loaded.device.info
+        path = self.path
+        with suppress(OSError):  # the working folder is gone
+            path = path.absolute()
         if info.holds:
             state = DeviceState(
                 holds=list(info.holds),
                 run_id=facts["run_id"],
-                recording=str(self.path.absolute()),
+                recording=str(path),
                 started=datetime.fromisoformat(facts["started"]),
                 coil=coil,
             )
@@ -271,10 +275,11 @@ class Recorder:
             self._stays()
             self._file.stream.flush(sync=True)
             sync_folder(self.path.parent)
-            self._file.stream.close()
         except OSError as error:
             self._problem = self._cannot(error.strerror)
             return False
+        with suppress(OSError):  # all of it is on the disk
+            self._file.stream.close()
         self._problem = ""
         return True
 
