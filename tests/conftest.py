@@ -155,9 +155,10 @@ def read_once():
 # the folder of its own scope, and neither a user's command nor another test's can end it.
 @pytest.fixture(scope="session", autouse=True)
 def session_runs(memory):
-    """Keep the runs of session fixtures apart from this user's."""
+    """Keep the runs of session fixtures, and what they left, apart from this user's."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("HILCTL_RUNS", str(memory / "session"))
+        patch.setenv("XDG_STATE_HOME", str(memory / "session-state"))
         yield
 
 
@@ -167,17 +168,19 @@ def module_runs(session_runs, memory, request):
     folder = runs_folder(memory, request.node.nodeid)
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("HILCTL_RUNS", str(folder))
+        patch.setenv("XDG_STATE_HOME", f"{folder}-state")
         yield folder
 
 
 @pytest.fixture(autouse=True)
 def own_runs(module_runs, memory, monkeypatch, request):
-    """Keep each test's runs apart from those of other tests and of this user.
+    """Keep each test's runs, and what they left, apart from other tests' and this user's.
 
     A guardian that still drives a device when the test is over is ended.
     """
     folder = runs_folder(memory, request.node.nodeid)
     monkeypatch.setenv("HILCTL_RUNS", str(folder))
+    monkeypatch.setenv("XDG_STATE_HOME", f"{folder}-state")
     yield
     for run in runs() if folder.exists() else []:
         signal_guardian(run, signal.SIGKILL)

@@ -78,7 +78,7 @@ def run(
     # Not before: a supervisor has no use for a loop of its own.
     from hilctl.run.unpaced import run_unpaced
 
-    checked = checked_experiment(path, texts, chosen)
+    checked = checked_experiment(path, texts)
     return run_unpaced(checked, output_of(checked, chosen), overwrite=overwrite)
 
 

@@ -71,7 +71,7 @@ def run_task(task: FastTask) -> FastRun:
     with tempfile.TemporaryDirectory(prefix="hilctl-campaign-") as folder:
         output = Path(folder) / "run.mcap"
         try:
-            result = run_unpaced(check(loaded, None, task.heat_a2), output)
+            result = run_unpaced(check(loaded, task.heat_a2), output)
         except HilctlError as error:
             return FastRun(b"", "refused", str(error), harmless=True)
         content, recording = output.read_bytes(), read(output)

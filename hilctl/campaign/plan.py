@@ -163,7 +163,7 @@ def _checked(
     same = known.get(each.step.settings)
     if same is None:
         # At a far time: what the last run has left is waited for, and no reason to refuse a step.
-        forecast = check(each.loaded, folder, now_s=_LONG_AFTER_S).forecast
+        forecast = check(each.loaded, now_s=_LONG_AFTER_S).forecast
         same = replace(each, heat=forecast.heat, megabytes=forecast.recording_mb)
         known[each.step.settings] = same
     return replace(each, heat=same.heat, megabytes=same.megabytes)

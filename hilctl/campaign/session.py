@@ -230,7 +230,7 @@ def _heat_a2(each: PlannedStep, folder: Path, last: Path | None, now_s: float) -
     A simulated device has no past of its own; within a campaign it is one rig all the same.
     """
     config, info = each.loaded.config, each.loaded.device.info
-    heat_a2 = heat_before(each.loaded, folder, now_s)
+    heat_a2 = heat_before(each.loaded, now_s)
     if config.limits.thermal_time_constant_s is None or not info.simulated or last is None:
         return heat_a2
     return max(heat_a2, heat_after(last, config, now_s))

@@ -265,7 +265,7 @@ class Campaign:
     def _pause_s(self, heat: RunHeat) -> float:
         """Return how long the coil must cool, by the steps here and by the device's last run."""
         now_s = self._host.now_s()
-        last_a2 = heat_before(self._loaded, self._folder, now_s)
+        last_a2 = heat_before(self._loaded, now_s)
         last = CoolingCoil(self._loaded.config, last_a2, now_s)
         return max(coil.pause_s(heat, now_s) for coil in (self._coil, last))
 

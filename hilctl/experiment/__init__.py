@@ -6,6 +6,7 @@ load.py           from a file to the experiment with all that it refers to
 correction.py     what learning has added to the compensator's input
 initial_state.py  what the run before left in the actuator
 heat.py           the coil's heat, from run to run; history.py  what the last run left
+device_state.py   which run was the last one of a device, kept between runs
 check.py          the whole run worked out beforehand, held against device, model and limits
 model_range.py    whether the reference stays within what the model was identified on
 pace.py           whether no timer is quick enough for its ticks

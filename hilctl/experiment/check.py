@@ -8,7 +8,6 @@ import logging
 import math
 import time
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 
@@ -94,7 +93,6 @@ class Checked:
 
 def check(
     loaded: LoadedExperiment,
-    folder: Path | None = None,
     heat_a2: float = 0.0,
     now_s: float | None = None,
 ) -> Checked:
@@ -102,8 +100,6 @@ def check(
 
     Args:
         loaded: The experiment.
-        folder: Folder that the run is written to, where that is not ``recording.folder``: the last
-            run of its device may have been, too.
         heat_a2: Heat that its coil has at least, in A^2, whatever the last run of it says.
         now_s: Unix time in s at which the run starts; the present where None.
 
@@ -127,7 +123,7 @@ def check(
         conditioning = conditioning_of(loaded)
         conditioned = np.empty(0) if conditioning is None else conditioning.command
         now_s = time.time() if now_s is None else now_s
-        before, begins = _state_before(loaded, folder, conditioned, now_s, problems)
+        before, begins = _state_before(loaded, conditioned, now_s, problems)
         if before is not None:
             values = before.lead_in(values, config.lead_in_samples)
         begun = begin(loaded.model, config.sample_rate_hz, values, before, begins)
@@ -135,7 +131,7 @@ def check(
             begun = replace(begun, stands_um=None)
         problems += feedback_problems(loaded, begun.preview)
         problems += adaptation_problems(loaded, begun.preview)
-        heat_a2 = max(heat_a2, heat_before(loaded, folder, now_s))
+        heat_a2 = max(heat_a2, heat_before(loaded, now_s))
         forecast = forecast_of(loaded, reference, begun, conditioned, heat_a2)
     except ModelError as error:
         problems.append(_problem(loaded, "compensator.model", str(error)))
@@ -197,7 +193,6 @@ def _corrected(loaded: LoadedExperiment, reference: Reference, problems: list[Pr
 
 def _state_before(
     loaded: LoadedExperiment,
-    folder: Path | None,
     conditioned: F64,
     now_s: float,
     problems: list[Problem],
@@ -206,7 +201,6 @@ def _state_before(
 
     Args:
         loaded: The experiment.
-        folder: See :func:`check`.
         conditioned: float64[m], commands that come before the waveform: a cycle that makes all
             before it forgotten, and a rest; or the rest alone; or none.
         now_s: Unix time in s.
@@ -223,7 +217,7 @@ def _state_before(
     if config.condition is not None:
         begins = "where its condition leaves the actuator"
     elif named == "last":
-        before, begins = left_by_last_run(loaded, now_s, folder)
+        before, begins = left_by_last_run(loaded, now_s)
     elif named != "rest":
         begins = f"where {named} left the actuator"
         try:

@@ -1,36 +1,34 @@
-"""What the last run of a device left in its actuator and its coil, where a recording says so.
+"""What the last run of a device left in its actuator and its coil.
 
-The newest recording of the same device in the folders that runs are written to is taken, or none:
-an older one would leave out what came after it. A device is the same by what it holds alone while
-it is open; simulated ones hold nothing, and begin at rest whenever they are made.
+The device's state says which run that was, see :mod:`hilctl.experiment.device_state`; the commands
+in its recording say where they left the actuator, by whatever model. Simulated devices have no
+state, and begin at rest whenever they are made.
 """
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from datetime import datetime
 from pathlib import Path
 
 from hilctl.base.errors import DataError
+from hilctl.experiment.device_state import DeviceState, read_device_state
 from hilctl.experiment.file import Experiment
 from hilctl.experiment.heat import CoilHeat, cooled
 from hilctl.experiment.initial_state import InitialState, initial_state_after
 from hilctl.experiment.load import LoadedExperiment
 from hilctl.recording.ends import read_ends
-from hilctl.recording.facts import HEAT_FACT, HOLDS_FACT
+from hilctl.recording.facts import HEAT_FACT
 
 _LARGEST_BYTES = 256 << 20  # some minutes at 50 kHz: more would keep the start waiting
 
 
-def left_by_last_run(
-    loaded: LoadedExperiment, now_s: float, folder: Path | None = None
-) -> tuple[InitialState | None, str]:
+def left_by_last_run(loaded: LoadedExperiment, now_s: float) -> tuple[InitialState | None, str]:
     """Return where the last run left the actuator, or None for rest; and which, or why, in words.
 
     Args:
         loaded: The experiment; it has a compensator.
         now_s: Unix time in s.
-        folder: Folder that this run is written to, where that is not ``recording.folder``.
 
     Raises:
         ModelError: The model has no inverse.
@@ -38,36 +36,64 @@ def left_by_last_run(
     config, model, holds = loaded.config, loaded.model, loaded.device.info.holds
     if not holds or model is None:
         return None, "at rest"
-    folders = _folders(config, folder)
-    path = _newest(folders, holds)
-    if path is None:
-        where = " and ".join(str(each) for each in folders)
-        return None, f"at rest: no recording of this device in {where}"
+    state = read_device_state(holds)
+    if state is None:
+        return None, "at rest: no earlier run of this device is known"
+    path = Path(state.recording)
     try:
-        left, why = None, f"{path}: is larger than {_LARGEST_BYTES >> 20} MB"
-        if path.stat().st_size <= _LARGEST_BYTES:
-            left = initial_state_after(path, model, config.sample_rate_hz, now_s)
+        _check_run(state)
+        left = initial_state_after(path, model, config.sample_rate_hz, now_s)
     except (DataError, OSError) as error:
-        left, why = None, str(error)
-    if left is None:
-        return None, f"at rest, what the last run left is not known: {why}"
+        return None, f"at rest, what the last run left is not known: {error}"
     return left, f"where {path} left the actuator"
 
 
-def heat_before(loaded: LoadedExperiment, folder: Path | None, now_s: float) -> float:
+def _check_run(state: DeviceState) -> None:
+    """Raise DataError unless the recording is that of the last run, and not too large."""
+    path = Path(state.recording)
+    if read_ends(path).run.get("run_id") != state.run_id:
+        raise DataError(f"{path}: is not the recording of the last run any more")
+    if path.stat().st_size > _LARGEST_BYTES:
+        raise DataError(f"{path}: is larger than {_LARGEST_BYTES >> 20} MB")
+
+
+def heat_before(loaded: LoadedExperiment, now_s: float) -> float:
     """Return what the last run has left of the coil's heat, in A^2; that of the safe value, if any.
 
     Args:
         loaded: The experiment.
-        folder: Folder that this run is written to, where that is not ``recording.folder``.
         now_s: Unix time in s.
     """
     config, holds = loaded.config, loaded.device.info.holds
-    rest_a2 = config.safe.value**2
-    if not holds or config.limits.thermal_time_constant_s is None:
-        return rest_a2
-    path = _newest(_folders(config, folder), holds)
-    return rest_a2 if path is None else heat_after(path, config, now_s)
+    rest, tau_s = config.safe.value, config.limits.thermal_time_constant_s
+    state = read_device_state(holds) if tau_s is not None else None
+    if state is None:
+        return rest**2
+    coil = state.coil
+    if coil is None or (coil.output_safe and coil.thermal_time_constant_s != tau_s):
+        try:
+            _check_run(state)
+            return heat_after(Path(state.recording), config, now_s)
+        except (DataError, OSError):
+            heat_a2, ended_s = _budget_a2(config), _last_seen_s(state)
+    else:
+        heat_a2, ended_s = coil.heat_a2, coil.ended.timestamp()
+        if not coil.output_safe:  # it may have been driven on
+            heat_a2 = _budget_a2(config)
+    return max(rest**2, cooled(heat_a2, rest, tau_s, now_s - ended_s))
+
+
+def _budget_a2(config: Experiment) -> float:
+    return (config.limits.rms_current_a or 0.0) ** 2
+
+
+def _last_seen_s(state: DeviceState) -> float:
+    """Return the latest time at which a run whose recording cannot be read may have gone on."""
+    if state.coil is not None:
+        return state.coil.ended.timestamp()
+    path = Path(state.recording)
+    # Of a file that was removed or replaced, its folder tells when.
+    return max(state.started.timestamp(), *(_changed_s(each, 0.0) for each in (path, path.parent)))
 
 
 def heat_after(path: Path, config: Experiment, now_s: float) -> float:
@@ -83,11 +109,10 @@ def heat_after(path: Path, config: Experiment, now_s: float) -> float:
         now_s: Unix time in s.
     """
     rest = config.safe.value
-    budget_a2 = (config.limits.rms_current_a or 0.0) ** 2
     try:
         heat_a2, ended_s = _heat_at_end(path, config)
     except (DataError, OSError, ValueError):
-        heat_a2, ended_s = budget_a2, _changed_s(path, now_s)
+        heat_a2, ended_s = _budget_a2(config), _changed_s(path, now_s)
     tau_s = config.limits.thermal_time_constant_s
     return max(rest**2, cooled(heat_a2, rest, tau_s, now_s - ended_s))
 
@@ -130,25 +155,3 @@ def _changed_s(path: Path, otherwise: float) -> float:
 
 def _unix_s(text: str) -> float:
     return datetime.fromisoformat(text).timestamp()
-
-
-def _folders(config: Experiment, folder: Path | None) -> list[Path]:
-    return [*dict.fromkeys([Path(config.recording.folder), *([folder] if folder else [])])]
-
-
-def _newest(folders: Sequence[Path], holds: Sequence[str]) -> Path | None:
-    """Return the newest recording of a device in some folders."""
-    aged = []
-    for path in (path for folder in folders for path in folder.glob("*.mcap")):
-        try:
-            aged.append((path.stat().st_mtime_ns, path))
-        except OSError:  # it has gone meanwhile
-            continue
-    for _, path in sorted(aged, reverse=True):
-        try:
-            facts = read_ends(path).run
-        except DataError:  # not one of hilctl, or without a beginning
-            continue
-        if facts.get(HOLDS_FACT) == json.dumps(list(holds)):
-            return path
-    return None

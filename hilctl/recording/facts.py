@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import TypeAlias
 
 HOLDS_FACT = "holds"
-"""Fact of a run, by which later ones know its device: JSON list of what it holds while open."""
+"""Fact of a run: JSON list of what its device holds alone while it is open."""
 HEAT_FACT = "coil_heat_a2"
 """Fact of a run and of its end: heat of the coil then, the running mean square of its current."""
 LABELS_FACT = "labels"

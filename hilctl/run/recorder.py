@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
@@ -16,6 +17,7 @@ from hilctl.base.remedy import reason
 from hilctl.base.samples import Batch, Head, Samples
 from hilctl.experiment.check import Checked
 from hilctl.experiment.correction import dump_correction
+from hilctl.experiment.device_state import CoilState, DeviceState, write_device_state
 from hilctl.experiment.heat import CoilHeat
 from hilctl.models.files import dump_model
 from hilctl.recording.facts import HEAT_FACT
@@ -103,6 +105,27 @@ class Recorder:
     def give_back(self) -> None:
         """Leave no file behind where there was none: the run does not start."""
         self._file.give_back()
+
+    def note_device(self, coil: CoilState | None = None) -> None:
+        """Note that this run is the last one of its device.
+
+        Args:
+            coil: How it left the coil; None while it is running.
+        """
+        assert self._run is not None
+        facts, info = self._run.facts, self._checked.loaded.device.info
+        path = self.path
+        with suppress(OSError):  # the working folder is gone
+            path = path.absolute()
+        if info.holds:
+            state = DeviceState(
+                holds=list(info.holds),
+                run_id=facts["run_id"],
+                recording=str(path),
+                started=datetime.fromisoformat(facts["started"]),
+                coil=coil,
+            )
+            write_device_state(state)
 
     def batch(self, batch: Batch) -> None:
         """Write a batch."""
@@ -228,9 +251,20 @@ class Recorder:
         until_s = time.monotonic() + patience_s
         while not (closed := self._closed()) and not self._failed and time.monotonic() < until_s:
             time.sleep(_RETRY_S)
-        if not closed:
+        if closed:
+            self._note_coil(end, now_ns)
+        else:
             self._file.stream.abandon()
         return closed
+
+    def _note_coil(self, end: Mapping[str, str], now_ns: int) -> None:
+        coil = CoilState(
+            ended=datetime.fromtimestamp(now_ns * 1e-9, tz=UTC),
+            output_safe=end.get("output_safe") == "true",
+            heat_a2=self._heat.heat_a2,
+            thermal_time_constant_s=self._checked.loaded.config.limits.thermal_time_constant_s,
+        )
+        self.note_device(coil)
 
     def _closed(self) -> bool:
         """Close the finished file; return whether all of it is there."""
@@ -241,10 +275,11 @@ class Recorder:
             self._stays()
             self._file.stream.flush(sync=True)
             sync_folder(self.path.parent)
-            self._file.stream.close()
         except OSError as error:
             self._problem = self._cannot(error.strerror)
             return False
+        with suppress(OSError):  # all of it is on the disk
+            self._file.stream.close()
         self._problem = ""
         return True
 

@@ -85,6 +85,7 @@ class RingRecorder:
         return time.monotonic() - self._released_s
 
     def _run(self) -> None:
+        self._guarded(self.recorder.note_device)
         while not self._ending.wait(_POLL_S):
             self._guarded(self._work)
         self._guarded(self._finish)

@@ -19,21 +19,18 @@ from hilctl.run.waiting_loop import started_ahead
 _log = logging.getLogger(__name__)
 
 
-def checked_experiment(
-    path: Path, settings: Sequence[str], output: Path | None = None, heat_a2: float = 0.0
-) -> Checked:
+def checked_experiment(path: Path, settings: Sequence[str], heat_a2: float = 0.0) -> Checked:
     """Load an experiment and hold it against device, model and limits.
 
     Args:
         path: Experiment file.
         settings: ``key=value`` texts over it.
-        output: Recording to write; None where it goes to the experiment's folder.
         heat_a2: Heat that its coil has at least, in A^2.
 
     Raises:
         InputError: It can't be used, all problems are listed.
     """
-    return check(load_experiment(path, settings), output.parent if output else None, heat_a2)
+    return check(load_experiment(path, settings), heat_a2)
 
 
 def output_of(checked: Checked, output: Path | None) -> Path:
@@ -93,7 +90,7 @@ def _run(
     # Not before: what only checks or computes works where a supervisor can't be imported.
     from hilctl.run.supervisor import Supervisor
 
-    checked = checked_experiment(path, settings, output, heat_a2)
+    checked = checked_experiment(path, settings, heat_a2)
     # Of a device with a past: nobody should have to look into the recording for what was taken.
     if checked.begun.begins and checked.loaded.device.info.holds:
         _log.warning("the compensator begins %s", checked.begun.begins)

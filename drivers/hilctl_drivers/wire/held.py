@@ -1,8 +1,8 @@
 """What a device holds alone, as :attr:`hilctl.base.device.DeviceInfo.holds` has it.
 
 One device is one lock, whatever it is called. So each place has all the names that another
-experiment could know it by: a port its path, the file that its links lead to and the number that the
-kernel knows it by, a host its name and its addresses.
+experiment could know it by: a port its path, the file that its links lead to and the number that
+the kernel knows it by, a host its name and its addresses.
 """
 
 import ipaddress

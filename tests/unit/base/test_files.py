@@ -1,13 +1,22 @@
 """Text files are read once, and not at all once the texts are given; files are written whole."""
 
+import errno
 import os
+from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 
 import pytest
 
 from hilctl.base.errors import InputError
-from hilctl.base.files import TextFiles, check_writable, read_text, write_file, write_text
+from hilctl.base.files import (
+    TextFiles,
+    check_writable,
+    read_text,
+    sync_folder,
+    write_file,
+    write_text,
+)
 
 
 def test_file_is_read_once(tmp_path):
@@ -161,6 +170,14 @@ class TestWriting:
             write_text(tmp_path / "out.txt", "text", overwrite=False)
         assert list(tmp_path.iterdir()) == []
 
+    def test_a_folder_that_can_not_be_brought_to_the_disk(self, tmp_path, monkeypatch):
+        """Some file systems can't do it at all: no reason to refuse the file."""
+        for number in (errno.EINVAL, errno.EIO):
+            monkeypatch.setattr(os, "fsync", partial(_refuse_by, number))
+            refused = pytest.raises(OSError, match="Input/output")
+            with refused if number == errno.EIO else nullcontext():
+                sync_folder(tmp_path)
+
     def test_what_is_no_regular_file_is_not_replaced(self, tmp_path):
         """A folder, a pipe or a device such as /dev/null never gives way to a file."""
         os.mkfifo(tmp_path / "pipe")
@@ -186,6 +203,10 @@ class TestWriting:
         """A name may be as long as the file system allows."""
         write_text(tmp_path / ("x" * 255), "text", overwrite=False)
         write_text(tmp_path / ("x" * 255), "again", overwrite=True)
+
+
+def _refuse_by(number, _):
+    raise OSError(number, os.strerror(number))
 
 
 def _refuse(*_arguments):

@@ -594,7 +594,7 @@ def test_commands_at_its_end_are_looked_at_before_it_starts() -> None:
 def test_the_coil_is_cold_unless_something_says_otherwise(monkeypatch: pytest.MonkeyPatch) -> None:
     """The last run by what has cooled since, or whoever asks; the hotter counts."""
     assert checked(CURRENT).heat_a2 == 0.0
-    monkeypatch.setattr(module, "heat_before", lambda loaded, folder, now_s: now_s)
+    monkeypatch.setattr(module, "heat_before", lambda loaded, now_s: now_s)
     monkeypatch.setattr(module, "time", SimpleNamespace(time=lambda: 7.0))
     made = loaded(CURRENT)
     assert check(made).heat_a2 == 7.0

@@ -1,8 +1,6 @@
-"""What the last run of a device left: which recording is taken, and what is said where none is."""
+"""What the last run of a device left: which run that was, and what is said where none is known."""
 
-import json
 import os
-import shutil
 from dataclasses import replace
 from datetime import datetime
 from types import SimpleNamespace
@@ -13,11 +11,12 @@ import pytest
 from hilctl.base.errors import ConfigError
 from hilctl.base.yaml.document import Document
 from hilctl.experiment.check import check
+from hilctl.experiment.device_state import CoilState, DeviceState, write_device_state
 from hilctl.experiment.heat import CoilHeat
 from hilctl.experiment.history import heat_after, heat_before, left_by_last_run
 from hilctl.experiment.load import resolve
 from hilctl.models.files import dump_model
-from hilctl.recording.facts import HEAT_FACT, HOLDS_FACT
+from hilctl.recording.facts import HEAT_FACT
 from tests.unit.experiment.test_initial_state import COMMAND, OMEGA, record
 
 HOLDS = ("tcp:10.0.0.5:502",)
@@ -34,6 +33,9 @@ recording: {folder: runs}
 NOW_S = 2e9
 
 
+STARTED = datetime.fromisoformat("2026-01-01T00:00:00+00:00")
+
+
 class Folder:
     """An experiment, and the folder that its runs are written to."""
 
@@ -41,7 +43,6 @@ class Folder:
         self.path, self.runs = path, path / "runs"
         self.runs.mkdir()
         (path / "model.yaml").write_text(dump_model(OMEGA))
-        self.age_s = 0
 
     def loaded(self, *settings, holds=HOLDS):
         """The experiment on a device that holds this."""
@@ -50,13 +51,19 @@ class Folder:
         info = replace(made.device.info, holds=holds)
         return replace(made, device=SimpleNamespace(info=info))
 
-    def record(self, name, *, holds=HOLDS, **made):
-        """Write a run, each older than the one before."""
-        facts = {HOLDS_FACT: json.dumps(list(holds)), "run_id": name}
-        path = record(self.runs / f"{name}.mcap", COMMAND, facts=facts, **made)
-        self.age_s += 10
-        os.utime(path, (1e9 - self.age_s, 1e9 - self.age_s))
+    def record(self, name, *, holds=HOLDS, facts=None, coil=None, **made):
+        """Write a run, which is the last of its device."""
+        path = self.runs / f"{name}.mcap"
+        record(path, COMMAND, facts={"run_id": name, **(facts or {})}, **made)
+        self.begin(name, holds=holds, coil=coil)
         return path
+
+    def begin(self, name, *, holds=HOLDS, coil=None):
+        """Have a run be the last of its device."""
+        path = str(self.runs / f"{name}.mcap")
+        write_device_state(
+            DeviceState(holds=[*holds], run_id=name, recording=path, started=STARTED, coil=coil)
+        )
 
 
 @pytest.fixture
@@ -64,15 +71,17 @@ def folder(tmp_path):
     return Folder(tmp_path)
 
 
-def test_the_newest_of_this_device_is_taken(folder):
-    """By the time of its file, whatever its name; other devices and other files are passed over."""
+def test_the_last_run_of_this_device_is_taken(folder):
+    """By its state, whatever the times of files say; other devices are passed over."""
+    folder.record("older")
+    path = folder.record("last")
     folder.record("other", holds=("tcp:10.0.0.6:502",))
-    (folder.runs / "text.mcap").write_text("no recording")
-    path = folder.record("b")
-    folder.record("a")
+    for each in folder.runs.iterdir():
+        # As after a recovery, a copy or a checkout of an old recording.
+        os.utime(each, (1e9, 1e9) if each == path else (2e9, 2e9))
     left, words = left_by_last_run(folder.loaded(), NOW_S)
     assert left is not None
-    assert left.run_id == "b"
+    assert left.run_id == "last"
     assert abs(left.stands_um) > 0.5
     assert words == f"where {path} left the actuator"
 
@@ -85,15 +94,26 @@ def test_the_newest_of_this_device_is_taken(folder):
         ({"end": {"output_safe": "false"}}, "did not confirm its safe value"),
     ],
 )
-def test_no_older_one_stands_in_for_the_newest(folder, made, why):
+def test_no_older_one_stands_in_for_the_last(folder, made, why):
     """What came after it is not known: rest, and the reason."""
-    folder.record("new", **made)
     folder.record("old")
+    folder.record("new", **made)
     left, words = left_by_last_run(folder.loaded(), NOW_S)
     assert left is None
     assert words.startswith("at rest, what the last run left is not known")
     assert why in words
     assert "new.mcap" in words
+
+
+def test_a_run_without_a_recording_is_not_known(folder):
+    """As one that was killed by a power cut before its first flush; or deleted, or replaced."""
+    folder.record("old")
+    folder.begin("new")
+    assert "new.mcap: can't be read: No such file" in left_by_last_run(folder.loaded(), NOW_S)[1]
+    (folder.runs / "old.mcap").rename(folder.runs / "new.mcap")
+    left, words = left_by_last_run(folder.loaded(), NOW_S)
+    assert left is None
+    assert "new.mcap: is not the recording of the last run any more" in words
 
 
 def test_another_rate_or_a_large_file(folder, monkeypatch):
@@ -108,26 +128,10 @@ def test_another_rate_or_a_large_file(folder, monkeypatch):
     assert (left, f"{path}: is larger than 0 MB" in words) == (None, True)
 
 
-def test_where_this_run_goes_the_last_one_may_be(folder):
-    """A run written elsewhere is seen by the next one that is; the newest of both counts."""
-    (folder.path / "other").mkdir()
-    folder.record("older")
-    newer = folder.path / "other" / "newer.mcap"
-    shutil.copy(folder.runs / "older.mcap", newer)
-    assert (
-        left_by_last_run(folder.loaded(), NOW_S, newer.parent)[1]
-        == f"where {newer} left the actuator"
-    )
-    assert "older.mcap" in left_by_last_run(folder.loaded(), NOW_S)[1]
-
-
 def test_nothing_there(folder):
-    """No recording, no folder; and no device that could have a past."""
+    """No run of this device; and no device that could have a past."""
     words = left_by_last_run(folder.loaded(), NOW_S)[1]
-    assert words == f"at rest: no recording of this device in {folder.runs}"
-    assert (
-        left_by_last_run(folder.loaded(f"recording.folder={folder.path}/absent"), NOW_S)[0] is None
-    )
+    assert words == "at rest: no earlier run of this device is known"
     folder.record("new", holds=())
     assert left_by_last_run(folder.loaded(holds=()), NOW_S) == (None, "at rest")
 
@@ -169,52 +173,60 @@ class TestCheck:
 
 
 HOT = ["limits.rms_current_a=3.0", "limits.thermal_time_constant_s=20.0"]
-ENDED_S = datetime.fromisoformat("2026-01-01T00:01:00+00:00").timestamp()
-SAFE_END = {"output_safe": "true", "ended": "2026-01-01T00:01:00.000+00:00"}
+ENDED = datetime.fromisoformat("2026-01-01T00:01:00+00:00")
+ENDED_S = ENDED.timestamp()
+SAFE_END = {"output_safe": "true", "ended": ENDED.isoformat()}
+
+
+def coil(heat_a2=4.0, *, output_safe=True, tau_s=20.0):
+    return CoilState(
+        ended=ENDED, output_safe=output_safe, heat_a2=heat_a2, thermal_time_constant_s=tau_s
+    )
 
 
 class TestHeat:
     """What the last run has left of the coil's heat."""
 
-    def begun(self, folder, **facts):
-        return {
-            "started": "2026-01-01T00:00:00.000+00:00",
+    def record(self, folder, coil=None, end=None, **facts):
+        facts |= {
+            "started": STARTED.isoformat(),
             "limits": folder.loaded(*HOT).config.limits.model_dump_json(exclude_none=True),
-            HOLDS_FACT: json.dumps(list(HOLDS)),
-            **facts,
         }
-
-    def write(self, folder, end, **facts):
-        return record(folder.runs / "a.mcap", COMMAND, facts=self.begun(folder, **facts), end=end)
+        return folder.record("a", facts=facts, coil=coil, end=end)
 
     def left(self, folder, waited_s, *settings):
-        return heat_before(folder.loaded(*HOT, *settings), None, ENDED_S + waited_s)
+        return heat_before(folder.loaded(*HOT, *settings), ENDED_S + waited_s)
 
     def test_it_has_cooled_since(self, folder):
-        """As the recording says it; by the clock, and not to below what the safe value makes."""
-        self.write(folder, {**SAFE_END, HEAT_FACT: "4.0"})
+        """By the clock, without its recording, and not to below what the safe value makes."""
+        folder.begin("gone", coil=coil(4.0))
         assert self.left(folder, 0.0) == 4.0
         assert self.left(folder, 20.0) == pytest.approx(4.0 / np.e)
         assert self.left(folder, 1e6, "safe.value=1.0") == pytest.approx(1.0)
 
+    def test_a_clock_that_was_set_back_leaves_it_hot(self, folder):
+        folder.begin("gone", coil=coil(4.0))
+        assert self.left(folder, -1e6) == 4.0
+
     def test_without_a_budget_or_a_past_there_is_none(self, folder):
-        self.write(folder, {**SAFE_END, HEAT_FACT: "4.0"})
-        assert heat_before(folder.loaded(), None, ENDED_S) == 0.0
-        assert heat_before(folder.loaded(*HOT, holds=()), None, ENDED_S) == 0.0
-        assert heat_before(folder.loaded(*HOT, holds=("tcp:other",)), None, ENDED_S) == 0.0
+        folder.begin("gone", coil=coil(4.0))
+        assert heat_before(folder.loaded(), ENDED_S) == 0.0
+        assert heat_before(folder.loaded(*HOT, holds=()), ENDED_S) == 0.0
+        assert heat_before(folder.loaded(*HOT, holds=("tcp:other",)), ENDED_S) == 0.0
 
     @pytest.mark.parametrize("end", [{}, SAFE_END, {**SAFE_END, HEAT_FACT: "warm"}])
     def test_a_killed_run_s_is_worked_out_from_its_samples(self, folder, end):
         """With what it began with; a fact that is no number is as hot as can be."""
-        path = self.write(folder, end, **{HEAT_FACT: "4.0"})
+        path = self.record(folder, end=end, **{HEAT_FACT: "4.0"})
         limits = folder.loaded(*HOT).config.limits
         sure = CoilHeat(limits, 10000.0, 4.0)
         sure.add(COMMAND)
-        found = heat_after(path, folder.loaded(*HOT).config, ENDED_S - 60.0)
-        assert found == (9.0 if HEAT_FACT in end else pytest.approx(sure.heat_a2, rel=1e-9))
+        expected = 9.0 if HEAT_FACT in end else pytest.approx(sure.heat_a2, rel=1e-9)
+        assert heat_after(path, folder.loaded(*HOT).config, ENDED_S - 60.0) == expected
+        assert heat_before(folder.loaded(*HOT), ENDED_S - 60.0) == expected
 
     def test_another_time_constant_asks_for_the_samples(self, folder):
-        self.write(folder, {**SAFE_END, HEAT_FACT: "4.0"}, **{HEAT_FACT: "0.0"})
+        self.record(folder, coil=coil(4.0), end=SAFE_END, **{HEAT_FACT: "0.0"})
         other = self.left(folder, -1e6, "limits.thermal_time_constant_s=0.05")
         sure = CoilHeat(
             folder.loaded(*HOT, "limits.thermal_time_constant_s=0.05").config.limits, 10000.0, 0.0
@@ -222,20 +234,26 @@ class TestHeat:
         sure.add(COMMAND)
         assert other == pytest.approx(sure.heat_a2, rel=1e-9)
 
-    def test_where_nothing_says_it_the_coil_is_as_hot_as_its_budget_allows(self, folder):
-        path = self.write(folder, {**SAFE_END, "output_safe": "false", HEAT_FACT: "1.0"})
-        os.utime(path, (ENDED_S + 5.0, ENDED_S + 5.0))
+    def test_an_output_that_is_not_known_to_be_safe_leaves_it_as_hot_as_can_be(self, folder):
+        folder.begin("gone", coil=coil(1.0, output_safe=False))
+        assert self.left(folder, 0.0) == 9.0
+        assert self.left(folder, 20.0) == pytest.approx(9.0 / np.e)
+
+    def test_a_killed_run_without_a_recording_leaves_it_as_hot_as_can_be(self, folder):
+        """Since the run began, or its folder was changed by what became of the recording."""
+        folder.begin("gone")
+        os.utime(folder.runs, (ENDED_S + 5.0, ENDED_S + 5.0))
         assert self.left(folder, 5.0) == 9.0
         assert self.left(folder, 25.0) == pytest.approx(9.0 / np.e)
 
     def test_a_run_that_would_overheat_the_coil_is_refused_until_it_has_cooled(self, folder):
         """And says how long that takes."""
-        self.write(folder, {**SAFE_END, HEAT_FACT: "8.9"})
+        folder.begin("gone", coil=coil(8.9))
         sine = "waveform={kind: sine, unit: A, amplitude: 5.0, frequency_hz: 10.0, duration_s: 2.0}"
         loaded = folder.loaded(*HOT, "compensator=none", sine)
         with pytest.raises(ConfigError, match=r"begins at 2\.98 A rms, left by the last run: wait"):
-            check(loaded, None, 0.0, ENDED_S)
-        later = check(loaded, None, 0.0, ENDED_S + 60.0)
+            check(loaded, 0.0, ENDED_S)
+        later = check(loaded, 0.0, ENDED_S + 60.0)
         assert later.heat_a2 == pytest.approx(8.9 * np.exp(-3.0))
         with pytest.raises(ConfigError, match="rms_current_a"):
-            check(loaded, None, 8.9, ENDED_S + 60.0)
+            check(loaded, 8.9, ENDED_S + 60.0)

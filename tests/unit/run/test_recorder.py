@@ -3,7 +3,10 @@
 import errno
 import os
 import shutil
+from dataclasses import replace
+from datetime import datetime
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,6 +15,8 @@ from mcap.writer import MCAP0_MAGIC
 from hilctl.base.errors import InputError
 from hilctl.base.events import Event
 from hilctl.base.samples import Batch, Head
+from hilctl.experiment.device_state import read_device_state
+from hilctl.recording.ends import read_ends
 from hilctl.recording.reader import read
 from hilctl.recording.writer import OutputFile, PendingFile
 from hilctl.run import recorder
@@ -140,6 +145,38 @@ def test_a_disk_that_can_not_keep_the_recording_is_an_error(begun, monkeypatch):
     made.flush()
     assert not made.finish(END, 200, patience_s=0.0)
     assert "not brought to the disk: Input/output error" in made.error
+
+
+def test_the_state_of_the_device_names_the_run_and_how_it_ended(checked, tmp_path):
+    """From its beginning on: a run that is killed must not leave the device to the one before."""
+    device = checked.loaded.device
+    real = SimpleNamespace(info=replace(device.info, holds=("tcp:10.0.0.5:502",)))
+    checked = replace(checked, heat_a2=4.0, loaded=replace(checked.loaded, device=real))
+    made = Recorder(checked, tmp_path / "run.mcap", overwrite=False)
+    made.begin(10**18, {})
+    made.note_device()
+    begun = read_device_state(real.info.holds)
+    run_id = read_ends(made.path).run["run_id"]
+    assert (begun.run_id, begun.recording, begun.coil) == (run_id, str(made.path), None)
+    assert begun.started.timestamp() == 1e9
+    made.batch(batch(0, 20))
+    assert made.finish({**END, "output_safe": "true"}, 200)
+    ended, facts = read_device_state(real.info.holds), read(made.path).end
+    assert ended.run_id == run_id
+    assert ended.coil.output_safe
+    assert ended.coil.heat_a2 == float(facts["coil_heat_a2"])
+    assert (
+        abs(ended.coil.ended.timestamp() - datetime.fromisoformat(facts["ended"]).timestamp())
+        < 2e-3
+    )
+
+
+def test_a_recording_that_is_not_finished_leaves_the_device_s_end_open(begun):
+    made, disk = begun
+    made.note_device = lambda coil=None: pytest.fail("it has not ended")
+    disk.room = disk.tell()
+    made.batch(batch(0, 20))
+    assert not made.finish(END, 200, patience_s=0.0)
 
 
 def test_a_bug_ends_the_recording_as_it_was_flushed(begun):

@@ -36,6 +36,9 @@ class Recorder:
     def event(self, event):
         self.events.append(event.code)
 
+    def note_device(self):
+        self.noted = len(self.firsts)
+
     def begin_anew(self):
         emptied, self.emptied = self.emptied, False
         return emptied
@@ -190,6 +193,15 @@ def test_whatever_goes_wrong_in_it_is_said_and_the_end_comes_all_the_same(ring, 
     recording._thread.join(30.0)
     assert recording.finished
     assert recording.recorder.finished == ("waveform completed", 8)
+
+
+def test_the_device_is_told_of_the_run_before_all_else(ring, recording):
+    """A run that is killed must not leave the device to the one before it."""
+    exchange(ring, 2)
+    recording.end(ENDED, lost_loop=False)
+    recording.start()
+    recording._thread.join(30.0)
+    assert (recording.recorder.noted, recording.recorder.firsts) == (0, [0, 1])
 
 
 def test_nobody_waits_for_a_disk_that_stands_still(ring, recording, monkeypatch):
