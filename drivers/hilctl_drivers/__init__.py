@@ -3,6 +3,7 @@
 ``hilctl`` never imports this package; its registry loads a device by name. Modules here see only
 ``hilctl.base`` and ``hilctl.kernels``.
 
+contract.py       the contract of devices as pytest checks, for any package
 device.py         the base of every device: range, sizes, rate, safe value, wording
 wiring.py         an experiment's options: place, amplifier, sensor, reader, watchdog
 starter.py        a device section to begin with

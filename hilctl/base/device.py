@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
 from hilctl.base.arrays import F64
+from hilctl.base.errors import InputError
 from hilctl.base.strict import Strict
 from hilctl.base.units import CommandUnit
 
@@ -82,6 +83,35 @@ class DeviceInfo:
     details: Mapping[str, str] = field(default_factory=dict)
 
 
+REQUIRED = ("info", "open", "exchange", "make_safe", "close")
+"""What a device must have of its own."""
+OPTIONAL = ("output",)
+"""Methods that it may lack; it then has those of :class:`Device`."""
+
+
+def complete(device: Any) -> "Device":
+    """Return a device with the optional methods that it lacks.
+
+    Its class need not have :class:`Device` as its base.
+
+    Raises:
+        InputError: It lacks what is required; all of it is named.
+    """
+    kind = type(device)
+    missing = [
+        name
+        for name in REQUIRED
+        if not hasattr(device, name) or getattr(kind, name, None) is getattr(Device, name)
+    ]
+    if missing:
+        raise InputError(f"{kind.__name__} lacks {', '.join(missing)} (see drivers/README.md)")
+    for name in OPTIONAL:
+        if not hasattr(device, name):
+            setattr(kind, name, getattr(Device, name))
+    found: Device = device
+    return found
+
+
 class Device(Protocol):
     """A DAC, its amplifier, the actuator and its sensor, seen as one thing.
 
@@ -117,13 +147,13 @@ class Device(Protocol):
     def output(self) -> float | None:
         """Return what the open device puts out, before the first exchange.
 
-        Read back where that can be had. The run begins with a ramp from there, so a guess can do
-        harm: None where the device can't know.
+        Optional. Read back where that can be had. The run begins with a ramp from there, so a guess
+        can do harm: None if the device can't know, as in the default.
 
         Raises:
             DeviceError: It did not answer, or is not open.
         """
-        ...
+        return None
 
     def exchange(
         self, first_sample: int, command: F64, displacement_um: F64, measured: F64

@@ -5,7 +5,7 @@ The guardian of a run makes it too, without the rest of the experiment: numba mu
 
 from pathlib import Path
 
-from hilctl.base.device import Device
+from hilctl.base.device import Device, complete
 from hilctl.base.errors import ConfigError, InputError, Problem
 from hilctl.base.files import TextFiles
 from hilctl.base.yaml.document import Document
@@ -39,7 +39,7 @@ def made_device(document: Document, folder: Path, files: TextFiles) -> Device | 
     context = {"folder": folder, "files": files}
     options = document.validate(chosen.Options, at=("device",), without=("kind",), context=context)
     try:
-        return chosen(options)
+        return complete(chosen(options))
     except ConfigError:
         raise
     except InputError as error:

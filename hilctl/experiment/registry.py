@@ -34,7 +34,8 @@ def device_class(kind: str) -> type[Device]:
     """Return a device's class.
 
     Raises:
-        InputError: There is no such device, or its module can't be imported.
+        InputError: There is no such device, its module can't be imported, or its class has no
+            options.
     """
     known = known_devices()
     if kind not in known:
@@ -42,6 +43,7 @@ def device_class(kind: str) -> type[Device]:
     module_name, _, class_name = known[kind].partition(":")
     try:
         found: type[Device] = getattr(import_module(module_name), class_name)
+        _ = found.Options
     except (ImportError, AttributeError) as error:
         raise InputError(f"device '{kind}' can't be loaded: {error}") from error
     return found

@@ -1,32 +1,21 @@
 """The contract of devices must be able to fail: each of these breaks one rule, and is found out."""
 
-import importlib.util
 from collections import deque
 from dataclasses import replace
 from inspect import signature
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from hilctl.base.device import DeviceInfo
 from hilctl.base.errors import DeviceError
+from hilctl.experiment.registry import BUILTIN
+from hilctl_drivers import contract as CONTRACT  # noqa: N812
 
 UM_PER_A = 10.0
 HIGHEST_A = 5.0
 
 
-def _checks():
-    path = Path(__file__).with_name("test_devices.py")
-    spec = importlib.util.spec_from_file_location("device_contract_for_bad_ones", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-CONTRACT = _checks()
 REFUSED = next(
     mark.args[1]
     for mark in CONTRACT.test_refuses_what_it_can_not_do.pytestmark
@@ -170,7 +159,7 @@ class Sluggish(Ideal):
 class BeginsAtRest(Ideal):
     """As simulated ones do: with each opening."""
 
-    info = replace(Ideal.info, name=CONTRACT.SIMULATED[0])
+    info = replace(Ideal.info, name="simulated_piezo")
 
     def open(self, sample_rate_hz, block):
         super().open(sample_rate_hz, block)
@@ -635,7 +624,12 @@ def failures(kind):
     def make(case=""):
         made = kind()
         return CONTRACT.DrivenDevice(
-            made, CONTRACT.SAMPLES, CONTRACT.RATE_HZ, lambda: made.current_a
+            made,
+            CONTRACT.SAMPLES,
+            CONTRACT.RATE_HZ,
+            lambda: made.current_a,
+            name=made.info.name if made.info.name in BUILTIN else Ideal.info.name,
+            starts_at_rest=isinstance(made, BeginsAtRest),
         )
 
     found = set()

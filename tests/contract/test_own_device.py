@@ -151,3 +151,31 @@ def test_make_safe_moves_the_spring(monkeypatch):
     device.make_safe(0.0)
     device.open(1000.0, 50)
     assert device.output() == 0.0
+
+
+CONTRACT = """
+import pytest
+from hilctl_drivers.contract import *
+from own_device.spring import Spring, SpringOptions
+
+class Stuck(Spring):
+    def make_safe(self, command):
+        pass
+
+@pytest.fixture
+def new_device():
+    return lambda: {kind}(SpringOptions())
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("kind", "code"), [("Spring", 0), ("Stuck", 1)])
+def test_its_package_runs_the_contract(installed, tmp_path, kind, code):
+    """By the lines that drivers/README.md gives; a device that breaks it fails."""
+    path = tmp_path / "test_spring.py"
+    path.write_text(CONTRACT.format(kind=kind), encoding="utf-8")
+    words = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", path]
+    ran = subprocess.run(words, capture_output=True, text=True, env=installed, cwd=tmp_path)
+    assert ran.returncode == code, ran.stdout
+    assert ("make_safe_works_open_or_closed" in ran.stdout) == bool(code)
+    assert "passed" in ran.stdout

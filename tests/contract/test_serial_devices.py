@@ -4,7 +4,6 @@ The checks are those of ``test_devices.py``, run with the benches of this file. 
 no input, the sensor stands on another one, with a line of its own or on the same.
 """
 
-import importlib.util
 import time
 from contextlib import ExitStack
 from pathlib import Path
@@ -14,6 +13,8 @@ import pytest
 
 from hilctl.base.errors import DeviceError
 from hilctl.experiment.registry import device_class
+from hilctl_drivers import contract
+from hilctl_drivers.contract import *  # noqa: F403  the checks, and the fixture driven
 from hilctl_drivers.emulator.options import EmulatorOptions
 from hilctl_drivers.profile import load_profile, shipped_profiles
 from tests.fakes import emulated
@@ -41,30 +42,11 @@ turnaround_s: 0.001
 max_rate_hz: 100.0
 watchdog: none
 """
+SETTLED_NS = 2_000_000
 STREAM_RATE_HZ = 640.0
 BLOCK = 10
 FIFO_BLOCKS = 32  # 500 ms, which is what a busy machine may stall for
 MUST_BE_AT_REST = {"kepco_bop", "tdk_lambda_gen"}
-
-
-def _checks():
-    path = Path(__file__).with_name("test_devices.py")
-    spec = importlib.util.spec_from_file_location("device_contract_checks", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-CHECKS = _checks()
-globals().update(
-    {
-        name: check
-        for name, check in vars(CHECKS).items()
-        if name.startswith("test_") and not name.endswith("_left_out")
-    }
-)
 
 
 def serial_profiles():
@@ -91,6 +73,8 @@ class DrivenSerial:
     command is not answered, time passes only after it has arrived: another line is no faster.
     """
 
+    name = "serial_dac"
+    starts_at_rest = False
     must_be_at_rest = False
     reads_back = True
 
@@ -119,7 +103,7 @@ class DrivenSerial:
         measured = np.full(padded.size + held.size, np.nan)
         for start in range(0, padded.size + held.size, self.block):
             part = slice(start, start + self.block)
-            self._clock.now_ns += min(round(1e9 / self.rate_hz), CHECKS.SETTLED_NS)
+            self._clock.now_ns += min(round(1e9 / self.rate_hz), SETTLED_NS)
             sent = np.concatenate([padded, held])[part]
             before = sent.copy()
             self.device.exchange(self._sent, sent, displacement_um[part], measured[part])
@@ -132,7 +116,7 @@ class DrivenSerial:
     def assert_stands(self, command):
         """Wait for it: some commands are not answered, and another line is no faster."""
         end_s = time.monotonic() + 5.0
-        while abs(self.stands() - command) > CHECKS.STEP:
+        while abs(self.stands() - command) > contract.STEP:
             assert time.monotonic() < end_s, f"{command} A does not stand"
 
     def _await(self, sent_a):
@@ -212,7 +196,7 @@ def driven(make, case):
 def test_opening_does_not_move_the_output(driven, case):
     """Supplies that must be set up at 0 A are refused while current flows; others stay put."""
     if case.split()[0] not in MUST_BE_AT_REST:
-        CHECKS.test_opening_does_not_move_the_output(driven)
+        contract.test_opening_does_not_move_the_output(driven)
         return
     driven.open()
     driven.exchange(np.full(5, driven.middle))

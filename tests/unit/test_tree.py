@@ -12,6 +12,7 @@ WITHOUT = {
     "base/units": "a name of a type; nothing runs",
     "base/events": "one record of plain values; seen in run/test_shared_page.py",
     "cli/options": "types of options; cli/test_commands.py loads every command that has them",
+    "drivers/contract": "the checks of tests/contract; test_bad_devices.py makes each of them fail",
     "drivers/emulator/wire": "a contract and a record; drivers/emulator/test_server.py uses both",
     "drivers/labjack/safe_write": "two messages; labjack/test_device.py sees what becomes of them",
     "experiment/run_parts": "a contract; run/test_carried_out.py runs what keeps it",

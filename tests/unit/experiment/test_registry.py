@@ -20,12 +20,13 @@ class Amplifier:
 @pytest.fixture
 def package(monkeypatch: pytest.MonkeyPatch) -> None:
     """An installed package with two devices, one of them by the name of a built-in."""
-    monkeypatch.setitem(sys.modules, "my_package", SimpleNamespace(Amplifier=Amplifier))
+    monkeypatch.setitem(sys.modules, "my_package", SimpleNamespace(Amplifier=Amplifier, len=len))
     points = [
         EntryPoint("my_amplifier", "my_package:Amplifier", registry.GROUP),
         EntryPoint("simulated_piezo", "my_package:Amplifier", registry.GROUP),
         EntryPoint("no_module", "my_lost_package.inner:Amplifier", registry.GROUP),
         EntryPoint("no_class", "my_package:Amplifyer", registry.GROUP),
+        EntryPoint("no_options", "my_package:len", registry.GROUP),
         EntryPoint("no_colon", "my_package", registry.GROUP),
     ]
 
@@ -84,6 +85,7 @@ def test_unknown_device_without_a_near_name(package: None) -> None:
     [
         ("no_module", "No module named 'my_lost_package'"),
         ("no_class", "no attribute 'Amplifyer'"),
+        ("no_options", "no attribute 'Options'"),
         ("no_colon", ""),
     ],
 )
