@@ -16,7 +16,7 @@ from hilctl.experiment.file import Experiment
 from hilctl.experiment.heat import CoilHeat, cooled
 from hilctl.experiment.initial_state import InitialState, initial_state_after
 from hilctl.experiment.load import LoadedExperiment
-from hilctl.recording.ends import read_ends
+from hilctl.recording.ends import read_ends, recordings_in
 from hilctl.recording.facts import HEAT_FACT, HOLDS_FACT
 
 _LARGEST_BYTES = 256 << 20  # some minutes at 50 kHz: more would keep the start waiting
@@ -139,7 +139,7 @@ def _folders(config: Experiment, folder: Path | None) -> list[Path]:
 def _newest(folders: Sequence[Path], holds: Sequence[str]) -> Path | None:
     """Return the newest recording of a device in some folders."""
     aged = []
-    for path in (path for folder in folders for path in folder.glob("*.mcap")):
+    for path in (path for folder in folders for path in recordings_in(folder)):
         try:
             aged.append((path.stat().st_mtime_ns, path))
         except OSError:  # it has gone meanwhile
