@@ -187,7 +187,7 @@ def _scan(folder: str, below: str) -> Iterator[Found]:
         path = below + os.fsencode(entry.name).decode("utf-8", "backslashreplace")
         if entry.is_dir(follow_symlinks=False):
             yield from _scan(entry.path, f"{path}/")
-        elif entry.name.endswith(".mcap"):
+        elif entry.name.endswith(".mcap") and not entry.is_dir():
             yield _found(entry, path)
 
 

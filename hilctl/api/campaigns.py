@@ -65,6 +65,7 @@ def characterise(
     from hilctl.base.files import check_no_input, check_writable
     from hilctl.characterise.session import Campaign, CampaignHost
     from hilctl.experiment.load import inputs_of
+    from hilctl.recording.ends import recordings_in
     from hilctl.run.step import paced, unpaced
 
     file, chosen = Path(output), runs_folder(output, folder)
@@ -76,9 +77,9 @@ def characterise(
     if not dry_run:
         inputs = inputs_of(Path(experiment), texts_of(settings))
         check_writable(file, overwrite=overwrite, inputs=inputs)
-        again = overwrite or any(chosen.glob("*.mcap"))
+        again = overwrite or bool(recordings_in(chosen))
         check_writable(page, overwrite=again, inputs=inputs)
-        for path in chosen.glob("*.mcap"):
+        for path in recordings_in(chosen):
             check_no_input(path, inputs)
         finish_dead_runs()
     on_plan(measured.plan)

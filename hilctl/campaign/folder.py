@@ -12,7 +12,7 @@ from hilctl.base.locks import HAS_LOCKS, take_lock
 from hilctl.base.yaml.document import load_document
 from hilctl.campaign.steps import CampaignSteps, base_problem, settings_of
 from hilctl.experiment.parts import RecordingConfig
-from hilctl.recording.ends import read_ends
+from hilctl.recording.ends import read_ends, recordings_in
 from hilctl.recording.locks import is_being_recorded
 from hilctl.recording.recover import recover_recording
 from hilctl.run.run_folder import RunFolder, runs
@@ -121,7 +121,7 @@ def make_whole(folder: Path) -> list[str]:
     with less than a head is kept as ``NAME.torn``.
     """
     done = []
-    for path in sorted(folder.glob("*.mcap")):
+    for path in recordings_in(folder):
         try:
             if read_ends(path).state in {"unfinished", "damaged"}:
                 done.append(f"{path}: {recover_recording(path).reason}")
@@ -146,7 +146,7 @@ def _put_aside(path: Path) -> list[str]:
 def standing_runs(folder: Path) -> dict[RunKey, list[Path]]:
     """Return the completed runs whose recordings are in a folder, in the order of their names."""
     found: dict[RunKey, list[Path]] = {}
-    for path in sorted(folder.glob("*.mcap")):
+    for path in recordings_in(folder):
         key = completed_key(path)
         if key is not None:
             found.setdefault(key, []).append(path)
@@ -156,7 +156,7 @@ def standing_runs(folder: Path) -> dict[RunKey, list[Path]]:
 def last_begun(folder: Path) -> Path | None:
     """Return the recording in a folder whose run began last; None without any."""
     begun = []
-    for path in folder.glob("*.mcap"):
+    for path in recordings_in(folder):
         try:
             begun.append((read_ends(path).run.get("started", ""), path))
         except DataError:

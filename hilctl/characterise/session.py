@@ -160,7 +160,9 @@ class Campaign:
     def discard(self) -> None:
         """Remove the recordings of steps that stand in the folder, so that all begins anew."""
         for number, step in enumerate(STEPS, 1):
-            self._path(number, step).unlink(missing_ok=True)
+            path = self._path(number, step)
+            if path.is_file():  # a folder of that name is none of them
+                path.unlink()
 
     def characterise(self, output: Path, *, overwrite: bool = False) -> Characterisation:
         """Run every step, identify the model, and judge it.

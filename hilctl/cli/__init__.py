@@ -53,6 +53,11 @@ READING = ("report", "replay", "export")
 QUICK = (*STEERING, *READING, "list")
 """Commands that nobody wants to wait for: they go past the application, which takes longer to
 import than most of them take to run."""
+ACTING = (
+    *("run", "set", "mark", "stop", "safe"),
+    *("characterise", "campaign", "sweep", "learn", "demo"),
+)
+"""Commands that move an actuator, or change a run."""
 
 _SEARCHED_OBJECTS = 500_000
 """New objects after which Python searches for garbage: more than any command imports."""
@@ -75,7 +80,12 @@ def main() -> None:
     # it again and again takes a tenth of the time, and at the end a fifth of a second.
     gc.set_threshold(_SEARCHED_OBJECTS)
     atexit.register(gc.freeze)
-    with plain_streams(), _memory_said_once(), heard_as_asked(as_json="--json" in sys.argv):
+    acts = any(name in ACTING for name in sys.argv[1:2])
+    with (
+        plain_streams(acts=acts),
+        _memory_said_once(),
+        heard_as_asked(as_json="--json" in sys.argv),
+    ):
         try:
             _command()
         except HilctlError as error:

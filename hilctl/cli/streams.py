@@ -86,8 +86,12 @@ class PlainStream(StandardStream):
 
 
 @contextmanager
-def plain_streams() -> Iterator[None]:
+def plain_streams(*, acts: bool = False) -> Iterator[None]:
     """Have standard output and error show control characters.
+
+    Args:
+        acts: Whether the command moves something: then what became of that decides its exit code,
+            and not whether it could be printed.
 
     Raises:
         SystemExit: Standard output could not be written, which is said on standard error.
@@ -108,8 +112,9 @@ def plain_streams() -> Iterator[None]:
         lost = [each for each in failures if each and each.errno not in _READER_IS_GONE]
         if lost:
             with suppress(OSError):
-                print(f"hilctl: standard output: {lost[0].strerror}", file=sys.stderr, flush=True)
-            if not code:
+                what = "the result could not be printed" if acts else "standard output"
+                print(f"hilctl: {what}: {lost[0].strerror}", file=sys.stderr, flush=True)
+            if not code and not acts:
                 raise SystemExit(3)
 
 

@@ -43,6 +43,14 @@ class RecordingEnds:
     problem: str = ""
 
 
+def recordings_in(folder: Path) -> list[Path]:
+    """Return the files of a folder that are named as recordings are, in the order of their names.
+
+    A folder or a pipe of such a name is none.
+    """
+    return sorted(path for path in folder.glob("*.mcap") if path.is_file())
+
+
 def read_ends(path: Path) -> RecordingEnds:
     """Read what a recording says of its run at its start and at its end.
 

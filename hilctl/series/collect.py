@@ -7,6 +7,7 @@ from pathlib import Path
 
 from hilctl.base.errors import DataError, InputError
 from hilctl.models.base import HysteresisModel
+from hilctl.recording.ends import recordings_in
 from hilctl.recording.reader import read
 from hilctl.series.columns import COMPLETED, PLANNED, SeriesEntry, find_table, read_entries
 from hilctl.series.digest import RunDigest, digest_of
@@ -127,7 +128,7 @@ def collect(
     table = find_table(folders[0])
     if table is not None:
         return _of_campaign(table, model, on_read)
-    found = sorted(folders[0].glob("*.mcap"))
+    found = recordings_in(folders[0])
     if not found:
         raise InputError(f"{folders[0]}: holds no recordings (*.mcap)")
     return _of_files(found, folders[0].resolve().name, model, on_read, missing=[])

@@ -17,6 +17,7 @@ from hilctl.recording.reader import read
 from hilctl.run.dead_runs import finish_dead_runs
 from hilctl.run.run_folder import runs
 
+DEMO = Path(__file__).parents[2] / "configs" / "demo.yaml"
 RATE_HZ = 5000
 SECONDS = 4.0
 RAMP_SAMPLES = round(0.2 * RATE_HZ)
@@ -259,3 +260,15 @@ def test_memory_that_is_not_to_be_had_is_told(tmp_path):
     assert err.count("\n") == 1
     assert "ring: no memory: File too large; less recording.ring_s needs less of it" in err
     assert not (tmp_path / "run.mcap").exists()
+
+
+def test_a_full_disk_below_standard_output_does_not_make_a_good_run_a_fault(tmp_path):
+    """The run's result counts; that it could not be printed is said."""
+    output = tmp_path / "run.mcap"
+    command = [sys.executable, "-m", "hilctl", "run", str(DEMO)]
+    command += ["--set", "waveform.duration_s=0.5", "--output", str(output), "--json"]
+    with Path("/dev/full").open("w") as full:
+        ended = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, timeout=240)
+    assert ended.returncode == 0, ended.stderr
+    assert "No space left on device" in ended.stderr
+    assert read(output).end["code"] == "completed"

@@ -93,6 +93,7 @@ def test_what_can_not_be_read_is_listed_and_looked_at_anew(folder):
     (folder / "folder.mcap").mkdir()
     os.mkfifo(folder / "pipe.mcap")
     (folder / "link.mcap").symlink_to("nowhere")
+    (folder / "linked_folder.mcap").symlink_to("folder.mcap")
     (folder / "round").symlink_to(folder)
     (folder / os.fsdecode(b"\xff\xfe.mcap")).write_text("hello")
     (folder / "notes.txt").write_text("hello")

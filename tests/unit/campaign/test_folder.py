@@ -1,5 +1,7 @@
 """A campaign's folder."""
 
+import os
+
 import pytest
 
 from hilctl.base.errors import ConfigError, InputError
@@ -106,6 +108,18 @@ def test_what_was_killed_before_its_run_began_is_out_of_the_way(recorded, tmp_pa
     assert len(make_whole(tmp_path)) == 2
     left = {each.name for each in tmp_path.iterdir() if each.suffix != ".yaml"}
     assert left == {"a.mcap", "head.mcap.torn", "text.mcap"}
+
+
+def test_what_is_no_file_is_no_recording(recorded, tmp_path):
+    """A folder, a pipe and a link that leads nowhere keep no campaign from going on."""
+    path, key = recorded("a.mcap")
+    (tmp_path / "b.mcap").mkdir()
+    os.mkfifo(tmp_path / "c.mcap")
+    (tmp_path / "d.mcap").symlink_to("nowhere")
+    (tmp_path / "e.mcap").symlink_to("b.mcap")
+    assert make_whole(tmp_path) == []
+    assert standing_runs(tmp_path) == {key: [path]}
+    assert last_begun(tmp_path) == path
 
 
 def test_names_are_never_taken_twice(tmp_path):

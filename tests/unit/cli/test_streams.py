@@ -8,6 +8,8 @@ import sys
 
 import pytest
 
+from hilctl.cli import ACTING
+from hilctl.cli.commands import COMMANDS
 from hilctl.cli.streams import PlainStream, StandardStream, plain_streams
 
 HOSTILE = "a\x1b]0;title\x07b\x9b2Jc\rd\x7fe\u202ef"
@@ -72,6 +74,18 @@ def test_lost_output_is_an_error():
 def test_exit_code_stays_where_output_is_lost():
     ended = in_a_process(f"{PRINTING}\n    raise SystemExit(2)", "> /dev/full")
     assert ended.returncode == 2
+
+
+@pytest.mark.parametrize("code", [0, 130])
+def test_what_a_command_has_done_counts_and_not_whether_it_could_be_said(code):
+    acting = PRINTING.replace("plain_streams():", "plain_streams(acts=True):")
+    ended = in_a_process(f"{acting}\n    raise SystemExit({code})", "> /dev/full")
+    assert ended.returncode == code
+    assert "No space left on device" in ended.stderr
+
+
+def test_acting_commands_are_commands():
+    assert set(ACTING) <= set(COMMANDS)
 
 
 def test_a_reader_who_leaves_is_no_error():

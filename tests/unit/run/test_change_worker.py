@@ -112,7 +112,7 @@ def test_a_process_answers_and_ends_with_its_supervisor(ring, checked):
     """Signals to the whole group are the supervisor's to handle."""
     with ChangeWorker(checked) as worker:
         number = worker._process.pid
-        for sent in SUPERVISORS:
+        for sent in (*SUPERVISORS, signal.SIGTSTP):
             worker.begin(wanted(ring))
             os.kill(number, sent)
             assert await_result(worker).tuning.gain == 0.5

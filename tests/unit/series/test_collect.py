@@ -35,6 +35,7 @@ def test_files_are_told_apart_by_their_experiments():
 
 def test_a_folder_without_a_table_gives_all_that_can_be_read(folder):
     (folder / "zz.mcap").write_text("no recording")
+    (folder / "folder.mcap").mkdir()
     series = collect([folder])
     assert len(series.runs) == len(list(GOLDEN.glob("*.mcap")))
     assert len(series.missing) == 1
