@@ -31,7 +31,7 @@ RAMP_S = 0.3
 PEAK_A = 5.0
 RAMP_A_PER_S = PEAK_A / RAMP_S
 START_A = 3.0
-"""Where the output is before a run, so that each begins with a ramp."""
+"""Where a Modbus device's output is before a run, so that it begins with a ramp."""
 _TOLERANCE_A = 2e-3
 _JITTER_S = 0.01
 EXPERIMENT: dict[str, Any] = {
@@ -45,9 +45,9 @@ EXPERIMENT: dict[str, Any] = {
         "soft_start_s": 0.1,
     },
     "compensator": "none",
-    "condition": {"amplitude_a": 2.0, "frequency_hz": 10.0, "cycles": 5},
+    "condition": {"amplitude_a": 2.0, "frequency_hz": 5.0, "cycles": 3},
     "limits": {"peak_current_a": PEAK_A, "slew_a_per_s": 130.0, "stroke_um": [-120.0, 120.0]},
-    "safe": {"value": 0.0, "ramp_s": RAMP_S, "at_start": START_A},
+    "safe": {"value": 0.0, "ramp_s": RAMP_S},
     "timing": {"on_misses": "warn"},  # a busy machine must not be quicker than the attack
     "recording": {"ring_s": 60.0, "flush_s": 0.5},
 }
@@ -68,19 +68,23 @@ class AttackedWire:
         rate_hz: Sample rate.
         profile: Text of the device's profile.
         device: The experiment's device section without profile, address and what all have.
+        start_a: Where the output is before a run.
     """
 
     rate_hz: float
     profile: str
     device: dict[str, Any]
+    start_a: float = 0.0
 
 
 def _wires() -> dict[str, AttackedWire]:
     tcp = shipped_profiles()["generic_float32"].read_text(encoding="utf-8")
     board = shipped_profiles()["cobs_board"].read_text(encoding="utf-8")
     return {
-        "tcp": AttackedWire(500.0, tcp, _MODBUS),
-        "rtu": AttackedWire(150.0, (_DATA / "rtu_module.yaml").read_text("utf-8"), _MODBUS),
+        "tcp": AttackedWire(500.0, tcp, _MODBUS, START_A),
+        "rtu": AttackedWire(
+            150.0, (_DATA / "rtu_module.yaml").read_text("utf-8"), _MODBUS, START_A
+        ),
         "text": AttackedWire(
             100.0,
             (_DATA / "dcon_module.yaml").read_text("utf-8"),
@@ -122,7 +126,9 @@ class AttackedRun:
         self._environment = {**os.environ, "HILCTL_RUNS": str(folder / "runs")}
         profile, self._log = folder / "profile.yaml", folder / "log.jsonl"
         profile.write_text(wire.profile, encoding="utf-8")
-        words = ["emulate", str(profile), "--log", str(self._log), "--current-a", str(START_A)]
+        words = ["emulate", str(profile), "--log", str(self._log)]
+        if wire.start_a:
+            words += ["--current-a", str(wire.start_a)]
         for each in faults:
             words += ["--fault", each]
         self.emulator = self.hilctl(*words, stdout=subprocess.PIPE, text=True)
@@ -140,6 +146,7 @@ class AttackedRun:
         }
         experiment = folder / "run.yaml"
         text = {**EXPERIMENT, "sample_rate_hz": wire.rate_hz, "device": device}
+        text["safe"] = {**EXPERIMENT["safe"], "at_start": wire.start_a}
         experiment.write_text(yaml.safe_dump(text), encoding="utf-8")
         self._environment |= environment or {}
         # Into a file: a guardian that is stopped holds a pipe open.
@@ -186,14 +193,17 @@ class AttackedRun:
 
     def log(self) -> "DeviceLog":
         """Return what the device has put out until now."""
-        return DeviceLog.read(self._log, 1.0 / self._wire.rate_hz)
+        return DeviceLog.read(self._log, 1.0 / self._wire.rate_hz, self._wire.start_a)
 
     def close(self) -> None:
-        """End whatever is left of it."""
-        for process in (self.process, self.emulator):
-            process.send_signal(signal.SIGCONT)
-            process.kill()
-            process.wait()
+        """End whatever is left of it: all processes that have its environment."""
+        mine = f"HILCTL_RUNS={self._environment['HILCTL_RUNS']}".encode()
+        for each in Path("/proc").glob("[0-9]*"):
+            with suppress(OSError):
+                if mine in (each / "environ").read_bytes().split(b"\0"):
+                    os.kill(int(each.name), signal.SIGKILL)
+        self.process.wait()
+        self.emulator.wait()
 
 
 @contextmanager
@@ -214,19 +224,21 @@ class DeviceLog:
         times_ns: int64[n], monotonic time of each write.
         current_a: float64[n], the output from then on.
         period_s: Time from one sample of the run to the next.
+        start_a: The output before.
     """
 
     times_ns: I64 = field(repr=False)
     current_a: F64 = field(repr=False)
     period_s: float
+    start_a: float = START_A
 
     @classmethod
-    def read(cls, path: Path, period_s: float) -> "DeviceLog":
+    def read(cls, path: Path, period_s: float, start_a: float = START_A) -> "DeviceLog":
         """Read an emulator's log as far as it is written."""
         lines = path.read_bytes().split(b"\n")[:-1] if path.exists() else []
         entries = [each for each in map(json.loads, lines) if "current_a" in each]
         times_ns = np.array([each["monotonic_ns"] for each in entries], dtype=np.int64)
-        return cls(times_ns, np.array([each["current_a"] for each in entries]), period_s)
+        return cls(times_ns, np.array([each["current_a"] for each in entries]), period_s, start_a)
 
     def unsafe(self) -> Any:
         """Return which writes are not the safe value, bool[n]."""
@@ -235,7 +247,7 @@ class DeviceLog:
     def at(self, time_ns: int) -> float:
         """Return the output at a time."""
         before = int(np.searchsorted(self.times_ns, time_ns, side="right"))
-        return float(self.current_a[before - 1]) if before else START_A
+        return float(self.current_a[before - 1]) if before else self.start_a
 
     def beyond_ramp_s(self, due_ns: int) -> float:
         """Return how much longer than a ramp it took from a time on until the output stayed safe.
@@ -277,7 +289,8 @@ class DeviceLog:
                 matching, first = known, before
         rest = slice(first + matching, None)
         put_out, times_ns = self.current_a[rest], self.times_ns[rest]
-        idle = np.isclose(put_out, START_A if not matching else 0.0, rtol=0.0, atol=_TOLERANCE_A)
+        idle_a = 0.0 if matching else self.start_a
+        idle = np.isclose(put_out, idle_a, rtol=0.0, atol=_TOLERANCE_A)
         return int(np.count_nonzero(~idle & (times_ns <= until_ns))) + _not_put_out(
             samples, matching
         )

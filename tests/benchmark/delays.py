@@ -12,6 +12,7 @@ import signal
 import sys
 import tempfile
 import time
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from tests.benchmark.attacked import RAMP_S, WIRES, AttackedRun, attacked_run
 from tests.fakes import loop_of
 
 TIMEOUT_S = 0.5
+QUIET_S = 0.05
 RETRY_S = 2.0
 FIRST, LAST = 10, 200
 """Writes before the one that is late: from the ramp before the waveform to the waveform."""
@@ -58,18 +60,19 @@ def one_late_request(folder: Path, wire: str, chance: random.Random) -> Trial:
     what = f"{delay_s:.2f} s at request {at}, loop {'killed' if kill else 'times out'}"
     faults = (f"late:{delay_s:.3f}@{at}",)
     with attacked_run(folder, WIRES[wire], TIMEOUT_S, faults) as run:
-        run.await_(lambda: run.log().times_ns.size >= at // 3)
-        if kill:
-            loop = loop_of(run.process.pid)
-            # Until the late request keeps the loop waiting.
-            seen, since = 0, time.monotonic()
-            while time.monotonic() - since < 0.03 and run.process.poll() is None:
-                if (size := run.log().times_ns.size) != seen:
-                    seen, since = size, time.monotonic()
-                time.sleep(0.002)
+        writes, changed_s = 0, math.inf
+        # Until the late request, or what follows from it, keeps the device waiting.
+        while run.process.poll() is None and time.monotonic() - changed_s < QUIET_S:
+            if (size := run.log().times_ns.size) != writes:
+                writes, changed_s = size, time.monotonic() if size >= at // 3 else math.inf
+            time.sleep(0.002)
+        if kill and run.process.poll() is None:
             time.sleep(chance.uniform(0.0, 0.3))
-            if Path(f"/proc/{loop}").exists():
-                os.kill(loop, signal.SIGKILL)
+            with suppress(AssertionError, ProcessLookupError):  # the run has ended it already
+                os.kill(loop_of(run.process.pid), signal.SIGKILL)
+        time.sleep(TIMEOUT_S)
+        # It goes on if the request was not late enough, or the last before the loop was killed.
+        run.process.send_signal(signal.SIGTERM)
         said_safe, ended_ns = _said_safe(run)
         time.sleep(delay_s + 0.5)
         log = run.log()
