@@ -1,9 +1,10 @@
-"""Kill and stop a run's processes at random times, and judge by the device's own log of writes.
+"""Kill and stop a run's processes at random times in each of its phases; the device's log judges.
 
 Run it with ``python -m tests.benchmark.kills``; see README.md beside it.
 """
 
 import argparse
+import itertools
 import json
 import os
 import random
@@ -12,264 +13,264 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
-import numpy as np
-import yaml
-
+from hilctl.base.errors import HilctlError
 from hilctl.recording.reader import read
-from tests.benchmark.kill_wires import WIRES, AttackedWire, DeviceLog
-from tests.benchmark.other_reader import NOT_INSTALLED, verdict
-from tests.benchmark.wire_runs import make_real_time
+from hilctl.run.shared_page import Field, Phase, SharedPage
+from tests.benchmark.attacked import (
+    LONGEST_S,
+    RAMP_A_PER_S,
+    RAMP_S,
+    START_A,
+    WIRES,
+    AttackedRun,
+    attacked_run,
+)
+from tests.benchmark.other_reader import verdict
 
 SLOW_WRITE = Path(__file__).with_name("slow_write.c")
 OBSERVED_S = 1.0
-LONGEST_S = 120.0
-RAMP_S = 0.1
-EXPERIMENT: dict[str, Any] = {
-    "name": "kill",
-    "waveform": {
-        "kind": "sine",
-        "unit": "A",
-        "amplitude": 4.0,
-        "frequency_hz": 2.0,
-        "duration_s": 600.0,
-        "soft_start_s": 0.1,
-    },
-    "compensator": "none",
-    "limits": {"peak_current_a": 5.0, "slew_a_per_s": 500.0, "stroke_um": [-100.0, 100.0]},
-    "safe": {"value": 0.0, "ramp_s": RAMP_S},
-    "timing": {"on_misses": "warn"},  # a busy machine must not be quicker than the attack
-    "recording": {"ring_s": 60.0, "flush_s": 0.5},
-}
-ROLES = {"loop": b"hilctl.run.loop_process", "guardian": b"hilctl.run.guardian"}
-TARGETS = ("loop", "supervisor", "guardian", "loop+supervisor", "loop+guardian")
-TARGETS += ("supervisor+guardian",)
-ATTACKS = tuple(f"{action}:{target}" for target in TARGETS for action in ("kill", "stop"))
-SIGNALS = {"kill": signal.SIGKILL, "stop": signal.SIGSTOP, "term": signal.SIGTERM}
-LATE, LATE_FROM = 400, 60
-"""How many answers are late where a run is ended by SIGTERM, and the first that is."""
+END_S = 30.0
+STAYS = ", does not end"
+MODULES = {"loop": b"hilctl.run.loop_process", "guardian": b"hilctl.run.guardian"}
+PHASES = ("start", "ramp in", "condition", "run", "set", "ramp out", "close", "recovery")
+TARGETS = (
+    *("loop", "guardian", "supervisor"),
+    *("loop+guardian", "loop+supervisor", "guardian+supervisor"),
+)
+SIGNALS = {"kill": signal.SIGKILL, "stop": signal.SIGSTOP}
 
 
-@dataclass
+@dataclass(frozen=True, slots=True)
 class Attack:
     """What one attack came to.
 
     Attributes:
-        attack: ``kill`` or ``stop``, and the processes that it hit.
-        after_s: Time from the first writes to the attack.
-        safe_ms: Longest time from the attack on that the output stood at another value than the
-            safe one with no new write: nobody had it under control. Where a device plays from a
-            FIFO and the loop was hit, and after SIGTERM, time until the output was safe. Infinite
-            where it stayed.
-        allowed_ms: What of that the ramp and late answers may take.
-        written: Samples that the device put out.
-        recorded: Samples in the recording.
+        phase: What the run did when it was hit.
+        hit: What was done to which processes.
         lost: Samples put out that are not in the recording, in order.
-        reason: What the recording says of the end.
-        other_reader: Where another program's reading of the recording differs; empty where not.
+        beyond_ramp_s: Time until the output stayed at its safe value, from the attack or, if the
+            loop was to go on, from the end of the run, less what the safe ramp takes.
+        largest_step: Largest step from then on, over what the safe ramp may move meanwhile.
+        reader: What another reader says against the recording; empty if it agrees.
     """
 
-    attack: str
-    after_s: float
-    safe_ms: float
-    allowed_ms: float
-    written: int
-    recorded: int
+    phase: str
+    hit: str
     lost: int
-    reason: str
-    other_reader: str
+    beyond_ramp_s: float
+    largest_step: float
+    reader: str
 
-    def is_good(self, within_ms: float) -> bool:
-        """Return whether nothing was lost, the output was safe in time, and all readers agree."""
-        agree = self.other_reader in {"", NOT_INSTALLED}
-        return self.lost == 0 and self.safe_ms <= within_ms + self.allowed_ms and agree
-
-
-class AttackedRuns:
-    """Runs of one experiment, each on a device emulated anew."""
-
-    def __init__(self, folder: Path, options: argparse.Namespace) -> None:
-        self._folder = folder
-        self._wire: AttackedWire = WIRES[options.wire]
-        self._profile = self._wire.profile_in(folder)
-        self._random = random.Random(options.seed)
-        self._environment = {**os.environ, "HILCTL_RUNS": str(folder / "runs")}
-        self._disk = _slow_disk(folder, options.stall_s) if options.stall_s else {}
-
-    def _hilctl(
-        self, words: list[str], environment: dict[str, str] | None = None, **options: Any
-    ) -> subprocess.Popen[Any]:
-        command = [sys.executable, "-m", "hilctl", *words]
-        given = {**self._environment, **(environment or {})}
-        return subprocess.Popen(command, env=given, **options)
-
-    @contextmanager
-    def _emulated(self, log: Path, faults: list[str]) -> Iterator[str]:
-        """Emulate the device in a process; yield its address."""
-        words = ["emulate", self._profile, "--log", str(log), *self._wire.words, *faults]
-        emulator = self._hilctl(words, stdout=subprocess.PIPE, text=True)
-        make_real_time(emulator.pid)  # a busy machine slows no real device
-        try:
-            yield emulator.stdout.readline().split()[-1]
-        finally:
-            emulator.terminate()
-            emulator.wait()
-
-    def attack(self, attack: str, number: int) -> Attack:
-        """Run, attack at a random time, wait until all is over, and judge."""
-        name = f"{attack.replace(':', '-')}-{number}"
-        log, experiment = self._folder / f"{name}.jsonl", self._folder / f"{name}.yaml"
-        late = attack.startswith("term")
-        with self._emulated(log, self._late() if late else []) as address:
-            changes = {
-                "sample_rate_hz": self._wire.rate_hz,
-                "block": self._wire.block,
-                "device": self._wire.section(self._profile, address),
-            }
-            text = {**EXPERIMENT, **changes}
-            if late:  # a late answer is no hang here
-                text["timing"] = {**EXPERIMENT["timing"], "hang_s": 2.0 * self._wire.latest_s}
-            experiment.write_text(yaml.safe_dump(text), encoding="utf-8")
-            return self._attacked(attack, experiment, log)
-
-    def _late(self) -> list[str]:
-        """Return what makes answers late, from some time after the start on."""
-        latest_s, every = self._wire.latest_s, self._wire.late_every
-        times_s = [self._random.uniform(0.05, latest_s) for _ in range(LATE)]
-        faults = [f"delay:{each:.3f}@{LATE_FROM + k * every}" for k, each in enumerate(times_s)]
-        return [word for fault in faults for word in ("--fault", fault)]
-
-    def _attacked(self, attack: str, experiment: Path, log: Path) -> Attack:
-        action, _, names = attack.partition(":")
-        output = experiment.with_suffix(".mcap")
-        words = ["run", str(experiment), "--output", str(output), "--json"]
-        quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-        run = self._hilctl(words, self._disk, **quiet)
-        while np.count_nonzero(DeviceLog.read(log).current_a) < 10:
-            assert run.poll() is None, f"the run ended by itself: {read(output).end}"
-            time.sleep(0.02)
-        processes = {"supervisor": run.pid, **_children(run.pid)}
-        after_s = self._random.uniform(0.05, 1.5)
-        time.sleep(after_s)
-        hit = [processes[name] for name in names.split("+")]
-        self._random.shuffle(hit)
-        hit_ns = time.monotonic_ns()
-        for process in hit:
-            os.kill(process, SIGNALS[action])
-        time.sleep(OBSERVED_S)
-        # A supervisor that was stopped is to close its recording; a run that goes on is to end.
-        for number in (signal.SIGCONT, signal.SIGTERM):
-            with suppress(ProcessLookupError):
-                run.send_signal(number)
-        run.wait(LONGEST_S)
-        _await_end([*processes.values()])
-        self._hilctl(["status"], **quiet).wait()  # the next command of any kind recovers
-        return self._judge(attack, after_s, hit_ns, DeviceLog.read(log), output)
-
-    def _judge(
-        self, attack: str, after_s: float, hit_ns: int, log: DeviceLog, path: Path
-    ) -> Attack:
-        recording = read(path)
-        # Values of a FIFO go on without anybody: where the loop was hit, that is no control. And a
-        # ramp that is asked for takes its own time, beside that of the answers it waits for.
-        ramp = attack.startswith("term")
-        alone = ramp or (self._wire.streams and "loop" in attack)
-        allowed_ms = 1e3 * (RAMP_S + 2.0 * self._wire.latest_s) if ramp else 0.0
-        return Attack(
-            attack=attack,
-            after_s=after_s,
-            safe_ms=log.safe_after_ms(hit_ns) if alone else log.uncontrolled_ms(hit_ns),
-            allowed_ms=allowed_ms,
-            written=int(log.ends.max()) if self._wire.streams else log.times_ns.size,
-            recorded=recording.samples.command.size,
-            lost=log.lost(recording.samples),
-            reason=recording.end.get("reason", "none"),
-            other_reader=verdict(
-                path, None if self._wire.streams else recording.samples.command.size
-            ),
-        )
+    def is_good(self, within_s: float, max_step: float) -> bool:
+        """Return whether nothing was lost, the output was safe in time, and the readers agree."""
+        safe = self.beyond_ramp_s <= within_s and self.largest_step <= max_step
+        return self.lost == 0 and safe and not self.reader and not self.hit.endswith(STAYS)
 
 
 def _children(supervisor: int) -> dict[str, int]:
     """Return loop and guardian of a run by name."""
-    children = Path(f"/proc/{supervisor}/task/{supervisor}/children").read_text().split()
     found = {}
-    for child in children:
-        words = Path(f"/proc/{child}/cmdline").read_bytes().split(b"\0")
-        found |= {name: int(child) for name, module in ROLES.items() if module in words}
+    with suppress(FileNotFoundError):
+        children = Path(f"/proc/{supervisor}/task/{supervisor}/children").read_text().split()
+        for child in children:
+            words = Path(f"/proc/{child}/cmdline").read_bytes().split(b"\0")
+            found |= {name: int(child) for name, module in MODULES.items() if module in words}
     return found
 
 
-def _await_end(processes: list[int]) -> None:
-    """Wait until all processes are gone; a guardian that was stopped beside nobody never is."""
-    deadline = time.monotonic() + LONGEST_S
-    while any(Path(f"/proc/{each}").exists() for each in processes):
-        assert time.monotonic() < deadline
-        for each in processes:
-            if Path(f"/proc/{each}").exists():
+def _await(run: AttackedRun, phase: str, chance: random.Random) -> tuple[SharedPage, float]:
+    """Bring a run to a phase; return its page, and how long that phase lasts."""
+    page = run.page()
+    waveform_at = lambda: page.get(Field.ENDED_AT) > page.get(Field.WAVEFORM_AT) > 0  # noqa: E731
+    if phase == "start":
+        return page, 0.6
+    if phase == "ramp in":
+        run.await_(lambda: page.get(Field.ENDED_AT) > 0)
+        return page, START_A / RAMP_A_PER_S
+    if phase == "condition":
+        run.await_(lambda: page.get(Field.ENDED_AT) > 0)
+        time.sleep(START_A / RAMP_A_PER_S)
+        return page, 0.6
+    run.await_(waveform_at)
+    if phase == "set":
+        run.hilctl("set", "gain=0.5", "--over", "0.5", stdout=subprocess.DEVNULL).wait(LONGEST_S)
+        return page, 0.7
+    if phase in {"ramp out", "close"}:
+        time.sleep(chance.uniform(0.1, 1.0))
+        run.process.send_signal(signal.SIGTERM)
+        reached: Callable[[], bool] = lambda: page.get(Field.STOP) != 0  # noqa: E731
+        if phase == "close":
+            reached = lambda: page.get(Field.PHASE) in {Phase.CLOSING, Phase.ENDED}  # noqa: E731
+        run.await_(reached)
+        return page, RAMP_S if phase == "ramp out" else 0.1
+    return page, 1.0
+
+
+def attack(
+    run: AttackedRun, phase: str, targets: str, actions: list[str], chance: random.Random
+) -> tuple[str, int, int | None, float]:
+    """Hit processes of a run in a phase, each by one of the actions, and let it end.
+
+    Returns:
+        What was done, when, when the output was to become safe (None for not at all), and up to
+        when the loop could put out samples.
+    """
+    page, lasts_s = _await(run, phase, chance)
+    time.sleep(chance.uniform(0.0, lasts_s))
+    processes = {"supervisor": run.process.pid, **_children(run.process.pid)}
+    names = ["loop", "supervisor"] if phase == "recovery" else targets.split("+")
+    plan = {name: chance.choice(actions) for name in names}
+    if phase == "recovery":
+        plan = dict.fromkeys(names, "kill")
+    chance.shuffle(names)
+    hit_ns = time.monotonic_ns()
+    for name in names:
+        with suppress(ProcessLookupError):
+            if name in processes:
+                os.kill(processes[name], SIGNALS[plan[name]])
+    said = ", ".join(f"{what} {name}" for name, what in sorted(plan.items()))
+    if phase == "recovery":
+        said += ", " + _hit_recovery(run, chance)
+    time.sleep(OBSERVED_S)
+    stop_ns = time.monotonic_ns()
+    for number in (signal.SIGCONT, signal.SIGTERM):  # a supervisor that was stopped ends its run
+        with suppress(ProcessLookupError):
+            run.process.send_signal(number)
+    said += _await_end(run, [*processes.values()])
+    run.recover()
+    ends = "loop" in plan or plan.get("supervisor") == "kill" or phase in {"ramp out", "close"}
+    due_ns = hit_ns if ends else stop_ns
+    # Without the start signal the loop has sent nothing, and the output stays as it was.
+    moved = page.get(Field.GO) != 0
+    return said, hit_ns, due_ns if moved else None, hit_ns if "loop" in plan else 1e30
+
+
+def _hit_recovery(run: AttackedRun, chance: random.Random) -> str:
+    """Kill or stop the command that finishes a dead run."""
+    next_command = run.hilctl("status", stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    time.sleep(chance.uniform(0.1, 1.0))
+    what = chance.choice(list(SIGNALS))
+    next_command.send_signal(SIGNALS[what])
+    if what == "stop":
+        time.sleep(0.3)
+        next_command.send_signal(signal.SIGCONT)
+    next_command.wait(LONGEST_S)
+    return f"{what} the next command"
+
+
+def _await_end(run: AttackedRun, processes: list[int]) -> str:
+    """Wait until all processes are gone, and return STAYS if they are not; then they are killed.
+
+    What is stopped goes on once the supervisor has ended.
+    """
+    deadline = time.monotonic() + END_S
+    while left := [each for each in processes if _lives(each)]:
+        ended = run.process.poll() is not None
+        if time.monotonic() > deadline:
+            for each in left:
+                os.kill(each, signal.SIGKILL)
+            return STAYS
+        for each in left if ended else []:
+            with suppress(ProcessLookupError):
                 os.kill(each, signal.SIGCONT)
         time.sleep(0.02)
+    return ""
+
+
+def _lives(process: int) -> bool:
+    with suppress(OSError):
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    return False
+
+
+def judged(run: AttackedRun, phase: str, done: tuple[str, int, int | None, float]) -> Attack:
+    """Return what an attack came to."""
+    said, hit_ns, due_ns, until_ns = done
+    log, samples, reader = run.log(), None, ""
+    if due_ns is not None or (run.output.exists() and run.output.stat().st_size):
+        try:
+            samples = read(run.output).samples
+            reader = verdict(run.output, samples.command.size)
+        except HilctlError as error:
+            reader = str(error)
+    return Attack(
+        phase=phase,
+        hit=said,
+        lost=log.lost(samples, until_ns),
+        beyond_ramp_s=0.0 if due_ns is None else log.beyond_ramp_s(due_ns),
+        largest_step=log.largest_step(hit_ns if due_ns is None else due_ns),
+        reader=reader,
+    )
 
 
 def _slow_disk(folder: Path, stall_s: float) -> dict[str, str]:
     """Return what must stand in the environment of a run whose every write takes ``stall_s``."""
+    if not stall_s:
+        return {}
     library = folder / "slow_write.so"
     words = ["cc", "-shared", "-fPIC", "-O2", "-o", str(library), str(SLOW_WRITE), "-ldl"]
     subprocess.run(words, check=True)
     return {"LD_PRELOAD": str(library), "SLOW_WRITE_S": str(stall_s)}
 
 
-def main() -> int:
-    """Run it; exit code 1 where a write was lost, safety came late, or readers differ."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--count", type=int, default=10, help="attacks of each kind")
-    parser.add_argument(
-        "--attacks",
-        nargs="+",
-        default=ATTACKS,
-        metavar="kill:loop+guardian",
-        help="also stop:... and term:supervisor, beside a device that is late",
-    )
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--wire", choices=WIRES, default="modbus")
-    parser.add_argument("--stall-s", type=float, default=0.0, help="time that a write takes")
-    parser.add_argument("--within-ms", type=float, default=200.0)
-    parser.add_argument("--json", action="store_true", help="print every attack as JSON")
-    options = parser.parse_args()
-    found: list[Attack] = []
-    with tempfile.TemporaryDirectory(prefix="hilctl-kills-") as folder:
-        runs = AttackedRuns(Path(folder), options)
-        for attack in options.attacks:
-            for number in range(options.count):
-                found.append(runs.attack(attack, number))
-                if not options.json:
-                    print(found[-1], flush=True)
-    if options.json:
-        print(json.dumps([asdict(each) for each in found], indent=2))
-    else:
-        _print_summary(options.attacks, found)
-    return 0 if all(each.is_good(options.within_ms) for each in found) else 1
-
-
-def _print_summary(attacks: list[str], found: list[Attack]) -> None:
-    for attack in attacks:
-        chosen = [each for each in found if each.attack == attack]
-        times = np.array([each.safe_ms for each in chosen])
+def print_table(found: list[tuple[str, Attack]]) -> None:
+    """Print a line for each phase and each group of processes."""
+    print(f"{'attack':<32} runs  lost  to safe beyond ramp  largest step  readable")
+    for name, group in itertools.groupby(sorted(found, key=lambda each: each[0]), lambda e: e[0]):
+        rows = [each for _, each in group]
+        readable = sum(not each.reader for each in rows)
         print(
-            f"{attack}: {times.size} times, {np.median(times):.0f} ms without control median, "
-            f"{times.max():.0f} ms worst; {sum(each.lost for each in chosen)} writes lost of "
-            f"{sum(each.written for each in chosen)}; @mcap/core {_agreement(chosen)}"
+            f"{name:<32} {len(rows):4} {sum(each.lost for each in rows):5}"
+            f" {1e3 * max(each.beyond_ramp_s for each in rows):17.0f} ms"
+            f" {max(each.largest_step for each in rows):13.2f} {readable:4} of {len(rows)}"
         )
 
 
-def _agreement(found: list[Attack]) -> str:
-    said = {each.other_reader for each in found}
-    return "agrees" if said == {""} else " and ".join(sorted(said - {""}))
+def main() -> int:
+    """Run it; exit code 1 if a sample is lost, the output safe too late, or a reader disagrees."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--count", type=int, default=48, help="attacks, over all phases in turn")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--wire", choices=WIRES, default="tcp")
+    parser.add_argument("--phase", choices=PHASES, help="only this one")
+    parser.add_argument("--targets", choices=TARGETS, help="only these")
+    parser.add_argument("--action", choices=SIGNALS, help="only this one")
+    parser.add_argument("--stall-s", type=float, default=0.0, help="time that a write takes")
+    parser.add_argument("--within-ms", type=float, default=200.0, help="to safe beyond the ramp")
+    parser.add_argument("--max-step", type=float, default=1.0, help="over the safe ramp's")
+    parser.add_argument("--json", action="store_true", help="print every attack as JSON")
+    options = parser.parse_args()
+    chance = random.Random(options.seed)
+    kinds = [
+        (phase, targets)
+        for phase in ([options.phase] if options.phase else PHASES)
+        for targets in ([options.targets] if options.targets else TARGETS)
+        if phase != "recovery" or targets == "loop+supervisor"
+    ]
+    chance.shuffle(kinds)
+    actions = [options.action] if options.action else list(SIGNALS)
+    found: list[tuple[str, Attack]] = []
+    with tempfile.TemporaryDirectory(prefix="hilctl-kills-") as name:
+        folder = Path(name)
+        disk = _slow_disk(folder, options.stall_s)
+        for number, (phase, targets) in zip(range(options.count), itertools.cycle(kinds)):
+            wire = WIRES[options.wire]
+            with attacked_run(folder / str(number), wire, environment=disk) as run:
+                attacked = judged(run, phase, attack(run, phase, targets, actions, chance))
+            found.append((f"{phase}: {targets}", attacked))
+            if not attacked.is_good(1e-3 * options.within_ms, options.max_step):
+                print(attacked, file=sys.stderr, flush=True)
+    if options.json:
+        print(json.dumps([asdict(each) for _, each in found], indent=2))
+    else:
+        print_table(found)
+    good = (each.is_good(1e-3 * options.within_ms, options.max_step) for _, each in found)
+    return 0 if all(good) else 1
 
 
 if __name__ == "__main__":

@@ -1,0 +1,304 @@
+"""Runs on emulated devices that are attacked, and what the device's own log says of them.
+
+No device here has a watchdog: whatever it was last given stays on the output.
+"""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from hilctl.base.arrays import F64, I64
+from hilctl.base.samples import Flag
+from hilctl.recording.data import Samples
+from hilctl.run.ring import SampleRing
+from hilctl.run.shared_page import SharedPage
+from hilctl_drivers.profile import shipped_profiles
+from tests.benchmark.wire_runs import make_real_time
+
+LONGEST_S = 120.0
+RAMP_S = 0.3
+PEAK_A = 5.0
+RAMP_A_PER_S = PEAK_A / RAMP_S
+START_A = 3.0
+"""Where a Modbus device's output is before a run, so that it begins with a ramp."""
+_TOLERANCE_A = 2e-3
+_JITTER_S = 0.01
+EXPERIMENT: dict[str, Any] = {
+    "name": "attacked",
+    "waveform": {
+        "kind": "sine",
+        "unit": "A",
+        "amplitude": 4.0,
+        "frequency_hz": 1.0,
+        "duration_s": 600.0,
+        "soft_start_s": 0.1,
+    },
+    "compensator": "none",
+    "condition": {"amplitude_a": 2.0, "frequency_hz": 5.0, "cycles": 3},
+    "limits": {"peak_current_a": PEAK_A, "slew_a_per_s": 130.0, "stroke_um": [-120.0, 120.0]},
+    "safe": {"value": 0.0, "ramp_s": RAMP_S},
+    "timing": {"on_misses": "warn"},  # a busy machine must not be quicker than the attack
+    "recording": {"ring_s": 60.0, "flush_s": 0.5},
+}
+_DEVICE = {
+    "sensor": {"um_per_v": 12.5},
+    "amplifier": {"gain_a_per_v": 1.0},
+    "watchdog": "none",
+}
+_MODBUS = {"kind": "modbus_dac", "output": "OUT", "input": "IN"}
+_DATA = Path(__file__).parents[1] / "data"
+
+
+@dataclass(frozen=True, slots=True)
+class AttackedWire:
+    """One way to the rig.
+
+    Attributes:
+        rate_hz: Sample rate.
+        profile: Text of the device's profile.
+        device: The experiment's device section without profile, address and what all have.
+        start_a: Where the output is before a run.
+    """
+
+    rate_hz: float
+    profile: str
+    device: dict[str, Any]
+    start_a: float = 0.0
+
+
+def _wires() -> dict[str, AttackedWire]:
+    tcp = shipped_profiles()["generic_float32"].read_text(encoding="utf-8")
+    board = shipped_profiles()["cobs_board"].read_text(encoding="utf-8")
+    return {
+        "tcp": AttackedWire(500.0, tcp, _MODBUS, START_A),
+        "rtu": AttackedWire(
+            150.0, (_DATA / "rtu_module.yaml").read_text("utf-8"), _MODBUS, START_A
+        ),
+        "text": AttackedWire(
+            100.0,
+            (_DATA / "dcon_module.yaml").read_text("utf-8"),
+            {"kind": "serial_dac", "output": "AO0", "input": "AI0"},
+        ),
+        "frames": AttackedWire(
+            200.0,
+            board.replace("boot_wait_s: 2.0", "boot_wait_s: 0.0"),
+            {"kind": "serial_dac", "output": "DAC", "input": "ADC"},
+        ),
+    }
+
+
+WIRES = _wires()
+
+
+class AttackedRun:
+    """A ``hilctl run`` on a device that is emulated for it alone.
+
+    Args:
+        folder: A new folder for all of its files.
+        wire: How it reaches the device.
+        timeout_s: How long it waits for an answer.
+        faults: What the device does wrong, as ``hilctl emulate --fault`` takes it.
+        environment: More of the run's environment.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        wire: AttackedWire,
+        timeout_s: float = 1.0,
+        faults: tuple[str, ...] = (),
+        environment: dict[str, str] | None = None,
+    ) -> None:
+        folder.mkdir()
+        self.output = folder / "run.mcap"
+        self._folder, self._wire = folder, wire
+        self._environment = {**os.environ, "HILCTL_RUNS": str(folder / "runs")}
+        profile, self._log = folder / "profile.yaml", folder / "log.jsonl"
+        profile.write_text(wire.profile, encoding="utf-8")
+        words = ["emulate", str(profile), "--log", str(self._log)]
+        if wire.start_a:
+            words += ["--current-a", str(wire.start_a)]
+        for each in faults:
+            words += ["--fault", each]
+        self.emulator = self.hilctl(*words, stdout=subprocess.PIPE, text=True)
+        make_real_time(self.emulator.pid)  # a busy machine slows no real device
+        assert self.emulator.stdout is not None
+        address = self.emulator.stdout.readline().split()[-1]
+        host, _, port = address.rpartition(":")
+        place = {"host": host, "tcp_port": int(port)} if host else {"serial_port": address}
+        device = {
+            **wire.device,
+            **_DEVICE,
+            **place,
+            "profile": str(profile),
+            "timeout_s": timeout_s,
+        }
+        experiment = folder / "run.yaml"
+        text = {**EXPERIMENT, "sample_rate_hz": wire.rate_hz, "device": device}
+        text["safe"] = {**EXPERIMENT["safe"], "at_start": wire.start_a}
+        experiment.write_text(yaml.safe_dump(text), encoding="utf-8")
+        self._environment |= environment or {}
+        # Into a file: a guardian that is stopped holds a pipe open.
+        self._said = folder / "said.txt"
+        with self._said.open("wb") as said:
+            words = ["run", str(experiment), "--output", str(self.output), "--json"]
+            self.process = self.hilctl(*words, stdout=said, stderr=said)
+
+    def hilctl(self, *words: str, **options: Any) -> subprocess.Popen[Any]:
+        """Start a command of hilctl, for which this run is the only one."""
+        return subprocess.Popen(
+            [sys.executable, "-m", "hilctl", *words], env=self._environment, **options
+        )
+
+    def said(self) -> str:
+        """Wait for its end, and return what it printed."""
+        self.process.wait(LONGEST_S)
+        return self._said.read_text(encoding="utf-8")
+
+    def recover(self) -> None:
+        """Run the next command, of any kind: it finishes what a dead run has left."""
+        quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+        self.hilctl("status", **quiet).wait(LONGEST_S)
+
+    def page(self) -> SharedPage:
+        """Return the page that the run's processes share, once there is one."""
+        deadline = time.monotonic() + LONGEST_S
+        while True:
+            for ring in (self._folder / "runs").rglob("ring"):
+                with suppress(ValueError, OSError):  # about to be made
+                    return SampleRing(ring, look_only=True).page
+            self._alive(deadline)
+
+    def await_(self, reached: Any) -> None:
+        """Wait until a function of nothing says so; the run must go on until then."""
+        deadline = time.monotonic() + LONGEST_S
+        while not reached():
+            self._alive(deadline)
+
+    def _alive(self, deadline: float) -> None:
+        assert time.monotonic() < deadline, "the run does not get there"
+        assert self.process.poll() is None, self.said()
+        time.sleep(0.001)
+
+    def log(self) -> "DeviceLog":
+        """Return what the device has put out until now."""
+        return DeviceLog.read(self._log, 1.0 / self._wire.rate_hz, self._wire.start_a)
+
+    def close(self) -> None:
+        """End whatever is left of it: all processes that have its environment."""
+        mine = f"HILCTL_RUNS={self._environment['HILCTL_RUNS']}".encode()
+        for each in Path("/proc").glob("[0-9]*"):
+            with suppress(OSError):
+                if mine in (each / "environ").read_bytes().split(b"\0"):
+                    os.kill(int(each.name), signal.SIGKILL)
+        self.process.wait()
+        self.emulator.wait()
+
+
+@contextmanager
+def attacked_run(*arguments: Any, **options: Any) -> Iterator[AttackedRun]:
+    """Yield an :class:`AttackedRun`, and close it at the end."""
+    run = AttackedRun(*arguments, **options)
+    try:
+        yield run
+    finally:
+        run.close()
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceLog:
+    """What a device has put out.
+
+    Attributes:
+        times_ns: int64[n], monotonic time of each write.
+        current_a: float64[n], the output from then on.
+        period_s: Time from one sample of the run to the next.
+        start_a: The output before.
+    """
+
+    times_ns: I64 = field(repr=False)
+    current_a: F64 = field(repr=False)
+    period_s: float
+    start_a: float = START_A
+
+    @classmethod
+    def read(cls, path: Path, period_s: float, start_a: float = START_A) -> "DeviceLog":
+        """Read an emulator's log as far as it is written."""
+        lines = path.read_bytes().split(b"\n")[:-1] if path.exists() else []
+        entries = [each for each in map(json.loads, lines) if "current_a" in each]
+        times_ns = np.array([each["monotonic_ns"] for each in entries], dtype=np.int64)
+        return cls(times_ns, np.array([each["current_a"] for each in entries]), period_s, start_a)
+
+    def unsafe(self) -> Any:
+        """Return which writes are not the safe value, bool[n]."""
+        return np.abs(self.current_a) > _TOLERANCE_A
+
+    def at(self, time_ns: int) -> float:
+        """Return the output at a time."""
+        before = int(np.searchsorted(self.times_ns, time_ns, side="right"))
+        return float(self.current_a[before - 1]) if before else self.start_a
+
+    def beyond_ramp_s(self, due_ns: int) -> float:
+        """Return how much longer than a ramp it took from a time on until the output stayed safe.
+
+        Infinite if it is not safe in the end.
+        """
+        moved = np.flatnonzero(self.unsafe())
+        if not moved.size:
+            return 0.0
+        if moved[-1] + 1 == self.current_a.size:
+            return float("inf")
+        took_s = max(0.0, float(self.times_ns[moved[-1] + 1] - due_ns) * 1e-9)
+        return max(0.0, took_s - abs(self.at(due_ns)) / RAMP_A_PER_S)
+
+    def largest_step(self, due_ns: int) -> float:
+        """Return the largest step from a time on, over what the safe ramp may move meanwhile.
+
+        That is its slew times the time between both writes, a sample period and some jitter.
+        """
+        first = max(0, int(np.searchsorted(self.times_ns, due_ns)) - 1)
+        steps_a = np.abs(np.diff(self.current_a[first:]))
+        apart_s = np.diff(self.times_ns[first:]) * 1e-9
+        allowed_a = RAMP_A_PER_S * (apart_s + self.period_s + _JITTER_S)
+        return float((steps_a / allowed_a).max(initial=0.0))
+
+    def lost(self, samples: Samples | None, until_ns: float) -> int:
+        """Return how many writes up to a time are not in the recording, in order.
+
+        Opening a device may write what it puts out already.
+        """
+        commands = np.empty(0) if samples is None else samples.command
+        matching, first = 0, 0
+        for before in range(min(4, self.current_a.size)):
+            size = min(commands.size, self.current_a.size - before)
+            put_out = self.current_a[before : before + size]
+            same = np.isclose(put_out, commands[:size], rtol=0.0, atol=_TOLERANCE_A)
+            known = size if same.all() else int(np.argmin(same))
+            if known > matching:
+                matching, first = known, before
+        rest = slice(first + matching, None)
+        put_out, times_ns = self.current_a[rest], self.times_ns[rest]
+        idle_a = 0.0 if matching else self.start_a
+        idle = np.isclose(put_out, idle_a, rtol=0.0, atol=_TOLERANCE_A)
+        return int(np.count_nonzero(~idle & (times_ns <= until_ns))) + _not_put_out(
+            samples, matching
+        )
+
+
+def _not_put_out(samples: Samples | None, matching: int) -> int:
+    """Return how many answered samples of the recording the device does not know."""
+    if samples is None:
+        return 0
+    answered = samples.flags[matching:] & Flag.UNANSWERED.value == 0
+    return int(np.count_nonzero(answered))
