@@ -6,6 +6,8 @@
 import os
 import pty
 import select
+import struct
+import termios
 import threading
 import tty
 from collections.abc import Callable, Iterator
@@ -20,10 +22,12 @@ from hilctl_drivers.modbus.setup import ModbusOptions
 from hilctl_drivers.profile import shipped_profiles
 from hilctl_drivers.serial.device import SerialDac
 from hilctl_drivers.serial.setup import SerialOptions
+from hilctl_drivers.wire.framing import binary_framing
 
 TIMEOUT_S = 0.15
 RATE_HZ = 10.0
 OLD, SAFE = 4.5, 0.0
+FRAMES = binary_framing("cobs", "crc16_ccitt_false")
 
 TEXT = """\
 vendor: nobody
@@ -392,3 +396,49 @@ def test_a_value_that_the_command_would_round_is_not_written(text, value, comman
     device.open(RATE_HZ, 1)
     device.close()
     assert scripted.commands == commands
+
+
+def test_attempts_at_a_silent_board_wait_for_no_boot_and_cause_none(tmp_path, line):
+    """Each opens the port anew; the levels that reset a board stay as they are."""
+    path = tmp_path / "board.yaml"
+    path.write_text(shipped_profiles()["cobs_board"].read_text())
+    options = _options(path, line(dead), output="DAC", input="ADC")
+    device = SerialDac(SerialOptions.model_validate(options))
+    slept = []
+    device.wire._link._sleep = slept.append
+    for _ in range(3):
+        with pytest.raises(DeviceError, match="no answer"):
+            device.make_safe(SAFE)
+        assert not device.wire._link.is_open
+        descriptor = os.open(options["serial_port"], os.O_RDWR | os.O_NOCTTY)
+        assert not termios.tcgetattr(descriptor)[2] & termios.HUPCL
+        os.close(descriptor)
+    assert slept == []
+
+
+def refuse_safe(data):
+    """Answer frames as a board of +-10 V that puts out 3 V and knows SAFE only by name."""
+    *whole, rest = data.split(b"\0")
+    sent = b""
+    for body in filter(None, whole):
+        payload = FRAMES.decode(body + b"\0")
+        kind, seq = payload[0], payload[1]
+        info = struct.pack("<BHHfff", 2, 0, 1, 1000.0, -10.0, 10.0)
+        bodies = {
+            0x14: b"\0" + info + b"board",
+            0x16: struct.pack("<BBff", 0, 0, 3.0, 0.0),
+            0x12: b"\0" + payload[2:6],
+            0x13: b"\x04",
+        }
+        sent += FRAMES.encode(bytes([kind | 0x80, seq]) + bodies[kind])
+    return sent, rest
+
+
+def test_a_board_that_refuses_safe_is_not_opened(tmp_path, line):
+    board = shipped_profiles()["cobs_board"].read_text()
+    path = tmp_path / "board.yaml"
+    path.write_text(board.replace("boot_wait_s: 2.0", "boot_wait_s: 0.0"))
+    options = _options(path, line(refuse_safe), output="DAC", input="ADC")
+    device = SerialDac(SerialOptions.model_validate(options))
+    with pytest.raises(DeviceError, match="safe value cannot be written by SAFE: refused"):
+        device.open(RATE_HZ, 1)

@@ -161,8 +161,9 @@ class Run:
         samples = self.assert_recorded(at_least).samples
         put_out = np.array([each["current_a"] for each in writes])
         known = samples.index.size - 1
-        assert put_out.size >= known
-        assert put_out[:known] == pytest.approx(samples.command[:known], abs=2e-3)
+        commands = pytest.approx(samples.command[:known], abs=2e-3)
+        # Opening the device may repeat what the output held, some times.
+        assert any(put_out[first : first + known] == commands for first in range(4))
 
 
 class Emulated:
