@@ -16,7 +16,6 @@ root has.
 import hashlib
 import json
 import logging
-import math
 import os
 import shutil
 import socket
@@ -40,6 +39,7 @@ _SUPERVISOR = "supervisor.lock"
 _DEVICES = "devices"
 _REMOVED = " (deleted)"
 _PEER = struct.Struct("3i")  # process, user and group, as in unix(7)
+_LATEST_S = 1e12
 _BACKLOG = 1000  # connections that ask who holds a device; they are never accepted
 
 
@@ -79,7 +79,7 @@ class RunCard:
             value, kind = values.get(name), kinds.get(name, str)
             if not isinstance(value, kind) or isinstance(value, bool):
                 raise ValueError(f"{name} must not be {value!r}")  # noqa: TRY004, see Raises
-        if not (math.isfinite(values["started"]) and 0 < values["supervisor"] < 2**31):
+        if not (0 <= values["started"] < _LATEST_S and 0 < values["supervisor"] < 2**31):
             raise ValueError("started or supervisor is out of range")
         return cls(
             **{each.name: values[each.name] for each in fields(cls)}
@@ -233,8 +233,9 @@ def runs() -> list[RunFolder]:
         with suppress(OSError):  # being made or removed at this moment, or no run's folder
             text = readable.read_text(encoding="utf-8", errors="replace")
             try:
-                found.append(RunFolder(path.parent, RunCard.from_json(text)))
-            except ValueError as error:
+                if text:  # a run that is over has emptied it
+                    found.append(RunFolder(path.parent, RunCard.from_json(text)))
+            except (ValueError, RecursionError) as error:
                 _warn_once(path.parent.name, f"{path}: {error}")
     return sorted(found, key=lambda run: run.card.started)
 
@@ -256,7 +257,8 @@ def _removed_files(process: str = "[0-9]*") -> dict[Path, Path]:
     found: dict[Path, Path] = {}
     for opened in Path("/proc").glob(f"{process}/fd"):
         with suppress(OSError):  # it has ended, or is not this user's
-            for link in opened.iterdir():
+            own = opened.stat().st_uid == os.geteuid()
+            for link in opened.iterdir() if own else ():
                 with suppress(OSError):
                     name = str(link.readlink())
                     if not name.endswith(_REMOVED):

@@ -97,6 +97,7 @@ GOOD = {"name": "x", "experiment": "x", "recording": "/x.mcap", "supervisor": 7,
         {"started": "x"},
         {"started": True},
         {"started": math.nan},
+        {"started": 10**400},
         {"supervisor": 0},
         {"supervisor": 2**40},
         {"supervisor": 7.5},
@@ -115,6 +116,9 @@ def test_a_card_with_a_wrong_value_is_passed_over_with_one_warning(tmp_path, cap
         assert runs() == [folder]
     (warned,) = caplog.messages
     assert str(card) in warned
+    card.write_text("")
+    assert runs() == []
+    assert len(caplog.messages) == 1
     card.write_text(json.dumps(GOOD))
     assert [run.card.name for run in runs()] == ["x"]
 
