@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import yaml
 
+from hilctl.experiment.device_state import DeviceState
 from hilctl.run.start import checked_experiment
 from hilctl.run.supervisor import Supervisor
 from tests.faults.conftest import PATIENT_DEVICE, PATIENT_TIMING, each_kind
@@ -46,6 +47,12 @@ MODULE = {
 def over_tcp(address: str) -> dict:
     host, port = address.split(":")
     return {**T7, "host": host, "tcp_port": int(port)}
+
+
+def left() -> DeviceState:
+    """Return the state of the one device that this test's runs had."""
+    (path,) = Path(os.environ["XDG_STATE_HOME"]).glob("hilctl/devices/*.json")
+    return DeviceState.model_validate_json(path.read_text())
 
 
 TCP_FAULTS: dict[str, str] = {
@@ -148,6 +155,8 @@ def test_dead_host_is_noticed_by_the_device(emulate, run):
     silent_s = (trip["monotonic_ns"] - last["monotonic_ns"]) * 1e-9
     assert 0.99 * WATCHDOG_S < silent_s < 2.0 * WATCHDOG_S
     assert started.readable_samples() > 100
+    # A power cut looks the same: this run was the device's last, and nobody knows how it ended.
+    assert (left().recording, left().coil) == (str(started.output), None)
 
 
 def test_second_run_on_the_same_device_is_refused(emulate, run):
@@ -164,6 +173,7 @@ def test_second_run_on_the_same_device_is_refused(emulate, run):
     device.log.await_events("DAC0", seen + 50, first.process)
     printed = first.interrupt()
     assert printed["code"] == "stopped"
+    assert (left().recording, left().coil.output_safe) == (str(first.output), True)
     assert printed["dropped"] == printed["skipped_ticks"]  # a busy machine may be late
 
 
