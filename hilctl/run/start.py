@@ -12,6 +12,7 @@ from hilctl.experiment.check import Checked, check
 from hilctl.experiment.load import load_experiment
 from hilctl.run.architecture import require_real_time_machine
 from hilctl.run.end_commands import with_end_commands
+from hilctl.run.own_process import has_threads, run_in_own_process
 from hilctl.run.result import Progress, RunResult
 from hilctl.run.waiting_loop import started_ahead
 
@@ -61,6 +62,8 @@ def start_run(
 ) -> RunResult:
     """Run an experiment file to its end.
 
+    A program with threads, such as a notebook or a window, runs it in a process of its own.
+
     Args:
         path: Experiment file.
         settings: ``key=value`` texts over it.
@@ -74,6 +77,9 @@ def start_run(
         RunError: The device could not be opened; nothing has moved, and no file is left.
     """
     require_real_time_machine()
+    if has_threads():
+        given = (path, settings, output, overwrite, heat_a2)
+        return run_in_own_process(given, on_progress)
     with started_ahead():
         return _run(path, settings, output, overwrite, on_progress, heat_a2)
 

@@ -207,14 +207,16 @@ class Supervisor:
         def note(number: int, frame: FrameType | None) -> None:
             self._stop_signal = self._stop_signal or number
 
-        # Never the default, which would end a process that is asked to stop a moment too late.
-        signal.signal(STOP_SIGNAL, signal.SIG_IGN)
         before = {number: signal.signal(number, note) for number in STOPS}
+        # Never the default, which would end a process that is asked to stop a moment too late.
+        if before[STOP_SIGNAL] == signal.SIG_DFL:
+            before[STOP_SIGNAL] = signal.SIG_IGN
         try:
             yield
         finally:
             for number, handler in before.items():
-                signal.signal(number, handler)
+                if handler is not None:  # one that is not Python's can't be set again
+                    signal.signal(number, handler)
 
     def _make_ring(self, folder: RunFolder) -> SampleRing:
         config, info = self._config, self._checked.loaded.device.info

@@ -342,6 +342,17 @@ def test_the_first_signal_is_the_one_that_stops_it(stage, number):
     assert signal.getsignal(STOP_SIGNAL) == signal.SIG_IGN
 
 
+def test_handlers_of_the_program_come_back(stage):
+    """Also that of the signal that stops a run."""
+
+    def own(number, frame):
+        pass
+
+    signal.signal(STOP_SIGNAL, own)
+    stage.run()
+    assert signal.getsignal(STOP_SIGNAL) is own
+
+
 def wrong(stage, **changes):
     for name, value in changes.items():
         setattr(stage if hasattr(stage, name) else stage.recorder, name, value)
