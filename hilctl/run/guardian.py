@@ -153,8 +153,8 @@ def main(words: list[str]) -> int:
     page = _page(job.ring)
     try:
         device = job.device()
-    except HilctlError as error:
-        page.write_text(PageText.GUARDIAN, str(error))
+    except (HilctlError, MemoryError) as error:
+        page.write_text(PageText.GUARDIAN, str(error) or "not enough memory")
         page.put(Field.GUARDIAN_PHASE, GuardianPhase.FAILED)
         return 1
     "localhost".encode("idna")  # the codec, which is imported at the first connection otherwise
@@ -183,4 +183,7 @@ def _stay_in_memory(process: LinuxProcess) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    try:
+        sys.exit(main(sys.argv[1:]))
+    except MemoryError:
+        sys.exit("hilctl: not enough memory for the guardian")
