@@ -16,6 +16,7 @@ from hilctl.analysis.catalogue_cache import cache_file, merged, read_cache, writ
 from hilctl.analysis.run_entry import COLUMNS, OPTIONS, Entry, entry_of, unreadable
 from hilctl.analysis.where import RunCondition, check_names
 from hilctl.base.errors import InputError
+from hilctl.base.finite_json import finite_json
 from hilctl.recording.facts import LABELS_FACT
 
 _LABEL = "label"
@@ -97,15 +98,17 @@ class Catalogue:
 
     def json_lines(self, rows: Iterable[int]) -> Iterator[str]:
         """Yield what :meth:`entry` returns as JSON."""
-        encode = json.JSONEncoder(allow_nan=False).encode
         columns = [self.column(name) for name in _PLAIN]
         texts = {name: self.column(name) for name in (LABELS_FACT, "options")}
         for row in rows:
-            line = encode(dict(zip(_PLAIN, [values[row] for values in columns], strict=True)))[:-1]
+            plain = dict(zip(_PLAIN, [values[row] for values in columns], strict=True))
+            line = finite_json(plain)[:-1]
             for name, values in texts.items():
                 text = values[row] or "{}"
-                # It is JSON already; what is not ASCII may not be for every terminal.
-                line += f', "{name}": {text if text.isascii() else encode(json.loads(text))}'
+                # It is JSON already, but of Python, which has numbers that are not finite; what is
+                # not ASCII may not be for every terminal.
+                plain_text = text.isascii() and "NaN" not in text and "Infinity" not in text
+                line += f', "{name}": {text if plain_text else finite_json(json.loads(text))}'
             yield line + "}"
 
 

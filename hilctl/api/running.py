@@ -55,6 +55,9 @@ def run(
 ) -> "RunResult":
     """Run an experiment and record it. SIGINT and SIGTERM end it by its safe ramp.
 
+    It may be called in any thread: beside other threads the run has a process of its own, and
+    signals are passed on to it where the caller is the main thread. A connection stops it from any.
+
     Args:
         experiment: Experiment file (YAML).
         output: Recording to write; a new name in the experiment's folder where None.

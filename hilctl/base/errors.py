@@ -66,6 +66,9 @@ class ConfigError(InputError):
         self.problems = tuple(problems)
         super().__init__("\n".join(str(problem) for problem in self.problems))
 
+    def __reduce__(self) -> tuple[type["ConfigError"], tuple[tuple[Problem, ...]]]:
+        return ConfigError, (self.problems,)
+
 
 class ModelError(InputError):
     """Model parameters break a condition of the model or of its inverse.

@@ -35,6 +35,7 @@ import atexit
 import gc
 import signal
 import sys
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from importlib import import_module
@@ -61,6 +62,7 @@ ACTING = (
 
 _SEARCHED_OBJECTS = 500_000
 """New objects after which Python searches for garbage: more than any command imports."""
+_SEARCHED_BEFORE = gc.get_threshold()
 
 OF_LINUX = {"fcntl", "grp", "pty", "pwd", "resource", "termios", "tty"}
 """Modules of Python that other systems lack."""
@@ -93,9 +95,35 @@ def main() -> None:
             _refuse(error)
         except KeyboardInterrupt:
             raise SystemExit(128 + signal.SIGINT) from None
+        except OverflowError:
+            if _clock_can_be_read():
+                raise
+            _refuse(
+                InputError(
+                    "this computer's clock is beyond the year 2262: set it, as with timedatectl"
+                )
+            )
         except (OSError, EOFError, MemoryError, ImportError, SystemError) as error:
             print_origin()
             _refuse(RunError(machine_refused(error)))
+
+
+def _clock_can_be_read() -> bool:
+    """Return whether the time fits into 64 bits of ns; Python reads no other."""
+    try:
+        time.time_ns()
+    except OverflowError:
+        return False
+    return True
+
+
+def search_garbage() -> None:
+    """Have Python search for garbage as it does by itself, but not in what is there already.
+
+    For commands that stay or compute: once they have imported what they need.
+    """
+    gc.freeze()
+    gc.set_threshold(*_SEARCHED_BEFORE)
 
 
 @contextmanager

@@ -1,12 +1,13 @@
 """What all commands share: JSON for programs, and what they do for runs that had died."""
 
-import json
 from typing import Any
+
+from hilctl.base.finite_json import finite_json
 
 
 def print_json(value: dict[str, Any]) -> None:
-    """Print one JSON object."""
-    print(json.dumps(value, indent=2, allow_nan=False))
+    """Print one JSON object, with ``null`` for numbers that are not finite."""
+    print(finite_json(value, indent=2))
 
 
 def finish_orphans() -> None:

@@ -18,6 +18,9 @@ def shown_progress(name: str, *, quiet: bool) -> Iterator[Callable[[float, str],
         TextColumn("{task.description}", markup=False),
     )
     hidden = quiet or not terminal.is_terminal
-    with Progress(*columns, console=terminal, disable=hidden, transient=True) as bar:
+    # Without a thread that draws it: a campaign forks its runs' helpers below it.
+    with Progress(
+        *columns, console=terminal, disable=hidden, transient=True, auto_refresh=False
+    ) as bar:
         task = bar.add_task(name, total=1.0)
-        yield lambda done, text: bar.update(task, completed=done, description=text)
+        yield lambda done, text: bar.update(task, completed=done, description=text, refresh=True)

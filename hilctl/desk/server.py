@@ -5,7 +5,6 @@ It is a process of its own that only looks on. What is asked for goes the way of
 """
 
 import asyncio
-import json
 import logging
 import secrets
 import socket
@@ -20,6 +19,7 @@ from websockets.http11 import Request, Response
 from websockets.typing import Subprotocol
 
 from hilctl.base.errors import HilctlError, InputError, RunError
+from hilctl.base.finite_json import finite_json
 from hilctl.base.remedy import ADDRESS_REMEDIES, reason
 from hilctl.desk.admission import PROTOCOL, Admission, PendingConnections, bounded
 from hilctl.desk.feed import RunFeed
@@ -181,7 +181,7 @@ class LiveServer:
             state["spectrum"] = {"hz": hz.tolist(), "um": um.tolist()}
             state["description"] = feed.description.model_dump()
             state["signals"] = [[each.name, each.label, each.unit] for each in SIGNALS]
-        return json.dumps(state)
+        return finite_json(state)
 
 
 def _our_protocol(

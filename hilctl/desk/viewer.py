@@ -5,7 +5,6 @@ sees fewer of them, and the newest. One that takes nothing for seconds is cut.
 """
 
 import asyncio
-import json
 import time
 from collections.abc import Awaitable, Callable
 from typing import Annotated, Any, Literal
@@ -14,6 +13,7 @@ from pydantic import Field, ValidationError
 from websockets.asyncio.server import ServerConnection
 from websockets.exceptions import ConnectionClosed
 
+from hilctl.base.finite_json import finite_json
 from hilctl.base.strict import Strict
 from hilctl.desk.frames import ScopeMode
 
@@ -57,7 +57,7 @@ class PageMessage(Strict):
 
 def answer_text(message: PageMessage, **said: Any) -> str:
     """Return the answer to a message as JSON."""
-    return json.dumps({"kind": "answer", "id": message.id, "ask": message.ask, **said})
+    return finite_json({"kind": "answer", "id": message.id, "ask": message.ask, **said})
 
 
 class Allowance:

@@ -20,6 +20,7 @@ from typing import IO
 
 from hilctl.base.errors import DataError, InputError
 from hilctl.base.files import write_text
+from hilctl.base.finite_json import finite_json
 from hilctl.base.printable import printable
 from hilctl.experiment.end_commands import found_program
 from hilctl.experiment.load import LoadedExperiment
@@ -48,7 +49,7 @@ def with_end_commands(
     commands = loaded.config.on_end
     if not commands:
         return result
-    text = json.dumps(end_mapping(result, loaded.config.name))
+    text = finite_json(end_mapping(result, loaded.config.name))
     ended: list[EndCommandResult] = []
     with _interruptible():
         try:

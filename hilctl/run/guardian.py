@@ -232,8 +232,8 @@ def main(words: list[str]) -> int:
     page.put(Field.GUARDIAN_PID, os.getpid())
     try:
         device = job.device()
-    except HilctlError as error:
-        _fail(page, str(error))
+    except (HilctlError, MemoryError) as error:
+        _fail(page, str(error) or "not enough memory")
         return 1
     "localhost".encode("idna")  # the codec, which is imported at the first connection otherwise
     process = LinuxProcess()
@@ -267,4 +267,7 @@ def _stay_in_memory(process: LinuxProcess) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    try:
+        sys.exit(main(sys.argv[1:]))
+    except MemoryError:
+        sys.exit("hilctl: not enough memory for the guardian")

@@ -1,6 +1,7 @@
 """Runs whose processes have died: what they left in memory goes into their recordings."""
 
 import signal
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
@@ -144,6 +145,9 @@ def _left_behind(
 @contextmanager
 def _undisturbed() -> Iterator[None]:
     """Let no Ctrl-C come between a recovered recording and the end of its folder."""
+    if threading.current_thread() is not threading.main_thread():
+        yield  # a Ctrl-C goes to the main thread, and only that may set handlers
+        return
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         yield

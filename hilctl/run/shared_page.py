@@ -420,8 +420,15 @@ class SharedPage:
 
 
 def _packed(event: Event) -> str:
-    """Return an event as JSON that fits into a slot; a text that is too long is cut."""
-    text = event.text
-    while len(raw := json.dumps({**asdict(event), "text": text})) > _EVENT_BYTES - 8:
+    """Return an event as JSON that fits into a slot.
+
+    A text that is too long is cut. Values that alone are too long are left out: the loop must not
+    look for some that fit.
+    """
+    room = _EVENT_BYTES - 8
+    facts, text = asdict(event), event.text[:room]
+    if len(json.dumps({**facts, "text": ""})) > room:
+        facts["values"] = {}
+    while len(raw := json.dumps({**facts, "text": text})) > room and text:
         text = text[: len(text) * 3 // 4]
-    return raw
+    return raw[:room]

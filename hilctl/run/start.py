@@ -13,6 +13,7 @@ from hilctl.experiment.check import Checked, check
 from hilctl.experiment.load import input_files, load_experiment
 from hilctl.run.architecture import require_linux
 from hilctl.run.end_commands import with_end_commands
+from hilctl.run.own_process import has_threads, run_in_own_process
 from hilctl.run.result import Progress, RunResult
 from hilctl.run.waiting_loop import started_ahead
 
@@ -62,6 +63,8 @@ def start_run(
 ) -> RunResult:
     """Run an experiment file to its end.
 
+    A program with threads, such as a notebook or a window, runs it in a process of its own.
+
     Args:
         path: Experiment file.
         settings: ``key=value`` texts over it.
@@ -75,6 +78,9 @@ def start_run(
         RunError: The device could not be opened; nothing has moved, and no file is left.
     """
     require_linux()
+    if has_threads():
+        given = (path, settings, output, overwrite, heat_a2)
+        return run_in_own_process(given, on_progress)
     with started_ahead():
         return _run(path, settings, output, overwrite, on_progress, heat_a2)
 

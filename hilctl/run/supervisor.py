@@ -244,16 +244,18 @@ class Supervisor:
         def note(number: int, frame: FrameType | None) -> None:
             self._stop_signal = self._stop_signal or number
 
-        # Never the default, which would end a process that is asked to stop a moment too late.
-        signal.signal(STOP_SIGNAL, signal.SIG_IGN)
         handlers = dict.fromkeys(JOB_CONTROL, signal.SIG_IGN) | dict.fromkeys(STOPS, note)
         handlers[signal.SIGTSTP] = _stay
         before = {number: signal.signal(number, each) for number, each in handlers.items()}
+        # Never the default, which would end a process that is asked to stop a moment too late.
+        if before[STOP_SIGNAL] == signal.SIG_DFL:
+            before[STOP_SIGNAL] = signal.SIG_IGN
         try:
             yield
         finally:
             for number, handler in before.items():
-                signal.signal(number, handler)
+                if handler is not None:  # one that is not Python's can't be set again
+                    signal.signal(number, handler)
 
     def _make_ring(self, folder: RunFolder) -> SampleRing:
         config, info = self._config, self._checked.loaded.device.info

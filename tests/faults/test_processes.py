@@ -198,3 +198,36 @@ def test_both_processes_dead_is_told_and_recovered(tmp_path):
     assert recording.end["reason"] == "supervisor and loop died"
     assert recording.end["output_safe"] == "false"
     assert replay(recording).identical
+
+
+def test_run_of_a_program_with_threads(tmp_path):
+    """In another thread than the main one, beside handlers that the program has set."""
+    demo = str(ROOT / "configs" / "demo.yaml")
+    code = f"""
+import signal, threading
+from hilctl import api
+
+def own(number, frame):
+    pass
+
+signal.signal(signal.SIGUSR1, own)
+results, shown = [], []
+
+def run(number):
+    output, settings = f"{tmp_path}/{{number}}.mcap", {{"waveform.duration_s": 0.5}}
+    results.append(api.run({demo!r}, output, settings=settings, on_progress=shown.append).code)
+
+thread = threading.Thread(target=run, args=(1,))
+thread.start()
+thread.join()
+stop = threading.Event()
+thread = threading.Thread(target=stop.wait)
+thread.start()
+run(2)
+stop.set()
+thread.join()
+run(3)
+print(results, bool(shown), signal.getsignal(signal.SIGUSR1) is own)
+"""
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert ran.stdout == "['completed', 'completed', 'completed'] True True\n", ran.stderr

@@ -1,7 +1,6 @@
 """The command ``hilctl emulate``: serves an emulator until a signal ends it."""
 
 import gc
-import json
 import shlex
 import signal
 from collections.abc import Callable, Sequence
@@ -13,6 +12,7 @@ from typing import Annotated, Any, cast
 import typer
 
 from hilctl.base.errors import InputError
+from hilctl.base.finite_json import finite_json
 from hilctl_drivers.emulator.faults import parse_fault
 from hilctl_drivers.emulator.modbus_device import EmulatedModbus
 from hilctl_drivers.emulator.modbus_wire import LinkKind
@@ -124,7 +124,7 @@ def _say_json(
     if wired is not None:
         said["wiring"] = wired.wiring_mapping()
         said["arguments"] = wired.words(emulator)
-    typer.echo(json.dumps(said))
+    typer.echo(finite_json(said))
 
 
 def serve(options: EmulatorOptions, on_ready: Callable[[Sequence[Place], Emulator], None]) -> None:

@@ -169,3 +169,17 @@ def test_lines_of_json_are_the_entries(folder):
     assert [json.loads(line) for line in lines] == [known.entry(2), known.entry(0)]
     assert json.loads(lines[1])["labels"] == {"operator": "Zo\u00eb"}
     assert all(line.isascii() for line in lines)
+
+
+def test_lines_of_json_hold_no_number_that_is_none(folder):
+    """Python writes and reads them; nobody else has to."""
+    known = read_catalogue(folder)
+    known.column("labels")[0] = '{"gain": NaN, "limit": Infinity}'
+    known.column("duration_s")[0] = float("inf")
+    (line,) = known.json_lines([0])
+
+    def refuse(constant):
+        raise ValueError(constant)
+
+    found = json.loads(line, parse_constant=refuse)
+    assert (found["labels"], found["duration_s"]) == ({"gain": None, "limit": None}, None)

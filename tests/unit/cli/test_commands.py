@@ -116,6 +116,19 @@ def test_data_that_end_unexpectedly_are_not_taken_for_ctrl_d(in_here, monkeypatc
     assert "Ran out of input" in stderr
 
 
+def test_clock_beyond_what_can_be_told_is_refused(in_here, monkeypatch):
+    def beyond():
+        raise OverflowError("timestamp too large to convert to C _PyTime_t")
+
+    monkeypatch.setattr(cli, "_command", beyond)
+    with pytest.raises(OverflowError):  # whatever else overflows is a fault of hilctl
+        cli.main()
+    monkeypatch.setattr("time.time_ns", beyond)
+    code, _, stderr = in_here("check")
+    assert code == 2
+    assert "2262" in stderr
+
+
 def test_a_group_of_commands_runs_its_own(in_here):
     """``devices`` is one, with ``probe`` in it."""
     code, _, stderr = in_here("devices", "probe", "absent.yaml")
@@ -171,6 +184,24 @@ main()
 """
     ended = in_a_process(code, "report", str(tmp_path / "absent.mcap"))
     assert (ended.returncode, ended.stdout) == (2, "0 True\n")
+
+
+@pytest.mark.parametrize(("name", "called"), [("run", "run"), ("learn", "learn")])
+def test_commands_that_stay_search_for_garbage_as_python_does(tmp_path, name, called):
+    code = f"""
+import gc, sys
+own = gc.get_threshold()
+from hilctl import api
+from hilctl.base.errors import InputError
+from hilctl.cli import main
+def stays(*_, **__):
+    raise InputError(str(gc.get_threshold() == own))
+api.{called} = stays
+main()
+"""
+    words = (str(tmp_path / "absent.yaml"), "--output", str(tmp_path / "x.mcap"))
+    ended = in_a_process(code, name, *words)
+    assert (ended.returncode, ended.stderr) == (2, "hilctl: True\n")
 
 
 def test_help_imports_nothing_heavy():

@@ -1,6 +1,7 @@
 """The bar of progress: for people at a terminal only."""
 
 import io
+import threading
 
 import pytest
 
@@ -26,6 +27,8 @@ def test_a_terminal_sees_what_is_done(monkeypatch):
     stream = Terminal()
     monkeypatch.setattr("sys.stderr", stream)
     monkeypatch.setenv("TERM", "xterm")
+    threads = threading.active_count()
     with shown_progress("identify", quiet=False) as report:
         report(0.5, "following 3 starts")
+        assert threading.active_count() == threads
     assert "following 3 starts" in stream.getvalue()

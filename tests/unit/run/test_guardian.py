@@ -281,6 +281,16 @@ def test_a_device_that_can_not_be_made_is_said_before_the_start(written, experim
     assert said in written.page.read_text(PageText.GUARDIAN)
 
 
+def test_a_device_that_has_no_memory_is_said_before_the_start(written, monkeypatch):
+    def device(_job):
+        raise MemoryError
+
+    monkeypatch.setattr(GuardianJob, "device", device)
+    assert written.call("device: {kind: simulated_terfenol}") == 1
+    assert written.page.get(Field.GUARDIAN_PHASE) == GuardianPhase.FAILED
+    assert written.page.read_text(PageText.GUARDIAN) == "not enough memory"
+
+
 def test_the_device_is_made_of_the_experiment_alone():
     limits = SilenceLimits(1.0, 1.0, 1.0, 1.0)
     job = GuardianJob("device: {kind: simulated_terfenol}", {}, "", "", 0.0, 1.0, limits, 1, 1, 1)

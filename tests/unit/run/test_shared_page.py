@@ -80,6 +80,15 @@ def test_every_stop_has_its_words():
     assert len({stop.reason for stop in Stop}) == len(Stop)
 
 
+def test_values_that_do_not_fit_are_left_out(sides):
+    """The loop does not look for some that do."""
+    one, other = sides
+    values = {f"weight_{number}": 1.0 / 3.0 for number in range(500)}
+    one.push_event(Event(1, "info", "test", "text", values))
+    (event,) = other.pop_events()
+    assert (event.code, event.text, event.values) == ("test", "text", {})
+
+
 def test_who_looks_on_sees_the_newest_events_and_takes_none(sides):
     one, other = sides
     for number in range(3):

@@ -416,6 +416,17 @@ def test_a_terminal_can_not_suspend_it(stage, caplog):
     assert [signal.getsignal(number) for number in numbers] == before
 
 
+def test_handlers_of_the_program_come_back(stage):
+    """Also that of the signal that stops a run."""
+
+    def own(number, frame):
+        pass
+
+    signal.signal(STOP_SIGNAL, own)
+    stage.run()
+    assert signal.getsignal(STOP_SIGNAL) is own
+
+
 def wrong(stage, **changes):
     for name, value in changes.items():
         setattr(stage if hasattr(stage, name) else stage.recorder, name, value)
