@@ -9,7 +9,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -180,7 +180,7 @@ class AttackedRun:
                     return SampleRing(ring, look_only=True).page
             self._alive(deadline)
 
-    def await_(self, reached: Any) -> None:
+    def await_(self, reached: Callable[[], bool]) -> None:
         """Wait until a function of nothing says so; the run must go on until then."""
         deadline = time.monotonic() + LONGEST_S
         while not reached():

@@ -13,7 +13,6 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -83,30 +82,40 @@ def _children(supervisor: int) -> dict[str, int]:
     return found
 
 
+def _begun(page: SharedPage) -> bool:
+    return page.get(Field.ENDED_AT) > 0
+
+
+def _in_waveform(page: SharedPage) -> bool:
+    return page.get(Field.ENDED_AT) > page.get(Field.WAVEFORM_AT) > 0
+
+
+def _leaving(page: SharedPage) -> bool:
+    return page.get(Field.STOP) != 0
+
+
+def _closing(page: SharedPage) -> bool:
+    return page.get(Field.PHASE) in {Phase.CLOSING, Phase.ENDED}
+
+
 def _await(run: AttackedRun, phase: str, chance: random.Random) -> tuple[SharedPage, float]:
     """Bring a run to a phase; return its page, and how long that phase lasts."""
     page = run.page()
-    waveform_at = lambda: page.get(Field.ENDED_AT) > page.get(Field.WAVEFORM_AT) > 0  # noqa: E731
     if phase == "start":
         return page, 0.6
-    if phase == "ramp in":
-        run.await_(lambda: page.get(Field.ENDED_AT) > 0)
-        return page, START_A / RAMP_A_PER_S
-    if phase == "condition":
-        run.await_(lambda: page.get(Field.ENDED_AT) > 0)
-        time.sleep(START_A / RAMP_A_PER_S)
-        return page, 0.6
-    run.await_(waveform_at)
+    if phase in {"ramp in", "condition"}:
+        run.await_(lambda: _begun(page))
+        ramp_s = START_A / RAMP_A_PER_S
+        time.sleep(ramp_s if phase == "condition" else 0.0)
+        return page, 0.6 if phase == "condition" else ramp_s
+    run.await_(lambda: _in_waveform(page))
     if phase == "set":
         run.hilctl("set", "gain=0.5", "--over", "0.5", stdout=subprocess.DEVNULL).wait(LONGEST_S)
         return page, 0.7
     if phase in {"ramp out", "close"}:
         time.sleep(chance.uniform(0.1, 1.0))
         run.process.send_signal(signal.SIGTERM)
-        reached: Callable[[], bool] = lambda: page.get(Field.STOP) != 0  # noqa: E731
-        if phase == "close":
-            reached = lambda: page.get(Field.PHASE) in {Phase.CLOSING, Phase.ENDED}  # noqa: E731
-        run.await_(reached)
+        run.await_(lambda: _leaving(page) if phase == "ramp out" else _closing(page))
         return page, RAMP_S if phase == "ramp out" else 0.1
     return page, 1.0
 
