@@ -34,6 +34,7 @@ PATIENCE_S = 5.0
 guardian."""
 _RAMP_S = 0.005
 _RETRY_S = 0.05
+_LATER_RETRY_S = 0.5
 _REPEAT_S = 0.2
 _SENDS = 5
 _OWN_ERRORS = {errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.ENOBUFS}
@@ -138,7 +139,9 @@ class SafeOutput:
         except DeviceError as error:
             if _is_local(error):
                 raise LocalError(str(error)) from error
-            self.state, self.error, self.pause_s = "unknown", str(error), _RETRY_S
+            patient = now_s - self._began_s > PATIENCE_S
+            self.pause_s = _LATER_RETRY_S if patient else _RETRY_S
+            self.state, self.error = "unknown", str(error)
             # A device that was silent until now may find older commands beside the next one.
             self._held_since_s = None
             return
