@@ -162,7 +162,7 @@ def test_driving_ends_after_its_patience():
         amplifier, SafeGoal(0.0, 20.0, 4.0, pending=True), amplifier.clock, amplifier.sleep
     )
     assert (output.state, output.error) == ("unknown", "no answer")
-    assert amplifier.now_s == pytest.approx(100.2 + PATIENCE_S, abs=0.1)
+    assert amplifier.now_s == pytest.approx(100.2 + PATIENCE_S, abs=0.6)
 
 
 def test_each_write_is_noted_before_it_is_sent():
