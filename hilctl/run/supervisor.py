@@ -185,7 +185,9 @@ class Supervisor:
         """
         set_up, refused = json.loads(page.read_text(PageText.SET_UP))
         self._warn(refused)
-        delay_ns = _START_DELAY_NS
+        # Arming the device's watchdog comes before sample 0, and after the start signal.
+        least_ns = _START_DELAY_NS + round(self._checked.loaded.device.info.arm_s * 1e9)
+        delay_ns = least_ns
         for _ in range(_START_TRIES):
             began_ns = time.monotonic_ns()
             start_ns = began_ns + delay_ns
@@ -193,7 +195,7 @@ class Supervisor:
             took_ns = time.monotonic_ns() - began_ns
             if took_ns < delay_ns // 2:
                 return start_ns
-            delay_ns = _START_DELAY_NS + 3 * took_ns
+            delay_ns = least_ns + 3 * took_ns
         raise RunError(
             f"{self._output}: the disk took {took_ns * 1e-9:.3g} s for the first bytes; "
             "nothing has moved"

@@ -62,7 +62,9 @@ class Neighbours:
         self.guardian_looks, self.attended, self.on_attend = 2, [], {}
         self.refused = []
         self.ring = None
-        self.info = SimpleNamespace(simulated=False, holds=("tcp:here",), latency_blocks=0)
+        self.info = SimpleNamespace(
+            simulated=False, holds=("tcp:here",), latency_blocks=0, arm_s=0.0
+        )
         self.config = SimpleNamespace(
             name="stage",
             tick_s=0.01,
@@ -356,6 +358,14 @@ def test_a_slow_disk_has_the_start_put_off(stage, takes_ms, delays_ms):
     stage.run()
     assert [(unix - 10**18 - at) // MS for unix, at in stage.begun] == delays_ms
     assert stage.ring.page.get(Field.START_NS) == stage.begun[-1][1] + delays_ms[-1] * MS
+
+
+def test_the_first_sample_waits_for_the_watchdog_to_be_armed(stage):
+    """The file says when it is due, so that arming must not make it late."""
+    stage.info.arm_s = 0.15
+    stage.begin_takes_ns = [24 * MS]
+    stage.run()
+    assert [(unix - 10**18 - at) // MS for unix, at in stage.begun] == [200]
 
 
 def test_a_disk_that_takes_too_long_three_times_ends_it(stage):
