@@ -116,10 +116,6 @@ def run_job(
     try:
         output = starting_output(device, config.safe.at_start)
         waveform_at = loop.begin_at(output)
-    except BaseException:
-        device.close()  # and no safe value: what starts elsewhere is not to step there
-        raise
-    try:
         # A device may load kernels of its own when it is opened.
         all_compiled()
         ProcessMemory().release()
@@ -130,6 +126,10 @@ def run_job(
         # After the text, which the supervisor reads then.
         page.publish(Field.PHASE, Phase.READY)
         start_ns = _await_go(page, host)
+    except BaseException:
+        device.close()  # and no safe value: nothing has moved, and the output is not to step there
+        raise
+    try:
         page.publish(Field.PHASE, Phase.RUNNING)
         before = ProcessUsage.now()
         outcome = loop.run(start_ns)
@@ -153,10 +153,13 @@ def run_job(
 
 
 def _await_go(page: SharedPage, host: RingHost) -> int:
-    """Return when the first tick is due."""
+    """Return when the first tick is due.
+
+    Raises:
+        RunError: The supervisor has died; nothing has moved.
+    """
     while not page.observe(Field.GO):
         if not host.supervised():
-            # The loop ends in its first tick then: by its ramp, where the output is not at rest.
-            return host.clock.now_ns()
+            raise RunError("the supervisor died before the start; nothing has moved")
         time.sleep(0.001)
     return page.get(Field.START_NS)

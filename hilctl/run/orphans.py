@@ -86,8 +86,7 @@ def _has_started(run: RunFolder, recording: Path) -> bool:
         page = SampleRing(run.ring).page
     except (OSError, ValueError):  # it is made before anything is written to the recording
         return not (recording.is_file() and recording.stat().st_size == 0)
-    waits = page.get(Field.PHASE) in {Phase.STARTING, Phase.READY, Phase.REFUSED}
-    return not (waits and page.get(Field.GO) == page.get(Field.SENT) == 0)
+    return bool(page.get(Field.GO) or page.get(Field.SENT))
 
 
 def _remove_claimed(recording: Path) -> None:

@@ -55,6 +55,7 @@ def test_a_loop_that_ended_by_its_ramp_is_believed(dead):
         ended = Outcome("stopped", "stopped because the supervisor died", 0, "confirmed", 0)
         page.write_text(PageText.OUTCOME, json.dumps(asdict(ended)))
         page.put(Field.PHASE, Phase.ENDED)
+        page.put(Field.GO, 1)
 
     dead(fill)
     (orphan,) = recover_orphans()
@@ -71,6 +72,7 @@ def test_what_the_guardian_did_is_said(dead, error, words):
     def fill(folder):
         page = SampleRing.create(folder.ring, slots=4, block=1, state_size=1).page
         page.put(Field.PHASE, Phase.RUNNING)
+        page.put(Field.GO, 1)
         output = "unknown" if error else "confirmed"
         page.leave_safe_result(SafeActionResult(hung=False, output=output, error=error))
 
