@@ -1,5 +1,6 @@
 """Set a device to its safe value by hand, without a run."""
 
+import logging
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
@@ -7,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from hilctl.base.errors import ConfigError, Problem
+from hilctl.base.errors import ConfigError, Problem, RunError
 from hilctl.base.files import TextFiles
 from hilctl.base.yaml.document import load_document
 from hilctl.experiment.device import made_device
@@ -22,6 +23,8 @@ from hilctl.loop.safe_output import (
 )
 from hilctl.run.guardian_process import GuardianRelief
 from hilctl.run.run_folder import held_devices, runs
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,15 +89,14 @@ def put_safe(
     if device is None:
         raise ConfigError([Problem(str(path), "device", "is required, with a key kind")])
     info = device.info
-    # A run that died, or that a guardian had to end, may have left a command without an answer.
-    died = any(not run.supervised and set(run.card.holds) & set(info.holds) for run in runs())
+    died, relief = _earlier_run(info.holds)
     goal = SafeGoal(safe.value, 1.0, None, pending=died and not info.in_order)
-    relief, output = GuardianRelief(info.holds), SafeOutput(device, goal, clock)
+    output = SafeOutput(device, goal, clock)
     with ExitStack() as stack:
         locks: list[int] = []
         try:
             # Not past a run that holds it: its loop would overwrite the safe value a tick later.
-            locks = stack.enter_context(held_devices(info.holds))
+            locks = _locks(stack, info.holds)
             _drive(output, clock, sleep, watches=not relief.runs)
         finally:
             if output.final:
@@ -109,6 +111,28 @@ def put_safe(
         error=output.error,
         guardian_active=bool(relief.runs) and not output.final,
     )
+
+
+def _earlier_run(holds: Sequence[str]) -> tuple[bool, GuardianRelief]:
+    """Return whether a run of a device has died, and the relief of its guardian.
+
+    Such a run may have left a command without an answer.
+    """
+    try:
+        died = any(not run.supervised and set(run.card.holds) & set(holds) for run in runs())
+        return died, GuardianRelief(holds)
+    except RunError as error:
+        _log.warning("%s: the safe value is written all the same", error)
+        return True, GuardianRelief(())
+
+
+def _locks(stack: ExitStack, holds: Sequence[str]) -> list[int]:
+    """Hold a device; return the descriptors of its locks, none if they cannot be made."""
+    try:
+        return stack.enter_context(held_devices(holds))
+    except RunError as error:  # any user can fill /dev/shm: no reason to leave current flowing
+        _log.warning("%s: the safe value is written all the same", error)
+        return []
 
 
 def _drive(

@@ -185,7 +185,9 @@ class GuardianRelief:
 
     def __init__(self, holds: Sequence[str]) -> None:
         self.runs = [
-            run for run in runs() if set(holds) & set(run.card.holds) and safe_result_of(run)
+            run
+            for run in (runs() if holds else [])
+            if set(holds) & set(run.card.holds) and safe_result_of(run)
         ]
         for run in self.runs:
             signal_guardian(run, signal.SIGKILL, _END_S)

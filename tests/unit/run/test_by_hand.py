@@ -87,6 +87,17 @@ def test_a_device_that_a_run_holds_is_left_to_it(amplifier, experiment):
     assert amplifier.asked == []
 
 
+def test_no_room_for_a_lock_is_no_reason_to_leave_current_flowing(
+    amplifier, experiment, monkeypatch, tmp_path, caplog
+):
+    """Any user can fill the place where locks go, or take it."""
+    (tmp_path / "runs").write_text("")
+    monkeypatch.setenv("HILCTL_RUNS", str(tmp_path / "runs"))
+    assert put_safe(experiment, []).to_mapping()["output_safe"] is True
+    assert amplifier.asked == [0.5]
+    assert len(caplog.messages) == 1
+
+
 @pytest.mark.parametrize(
     ("text", "words"), [("name: x", "device"), ("device: {}\nsafe: {value: high}", "safe.value")]
 )
