@@ -81,6 +81,7 @@ class ProbedRig:
         section = {key: value for key, value in self.device.items() if key != "kind"}
         device = chosen(chosen.Options.model_validate(section))
         device.open(20.0, 1)
+        device.arm()
         device.exchange(0, np.array([command]), np.empty(1), np.empty(1))
         device._release()
 

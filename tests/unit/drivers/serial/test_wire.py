@@ -7,11 +7,12 @@ from hilctl_drivers.serial.wire import SerialWire
 
 def test_a_protocol_must_do_all_of_it():
     """One that forgot to make the output safe can't be made."""
-    names = {"rates", "open", "output", "look", "exchange", "_send", "_put_out", "close", "release"}
+    names = {"rates", "open", "arm", "output", "look", "exchange", "close", "release"}
+    names |= {"_send", "_put_out"}
     assert SerialWire.__abstractmethods__ == names
 
     class Forgetful(SerialWire):
-        rates = open = output = look = exchange = _send = close = release = None
+        rates = open = arm = output = look = exchange = _send = close = release = None
 
     with pytest.raises(TypeError, match="_put_out"):
         Forgetful(None)
