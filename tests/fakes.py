@@ -92,6 +92,7 @@ class FakeInfo:
     measures_command: bool = False
     in_order: bool = False
     confirms: bool = True
+    arm_s: float = 0.0
 
 
 @dataclass

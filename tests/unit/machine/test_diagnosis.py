@@ -66,5 +66,5 @@ def test_facts_for_a_recording(make_machine):
     """A recording gets every finding as one line of text, by a name without blanks."""
     facts = machine_facts(Realtime(), Path(), make_machine())
     assert facts["machine.kernel"] == "ok: PREEMPT_RT"
-    assert len(facts) == 14
+    assert len(facts) == 15
     assert not any(" " in name for name in facts)

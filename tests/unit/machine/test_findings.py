@@ -36,7 +36,7 @@ def test_a_good_machine_has_nothing_to_mend(make_machine):
     found = examine(make_machine(), Realtime(), Path())
     assert {each.level for each in found} == {"ok"}
     assert {each.remedy for each in found} == {""}
-    assert len({each.name for each in found}) == len(found) == 14
+    assert len({each.name for each in found}) == len(found) == 15
 
 
 def test_every_trouble_has_a_remedy(make_machine):
