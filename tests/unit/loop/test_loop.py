@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -250,7 +249,7 @@ class WatchedDevice(FakeDevice):
     arm_fails: bool = False
     armed_ns: list[int] = field(default_factory=list)
     exchanged_ns: list[int] = field(default_factory=list)
-    info = SimpleNamespace(measures_command=False, arm_s=0.004)
+    info: FakeInfo = field(default_factory=lambda: FakeInfo(in_order=True, arm_s=0.004))
 
     def arm(self):
         self.armed_ns.append(self.clock.now_ns())
@@ -281,7 +280,7 @@ def test_a_watchdog_that_cannot_be_armed_ends_as_an_exchange_that_fails():
     rig = Rig(sine(), device=WatchedDevice(clock=clock, arm_fails=True), clock=clock)
     outcome = rig.run()
     assert (outcome.code, outcome.reason, outcome.safe) == ("fault", "fake: not armed", True)
-    assert rig.device.made_safe == [0.0]
+    assert rig.device.made_safe[-1] == 0.0
     assert rig.device.commands == []
     assert [event.code for event in rig.host.events] == ["device_lost"]
 

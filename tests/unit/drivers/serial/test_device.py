@@ -302,8 +302,7 @@ def test_a_reader_that_fails_is_named(rig):
 def test_a_bad_answer_to_the_safe_value_confirms_nothing(rig, kind, fault):
     """The attempt that got it fails; a later one does not."""
     message = {"dcon": 15, "scpi": 15, "cobs": 10, "length": 10}[kind]
-    timeout_s = TIMEOUT_S if fault == "silence" else PATIENT_S
-    bench = rig(kind, faults=[f"{fault}@{message}"], timeout_s=timeout_s)
+    bench = rig(kind, faults=[f"{fault}@{message}"], timeout_s=TIMEOUT_S)
     bench.open()
     for _ in range(5):
         bench.exchange(2.0)
@@ -348,7 +347,7 @@ def test_making_safe_waits_for_no_board_to_boot(rig):
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_line_that_never_falls_silent_gets_the_safe_value(rig, kind):
     """It is put out; that it stands can't be known as long as the answers drown."""
-    bench = rig(kind)
+    bench = rig(kind, timeout_s=TIMEOUT_S)
     bench.open()
     bench.exchange(2.0)
     link = bench.device.wire._link
