@@ -8,6 +8,7 @@ one process holds the device. What is not confirmed when the run ends is left to
 
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from functools import partial
 
 from hilctl.base.errors import RunError
@@ -223,7 +224,7 @@ class Safety:
         """End the guardian, or leave an output that is not confirmed to one.
 
         Args:
-            stopped: Whether the user ends it.
+            stopped: Whether the user ends what this process still does for the output.
 
         Returns:
             Whether a guardian goes on after this process.
@@ -242,7 +243,8 @@ class Safety:
             self._action.end(_HAND_OVER_S)
             if self._started_to_act(stopped):
                 return True
-            self._stand_in()
+            with suppress(RuntimeError):  # no thread can be started: the next try may be luckier
+                self._stand_in()
             deadline_s = time.monotonic() + _HAND_OVER_S
             while time.monotonic() < deadline_s and not stopped() and not self._action.failed:
                 self.result = self._action.result(_POLL_S)

@@ -75,7 +75,7 @@ class Supervisor:
         self._overwrite = overwrite
         self._on_progress = on_progress
         self._notifier = Notifier()
-        self._stop_signal = 0
+        self._stop_signal = self._stops = 0
 
     def run(self) -> RunResult:
         """Run to the end.
@@ -125,7 +125,8 @@ class Supervisor:
             _go(ring.page, start_ns)
             self._attend(started, server, requests)
             ring.page.put(Field.RECORDED, int(not recorder.error))
-            guarded = safety.close(lambda: self._stop_signal != 0)
+            stops = self._stops
+            guarded = safety.close(lambda: self._stops > stops)
             if guarded or recorder.error:
                 folder.keep()  # its guardian is active, or recovery takes the rest from its ring
             return self._result(started, recorder, ring, folder, guarded=guarded)
@@ -245,6 +246,7 @@ class Supervisor:
     def _signals(self) -> Iterator[None]:
         def note(number: int, frame: FrameType | None) -> None:
             self._stop_signal = self._stop_signal or number
+            self._stops += 1
 
         handlers = dict.fromkeys(JOB_CONTROL, signal.SIG_IGN) | dict.fromkeys(STOPS, note)
         handlers[signal.SIGTSTP] = _stay
