@@ -24,8 +24,8 @@ from hilctl.recording.data import Samples
 from hilctl.run.ring import SampleRing
 from hilctl.run.shared_page import SharedPage
 from hilctl_drivers.profile import shipped_profiles
-from tests.benchmark.wire_runs import make_real_time
 
+PRIORITY = 50
 LONGEST_S = 120.0
 RAMP_S = 0.3
 PEAK_A = 5.0
@@ -99,6 +99,12 @@ def _wires() -> dict[str, AttackedWire]:
 
 
 WIRES = _wires()
+
+
+def make_real_time(pid: int) -> None:
+    """Schedule a process under SCHED_FIFO, if that is permitted and the process has not ended."""
+    with suppress(PermissionError, ProcessLookupError):
+        os.sched_setscheduler(pid, os.SCHED_FIFO, os.sched_param(PRIORITY))
 
 
 class AttackedRun:

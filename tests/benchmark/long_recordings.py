@@ -152,7 +152,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=int, nargs="+", default=[60, 900])
     parser.add_argument("--folder", type=Path, help="Where to make them; a temporary one if none.")
     parser.add_argument("--keep", action="store_true", help="Leave the recordings there.")
-    parser.add_argument("--goal", type=float, default=5.0, help="Million samples a second.")
+    parser.add_argument("--goal", type=float, default=3.0, help="Million samples per second.")
     parser.add_argument("--commands", default=COMMANDS)
     parser.add_argument("--runs", type=int, default=1, help="Of each command; the median counts.")
     options = parser.parse_args()

@@ -21,6 +21,9 @@ from pathlib import Path
 
 import numpy as np
 
+from hilctl_drivers.modbus.device import ModbusDac
+from hilctl_drivers.modbus.setup import ModbusOptions
+
 SOURCE = Path(__file__).with_suffix(".c")
 WARM_UP = 200
 PERIOD_S = 1e-3
@@ -72,9 +75,6 @@ def serving(server: Path, *words: str, fds: tuple[int, ...] = ()) -> Iterator[st
 
 def driver_batch(folder: Path, link: str, **where: object) -> Batch:
     """Return the driver's side: command in, displacement out, as in a tick."""
-    from hilctl_drivers.modbus.device import ModbusDac
-    from hilctl_drivers.modbus.setup import ModbusOptions
-
     profile = folder / "profile.yaml"
     profile.write_text(PROFILE.format(link=link), encoding="utf-8")
     options = {

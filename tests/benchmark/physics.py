@@ -11,7 +11,6 @@ import copy
 import json
 import os
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -25,30 +24,23 @@ import numpy as np
 
 from hilctl.base.arrays import F64
 from hilctl.experiment.condition import conditioning_of
-from hilctl.experiment.correction import Correction, write_correction
 from hilctl.experiment.initial_state import InitialState, begin, left_by
 from hilctl.experiment.load import LoadedExperiment, load_experiment
 from hilctl.identify.command import identify_records, settings_from
 from hilctl.identify.data.records import History
 from hilctl.identify.fit_model import FittedModel
-from hilctl.learning.session import Session, correction_setting
 from hilctl.loop.compensator import Compensator
 from hilctl.models.base import HysteresisModel
-from hilctl.models.files import dump_model, load_model
-from hilctl.run.step import unpaced
+from hilctl.models.files import load_model
 from hilctl.waveforms.build import build
 from hilctl_drivers.simulated.rigs import PHYSICS, Physics, TerfenolOptions
 from hilctl_drivers.simulated.terfenol import TerfenolActuator
-from tests.benchmark.causal_floor import CausalInverse, rods_wanted_um
-from tests.benchmark.learning import CYCLES, EXPERIMENT, SOFT_S
 from tests.benchmark.references import RATE_HZ, Row, Stroke, random, references
 
 CAMPAIGN = Path(__file__).parents[2] / "configs" / "identify_any.yaml"
 OMEGA = CAMPAIGN.parent / "models" / "terfenol_omega.yaml"
 MARGIN = 0.06  # of the range that a model was identified on, at either end
 MOST_A = 8.0
-LEARNED_HZ = (10.0, 100.0, 250.0)
-LEARNED_GOAL = 0.05
 EXTRAS: Mapping[str, tuple[str, Mapping[str, float]]] = {
     "creep": ("creep", {"share": 0.05}),
     "thermal": (
@@ -103,7 +95,7 @@ class Result:
     Attributes:
         row: The reference.
         noise: Largest noise of the sensor, in percent of the reference's peak-to-peak.
-        figures: From rest, and by what else was asked for: ``conditioned``, ``floor``.
+        figures: From rest and, if wanted, ``conditioned``.
     """
 
     row: Row
@@ -122,9 +114,7 @@ class Rig:
     def __init__(self, physics: Physics, extras: Sequence[str]) -> None:
         self.physics = physics
         chosen = dict(EXTRAS[name] for name in extras)
-        self.device = {"physics": physics, **chosen}
-        self._options = TerfenolOptions.model_validate(self.device)
-        self.parameters = self._options.parameters()
+        self._options = TerfenolOptions.model_validate({"physics": physics, **chosen})
 
     def at_rest(self, *, noise: bool = False, seed: int = 1) -> TerfenolActuator:
         options = self._options.model_copy(update={"noise": noise})
@@ -150,7 +140,7 @@ def identified(rig: Rig, kind: str, seed: int) -> tuple[FittedModel, float]:
     return found.fit, time.process_time() - start
 
 
-def conditioned(
+def after_conditioning(
     rig: Rig, model: HysteresisModel
 ) -> tuple[LoadedExperiment, InitialState, TerfenolActuator]:
     """Return where a decaying cycle leaves the model, and the rig."""
@@ -173,15 +163,15 @@ def compensated(model: HysteresisModel, reference_um: F64, before: InitialState 
     return np.clip(command, -MOST_A, MOST_A)
 
 
-def drives(rig: Rig, model: HysteresisModel, also: Sequence[str]) -> dict[str, Drive]:
-    """Return all that drives the rig."""
+def drives(rig: Rig, model: HysteresisModel, *, conditioned: bool) -> dict[str, Drive]:
+    """Return how the rig is driven: from rest and, if wanted, after a decaying cycle."""
 
     def from_rest(row: Row) -> tuple[F64, TerfenolActuator]:
         return compensated(model, row.reference_um, None), rig.at_rest()
 
     found: dict[str, Drive] = {"from rest": from_rest}
-    if "conditioned" in also:
-        loaded, left, stands = conditioned(rig, model)
+    if conditioned:
+        loaded, left, stands = after_conditioning(rig, model)
 
         def after(row: Row) -> tuple[F64, TerfenolActuator]:
             # References are shorter than the way from where the actuator stands: that comes first.
@@ -193,14 +183,6 @@ def drives(rig: Rig, model: HysteresisModel, also: Sequence[str]) -> dict[str, D
             return command[way:], rig_then
 
         found["conditioned"] = after
-    if "floor" in also:
-
-        def best(row: Row) -> tuple[F64, TerfenolActuator]:
-            wanted = rods_wanted_um(rig.parameters, row.reference_um, RATE_HZ)
-            following = np.append(wanted[1:], wanted[-1])
-            return CausalInverse(rig.at_rest(), MOST_A).drive(following), rig.at_rest()
-
-        found["floor"] = best
     return found
 
 
@@ -237,49 +219,6 @@ def judge(
     return results
 
 
-def learned(rig: Rig, model: HysteresisModel, inside: Stroke, say: Callable[[str], None]) -> bool:
-    """Learn the full stroke by runs, and say how far that got; return whether it is far enough."""
-    good = True
-    with tempfile.TemporaryDirectory(prefix="learning-") as folder:
-        file = Path(folder) / "model.yaml"
-        file.write_text(dump_model(model))
-        for frequency_hz in LEARNED_HZ:
-            settings = [
-                f"waveform.frequency_hz={frequency_hz}",
-                f"waveform.duration_s={round(2.0 * SOFT_S + (CYCLES + 0.02) / frequency_hz, 5)}",
-                f"waveform.amplitude={inside.half_um}",
-                f"waveform.offset={inside.middle_um}",
-                f"compensator.model={file}",
-                f"limits.peak_current_a={MOST_A}",
-                "limits.stroke_um=[-90.0, 90.0]",
-                *(f"device.{key}={json.dumps(value)}" for key, value in rig.device.items()),
-            ]
-            runs = Path(folder) / f"{frequency_hz:g}"
-            found = Session(EXPERIMENT, settings, runs, unpaced).learn(20, lambda _: None)
-            (check,) = found.check
-            error_percent = without_noise(settings, found.correction, runs / "without noise")
-            met = error_percent <= LEARNED_GOAL
-            good &= met
-            say(f"{rig.physics}, learned at {frequency_hz:g} Hz: {found.rows[0].error_percent:.2f} "
-                f"to {error_percent:.3f} % in {len(found.rows)} runs; under other noise "
-                f"{check.error_percent:.3f}, noise {check.floor_percent:.3f}"
-                f"{'' if met else '  missed'}")  # fmt: skip
-    return good
-
-
-def without_noise(settings: Sequence[str], correction: Correction, folder: Path) -> float:
-    """Return the error of a correction on the rig without sensor noise, in percent.
-
-    The average of 16 cycles has most of what is asked for left of that noise.
-    """
-    folder.mkdir()
-    file = folder / "correction.yaml"
-    write_correction(file, correction, overwrite=False)
-    quiet = [*settings, correction_setting(file), "device.noise=false"]
-    first, *_ = Session(EXPERIMENT, quiet, folder / "runs", unpaced).learn(0, lambda _: None).rows
-    return first.error_percent
-
-
 def cost_us(model: HysteresisModel, reference_um: F64) -> float:
     """Return processor time of the inverse, in us a sample, the best of some."""
     took = []
@@ -299,9 +238,7 @@ def line(result: Result, names: Sequence[str]) -> str:
         figures = result.figures[name]
         text += f" | {figures.aside:6.2f} {figures.rms_aside:6.3f}"
     goals = f"{row.goal:g}" + (f", {row.rms_goal:g} rms" if row.rms_goal else "")
-    missed = [
-        name for name in names if name != "floor" and result.figures[name].share_of_goal(row) > 1.0
-    ]
+    missed = [name for name in names if result.figures[name].share_of_goal(row) > 1.0]
     return f"{text} | {goals}" + (f"  missed {', '.join(missed)}" if missed else "")
 
 
@@ -325,22 +262,18 @@ def show(rig: Rig, options: argparse.Namespace) -> tuple[dict[str, Any], bool]:
     timed_um = inside.row("", (1.0, None), 0.6 * random(9)).reference_um
     cost, omega = cost_us(fit.model, timed_um), cost_us(load_model(OMEGA), timed_um)
     rows = [row for row in references(inside.low_um, inside.high_um) if wanted(row, options.rows)]
-    also = [name for name in ("conditioned", "floor") if getattr(options, name)]
-    names = ["from rest", *also]
+    names = ["from rest", *(["conditioned"] if options.conditioned else [])]
     say = partial(print, file=sys.stderr if options.json else sys.stdout, flush=True)
     say(f"\n{' '.join([rig.physics, *options.options])}, {options.model}, {taken}: "
         f"{took_s:.1f} s of processor time, inverse {cost:.2f} us a sample, "
         f"Omega {omega:.2f}")  # fmt: skip
     say(f"{'reference':20} {'peak %':>7} {'no mean':>8} {'rms %':>6} {'noise':>6}"
         + "".join(f" | {name:>13}" for name in names) + " | goal")  # fmt: skip
-    ways = drives(rig, fit.model, also)
+    ways = drives(rig, fit.model, conditioned=options.conditioned)
     results = judge(rows, ways, lambda result: say(line(result, names)))
     sums = [summary(results, name) for name in names]
     for text, _ in sums:
         say(f"{rig.physics}, {text}")
-    good = all(met for _, met in sums[: 1 + ("conditioned" in also)])
-    if options.learn:
-        good &= learned(rig, fit.model, inside, say)
     table = {
         "physics": rig.physics,
         "options": list(options.options),
@@ -350,7 +283,7 @@ def show(rig: Rig, options: argparse.Namespace) -> tuple[dict[str, Any], bool]:
         "omega_us": omega,
         "rows": [result.to_mapping() for result in results],
     }
-    return table, good
+    return table, all(met for _, met in sums)
 
 
 def wanted(row: Row, parts: Sequence[str]) -> bool:
@@ -367,8 +300,6 @@ def main() -> int:
     parser.add_argument("--rows", nargs="*", default=[], help="parts of names of references")
     parser.add_argument("--options", nargs="*", default=[], choices=list(EXTRAS))
     parser.add_argument("--condition", dest="conditioned", action="store_true")
-    parser.add_argument("--floor", action="store_true", help="minutes more")
-    parser.add_argument("--learn", action="store_true", help="learn full strokes as well")
     parser.add_argument("--json", action="store_true", help="tables go to standard error")
     options = parser.parse_args()
     shown = [show(Rig(physics, options.options), options) for physics in options.physics]

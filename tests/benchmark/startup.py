@@ -1,4 +1,4 @@
-"""How long it takes from the command to the first sample, and what both processes take meanwhile.
+"""Time from the command to the first sample, with and without cached kernels.
 
 Run it with ``python -m tests.benchmark.startup``; see README.md beside it.
 """
@@ -44,8 +44,8 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
     parser.add_argument("--experiment", type=Path, default=CONFIG)
     parser.add_argument("--runs", type=int, default=5)
-    parser.add_argument("--max-warm-s", type=float, default=1.0)
-    parser.add_argument("--max-cold-s", type=float, default=8.0)
+    parser.add_argument("--max-warm-s", type=float, default=2.5)
+    parser.add_argument("--max-cold-s", type=float, default=15.0)
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

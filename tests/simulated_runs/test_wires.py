@@ -1,61 +1,170 @@
 """One short compensated run over every wire, in the processes that a user starts."""
 
-import importlib.util
+import json
+import shutil
+import subprocess
 import sys
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 
 from hilctl.analysis.replay import replay
 from hilctl.recording.reader import read
+from hilctl_drivers.profile import shipped_profiles
+from tests.benchmark.attacked import make_real_time
+
+ROOT = Path(__file__).parents[2]
+MODEL = ROOT / "configs" / "models" / "terfenol_omega.yaml"
+DCON_READER = ROOT / "tests" / "data" / "dcon_module.yaml"
+CYCLES = 3
+AMPLIFIER = {"amplifier": {"gain_a_per_v": 1.0}}
+COMMON = {"sensor": {"um_per_v": 12.5}, "timeout_s": 2.0, "watchdog": "none"}
+VOLTMETER = {"reader": {"profile": "agilent_34970a"}}
+BOARD = {"kind": "serial_dac", "output": "DAC", "input": "ADC", **AMPLIFIER}
+MODBUS = {"kind": "modbus_dac", "output": "OUT", "input": "IN", **AMPLIFIER}
+SCPI = {"kind": "serial_dac", "output": "current", "input": "AI101", **VOLTMETER}
+DCON = {"kind": "serial_dac", "output": "AO0", "input": "AI0", "reader": {"profile": "dcon.yaml"}}
 
 
-def _wire_runs():
-    """Return the benchmark's module: test files can't import each other."""
-    path = Path(__file__).parents[1] / "benchmark" / "wire_runs.py"
-    spec = importlib.util.spec_from_file_location("wire_runs", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["wire_runs"] = module  # its dataclasses look themselves up there
-    spec.loader.exec_module(module)
-    return module
+@dataclass(frozen=True, slots=True)
+class Wire:
+    """One connection to the rig.
+
+    Attributes:
+        profile: Shipped profile, or a file that :func:`write_profiles` makes.
+        device: The experiment's device section without profile and addresses.
+        rate_hz: Sample rate.
+        ports: Keys of the device section that the emulator's addresses go to, in order.
+        words: More words for ``hilctl emulate``.
+        block: Samples per exchange.
+        per_cycle: Samples per cycle of the sine.
+    """
+
+    profile: str
+    device: dict[str, Any]
+    rate_hz: float
+    ports: tuple[str, ...] = ("serial_port",)
+    words: tuple[str, ...] = ()
+    block: int = 1
+    per_cycle: int = 50
 
 
-RUNS = _wire_runs()
-RATES_HZ = {
-    "Modbus TCP": 500.0,
-    "Modbus RTU": 100.0,
-    "SCPI": 15.0,
-    "SCPI, measured": 15.0,
-    "DCON": 35.0,
-    "COBS": 200.0,
-    "COBS FIFO": 10_000.0,
+TWO_PORTS = ("serial_port", "reader")
+SCPI_SENSOR = ("--sensor", "agilent_34970a:AI101")
+WIRES = {
+    "Modbus TCP": Wire("generic_float32", MODBUS, 500.0, ("host",)),
+    "Modbus RTU": Wire("rtu.yaml", MODBUS, 100.0),
+    "SCPI": Wire("kepco_bop", SCPI, 15.0, TWO_PORTS, SCPI_SENSOR, per_cycle=20),
+    "SCPI, measured": Wire(
+        "kepco_bop", {**SCPI, "measure": "current"}, 15.0, TWO_PORTS, SCPI_SENSOR, per_cycle=20
+    ),
+    "DCON": Wire(
+        "icp_m7024_dcon", {**DCON, **AMPLIFIER}, 35.0, TWO_PORTS, ("--sensor", "dcon.yaml:AI0")
+    ),
+    "COBS": Wire("cobs_board", BOARD, 200.0),
+    "COBS FIFO": Wire(
+        "cobs_board_fifo", {**BOARD, "fifo_blocks": 15}, 10_000.0, block=100, per_cycle=500
+    ),
 }
-PER_CYCLE = {"SCPI": 20, "SCPI, measured": 20, "COBS FIFO": 500}
 LIKE_OTHERS = {"Modbus RTU", "SCPI, measured"}
 """Wires whose parts the others have, each in a run that takes its time."""
-CYCLES = 3
+
+
+def hilctl(*words: object) -> list[str]:
+    return [sys.executable, "-m", "hilctl", *map(str, words)]
+
+
+def write_profiles(folder: Path) -> None:
+    """Write the profiles that are not shipped: float32 and function 23 over RTU, a DCON reader."""
+    rtu = yaml.safe_load(shipped_profiles()["generic_float32"].read_text(encoding="utf-8"))
+    rtu["link"] = {"kind": "rtu", "baud": 115200}
+    (folder / "rtu.yaml").write_text(yaml.safe_dump(rtu), encoding="utf-8")
+    shutil.copy(DCON_READER, folder / "dcon.yaml")
+
+
+@contextmanager
+def emulated(wire: Wire, folder: Path) -> Iterator[dict[str, Any]]:
+    """Emulate a wire's device in a process; yield the device section that reaches it."""
+    command = hilctl("emulate", wire.profile, *wire.words)
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=folder) as process:
+        try:
+            assert process.stdout is not None
+            make_real_time(process.pid)
+            found = [process.stdout.readline().split()[-1] for _ in wire.ports]
+            yield {**COMMON, "profile": wire.profile, **device_at(wire, found)}
+        finally:
+            process.terminate()
+
+
+def device_at(wire: Wire, found: Sequence[str]) -> dict[str, Any]:
+    """Return a wire's device section with the addresses that its emulator listens at."""
+    if wire.ports == ("host",):
+        host, port = found[0].split(":")
+        return {**wire.device, "host": host, "tcp_port": int(port)}
+    section = {**wire.device, "serial_port": found[0]}
+    if "reader" in wire.ports:
+        section["reader"] = {**wire.device["reader"], "serial_port": found[1]}
+    return section
+
+
+def write_experiment(path: Path, wire: Wire, device: dict[str, Any]) -> None:
+    """Write a compensated sine at full stroke: a soft start of one cycle, then two more."""
+    frequency_hz = wire.rate_hz / wire.per_cycle
+    experiment = {
+        "name": "wire",
+        "device": device,
+        "sample_rate_hz": wire.rate_hz,
+        "block": wire.block,
+        "waveform": {
+            "kind": "sine",
+            "unit": "um",
+            "amplitude": 40.8,
+            "offset": -6.9,
+            "frequency_hz": frequency_hz,
+            "duration_s": CYCLES / frequency_hz,
+            "soft_start_s": 1.0 / frequency_hz,
+        },
+        "compensator": {"model": str(MODEL)},
+        "limits": {
+            "peak_current_a": 7.07,
+            "slew_a_per_s": 400.0 * frequency_hz,
+            "stroke_um": [-75.0, 60.0],
+        },
+        "safe": {"value": 0.0, "ramp_s": 0.2},
+        # A busy machine may miss deadlines; that must not end the run.
+        "timing": {"on_misses": "warn", "max_late_s": 5.0, "hang_s": 5.0},
+    }
+    path.write_text(yaml.safe_dump(experiment), encoding="utf-8")
+
+
+def run(path: Path) -> dict[str, Any]:
+    """Run an experiment in processes of its own; return the JSON that it prints."""
+    command = hilctl("run", path, "--output", path.with_suffix(".mcap"), "--json")
+    done = subprocess.run(command, stdout=subprocess.PIPE, text=True, cwd=path.parent)
+    assert done.stdout, done.returncode
+    found: dict[str, Any] = json.loads(done.stdout)
+    return found
 
 
 @pytest.mark.parametrize(
     "name",
-    [
-        pytest.param(each, marks=pytest.mark.long if each in LIKE_OTHERS else ())
-        for each in RATES_HZ
-    ],
+    [pytest.param(each, marks=pytest.mark.long if each in LIKE_OTHERS else ()) for each in WIRES],
 )
 def test_compensated_run_is_complete(tmp_path, name):
     """Every sample of the waveform is recorded or counted, and the commands replay bit for bit."""
-    wire = next(each for each in RUNS.WIRES if each.name == name)
-    wire = replace(wire, per_cycle=PER_CYCLE.get(name, 50), block=min(wire.block, 100))
-    RUNS.write_profiles(tmp_path)
+    wire = WIRES[name]
+    write_profiles(tmp_path)
     path = tmp_path / "experiment.yaml"
-    with RUNS.emulated(wire, tmp_path) as device:
-        RUNS.write_experiment(path, wire, device, RATES_HZ[name], 0.0)
-        printed = RUNS.run(path)
+    with emulated(wire, tmp_path) as device:
+        write_experiment(path, wire, device)
+        printed = run(path)
+    assert "error" not in printed, printed["error"]
     assert printed["code"] == "completed", printed["reason"]
     assert printed["complete"]
     assert printed["output_safe"]

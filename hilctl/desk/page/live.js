@@ -28,12 +28,6 @@ let drawn = 0;
 let lastFrameMs = 0;
 let nextId = 1;
 const waiting = new Map();
-const counters = { frames: 0, received: 0, drawMs: 0, errors: 0, acknowledgedMs: null };
-window.hilctlLive = counters; // what a measurement reads
-counters.highest = (id) => plots[id].plot.data[1].reduce((most, value) => Math.max(most, value ?? most), -Infinity);
-
-addEventListener("error", () => { counters.errors += 1; });
-addEventListener("unhandledrejection", () => { counters.errors += 1; });
 
 // ---- connection
 
@@ -47,7 +41,7 @@ function connect() {
   socket.onopen = () => { notice(""); ask("view", { view }); };
   socket.onmessage = (message) => {
     if (typeof message.data === "string") said(JSON.parse(message.data));
-    else { frame = message.data; counters.received += 1; }
+    else frame = message.data;
   };
   socket.onclose = () => {
     socket = null;
@@ -555,11 +549,9 @@ function tidy(value) {
 // ---- what is pressed
 
 function stop() {
-  const began = performance.now();
   $("stop").textContent = "STOP …";
   notice("STOP requested, not yet acknowledged.");
   ask("stop", {}, (answer) => {
-    counters.acknowledgedMs = performance.now() - began;
     $("stop").textContent = answer.ok ? "STOP ✓" : "STOP";
     if (answer.ok) notice("STOP acknowledged: the run goes to its safe value.", "calm");
     else notice(`STOP is NOT acknowledged: ${answer.error}. Use hilctl stop, or the rig's own switch.`);
@@ -636,10 +628,7 @@ function refresh(now) {
   const data = unpack(frame);
   frame = null;
   if (!plots["plot-um"] || plots.unit !== status.run) { build(); Object.defineProperty(plots, "unit", { value: status.run }); }
-  const began = performance.now();
   draw(data);
-  counters.drawMs += performance.now() - began;
-  counters.frames += 1;
   const gap = now - lastFrameMs;
   lastFrameMs = now;
   if (gap < FRESH_MS) usualMs += (gap - usualMs) * 0.05; // of the times: that of the rates would be too high
