@@ -293,6 +293,19 @@ def test_lost_device_that_stays_lost_is_said():
     assert "the safe value could not be confirmed: fake: still no answer" in outcome.reason
 
 
+@pytest.mark.parametrize("latency", [0, 3])
+def test_an_interlock_that_trips_after_a_stop_is_recorded(latency):
+    """The run was stopped before and stays so; the recording says what happened on the ramp."""
+    asked = iter([""] * 40)
+    device = FakeFifoDevice(latency, nan_at=43) if latency else FakeDevice(nan_at=43)
+    rig = Rig(np.full(1000, 2.0), device=device, stop=lambda: next(asked, "stopped by a test"))
+    outcome = rig.run()
+    assert (outcome.code, outcome.reason) == ("stopped", "stopped by a test")
+    (event,) = rig.host.events
+    assert (event.level, event.sample) == ("error", 43)
+    assert "not within the stroke limits" in event.text
+
+
 def test_device_lost_on_the_ramp_keeps_the_first_reason():
     """A second fault in the safe ramp does not hide the first."""
     device = FakeDevice(nan_at=40, break_at=45)
