@@ -32,5 +32,5 @@ probe.py           whether a device answers, and whether that can be true
 orphans.py         what dead runs left behind; dead_runs.py  finished before anything is read
 by_hand.py         a device put at its safe value with no run
 unpaced.py         a run of a simulated device that needs no real time
-result.py          where a run stands, and how it ended; end_commands.py  programs that are told so
+result.py          where a run stands, and how it ended
 """
