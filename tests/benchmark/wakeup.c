@@ -1,13 +1,11 @@
 /* cyclictest's measurement for machines that allow no SCHED_FIFO, where cyclictest won't start.
  *
- * wakeup INTERVAL_US LOOPS LONGEST_US [catch_up|spin] prints "us count" for each us, then what lies
- * beyond. With catch_up it makes up for the wake-ups that a stall has cost, each late; with spin as
- * well, and it looks at the clock all the time instead of sleeping.
+ * wakeup INTERVAL_US LOOPS LONGEST_US [catch_up] prints "us count" for each us, then what lies
+ * beyond. With catch_up it makes up for the wake-ups that a stall has cost, each late.
  */
 #define _GNU_SOURCE
 #include <stdio.h>
 #include <stdlib.h>
-#include <string.h>
 #include <sys/prctl.h>
 #include <time.h>
 
@@ -31,13 +29,10 @@ int main(int argc, char **argv)
     for (long long us = 0; us <= longest; us++)
         counts[us] = 0;
     prctl(PR_SET_TIMERSLACK, 1, 0, 0, 0);
-    int spins = argc == 5 && strcmp(argv[4], "spin") == 0;
     long long due = now_ns() + interval;
     for (long long k = 0; k < loops; k++) {
         struct timespec when = {due / SECOND, due % SECOND};
-        while (spins && now_ns() < due)
-            ;
-        if (!spins && clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &when, NULL))
+        if (clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &when, NULL))
             return 1;
         long long now = now_ns(), late_us = (now - due) / 1000;
         counts[late_us < longest ? late_us : longest]++;
