@@ -24,8 +24,6 @@ class Quantiles:
         self._largest: Any = None
         self._values: list[Any] | None = []
         self._counts = np.empty(0, dtype=np.int64)
-        self._reach = (2 * _MIDDLE, 0)
-        self._zeros = 0
 
     def add(self, values: F64 | I64) -> None:
         """Take more values, float64[n] or int64[n]; none of them NaN."""
@@ -44,16 +42,12 @@ class Quantiles:
                     self._count(each)
 
     def _count(self, values: F64 | I64) -> None:
-        """Count values by the first bits of their floating-point form, which rise as they do."""
-        from hilctl.kernels.counting import count_keys  # what short runs never need
-
+        """Count values by the first bits of their floating-point form."""
         if not self._counts.size:  # pages that nothing is counted in take no memory
             self._counts = np.zeros(2 * _MIDDLE, dtype=np.int64)
         bits = np.ascontiguousarray(values, dtype=np.float64).view(np.int64)
-        # A reading that stands still gives zeros, far from all other numbers.
-        zeros, low, high = count_keys(bits, _SHIFT, self._counts)
-        self._zeros += zeros
-        self._reach = min(low, self._reach[0]), max(high, self._reach[1])
+        keys, counts = np.unique(_ordered(bits) >> _SHIFT, return_counts=True)
+        self._counts[keys + _MIDDLE] += counts
 
     @property
     def largest(self) -> float:
@@ -90,10 +84,12 @@ class Quantiles:
 
     def _centres(self) -> tuple[F64, I64]:
         """Return the middle of each bin, rising, and how many values there are up to its end."""
-        keys = np.flatnonzero(self._counts[slice(*self._reach)]) + self._reach[0] - _MIDDLE
-        counts = self._counts[keys + _MIDDLE]
-        edges = np.array([keys, keys + 1], dtype=np.int64) << _SHIFT
-        low, high = (edges ^ ((edges >> 63) & _SIGN)).view(np.float64)
-        at = int(np.searchsorted(keys, 0))
-        centres = np.insert(0.5 * low + 0.5 * high, at, 0.0)
-        return centres, np.cumsum(np.insert(counts, at, self._zeros))
+        places = np.flatnonzero(self._counts)
+        keys = places - _MIDDLE
+        low, high = _ordered(np.array([keys, keys + 1], dtype=np.int64) << _SHIFT).view(np.float64)
+        return np.where(keys, 0.5 * low + 0.5 * high, 0.0), np.cumsum(self._counts[places])
+
+
+def _ordered(bits: I64) -> I64:
+    """Return the bits of floating-point numbers as integers in the same order; its own inverse."""
+    return bits ^ ((bits >> 63) & _SIGN)

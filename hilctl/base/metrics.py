@@ -22,7 +22,6 @@ SHORTEST_PERIOD = 16.0
 MAD_TO_SIGMA = 1.482602218505602
 """Standard deviation of a normal distribution, of its median absolute deviation."""
 
-_MANY = 2**21  # from here on, what it takes to load compiled kernels is worth it
 _WIDEST_HOLE = 0.05
 _FEWEST_BINS = 4
 _ORDER = 6
@@ -77,7 +76,6 @@ class Folding:
     def __init__(self, period: float, signals: int, max_bins: int = MAX_BINS) -> None:
         bins = max(1, min(max_bins, int(period + 1e-9)))
         self._period = float(period)
-        self._taken = 0
         self._counts = np.zeros(bins, dtype=np.int64)
         self._sums = np.zeros((signals + 1, bins))
 
@@ -90,10 +88,6 @@ class Folding:
         """
         # Whole numbers are divided in a tenth of the time, with the same result.
         whole = self._period.is_integer()
-        self._taken += index.size
-        if whole and len(signals) == 2 and self._taken >= _MANY:
-            self._add_many(index, signals)
-            return
         finite = np.isfinite(signals).all(axis=0)
         if not finite.all():
             index, signals = index[finite], signals[:, finite]
@@ -104,14 +98,6 @@ class Folding:
         bin_of = np.minimum((phase * bins / self._period).astype(np.int64), bins - 1)
         self._counts += np.bincount(bin_of, minlength=bins)
         self._sums += [np.bincount(bin_of, row, bins) for row in (phase, *signals)]
-
-    def _add_many(self, index: I64, signals: F64) -> None:
-        from hilctl.kernels.counting import fold_pairs
-
-        counts, sums = np.zeros_like(self._counts), np.zeros_like(self._sums)
-        fold_pairs(index, np.ascontiguousarray(signals), int(self._period), counts, sums)
-        self._counts += counts
-        self._sums += sums
 
     def fold(self) -> Fold:
         """Return the average cycle; of no bin where nothing is finite."""

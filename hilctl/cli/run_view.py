@@ -129,11 +129,6 @@ def print_run(result: "RunResult", report: "RunReport | None") -> None:
         terminal.print(render(report))
     elif result.adapted:
         terminal.print(f"adapted: {adapted_text(result.adapted)}")
-    for each in result.on_end:
-        ended = "did not start" if each.exit_code is None else f"exit code {each.exit_code}"
-        text = f"on_end: {each.command[0]}: {ended} after {each.took_s:.1f} s"
-        style = "bold yellow" if each.error else None
-        terminal.print(text + (f": {each.error}" if each.error else ""), style=style)
     terminal.print(f"recorded: {result.path}", soft_wrap=True)
     path = shlex.quote(str(result.path))
     terminal.print(f"  hilctl report {path} --html run.html", soft_wrap=True)

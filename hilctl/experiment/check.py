@@ -22,7 +22,6 @@ from hilctl.experiment.adaptation import (
     worst_inputs,
 )
 from hilctl.experiment.condition import condition_problems, conditioning_of, measures_offset
-from hilctl.experiment.end_commands import end_command_problems
 from hilctl.experiment.feedback import feedback_problems
 from hilctl.experiment.forecast import Forecast, forecast_of
 from hilctl.experiment.heat import CoolingCoil
@@ -107,7 +106,6 @@ def check(
         ConfigError: The run must not start; all reasons are listed, each saying by how much.
     """
     problems = _device_problems(loaded) + interlock_problems(loaded) + condition_problems(loaded)
-    problems += end_command_problems(loaded)
     config = loaded.config
     try:
         reference = build(config.waveform, config.sample_rate_hz, loaded.folder)

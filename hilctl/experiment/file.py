@@ -8,7 +8,6 @@ from hilctl.experiment.limits import Limits
 from hilctl.experiment.parts import (
     AdaptationConfig,
     Condition,
-    EndCommand,
     FeedbackConfig,
     Name,
     RecordingConfig,
@@ -90,8 +89,6 @@ class Experiment(Strict):
         timing: What happens to late ticks.
         recording: Where and how the run is recorded.
         realtime: How the loop's process asks for real time.
-        on_end: What is started, one after another, once the run is over: the output is safe and the
-            recording closed. Each gets the result as JSON on its standard input.
     """
 
     name: Name
@@ -115,7 +112,6 @@ class Experiment(Strict):
     timing: Timing = Field(default_factory=Timing)
     recording: RecordingConfig = Field(default_factory=RecordingConfig)
     realtime: Realtime = Field(default_factory=Realtime)
-    on_end: Annotated[tuple[EndCommand, ...], Field(max_length=8)] = ()
 
     @property
     def tick_s(self) -> float:

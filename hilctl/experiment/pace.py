@@ -1,24 +1,24 @@
-"""Whether ticks come as fast as no timer wakes a loop for them."""
+"""Whether the ticks come faster than timers wake a loop."""
 
 from hilctl.base.device import DeviceInfo
 from hilctl.experiment.file import Experiment
 
-FASTEST_SLEEPING_S = 1e-4
-"""Shortest period of a tick that a loop which sleeps keeps on most machines: an idle CPU takes from
-a few us to a tenth of a millisecond to wake."""
+SHORTEST_TICK_S = 1e-4
+"""Shortest tick that timers keep on most machines: an idle CPU takes from a few us to a tenth of a
+millisecond to wake."""
 
 
 def pace_warnings(config: Experiment, info: DeviceInfo) -> tuple[str, ...]:
-    """Return what would keep many ticks late, and what to do about it.
+    """Return a warning if many ticks will be late.
 
     Args:
         config: The experiment.
         info: What its device says of itself: one that plays blocks from a FIFO keeps the pace.
     """
-    sleeps = config.realtime.wait == "sleep" and not info.latency_blocks
-    if not sleeps or config.tick_s >= FASTEST_SLEEPING_S:
+    if info.latency_blocks or config.tick_s >= SHORTEST_TICK_S:
         return ()
-    rate = f"{1.0 / config.tick_s:g} ticks a second"
-    longer = ", or a larger block" if info.buffered else ""
-    why = "on most machines timers wake a loop too late for that, now and then"
-    return (f"realtime.wait: {rate}: {why}; realtime.wait: spin is in time{longer}",)
+    remedy = "Use a larger block." if info.buffered else "Use a lower rate."
+    return (
+        f"sample_rate_hz: {1.0 / config.tick_s:g} ticks per second: on most machines timers wake "
+        f"the loop too late for some of them. {remedy}",
+    )

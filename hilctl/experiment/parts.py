@@ -215,19 +215,6 @@ class AdaptationConfig(Strict):
     sensor_delay_s: Annotated[float, Field(ge=0.0)] = 0.0
 
 
-class EndCommand(Strict):
-    """A program that gets the result of a run as JSON on its standard input.
-
-    Attributes:
-        command: The program and its arguments. No shell reads them: nothing in them is expanded. A
-            program with a slash in it is relative to the experiment file's folder.
-        timeout_s: It is killed after that time, with all that it has started.
-    """
-
-    command: Annotated[tuple[Annotated[str, Field(min_length=1)], ...], Field(min_length=1)]
-    timeout_s: Annotated[float, Field(gt=0.0, le=600.0)] = 30.0
-
-
 def _pi_where_not_said(value: Any) -> Any:
     return {"kind": "pi", **value} if isinstance(value, dict) else value
 

@@ -17,5 +17,4 @@ does not notice a callee that changed in another file. Units live one level abov
     limit.py     peak and slew limits of a command
     interlock.py what ends a run, looked at in every sample
     packed.py    messages of a recording's chunk, and their packed lists
-    counting.py  average cycles and distributions of long recordings
 """

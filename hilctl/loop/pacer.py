@@ -20,9 +20,6 @@ USUAL_MISSED_SHARE = 0.01
 _FOLLOW = 1.0 / 64.0
 _FEWEST_STALLS = 5  # one stall, however long, may be an accident; what goes on stalling is none
 _TIMER_ABSTIME = 1
-_LONGEST_SPIN_NS = 200_000
-_SPIN_SHARE = 0.6
-_SHORTEST_SLEPT_IN_NS = 40_000
 
 
 class _Timespec(ctypes.Structure):
@@ -66,41 +63,6 @@ class SystemClock:
                 return
             if code != errno.EINTR:
                 raise OSError(code, os.strerror(code))
-
-
-def spin_ns(period_ns: float) -> int:
-    """Return for how long a loop that spins is awake before each tick.
-
-    That is 0.2 ms, or so much of a shorter period that some of it is left to sleep in: a real-time
-    process that never sleeps is stopped by the kernel for 50 ms of each second. Where a sleep takes
-    as long as the period, it is all of it.
-    """
-    if period_ns < _SHORTEST_SLEPT_IN_NS:
-        return math.ceil(period_ns)
-    return min(_LONGEST_SPIN_NS, int(_SPIN_SHARE * period_ns))
-
-
-class SpinningClock(SystemClock):
-    """The same, but it is awake for some time before a time, and looks at the clock.
-
-    What a timer's interrupt and an idle CPU take to wake a thread, a tenth of a millisecond on a
-    virtual machine and more, is then no lateness.
-
-    Args:
-        awake_ns: For how long; see :func:`spin_ns`.
-    """
-
-    def __init__(self, awake_ns: int) -> None:
-        super().__init__()
-        self._awake_ns = awake_ns
-
-    def sleep_until_ns(self, deadline_ns: int) -> None:
-        """Sleep, then spin, until ``deadline_ns``; return at once where that is past."""
-        now_ns, awake_from_ns = self.now_ns, deadline_ns - self._awake_ns
-        if awake_from_ns > now_ns():
-            super().sleep_until_ns(awake_from_ns)
-        while now_ns() < deadline_ns:
-            pass
 
 
 @dataclass(slots=True)

@@ -34,8 +34,6 @@ PRIORITY_REMEDY = (
 _HEAP_BYTES = 2 << 20
 _HEADROOM_BYTES = 256 << 20
 _FAVOURED_NICE = -10
-_FIRST_NICE = -20
-_AT_MOST = "at most"
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,11 +148,9 @@ def _pin(settings: "Realtime", system: System) -> SetUpStep:
     return _step("cpu", f"CPU {cpu}", lambda: system.pin(cpu), remedy)
 
 
-def _set_fifo(settings: "Realtime", system: System, *, never_sleeps: bool) -> SetUpStep:
+def _set_fifo(settings: "Realtime", system: System) -> SetUpStep:
     priority = settings.priority
     throttling = _throttling(system)
-    if never_sleeps and throttling.startswith(_AT_MOST):
-        return _come_first(throttling, system)
     try:
         system.set_fifo(priority)
     except OSError as error:
@@ -168,37 +164,24 @@ def _set_fifo(settings: "Realtime", system: System, *, never_sleeps: bool) -> Se
     return SetUpStep("fifo", "done", f"SCHED_FIFO {priority}{throttling and ', '}{throttling}")
 
 
-def _come_first(throttling: str, system: System) -> SetUpStep:
-    """Put an ordinary process before all others: a real-time one that never sleeps is stopped.
-
-    The kernel takes its CPU for 50 ms of each second, so that others get their turn.
-    """
-    instead = _step("nice", f"nice {_FIRST_NICE}", lambda: system.set_nice(_FIRST_NICE)).detail
-    detail = f"it never sleeps, and SCHED_FIFO gets {throttling}; instead, {instead}"
-    return SetUpStep("fifo", "not asked", detail, f"write -1 to {RT_RUNTIME}")
-
-
 def _throttling(system: System) -> str:
     """Return what the kernel leaves to real-time work, in words; empty where it does not say."""
     with suppress(OSError, ValueError):
         runtime_us = int(system.read(RT_RUNTIME))
         period_us = int(system.read(RT_PERIOD))
-        return f"{_AT_MOST} {runtime_us} of {period_us} us" if runtime_us >= 0 else "no throttling"
+        return f"at most {runtime_us} of {period_us} us" if runtime_us >= 0 else "no throttling"
     return ""
 
 
 _THIS_PROCESS = LinuxProcess()
 
 
-def prepare(
-    settings: "Realtime", system: System = _THIS_PROCESS, *, never_sleeps: bool = False
-) -> tuple[SetUpStep, ...]:
+def prepare(settings: "Realtime", system: System = _THIS_PROCESS) -> tuple[SetUpStep, ...]:
     """Take every step that is allowed; call it last, when all memory is mapped and warm.
 
     Args:
         settings: What the experiment asks for.
         system: The operating system.
-        never_sleeps: Whether the process is awake all the time.
 
     Returns:
         The steps in the order in which they were tried.
@@ -222,7 +205,7 @@ def prepare(
             'a udev rule: KERNEL=="cpu_dma_latency", GROUP="realtime", MODE="0660"',
         ),
         _pin(settings, system),
-        _set_fifo(settings, system, never_sleeps=never_sleeps),
+        _set_fifo(settings, system),
     )
 
 
@@ -243,23 +226,6 @@ def require(steps: Sequence[SetUpStep]) -> None:
     if lines := refusals(steps):
         raise InputError(
             "real time is required and can't be had; nothing has moved\n" + "\n".join(lines)
-        )
-
-
-def require_another_cpu(settings: "Realtime", cpus: int) -> None:
-    """Refuse to spin on the only CPU, where nobody could end the run any more.
-
-    Args:
-        settings: What the experiment asks for.
-        cpus: How many this process may use.
-
-    Raises:
-        InputError: It is the only one.
-    """
-    if settings.wait == "spin" and cpus < 2:
-        raise InputError(
-            "realtime.wait: spin takes a CPU for the loop alone, and this process may use only one:"
-            " nothing has moved. Give it another, or set realtime.wait to sleep"
         )
 
 

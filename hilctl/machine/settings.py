@@ -16,9 +16,6 @@ class Realtime(Strict):
         priority: Its SCHED_FIFO priority.
         cpu: CPU that it runs on; ``none`` takes the first isolated one, or else leaves it open.
         require: Whether a run without SCHED_FIFO and locked memory is refused.
-        wait: How it waits for a tick: ``sleep``, or ``spin``, which wakes up to 0.2 ms early
-            and looks at the clock all the time until then. No timer wakes it late so, but it takes
-            most of a CPU, and another one has to be left for all the rest.
     """
 
     priority: Annotated[int, Field(ge=1, le=98)] = 80
@@ -30,4 +27,3 @@ class Realtime(Strict):
         ),
     ] = None
     require: bool = False
-    wait: Literal["sleep", "spin"] = "sleep"

@@ -160,8 +160,9 @@ class PendingFile:
             sync: Whether to wait until the disk itself has the whole file.
 
         Raises:
-            OSError: The disk refuses them; they stay pending. Or it has lost earlier bytes, which
-                the kernel reports with the first sync after it: then every flush fails.
+            OSError: The disk refuses them, or the file was deleted, renamed or truncated (ESTALE);
+                they stay pending. Or the disk has lost earlier bytes, which the kernel reports with
+                the first sync after it: then every flush fails.
         """
         if self._lost is not None:
             raise self._lost
@@ -169,6 +170,7 @@ class PendingFile:
         data = b"".join(self._pending)
         self._pending = [data]
         try:
+            self._check_file()
             self._raw.seek(self._written)
             done = 0
             while done < len(data):
@@ -183,6 +185,17 @@ class PendingFile:
         self._synced = self._written if sync else self._synced
         self._drop_pending()
         self.problem = ""
+
+    def _check_file(self) -> None:
+        own = os.fstat(self._raw.fileno())
+        try:
+            same = os.path.samestat(own, os.stat(self._raw.name))  # noqa: PTH116  maybe a descriptor
+        except FileNotFoundError:
+            same = False
+        if not same:
+            raise OSError(errno.ESTALE, "the file was deleted or renamed")
+        if own.st_size < self._written:  # a write behind its end would leave a hole
+            raise OSError(errno.ESTALE, "the file was truncated")
 
     def _sync(self) -> None:
         try:
@@ -211,7 +224,8 @@ class PendingFile:
     def abandon(self) -> None:
         """Close the file as the last complete :meth:`flush` left it."""
         with suppress(OSError):  # recovery copes with half a chunk as well
-            self._raw.truncate(self._written)
+            if os.fstat(self._raw.fileno()).st_size > self._written:
+                self._raw.truncate(self._written)
         with suppress(OSError):
             self._raw.close()
 
@@ -261,7 +275,7 @@ class OutputFile:
         self.stream = PendingFile(raw, sync=sync)
 
     def begin(self) -> PendingFile:
-        """Empty the file and return it; may be called again to begin anew."""
+        """Empty the file and return it."""
         self.stream.clear()
         return self.stream
 

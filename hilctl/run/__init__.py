@@ -18,7 +18,6 @@ reference_window.py  a reference that is longer than memory, worked out ahead of
 ring.py            sample blocks in shared memory, behind shared_page.py
 recorder.py        into the recording; metadata.py what it says of the run, end_figures.py of
                    what came out
-kept_file.py       a file that somebody takes away while it is written
 ring_recorder.py   from the ring into it, in a thread of its own; progress.py  for who looks on
 run_folder.py      runs that are going on, and who holds a device
 description.py     what a run says of itself to those who look on
@@ -32,5 +31,5 @@ probe.py           whether a device answers, and whether that can be true
 orphans.py         what dead runs left behind; dead_runs.py  finished before anything is read
 by_hand.py         a device put at its safe value with no run
 unpaced.py         a run of a simulated device that needs no real time
-result.py          where a run stands, and how it ended; end_commands.py  programs that are told so
+result.py          where a run stands, and how it ended
 """

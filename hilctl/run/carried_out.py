@@ -12,7 +12,7 @@ from hilctl.base.errors import HilctlError, InputError, RunError
 from hilctl.experiment.condition import conditioning_of
 from hilctl.experiment.run_parts import RunParts
 from hilctl.loop.loop import Loop
-from hilctl.loop.pacer import SpinningClock, SystemClock, spin_ns
+from hilctl.loop.pacer import SystemClock
 from hilctl.loop.plan import Outcome
 from hilctl.loop.safe_output import SafeGoal, describe, drive_to_safe
 from hilctl.machine.memory import ProcessMemory
@@ -20,7 +20,6 @@ from hilctl.machine.realtime import (
     prepare,
     refusals,
     require,
-    require_another_cpu,
     step_facts,
 )
 from hilctl.machine.usage import ProcessUsage
@@ -89,10 +88,7 @@ def run_job(
         HilctlError: It could not start, or broke; the output was put at its safe value.
     """
     config, device, page = parts.config, parts.device, ring.page
-    period_ns = config.tick_s * 1e9
-    awake_ns = spin_ns(period_ns) if config.realtime.wait == "spin" else 0
-    clock = SpinningClock(awake_ns) if awake_ns else SystemClock()
-    host = RingHost(ring, clock, job.supervisor, job.silence_s)
+    host = RingHost(ring, SystemClock(), job.supervisor, job.silence_s)
     conditioning = conditioning_of(parts, job.stands_um)
     reference, input_um = job.arrays()
     plan = assemble(
@@ -106,10 +102,9 @@ def run_job(
         heat_a2=job.heat_a2,
     )
     loop = Loop(plan, device, host)
-    require_another_cpu(config.realtime, len(os.sched_getaffinity(0)))
     # After the warm-up, so that all it has mapped gets locked; before the device is opened, so that
     # a refusal moves nothing.
-    steps = prepare(config.realtime, never_sleeps=awake_ns >= period_ns)
+    steps = prepare(config.realtime)
     if config.realtime.require:
         require(steps)
     device.open(config.sample_rate_hz, config.block)

@@ -1,5 +1,6 @@
 """The recording side of a run: claims the file, writes batches, retries what a disk refuses."""
 
+import errno
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -24,7 +25,6 @@ from hilctl.recording.facts import HEAT_FACT
 from hilctl.recording.messages import RecordingLayout
 from hilctl.recording.writer import OutputFile, RecordingWriter, RunFacts
 from hilctl.run.end_figures import EndFigures
-from hilctl.run.kept_file import is_emptied, put_back
 from hilctl.run.metadata import run_facts
 
 _SAMPLES_BEFORE = 50
@@ -49,13 +49,11 @@ class Recorder:
 
     def __init__(self, checked: Checked, path: Path, *, overwrite: bool) -> None:
         self.path = path
-        self.notes: list[str] = []
-        """What was done to the file while it was written, for people."""
         self.adapted: Mapping[str, float] = {}
         """Values of the newest event of adaptation."""
         self._failed = self._problem = ""
         self._next_sample = 0
-        self._flushed = self._had_bytes = 0
+        self._flushed = 0
         self._checked = checked
         self._writer: RecordingWriter | None = None
         self._unix_ns = steady_unix_ns()
@@ -90,17 +88,14 @@ class Recorder:
         try:
             # Before the file is opened for writing: that empties one which stood there.
             self._run = self._facts(start_unix_ns, set_up, waveform_at)
-            self._start_anew(self._run)
+            self._writer = RecordingWriter(self._file.begin(), self._run)
         except OSError as error:
             raise self._unwritable(error) from None
-        # What was taken away since it was claimed is noticed before anything moves.
+        compensated = self._checked.loaded.model is not None
+        self._figures = EndFigures(self._run.segments, compensated=compensated)
+        # Before anything moves: the file may have been deleted since it was claimed.
         if not self.flush():
             raise InputError(self.error)
-
-    def _start_anew(self, run: RunFacts) -> None:
-        self._writer = RecordingWriter(self._file.begin(), run)
-        compensated = self._checked.loaded.model is not None
-        self._figures = EndFigures(run.segments, compensated=compensated)
 
     def give_back(self) -> None:
         """Leave no file behind where there was none: the run does not start."""
@@ -160,7 +155,7 @@ class Recorder:
         return f"{self.path}: can't be written: {why}"
 
     def flush(self) -> bool:
-        """Hand all that was written to the kernel, and see to it that the file is still there.
+        """Hand all that was written to the kernel.
 
         Returns:
             Whether all of it is in the file. Otherwise it is kept for the next flush.
@@ -171,59 +166,21 @@ class Recorder:
             self._begun.flush()
             # Should a later write fail, no more than this is sure to be there.
             self._flushed = self._begun.samples
-            self._had_bytes = self._file.stream.tell()
-            done = self._stays()
         except OSError as error:
-            self._problem = self._problem or self._cannot(error.strerror)
+            self._note_problem(error)
             return False
         if self._problem:
             text = f"written again, nothing is lost: {self._problem}"
-            self._record("warning", "recording_retried", text)
+            sample = max(0, self._next_sample - 1)
+            event = Event(sample, "warning", "recording_retried", text, time_ns=self._unix_ns())
+            self._write(partial(self._begun.event, event))
             self._problem = ""
-        if done:
-            self._note("recording_moved", done)
         return True
 
-    def _stays(self) -> str:
-        """See to it that the file stands under its name; return what was done for it."""
-        try:
-            self.path, done = put_back(self.path, self._file.stream.fileno())
-        except OSError as error:
-            self._flushed = 0  # it stands under no name: nobody can read what is in it
-            error.strerror = f"somebody has taken it away: {error.strerror}"
-            raise
-        return f"the recording {done}" if done else ""
-
-    def begin_anew(self) -> bool:
-        """Begin again if somebody has emptied the file, because nothing in it can be read.
-
-        Returns:
-            Whether that was so: then all samples since the last flush have to be written again.
-        """
-        # Before a flush: what it writes would hide that the file is shorter than it was.
-        try:
-            emptied = is_emptied(self._file.stream.fileno(), self._had_bytes)
-        except OSError:  # the next write tells
-            return False
-        if self._failed or not emptied:
-            return False
-        assert self._run is not None
-        lost = self._flushed
-        self._start_anew(self._run)
-        self._tail = Tail(_SAMPLES_BEFORE)
-        self._flushed = self._had_bytes = 0
-        text = f"somebody has emptied the recording: {lost} samples that were in it are lost"
-        self._note("recording_emptied", text)
-        return True
-
-    def _note(self, code: str, text: str) -> None:
-        self.notes.append(text)
-        self._record("error", code, text)
-
-    def _record(self, level: str, code: str, text: str) -> None:
-        sample = max(0, self._next_sample - 1)
-        event = Event(sample, level, code, text, time_ns=self._unix_ns())
-        self._write(partial(self._begun.event, event))
+    def _note_problem(self, error: OSError) -> None:
+        if error.errno == errno.ESTALE:
+            self._flushed = 0  # under its name nobody can read what is in it
+        self._problem = self._problem or self._cannot(error.strerror)
 
     def finish(
         self, end: Mapping[str, str], ended_at: int, patience_s: float = _PATIENCE_S
@@ -240,7 +197,7 @@ class Recorder:
             flush left it.
         """
         self._next_sample = max(self._next_sample, ended_at)
-        self.flush()  # it sees to a file that was taken away, for the last time
+        self.flush()
         level = "info" if end["code"] == "completed" else "error"
         now_ns = self._unix_ns()
         facts = {**end, **self._gathered.facts(), "ended": iso_time(now_ns)}
@@ -271,12 +228,10 @@ class Recorder:
         if self._failed:
             return False
         try:
-            self._file.stream.flush()
-            self._stays()
             self._file.stream.flush(sync=True)
             sync_folder(self.path.parent)
         except OSError as error:
-            self._problem = self._cannot(error.strerror)
+            self._note_problem(error)
             return False
         with suppress(OSError):  # all of it is on the disk
             self._file.stream.close()

@@ -1,29 +1,12 @@
 """Where a run stands, and how it ended, for those who show it."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from hilctl.base.samples import Batch
 from hilctl.loop.safe_output import OutputState
-
-
-@dataclass(frozen=True, slots=True)
-class EndCommandResult:
-    """What became of a program that was started once a run was over.
-
-    Attributes:
-        command: The program and its arguments.
-        exit_code: Its exit code, minus the signal that ended it; None where it did not start.
-        took_s: Time that it took.
-        error: What was wrong, or what it said last where its exit code was not 0; else empty.
-    """
-
-    command: tuple[str, ...]
-    exit_code: int | None
-    took_s: float
-    error: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +25,6 @@ class RunResult:
         deadline_misses: How many were skipped of all, for people; empty where none was.
         adapted: What adaptation made of the model by the end, by name, see
             :data:`hilctl.base.events.ADAPTED`; empty without it.
-        on_end: What became of what was started once it was over.
         guardian_active: Whether a guardian still drives the output to its safe value.
     """
 
@@ -56,7 +38,6 @@ class RunResult:
     late_ticks: int
     deadline_misses: str = ""
     adapted: Mapping[str, float] = field(default_factory=dict)
-    on_end: tuple[EndCommandResult, ...] = ()
     guardian_active: bool = False
 
     @property
@@ -77,7 +58,6 @@ class RunResult:
             "guardian_active": self.guardian_active,
             "deadline_misses": self.deadline_misses,
             "adapted": dict(self.adapted),
-            "on_end": [asdict(each) for each in self.on_end],
         }
 
 

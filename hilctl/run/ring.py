@@ -89,7 +89,7 @@ class SampleRing:
         self._area = self._views(state_size)
         self._heads = memoryview(self._area.heads.data.cast("B")).cast("q")
         self._spares_used = 0
-        self._tail = self._safe = self._released = self.page.get(Field.TAIL)
+        self._tail = self._released = self.page.get(Field.TAIL)
 
     @classmethod
     def create(
@@ -242,11 +242,6 @@ class SampleRing:
         self._tail += count
         return batch
 
-    def take_again(self) -> None:
-        """Let all that was taken and is not safe be taken once more."""
-        self._tail = self._safe
-        self.page.take_events_again()
-
     def skip_damaged(self) -> int:
         """Pass over blocks that will never come out; for when the producer has ended.
 
@@ -305,7 +300,6 @@ class SampleRing:
             keep: Newest blocks that stay for those who look on, until the next time.
         """
         self.page.release_events()
-        self._safe = self._tail
         until = max(self._released, self._tail - keep)
         # Said first: who looks on must not take a block that is cleaned under its copy for whole.
         self.page.publish(Field.CLEANED, until)

@@ -101,10 +101,8 @@ class RingRecorder:
         self._drain()
         if self.stalled_s() < self._flush_s:
             return
-        if self.recorder.begin_anew():
-            self._ring.take_again()
         # Room is given back only once the file has what stood there.
-        elif self.recorder.flush():
+        if self.recorder.flush():
             self._ring.release(keep=self._ring.slots // _KEPT)
             self._released_s = time.monotonic()
 
@@ -135,9 +133,6 @@ class RingRecorder:
         outcome, page, recorder = self._outcome, self._ring.page, self.recorder
         assert outcome is not None
         self._drain_all()
-        if recorder.begin_anew():
-            self._ring.take_again()
-            self._drain_all()
         while self._ring.skip_damaged():  # no more will come: take what stands behind them
             self._drain_all()
         if self._lost_loop:

@@ -405,10 +405,6 @@ class SharedPage:
         """Give the room of all events that were taken back to the loop: they are safe elsewhere."""
         self.publish(Field.EVENT_TAIL, self._event_tail)
 
-    def take_events_again(self) -> None:
-        """Let all events that were taken and not released be taken once more."""
-        self._event_tail = self.get(Field.EVENT_TAIL)
-
     def _write(self, at: int, size: int, text: str) -> None:
         raw = text.encode()[: size - 8].decode(errors="ignore").encode()
         self._map[at + 8 : at + 8 + len(raw)] = raw

@@ -12,7 +12,6 @@ from hilctl.base.remedy import reason
 from hilctl.experiment.check import Checked, check
 from hilctl.experiment.load import input_files, load_experiment
 from hilctl.run.architecture import require_linux
-from hilctl.run.end_commands import with_end_commands
 from hilctl.run.own_process import has_threads, run_in_own_process
 from hilctl.run.result import Progress, RunResult
 from hilctl.run.waiting_loop import started_ahead
@@ -101,8 +100,7 @@ def _run(
     if checked.begun.begins and checked.loaded.device.info.holds:
         _log.warning("the compensator begins %s", checked.begun.begins)
     output = output_of(checked, output)
-    result = Supervisor(checked, output, overwrite=overwrite, on_progress=on_progress).run()
-    return with_end_commands(result, checked.loaded)
+    return Supervisor(checked, output, overwrite=overwrite, on_progress=on_progress).run()
 
 
 def default_output(name: str, folder: Path, now: time.struct_time) -> Path:

@@ -291,19 +291,18 @@ class Supervisor:
         cut = ""
         if recorder.error:
             cut = f"; {recorder.missing} samples are not in the recording: {recorder.error}; "
-            cut += f"what memory holds of them is kept in {folder.path}: once the disk accepts it, "
-            cut += "any hilctl command adds it"
+            cut += f"what memory holds of them is kept in {folder.path}: any hilctl command adds "
+            cut += "it once the file can be written"
         broke = f"; the supervisor broke: {started.broke}" if started.broke else ""
-        moved = "".join(f"; {note}" for note in recorder.notes)
         unasked = outcome.code == "stopped" and not stop_signal
-        fault = recorder.error or recorder.notes or started.broke or unasked
+        fault = recorder.error or started.broke or unasked
         code = "fault" if fault else outcome.code
         skipped = ring.page.lateness().skipped_ticks
         due = (recorder.samples + recorder.missing) // self._config.block
         return RunResult(
             path=recorder.path,
             code=code,
-            reason=outcome.reason + broke + moved + cut,
+            reason=outcome.reason + broke + cut,
             output_state=outcome.output,
             guardian_active=guarded,
             stop_signal=stop_signal if code == "stopped" else 0,

@@ -101,7 +101,7 @@ def test_folder_that_is_deleted_while_a_run_starts(tmp_path, device, inside):
         _, err = process.communicate(timeout=240)
     # Inside, it depends on how far it has come which of the two is noticed first.
     gone = "hilctl: the folder that it is started in has been deleted: change to another one"
-    taken = "run.mcap: can't be written: somebody has taken it away: No such file or directory"
+    taken = "run.mcap: can't be written: the file was deleted or renamed"
     (line,) = err.splitlines()
     assert line.endswith(taken) or (inside and line == gone)
     assert process.returncode in {2, 3}

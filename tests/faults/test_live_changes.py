@@ -1,7 +1,6 @@
 """A compensated run that is changed, marked, watched and stopped from outside."""
 
 import itertools
-import json
 import subprocess
 import sys
 from pathlib import Path
@@ -21,15 +20,10 @@ CHANGES = {"sample_rate_hz": 10000, "block": 20, "recording": {"flush_s": 0.2, "
 
 
 def experiment(folder):
-    """Write the demo at a rate that a busy machine keeps, with programs for its end."""
+    """Write the demo at a rate that a busy machine keeps."""
     made = yaml.safe_load((CONFIGS / "demo.yaml").read_text(encoding="utf-8")) | CHANGES
     made["waveform"] |= {"frequency_hz": 20.0, "duration_s": 60.0}
     made["compensator"]["model"] = str(CONFIGS / "models" / "terfenol_staged.yaml")
-    told = folder / "told.json"
-    made["on_end"] = [
-        {"command": ["sh", "-c", f"cat > {told}"]},
-        {"command": ["sleep", "60"], "timeout_s": 0.2},
-    ]
     path = folder / "experiment.yaml"
     path.write_text(yaml.safe_dump(made), encoding="utf-8")
     return path
@@ -71,25 +65,3 @@ def test_a_run_is_switched_marked_watched_and_stopped(recording):
     assert replay(left).identical
     step = np.abs(np.diff(left.samples.command)).max() * left.sample_rate_hz
     assert step <= 20_000.0
-
-
-def test_programs_get_the_result_and_one_that_hangs_is_ended(recording):
-    """Once the run is over: its folder is gone before, and its recording whole."""
-    assert hilctl("stop")["ended"]
-    beside = recording.with_name("run.on_end.json")
-    for _ in range(200):
-        if beside.exists():
-            break
-        subprocess.run(["sleep", "0.05"], check=True)
-    first, second = json.loads(beside.read_text())["on_end"]
-    assert (first["exit_code"], second["error"]) == (0, "killed after 0.2 s")
-    told = json.loads((recording.parent / "told.json").read_text())
-    assert (told["code"], told["output"]) == ("stopped", str(recording))
-    assert told["recorded_samples"] == read(recording).samples.index.size
-
-
-def test_a_program_that_is_not_there_is_found_before_anything_moves(tmp_path):
-    path = experiment(tmp_path)
-    setting = "on_end=[{command: [no-such-program]}]"
-    said = hilctl("check", path, "--set", setting, code=2)
-    assert "on_end.0.command: must begin with a program that can be run" in said

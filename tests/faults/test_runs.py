@@ -304,31 +304,39 @@ def test_a_display_that_fails_costs_no_run(tmp_path, how):
     assert said == (["progress_failed"] if how == "raises" else []) + ["run_ended"]
 
 
-@pytest.mark.parametrize("how", ["deleted", "renamed", "emptied"])
-def test_a_recording_that_is_taken_away_is_kept(tmp_path, how):
-    """The run goes on, says so, and leaves a recording with all that can be had."""
+@pytest.mark.parametrize("how", ["deleted", "renamed", "truncated"])
+@pytest.mark.parametrize("on_failure", ["stop", "go_on"])
+def test_if_the_recording_is_gone_the_run_is_a_fault(tmp_path, how, on_failure):
+    """It ends by its safe ramp, or goes on; what the ring holds is kept."""
+    output, moved = tmp_path / "run.mcap", tmp_path / "moved.mcap"
     done = []
 
     def take_away(progress):
-        path = tmp_path / "run.mcap"
-        if done or path.stat().st_size < 100_000:
+        if done or output.stat().st_size < 100_000:
             return
         done.append(how)
         if how == "deleted":
-            path.unlink()
+            output.unlink()
         elif how == "renamed":
-            path.rename(tmp_path / "moved.mcap")
+            output.rename(moved)
         else:
-            os.truncate(path, 0)
+            os.truncate(output, 0)
 
-    result, recording = supervised(tmp_path, take_away, waveform=short(5.0))
+    changes = {"waveform": short(5.0)}
+    changes["recording"] = {"flush_s": 0.1, "ring_s": 2.0, "on_failure": on_failure}
+    checked = checked_experiment(experiment(tmp_path, **changes), ())
+    result = Supervisor(checked, output, overwrite=False, on_progress=take_away).run()
     assert done
-    assert result.code == "fault"
-    assert how in result.reason
-    assert result.safe
-    index = recording.samples.index
-    assert np.array_equal(index, np.arange(index[0], index[-1] + 1))
-    assert recording.dropped == result.missing == index[0]
-    assert (index[0] > 0) == (how == "emptied")
-    assert recording.end["reason"] == "waveform completed"
-    assert replay(recording).identical
+    assert (result.code, result.output_state) == ("fault", "confirmed")
+    assert ("truncated" if how == "truncated" else "deleted or renamed") in result.reason
+    assert result.reason.startswith("waveform completed") == (on_failure == "go_on")
+    (left,) = runs()
+    assert str(left.path) in result.reason
+    if how == "renamed":
+        moved.rename(output)
+    (orphan,) = recover_orphans()
+    assert (orphan.kept is None) == (how == "renamed")
+    if how == "renamed" and on_failure == "stop":
+        recording = read(output)
+        assert recording.dropped == 0
+        assert replay(recording).identical

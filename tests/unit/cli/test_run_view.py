@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from hilctl.cli.run_view import LiveView, print_run, report_of, run_mapping
-from hilctl.run.result import EndCommandResult, RunResult
+from hilctl.run.result import RunResult
 
 ENDED = RunResult(Path("a.mcap"), "stopped", "stopped by hilctl stop", "confirmed", 15, 0, 3, 2)
 
@@ -22,7 +22,6 @@ def test_a_program_reads_how_the_run_ended():
         "guardian_active": False,
         "deadline_misses": "",
         "adapted": {},
-        "on_end": [],
     }
 
 
@@ -57,19 +56,3 @@ def test_what_was_adapted_is_said_of_a_run_without_a_report(capsys):
         RunResult(Path("a.mcap"), "completed", "", "confirmed", 0, 9, 0, 0, adapted=adapted), None
     )
     assert "adapted: offset +1.25 µm, gain 1.0200, weights -0.0050" in capsys.readouterr().out
-
-
-def test_what_became_of_programs_after_the_run_is_said(capsys):
-    """A failure is no fault of the run, and is not passed over either."""
-    ended = (
-        EndCommandResult(("mail", "lab"), 0, 0.31),
-        EndCommandResult(("lamp",), 3, 0.1, "no lamp"),
-        EndCommandResult(("chat",), None, 0.0, "it is not there any more"),
-    )
-    print_run(
-        RunResult(Path("a.mcap"), "completed", "", "confirmed", 0, 9, 0, 0, on_end=ended), None
-    )
-    shown = capsys.readouterr().out
-    assert "on_end: mail: exit code 0 after 0.3 s\n" in shown
-    assert "on_end: lamp: exit code 3 after 0.1 s: no lamp" in shown
-    assert "on_end: chat: did not start after 0.0 s: it is not there any more" in shown

@@ -586,11 +586,6 @@ def test_the_input_is_recorded_where_it_may_move() -> None:
         assert replace(plain, loaded=replace(plain.loaded, config=config)).records_input
 
 
-def test_commands_at_its_end_are_looked_at_before_it_starts() -> None:
-    (found,) = refusals(CURRENT, "on_end=[{command: [no-such-program]}]")
-    assert found.startswith("x.yaml: on_end.0.command: must begin with a program that can be run")
-
-
 def test_the_coil_is_cold_unless_something_says_otherwise(monkeypatch: pytest.MonkeyPatch) -> None:
     """The last run by what has cooled since, or whoever asks; the hotter counts."""
     assert checked(CURRENT).heat_a2 == 0.0

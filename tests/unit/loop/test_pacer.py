@@ -1,7 +1,6 @@
 """Pacing on absolute deadlines, with a clock that the test turns."""
 
 import errno
-from itertools import count
 
 import pytest
 
@@ -9,10 +8,8 @@ from hilctl.loop.pacer import (
     Lateness,
     LateRules,
     Pacer,
-    SpinningClock,
     SystemClock,
     deadline_misses,
-    spin_ns,
 )
 from tests.fakes import FakeClock
 
@@ -243,9 +240,9 @@ def test_slip_moves_the_grid():
     assert paced.late_ns == 0
 
 
-@pytest.mark.parametrize("clock", [SystemClock(), SpinningClock(100_000)])
-def test_system_clock_sleeps_to_a_deadline(clock):
+def test_system_clock_sleeps_to_a_deadline():
     """A sleep ends after its deadline, and one in the past at once."""
+    clock = SystemClock()
     deadline_ns = clock.now_ns() + 2_000_000
     clock.sleep_until_ns(deadline_ns)
     assert clock.now_ns() >= deadline_ns
@@ -277,45 +274,6 @@ def test_sleep_that_a_signal_interrupts_goes_on(monkeypatch):
     with pytest.raises(OSError, match="Invalid argument") as caught:
         clock.sleep_until_ns(2_000_000_001)
     assert caught.value.errno == errno.EINVAL
-
-
-AWAKE_NS = 30_000
-
-
-@pytest.mark.parametrize("ahead_ns", [AWAKE_NS + 1, AWAKE_NS, 0, -5])
-def test_a_clock_that_spins_sleeps_until_shortly_before_a_time_and_then_looks(
-    monkeypatch, ahead_ns
-):
-    """At a time that comes with each look, so that no sleep of the machine's is in it."""
-    clock, looks, slept_until = SpinningClock(AWAKE_NS), count(1_000_000, 50), []
-    now = next(looks)
-    monkeypatch.setattr(clock, "now_ns", lambda: next(looks))
-    monkeypatch.setattr(SystemClock, "sleep_until_ns", lambda _, to_ns: slept_until.append(to_ns))
-    deadline_ns = now + 50 + ahead_ns  # after the first look
-    clock.sleep_until_ns(deadline_ns)
-    assert slept_until == ([deadline_ns - AWAKE_NS] if ahead_ns > AWAKE_NS else [])
-    assert deadline_ns <= next(looks) - 50 <= max(deadline_ns, now + 100) + 50
-
-
-def test_a_clock_that_spins_ends_at_the_time_itself(monkeypatch):
-    """It looks once whether to sleep, and then until the time has come."""
-    clock, looks = SpinningClock(AWAKE_NS), iter([0, 99, 100])
-    monkeypatch.setattr(clock, "now_ns", lambda: next(looks))
-    clock.sleep_until_ns(100)
-    assert list(looks) == []
-
-
-@pytest.mark.parametrize(
-    ("rate_hz", "awake_ns"), [(100, 200_000), (1000, 200_000), (20_000, 30_000), (25_000, 24_000)]
-)
-def test_a_loop_that_spins_leaves_some_of_each_period_to_sleep_in(rate_hz, awake_ns):
-    """Else the kernel stops it; a long time awake before each tick gains nothing."""
-    assert spin_ns(1e9 / rate_hz) == awake_ns
-
-
-@pytest.mark.parametrize("rate_hz", [25_001, 50_000, 1e6])
-def test_a_period_too_short_to_sleep_in_is_spent_awake(rate_hz):
-    assert spin_ns(1e9 / rate_hz) >= 1e9 / rate_hz
 
 
 class TestTooLate:

@@ -21,7 +21,6 @@ from hilctl.machine.realtime import (
     favoured,
     prepare,
     require,
-    require_another_cpu,
     rt_group_runtime_us,
     step_facts,
 )
@@ -191,44 +190,6 @@ def test_throttling_is_reported(runtime, said):
     """The step says what share of a CPU the kernel leaves to real-time tasks."""
     files = {RT_RUNTIME: f"{runtime}\n", RT_PERIOD: "1000000\n"}
     assert said in by_name(prepare(Realtime(), FakeSystem(files=files)))["fifo"].detail
-
-
-THROTTLED = {RT_RUNTIME: "950000\n", RT_PERIOD: "1000000\n"}
-
-
-def test_a_loop_that_never_sleeps_comes_first_without_being_real_time():
-    """The kernel would keep it from its CPU for a twentieth of the time."""
-    system = FakeSystem(files=THROTTLED)
-    step = by_name(prepare(Realtime(), system, never_sleeps=True))["fifo"]
-    assert step.outcome == "not asked"
-    assert "at most 950000 of 1000000 us; instead, nice -20" in step.detail
-    assert "write -1 to" in step.remedy
-    assert system.nice_now == -20
-    assert not [each for each in system.asked if each[0] == "set_fifo"]
-
-
-def test_a_loop_that_never_sleeps_says_where_it_may_not_come_first():
-    system = FakeSystem(files=THROTTLED, refuses={"set_nice"})
-    step = by_name(prepare(Realtime(), system, never_sleeps=True))["fifo"]
-    assert step.detail.endswith("nice -20: Operation not permitted")
-
-
-@pytest.mark.parametrize(
-    ("files", "never_sleeps"),
-    [({}, True), ({**THROTTLED, RT_RUNTIME: "-1\n"}, True), (THROTTLED, False)],
-)
-def test_it_is_real_time_where_nothing_is_taken_from_it(files, never_sleeps):
-    system = FakeSystem(files=files)
-    steps = prepare(Realtime(wait="spin"), system, never_sleeps=never_sleeps)
-    assert by_name(steps)["fifo"].outcome == "done"
-    assert system.nice_now == 0
-
-
-def test_nobody_spins_on_the_only_cpu():
-    with pytest.raises(InputError, match="this process may use only one"):
-        require_another_cpu(Realtime(wait="spin"), 1)
-    require_another_cpu(Realtime(wait="spin"), 2)
-    require_another_cpu(Realtime(), 1)
 
 
 def test_a_control_group_without_share_is_named():

@@ -114,6 +114,35 @@ def test_what_is_abandoned_is_as_the_last_flush_left_it(pending):
     assert disk.closed
 
 
+@pytest.mark.parametrize("size", [0, 3])
+def test_nothing_is_written_behind_the_end_of_a_truncated_file(pending, size):
+    """It would leave a hole of zeros."""
+    file, _, path = pending
+    file.write(b"first")
+    file.flush()
+    os.truncate(path, size)
+    file.write(b"second")
+    with pytest.raises(OSError, match="truncated") as caught:
+        file.flush()
+    assert caught.value.errno == errno.ESTALE
+    file.abandon()
+    assert path.read_bytes() == b"first"[:size]
+
+
+def test_a_file_that_has_its_name_again_gets_what_it_lacks(pending):
+    file, _, path = pending
+    file.write(b"first")
+    path.rename(moved := path.with_name("moved"))
+    with pytest.raises(OSError, match="deleted or renamed"):
+        file.flush()
+    path.touch()  # another file in its place
+    with pytest.raises(OSError, match="deleted or renamed"):
+        file.flush()
+    moved.rename(path)
+    file.flush()
+    assert (file.problem, path.read_bytes()) == ("", b"first")
+
+
 class LossyDisk:
     """``os.fsync`` of a disk that loses, once, what it was not yet asked to keep."""
 

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import pytest
 
 from hilctl.base.errors import DeviceError, InputError, RunError
-from hilctl.loop.pacer import Lateness, SpinningClock, SystemClock
+from hilctl.loop.pacer import Lateness
 from hilctl.loop.plan import Outcome
 from hilctl.machine.realtime import SetUpStep
 from hilctl.machine.usage import ProcessUsage
@@ -66,9 +66,8 @@ class Prepared:
         memory = SimpleNamespace(release=lambda: self.device.events.append("small"))
         monkeypatch.setattr(carried_out, "ProcessMemory", lambda: memory)
 
-    def _prepare(self, settings, *, never_sleeps):
+    def _prepare(self, settings):
         assert settings is self.parts.config.realtime
-        self.never_sleeps = never_sleeps
         self.device.events.append("prepare")
         return self.steps
 
@@ -134,44 +133,6 @@ def test_nothing_is_compiled_any_more_when_the_device_is_open(prepared):
             made.job, made.ring, made.parts, lambda: made.device.events.append("compiled")
         )
     assert made.device.events[:4] == ["prepare", "open", "compiled", "small"]
-
-
-@pytest.mark.parametrize("wait", ["sleep", "spin"])
-def test_the_loop_waits_as_it_is_asked_to(prepared, monkeypatch, wait):
-    made, clocks = prepared(), []
-    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1})
-    realtime = made.parts.config.realtime.model_copy(update={"wait": wait})
-    object.__setattr__(made.parts.config, "realtime", realtime)
-    made.loop_does(lambda self, start_ns: clocks.append(type(self._host.clock)) or 1 / 0)
-    with pytest.raises(ZeroDivisionError):
-        made.run()
-    assert clocks == [SpinningClock if wait == "spin" else SystemClock]
-
-
-@pytest.mark.parametrize("awake_ns", [999_999, 1_000_000])
-def test_a_loop_that_never_sleeps_is_set_up_as_such(prepared, monkeypatch, awake_ns):
-    """Its period is 1 ms: 50 samples at 50 kHz."""
-    made, periods_ns, clocks = prepared(), [], []
-    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1})
-    monkeypatch.setattr(carried_out, "spin_ns", lambda ns: periods_ns.append(ns) or awake_ns)
-    realtime = made.parts.config.realtime.model_copy(update={"wait": "spin"})
-    object.__setattr__(made.parts.config, "realtime", realtime)
-    made.loop_does(lambda self, start_ns: clocks.append(self._host.clock._awake_ns) or 1 / 0)
-    with pytest.raises(ZeroDivisionError):
-        made.run()
-    assert periods_ns == [1e6]
-    assert clocks == [awake_ns]
-    assert made.never_sleeps == (awake_ns == 1_000_000)
-
-
-def test_spinning_on_the_only_cpu_is_refused_before_anything_is_touched(prepared, monkeypatch):
-    made = prepared()
-    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {3})
-    realtime = made.parts.config.realtime.model_copy(update={"wait": "spin"})
-    object.__setattr__(made.parts.config, "realtime", realtime)
-    with pytest.raises(InputError, match="only one"):
-        made.run()
-    assert made.device.events == []
 
 
 @pytest.mark.parametrize(("output", "ramps"), [(0.0, False), (5.0, True)])

@@ -244,43 +244,31 @@ def test_nothing_comes_before_the_first_sample():
     assert tail.up_to(102).index.tolist() == [100, 101, 102]
 
 
-@pytest.mark.parametrize("taken", ["deleted", "renamed"])
-def test_a_recording_that_is_taken_away_is_whole_in_the_end(checked, tmp_path, taken):
-    """Under its name, with every sample; it says what has happened to it."""
+@pytest.mark.parametrize(
+    ("take", "why"),
+    [
+        (Path.unlink, "deleted or renamed"),
+        (lambda path: path.rename(path.with_name("moved.mcap")), "deleted or renamed"),
+        (lambda path: os.truncate(path, 100), "truncated"),
+    ],
+    ids=["deleted", "renamed", "truncated"],
+)
+def test_if_the_recording_is_gone_the_run_is_a_fault_and_nothing_is_written(
+    checked, tmp_path, take, why
+):
+    """Nothing counts as recorded, so that the ring keeps all that it holds."""
     made = Recorder(checked, tmp_path / "run.mcap", overwrite=False)
     made.begin(10**18, {})
     made.batch(batch(0, 20))
     assert made.flush()
-    made.path.unlink() if taken == "deleted" else made.path.rename(tmp_path / "moved.mcap")
+    take(made.path)
+    left = {each.name: each.stat().st_size for each in tmp_path.iterdir()}
     made.batch(batch(200, 20))
-    assert made.flush()
-    made.finish(END, 400)
-    recording = read(tmp_path / "run.mcap")
-    assert np.array_equal(recording.samples.index, np.arange(400))
-    assert [event.code for event in recording.events] == ["recording_moved", "run_ended"]
-    assert taken in made.notes[0]
-    assert (made.error, made.samples, made.missing) == ("", 400, 0)
-
-
-def test_a_recording_that_is_emptied_begins_anew(checked, tmp_path):
-    """What had been handed over is lost and counted; what comes after stands in the same file."""
-    made = Recorder(checked, tmp_path / "run.mcap", overwrite=False)
-    made.begin(10**18, {})
-    made.batch(batch(0, 20))
-    assert made.flush()
-    assert not made.begin_anew()
-    made.path.open("wb").close()
-    made.batch(batch(200, 20))
-    assert made.begin_anew()
-    made.batch(batch(200, 20))
-    assert made.flush()
-    made.finish(END, 400)
-    recording = read(tmp_path / "run.mcap")
-    assert np.array_equal(recording.samples.index, np.arange(200, 400))
-    assert recording.dropped == made.missing == 200
-    assert made.notes == [
-        "somebody has emptied the recording: 200 samples that were in it are lost"
-    ]
+    assert not made.flush()
+    assert not made.finish(END, 400, patience_s=0.0)
+    assert why in made.error
+    assert (made.samples, made.missing) == (0, 400)
+    assert {each.name: each.stat().st_size for each in tmp_path.iterdir()} == left
 
 
 @pytest.fixture
@@ -291,34 +279,24 @@ def on_a_disk(checked, tmp_path):
     return Recorder(checked, folder / "run.mcap", overwrite=False)
 
 
-def test_a_recording_that_can_not_be_put_back_is_an_error(on_a_disk):
-    """What was in it is lost with it: nobody can read a file without a name."""
-    on_a_disk.begin(10**18, {})
-    on_a_disk.batch(batch(0, 20))
-    assert on_a_disk.flush()
-    assert (on_a_disk.samples, on_a_disk.missing) == (200, 0)
-    shutil.rmtree(on_a_disk.path.parent)
-    assert not on_a_disk.flush()
-    assert not on_a_disk.finish(END, 200, patience_s=0.0)
-    assert "somebody has taken it away: No such file or directory" in on_a_disk.error
-    assert (on_a_disk.samples, on_a_disk.missing) == (0, 200)
-
-
 def test_a_folder_that_comes_back_gets_the_recording(on_a_disk):
     """As that of a network drive does."""
+    folder = on_a_disk.path.parent
     on_a_disk.begin(10**18, {})
     on_a_disk.batch(batch(0, 20))
-    shutil.rmtree(on_a_disk.path.parent)
+    folder.rename(away := folder.with_name("away"))
     assert not on_a_disk.flush()
-    on_a_disk.path.parent.mkdir()
+    away.rename(folder)
     assert on_a_disk.finish(END, 200)
-    assert read(on_a_disk.path).samples.index.size == 200
+    recording = read(on_a_disk.path)
+    assert recording.samples.index.size == 200
+    assert [event.code for event in recording.events] == ["recording_retried", "run_ended"]
     assert (on_a_disk.error, on_a_disk.missing) == ("", 0)
 
 
-def test_a_recording_that_is_taken_away_before_the_start_is_refused(on_a_disk):
+def test_a_recording_that_is_deleted_before_the_start_is_refused(on_a_disk):
     """Claimed, and gone before anything has moved."""
     shutil.rmtree(on_a_disk.path.parent)
-    with pytest.raises(InputError, match="taken it away: No such file or directory"):
+    with pytest.raises(InputError, match="the file was deleted or renamed"):
         on_a_disk.begin(10**18, {})
     on_a_disk.give_back()

@@ -333,18 +333,6 @@ def test_a_block_that_is_cleaned_or_damaged_under_the_copy_is_left_out(tmp_path)
     assert (batch.heads[:, Head.FIRST_SAMPLE].tolist(), after) == ([6], 4)
 
 
-def test_what_is_safe_is_not_taken_again_though_it_stays(tmp_path):
-    ring = make(tmp_path, slots=4)
-    for number in range(2):
-        push(ring, number)
-    ring.pop()
-    ring.release(keep=1)
-    push(ring, 2)
-    ring.pop()
-    ring.take_again()
-    assert ring.pop().heads[:, Head.FIRST_SAMPLE].tolist() == [6]
-
-
 def test_cursors_are_published_after_what_they_say(tmp_path, monkeypatch):
     """Whoever observes them reads whole blocks, and writes into clean slots."""
     ring, seen = make(tmp_path), []

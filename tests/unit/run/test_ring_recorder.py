@@ -22,7 +22,7 @@ class Recorder:
         self.firsts, self.events, self.finished, self.errors = [], [], None, []
         self.disk = threading.Event()
         self.disk.set()
-        self.emptied = self.broken = self.refused = False
+        self.broken = self.refused = False
 
     @property
     def next_sample(self):
@@ -38,10 +38,6 @@ class Recorder:
 
     def note_device(self):
         self.noted = len(self.firsts)
-
-    def begin_anew(self):
-        emptied, self.emptied = self.emptied, False
-        return emptied
 
     def flush(self):
         assert self.disk.wait(30.0)
@@ -104,16 +100,6 @@ def test_a_loop_that_is_never_waited_for_keeps_no_sample_from_the_file(ring, rec
     numbers = recording.recorder.firsts
     assert numbers == list(range(len(numbers)))
     assert ring.pop() is None
-
-
-def test_what_an_emptied_file_has_lost_is_written_once_more(ring, recording):
-    exchange(ring, 2)
-    recording.recorder.emptied = True
-    recording._work()
-    assert ring.page.get(Field.TAIL) == 0
-    recording._work()
-    assert recording.recorder.firsts == [0, 1, 0, 1]
-    assert ring.page.get(Field.TAIL) == 1
 
 
 def test_what_the_disk_refuses_stays_in_the_ring(ring, recording, monkeypatch):

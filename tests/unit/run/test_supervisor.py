@@ -77,7 +77,7 @@ class Neighbours:
         self.checked = SimpleNamespace(loaded=loaded, state_size=1)
         self.output = folder / "run.mcap"
         self.recorder = SimpleNamespace(
-            path=self.output, samples=95, missing=5, error="", notes=[], adapted={},
+            path=self.output, samples=95, missing=5, error="", adapted={},
             begin=self.begin, give_back=lambda: self.note("given back"),
         )  # fmt: skip
         self.outcome, self.broke = (
@@ -437,23 +437,18 @@ def test_handlers_of_the_program_come_back(stage):
     assert signal.getsignal(STOP_SIGNAL) is own
 
 
-def wrong(stage, **changes):
-    for name, value in changes.items():
-        setattr(stage if hasattr(stage, name) else stage.recorder, name, value)
-
-
 @pytest.mark.parametrize(
     ("changes", "code", "reason"),
     [
         ({"broke": "a bug"}, "fault", "waveform completed; the supervisor broke: a bug"),
-        ({"notes": ["it was renamed"]}, "fault", "waveform completed; it was renamed"),
         ({"outcome": Outcome("stopped", "gone", 1, "confirmed", 0)}, "fault", "gone"),
         ({"outcome": Outcome("fault", "late", 1, "unknown", 0)}, "fault", "late"),
     ],
 )
 def test_how_it_ended(stage, changes, code, reason):
     """Whatever was not as it should be makes it a fault; a stop nobody asked for is one too."""
-    wrong(stage, **changes)
+    for name, value in changes.items():
+        setattr(stage, name, value)
     result = stage.run()
     assert (result.code, result.reason, result.stop_signal) == (code, reason, 0)
     assert result.safe == stage.outcome.safe
