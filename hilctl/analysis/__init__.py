@@ -16,6 +16,5 @@ run_page.py the page of a run; provenance.py  when, by whom and with what it was
 replay.py   the same commands again; predicted.py  the error of another model
 export.py   samples as a table; export_files.py  CSV, Parquet, NPZ, MAT; export_all.py  all
             recordings of a folder as one data set
-catalogue.py  the recordings below a folder, over catalogue_cache.py; run_entry.py  what is known
-            of each; where.py  conditions on them
+catalogue.py  the recordings in a folder, what is known of each, and conditions on them
 """

@@ -1,115 +1,179 @@
-"""All recordings below a folder, by head and tail of each; what was read once is kept in a cache.
+"""All recordings in a folder: read from head and tail of each file, searched with SQLite.
 
-The cache is this user's own, so that recordings may lie on a disk that is shared and can't be
-written. A file counts as known by its path, size and time. Only finished recordings are kept: of
-the others, the next look may find more.
+Each user has a cache of their own, so that recordings may be on a shared disk that is read-only. A
+file is known by its path, size and modification time. Only finished recordings are taken from the
+cache: the others may still change.
 """
 
+import hashlib
 import json
+import logging
+import math
 import os
+import re
+import sqlite3
 import stat
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import closing
+from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
-from hilctl.analysis.catalogue_cache import cache_file, merged, read_cache, write_cache
-from hilctl.analysis.run_entry import COLUMNS, OPTIONS, Entry, entry_of, unreadable
-from hilctl.analysis.where import RunCondition, check_names
-from hilctl.base.errors import InputError
-from hilctl.base.finite_json import finite_json
-from hilctl.recording.facts import LABELS_FACT
+from hilctl.base.errors import DataError, InputError
+from hilctl.base.printable import printable
+from hilctl.recording.facts import END_FIGURES, LABELS_FACT
 
-_LABEL = "label"
-_IN_JSON = {_LABEL: LABELS_FACT} | dict.fromkeys(OPTIONS, "options")
-_PLAIN = tuple(name for name in COLUMNS if name not in _IN_JSON.values())
+if TYPE_CHECKING:
+    from hilctl.base.segments import Segment
+
+_log = logging.getLogger(__name__)
+
+Entry: TypeAlias = dict[str, Any]
+"""One recording by the names of :data:`COLUMNS`; None where something is not known."""
+
+_RUN: dict[str, type] = {
+    **dict.fromkeys(("run_id", "name", "description", "started"), str),
+    **dict.fromkeys(("host", "hilctl", "device", "compensator", "command_unit"), str),
+    "simulated": bool,
+    "sample_rate_hz": float,
+}
+_END: dict[str, type] = {
+    **dict.fromkeys(("ended", "code", "reason"), str),
+    "output_safe": bool,
+    **dict.fromkeys(("recorded_samples", "missing_samples", "late_ticks", "skipped_ticks"), int),
+    **dict.fromkeys(END_FIGURES, float),
+}
+OPTIONS = ("device", "waveform")
+"""Facts of a run whose names begin so, and a point, are kept together in the column ``options``."""
+COLUMNS: dict[str, type] = {
+    "path": str,
+    "state": str,
+    "problem": str,
+    "size_bytes": int,
+    "mtime_ns": int,
+    **_RUN,
+    "waveform": str,
+    "frequency_hz": float,
+    "duration_s": float,
+    **_END,
+    LABELS_FACT: dict,
+    "options": dict,
+}
+"""Names and types of what is known of a recording.
+
+``path`` is relative to the folder that was listed, ``state`` that of
+:class:`hilctl.recording.ends.RecordingEnds`, or ``unreadable``, ``waveform`` what ran, for people,
+``frequency_hz`` the highest of all segments that repeat. All other names, except ``options``, are
+those of facts in a recording.
+"""
+
+_BOOLEANS = {"true": True, "false": False, "True": True, "False": False}
+_MOST_DIGITS = 15
+_OPTION_PREFIXES = tuple(f"{name}." for name in OPTIONS)
+_PREFIXES = ("label.", *_OPTION_PREFIXES)
+_SQL_TYPES = {str: "TEXT", int: "INTEGER", bool: "INTEGER", float: "REAL", dict: "TEXT"}
+_CREATE = "CREATE TABLE recordings ({})".format(
+    ", ".join(f"{name} {_SQL_TYPES[kind]}" for name, kind in COLUMNS.items())
+)
+_CACHE_VERSION = 1  # what the columns mean; a cache with other columns is not read either
+_TOKEN = re.compile(
+    r"""'[^']*' | "(?P<text>[^"]*)" | \[(?P<bracketed>[^]]*)\]
+    | \b(?P<dotted>(?:label|device|waveform)(?:\.\w+)+)""",
+    re.VERBOSE,
+)
 
 
-class Catalogue:
-    """The recordings below a folder, one row each, in the order of their paths.
+def keys_of(entries: Iterable[Entry]) -> list[str]:
+    """Return all keys of some recordings: columns, labels, options of devices and waveforms."""
+    plain = [name for name, kind in COLUMNS.items() if kind is not dict]
+    labels: set[str] = set()
+    options: set[str] = set()
+    for entry in entries:
+        labels.update(f"label.{key}" for key in entry[LABELS_FACT])
+        options.update(entry["options"])
+    return [*plain, *sorted(labels), *sorted(options)]
+
+
+def select(
+    entries: Sequence[Entry], where: str = "", sort: str = "started", *, reverse: bool = False
+) -> list[Entry]:
+    """Return the recordings that meet a condition, sorted.
 
     Args:
-        columns: Columns by the names of :data:`~hilctl.analysis.run_entry.COLUMNS`: lists, or what
-            has ``to_pylist``.
+        entries: The recordings.
+        where: A condition in the SQL of SQLite on the names of :func:`keys_of`; empty for all. A
+            text may be in double quotes too. A key that is not made of words is in square
+            brackets, as ``[label.batch no]``.
+        sort: Key to sort by; recordings without it are last.
+        reverse: Largest or newest first.
+
+    Raises:
+        InputError: The condition is not valid, or a key is unknown.
     """
+    names: set[str] = set()
+    condition, key = (_TOKEN.sub(partial(_as_sql, names), text) for text in (where, sort))
+    condition, direction = condition or "TRUE", "DESC" if reverse else "ASC"
+    order = f"({key}) IS NULL, ({key}) {direction}, path"
+    try:
+        with closing(_table(entries)) as db:
+            db.set_authorizer(_authorize)  # both texts can only read the table
+            met = {*db.execute(f"SELECT rowid FROM recordings WHERE ({condition}\n)")}  # noqa: S608
+            rows = [*db.execute(f"SELECT rowid FROM recordings ORDER BY {order}")]  # noqa: S608
+    except (sqlite3.Error, sqlite3.Warning, ValueError) as error:
+        given = f"--where '{where}' --sort '{sort}'" if where else f"--sort '{sort}'"
+        keys = ", ".join(keys_of(entries))
+        raise InputError(printable(f"{given}: {error}. The keys are: {keys}")) from None
+    for name in sorted(names.difference(keys_of(entries)) if names else ()):
+        _log.warning("no recording here has %s", printable(name))
+    return [entries[row[0] - 1] for row in rows if row in met]
 
-    def __init__(self, columns: Any) -> None:
-        self._columns = columns
-        self._values: dict[str, list[Any]] = {}
-        self._parsed: dict[str, list[dict[str, Any]]] = {}
 
-    def __len__(self) -> int:
-        return len(self._columns["path"])
+def _table(entries: Iterable[Entry], place: str = ":memory:") -> sqlite3.Connection:
+    """Return a new database with one row per recording, in their order."""
+    db = sqlite3.connect(place)
+    db.execute(_CREATE)
+    insert = f"INSERT INTO recordings VALUES ({', '.join('?' * len(COLUMNS))})"  # noqa: S608
+    db.executemany(insert, ([*map(_to_sql, entry.values())] for entry in entries))
+    db.commit()
+    return db
 
-    def column(self, key: str) -> list[Any]:
-        """Return the values of a key, one a row; None where a row has none."""
-        if key not in self._values:
-            self._values[key] = self._column(key)
-        return self._values[key]
 
-    def _column(self, key: str) -> list[Any]:
-        prefix, point, rest = key.partition(".")
-        if point:
-            name = rest if prefix == _LABEL else key
-            return [row.get(name) for row in self._mappings(_IN_JSON[prefix])]
-        column = self._columns[key]
-        values: list[Any] = column if isinstance(column, list) else column.to_pylist()
-        return values
+def _authorize(action: int, table: str | None, *_: str | None) -> int:
+    allowed = action in {sqlite3.SQLITE_SELECT, sqlite3.SQLITE_FUNCTION} or (
+        action == sqlite3.SQLITE_READ and table == "recordings"
+    )
+    return sqlite3.SQLITE_OK if allowed else sqlite3.SQLITE_DENY
 
-    def _mappings(self, name: str) -> list[dict[str, Any]]:
-        if name not in self._parsed:
-            self._parsed[name] = [json.loads(text or "{}") for text in self.column(name)]
-        return self._parsed[name]
 
-    def keys(self) -> list[str]:
-        """Return all keys that rows have: columns, labels, options of devices and waveforms."""
-        labels = {f"{_LABEL}.{key}" for row in self._mappings(LABELS_FACT) for key in row}
-        options = {key for row in self._mappings("options") for key in row}
-        return [*_PLAIN, *sorted(labels), *sorted(options)]
+def _as_sql(names: set[str], token: re.Match[str]) -> str:
+    """Return a token of a condition in SQL, and add keys of labels and options to the names."""
+    if token["text"] is not None:
+        return _quoted(token["text"])
+    key = token["bracketed"] or token["dotted"] or ""
+    if not key.startswith(_PREFIXES):
+        return token[0]
+    names.add(key)
+    column = LABELS_FACT if key.startswith("label.") else "options"
+    path = f'$."{key.removeprefix("label.")}"'
+    return f"json_extract({column}, {_quoted(path)})"
 
-    def rows(self, where: str = "", sort: str = "started", *, reverse: bool = False) -> list[int]:
-        """Return the numbers of the rows that match, in order.
 
-        Args:
-            where: A condition, see :class:`~hilctl.analysis.where.RunCondition`; empty for all.
-            sort: Key to sort by; rows that have none come last.
-            reverse: The other way round.
+def _quoted(text: str) -> str:
+    return "'" + text.replace("'", "''") + "'"
 
-        Raises:
-            InputError: The condition can't be read, or a key is none.
-        """
-        condition = RunCondition(where) if where else None
-        names = {sort, *(condition.names if condition else ())}
-        if not names <= set(_PLAIN):
-            check_names(names, self.keys(), [f"{prefix}." for prefix in _IN_JSON])
-        rows = list(range(len(self)))
-        if condition:
-            columns = {name: self.column(name) for name in condition.names}
-            rows = [k for k in rows if condition.matches({n: columns[n][k] for n in columns})]
-        values = self.column(sort)
-        known = [k for k in rows if values[k] is not None]
-        # Texts and numbers under one label can't be compared: numbers come first.
-        known.sort(key=lambda k: (isinstance(values[k], str), values[k]), reverse=reverse)
-        return known + [k for k in rows if values[k] is None]
 
-    def entry(self, row: int) -> Entry:
-        """Return all that is known of a recording, labels and options as mappings."""
-        plain = {name: self.column(name)[row] for name in _PLAIN}
-        return plain | {name: self._mappings(name)[row] for name in (LABELS_FACT, "options")}
+def _to_sql(value: Any) -> Any:
+    if isinstance(value, dict):
+        value = json.dumps(value, ensure_ascii=False)
+    # An escape in JSON of a recording may be half of a character, which is not valid UTF-8.
+    return value.encode(errors="backslashreplace").decode() if isinstance(value, str) else value
 
-    def json_lines(self, rows: Iterable[int]) -> Iterator[str]:
-        """Yield what :meth:`entry` returns as JSON."""
-        columns = [self.column(name) for name in _PLAIN]
-        texts = {name: self.column(name) for name in (LABELS_FACT, "options")}
-        for row in rows:
-            plain = dict(zip(_PLAIN, [values[row] for values in columns], strict=True))
-            line = finite_json(plain)[:-1]
-            for name, values in texts.items():
-                text = values[row] or "{}"
-                # It is JSON already, but of Python, which has numbers that are not finite; what is
-                # not ASCII may not be for every terminal.
-                plain_text = text.isascii() and "NaN" not in text and "Infinity" not in text
-                line += f', "{name}": {text if plain_text else finite_json(json.loads(text))}'
-            yield line + "}"
+
+def _from_sql(kind: type, value: Any) -> Any:
+    if kind is dict:
+        return json.loads(value)
+    return bool(value) if kind is bool and value is not None else value
 
 
 class Found(NamedTuple):
@@ -130,11 +194,11 @@ class Found(NamedTuple):
     problem: str = ""
 
 
-def read_catalogue(folder: Path) -> Catalogue:
-    """Return the catalogue of all ``.mcap`` files below a folder.
+def read_catalogue(folder: Path) -> list[Entry]:
+    """Return what is known of all ``.mcap`` files in a folder, at any depth, sorted by path.
 
     Raises:
-        InputError: It is no folder, or can't be listed.
+        InputError: It is not a folder, or cannot be listed.
     """
     try:
         folder = folder.resolve()
@@ -142,29 +206,61 @@ def read_catalogue(folder: Path) -> Catalogue:
             pass
     except OSError as error:
         raise InputError(f"{folder}: can't be listed: {error.strerror}") from None
-    cache = cache_file(folder)
-    table = read_cache(cache)
+    cache = _cache_file(folder)
     found = {(each.path, each.size_bytes, each.mtime_ns): each for each in _scan(str(folder), "")}
-    places = [] if table is None else [*zip(*_identities(table), strict=True)]
-    kept = [row for row, place in enumerate(places) if place in found]
-    for row in kept:
-        del found[places[row]]
-    if not found and len(kept) == len(places):
-        return Catalogue(table if table is not None else merged(None, [], _columns([])))
+    cached = _read_cache(cache)
+    kept = [entry for entry in cached if found.pop(_identity(entry), None)]
     new = [_entry(each) for each in found.values()]
     finished = [entry for entry in new if entry["state"] == "finished"]
-    if finished or len(kept) < len(places):
-        write_cache(cache, merged(table, kept, _columns(finished)))
-    return Catalogue(merged(table, kept, _columns(new)))
+    if finished or len(kept) < len(cached):
+        _write_cache(cache, [*kept, *finished])
+    return sorted([*kept, *new], key=lambda entry: entry["path"])
 
 
-def _identities(table: Any) -> Iterator[list[Any]]:
-    for name in ("path", "size_bytes", "mtime_ns"):
-        yield table[name].to_pylist()
+def _identity(entry: Entry) -> tuple[str, int, int]:
+    return entry["path"], entry["size_bytes"], entry["mtime_ns"]
 
 
-def _columns(entries: Sequence[Entry]) -> dict[str, list[Any]]:
-    return {name: [entry[name] for entry in entries] for name in COLUMNS}
+def _cache_file(folder: Path) -> Path | None:
+    """Return the cache file of a folder; None if this user has no home."""
+    given = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    try:
+        place = given if given.is_absolute() else Path.home() / ".cache"
+    except RuntimeError:
+        return None
+    key = f"{_CACHE_VERSION} {_CREATE} ".encode() + os.fsencode(folder)
+    return place / "hilctl" / f"recordings-{hashlib.sha256(key).hexdigest()[:32]}.sqlite"
+
+
+def _read_cache(path: Path | None) -> list[Entry]:
+    """Return the recordings in a cache; none if it is missing or damaged."""
+    if path is None:
+        return []
+    try:
+        # A cache file never changes: it is replaced as a whole.
+        with closing(sqlite3.connect(f"{path.as_uri()}?immutable=1", uri=True)) as db:
+            return [
+                {
+                    name: _from_sql(COLUMNS[name], value)
+                    for name, value in zip(COLUMNS, row, strict=True)
+                }
+                for row in db.execute("SELECT * FROM recordings")
+            ]
+    except (sqlite3.Error, ValueError):
+        return []
+
+
+def _write_cache(path: Path | None, entries: Sequence[Entry]) -> None:
+    if path is None:
+        return
+    try:
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        with TemporaryDirectory(dir=path.parent) as scratch:
+            new = Path(scratch, "new")
+            _table(entries, str(new)).close()
+            new.replace(path)
+    except (OSError, sqlite3.Error) as error:
+        _log.warning("cannot write the cache, recordings are read again next time: %s", error)
 
 
 def _entry(found: Found) -> Entry:
@@ -201,3 +297,84 @@ def _found(entry: "os.DirEntry[str]", path: str) -> Found:
         return Found(entry.path, path, 0, 0, f"can't be read: {error.strerror}")
     problem = "" if stat.S_ISREG(status.st_mode) else "is not a file"
     return Found(entry.path, path, status.st_size, status.st_mtime_ns, problem)
+
+
+def unreadable(path: str, size_bytes: int, mtime_ns: int, problem: str) -> Entry:
+    """Return the entry of what is no recording that can be read."""
+    known: Entry = {"path": path, "size_bytes": size_bytes, "mtime_ns": mtime_ns}
+    known |= {"state": "unreadable", "problem": problem, LABELS_FACT: {}, "options": {}}
+    return dict.fromkeys(COLUMNS) | known
+
+
+def entry_of(file: Path, path: str, size_bytes: int, mtime_ns: int) -> Entry:
+    """Return the entry of a file, by its head and its tail.
+
+    Args:
+        file: The file.
+        path: Its name in the catalogue.
+        size_bytes: Its size when it was found.
+        mtime_ns: Its time of modification then, in ns.
+    """
+    # What reads recordings takes a second to import: a catalogue that is known needs none of it.
+    from hilctl.recording.checks import labels_of
+    from hilctl.recording.ends import read_ends
+    from hilctl.recording.segments import segments_of
+
+    entry = unreadable(path, size_bytes, mtime_ns, "")
+    try:
+        ends = read_ends(file)
+        labels, segments = labels_of(ends.run), segments_of(ends.run.get("segments", "[]"))
+    except DataError as error:
+        return entry | {"problem": str(error).removeprefix(f"{file}: ")}
+    except ValueError as error:
+        return entry | {"problem": f"metadata hilctl.run: {error}"}
+    entry |= {"state": ends.state, "problem": ends.problem or None}
+    entry |= {name: _converted(kind, ends.run.get(name)) for name, kind in _RUN.items()}
+    entry |= {name: _converted(kind, ends.end.get(name)) for name, kind in _END.items()}
+    entry |= _of_segments(segments, entry["sample_rate_hz"])
+    samples = (entry["recorded_samples"] or 0) + (entry["missing_samples"] or 0)
+    if entry["sample_rate_hz"] and samples:
+        entry["duration_s"] = samples / entry["sample_rate_hz"]
+    entry[LABELS_FACT] = labels
+    entry["options"] = {
+        key: _plain(text)
+        for key, text in ends.run.items()
+        if key.startswith(_OPTION_PREFIXES) and text != "None"
+    }
+    return entry
+
+
+def _of_segments(segments: "Sequence[Segment]", sample_rate_hz: float | None) -> Mapping[str, Any]:
+    periods = [segment.period for segment in segments if segment.period > 0.0]
+    fastest_hz = sample_rate_hz / min(periods) if sample_rate_hz and periods else None
+    text = segments[0].label if segments else None
+    if len(segments) > 1:
+        text = f"{text} and {len(segments) - 1} more"
+    return {"waveform": text, "frequency_hz": fastest_hz}
+
+
+def _converted(kind: type, text: str | None) -> Any:
+    """Return a fact as a value; None where it is missing or none of that kind."""
+    if text is None or kind is str:
+        return text
+    if kind is bool:
+        return _BOOLEANS.get(text)
+    if kind is int:
+        return int(text) if text.isdecimal() and len(text) <= _MOST_DIGITS else None
+    try:
+        number = float(text)
+    except ValueError:
+        return None
+    return number if math.isfinite(number) else None
+
+
+def _plain(text: str) -> str | float | bool:
+    """Return a text as the number or truth value that it stands for, if it does for one."""
+    if text in _BOOLEANS:
+        return _BOOLEANS[text]
+    try:
+        value = json.loads(text)  # not float(): a serial number keeps the zeros before it
+    except (ValueError, RecursionError):
+        return text
+    number = isinstance(value, int | float) and abs(value) < math.inf
+    return value if number else text

@@ -14,10 +14,9 @@ from urllib.parse import quote
 
 import numpy as np
 
-from hilctl.analysis.catalogue import read_catalogue
+from hilctl.analysis.catalogue import Entry, read_catalogue
 from hilctl.analysis.export import columns, write_pieces
 from hilctl.analysis.export_files import Columns, ParquetFile, arrow
-from hilctl.analysis.run_entry import Entry
 from hilctl.base.errors import DataError, InputError
 from hilctl.base.files import write_file
 from hilctl.base.samples import RECORDED_FIELDS
@@ -65,13 +64,12 @@ def export_all(
         InputError: The folder can't be listed, a file can't be written, or pyarrow is missing.
     """
     arrow()  # before any work that would be in vain
-    catalogue = read_catalogue(folder)
+    entries = read_catalogue(folder)
     done = ExportedAll()
     sources: dict[Path, str] = {}
-    for row in range(len(catalogue)):
-        entry = catalogue.entry(row)
+    for number, entry in enumerate(entries):
         path = entry["path"]
-        on_progress(row / len(catalogue), path)
+        on_progress(number / len(entries), path)
         target = output / place_of(entry)
         if entry["state"] != "finished":
             done.left_out[path] = entry["problem"] or _ADVICE[entry["state"]]

@@ -245,17 +245,16 @@ def list_runs(
 
     Args:
         folder: The folder.
-        where: A condition, ``frequency_hz > 100 and label.sample == "A7"``; empty for all.
+        where: A condition in SQL, ``frequency_hz > 100 and label.sample == "A7"``; empty for all.
         sort: Key to sort by.
         reverse: The other way round.
 
     Raises:
-        InputError: The folder can't be listed, the condition can't be read, or a key is none.
+        InputError: The folder can't be listed, the condition is not valid, or a key is unknown.
     """
-    from hilctl.analysis.catalogue import read_catalogue
+    from hilctl.analysis.catalogue import read_catalogue, select
 
-    catalogue = read_catalogue(Path(folder))
-    return [catalogue.entry(row) for row in catalogue.rows(where, sort, reverse=reverse)]
+    return select(read_catalogue(Path(folder)), where, sort, reverse=reverse)
 
 
 def figures(

@@ -8,7 +8,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from hilctl.analysis.catalogue import Catalogue, read_catalogue
+from hilctl.analysis.catalogue import Entry, keys_of, read_catalogue, select
+from hilctl.base.finite_json import finite_json
 from hilctl.base.printable import printable, short_name
 from hilctl.cli.output import finish_orphans
 from hilctl.recording.facts import LABELS_FACT, RECORDINGS
@@ -37,13 +38,13 @@ def list_recordings(words: Sequence[str]) -> int:
     finish_orphans()
     catalogue = read_catalogue(given.folder)
     if given.keys:
-        print("\n".join(map(printable, catalogue.keys())))
+        print("\n".join(map(printable, keys_of(catalogue))))
         return 0
-    rows = catalogue.rows(given.where, given.sort, reverse=given.reverse)
+    entries = select(catalogue, given.where, given.sort, reverse=given.reverse)
     if given.json:
-        _print_json(catalogue, rows, given.folder)
+        _print_json(entries, len(catalogue), given.folder)
     else:
-        _print_table(catalogue, rows)
+        _print_table(entries, len(catalogue))
     return 0
 
 
@@ -59,7 +60,7 @@ def parser_of(name: str) -> argparse.ArgumentParser:
         "folder", nargs="?", type=Path, default=Path(RECORDINGS), metavar="FOLDER",
         help=f"Folder with recordings, at any depth; {RECORDINGS} where not given.",
     )  # fmt: skip
-    parser.add_argument("--where", default="", help="Condition that a run must meet.")
+    parser.add_argument("--where", default="", help="Condition that a run must meet, in SQL.")
     parser.add_argument(
         "--sort", default="started", metavar="KEY", help="Key to sort by; started where not given."
     )
@@ -69,25 +70,25 @@ def parser_of(name: str) -> argparse.ArgumentParser:
     return parser
 
 
-def _print_json(catalogue: Catalogue, rows: Sequence[int], folder: Path) -> None:
+def _print_json(entries: Sequence[Entry], count: int, folder: Path) -> None:
     """Print one object, a line a recording: indented as others are it would take seconds."""
-    lines = ",\n".join(catalogue.json_lines(rows))
-    head = f'"folder": {json.dumps(str(folder))}, "of": {len(catalogue)}'
+    lines = ",\n".join(map(finite_json, entries))
+    head = f'"folder": {json.dumps(str(folder))}, "of": {count}'
     print(f'{{{head}, "recordings": [\n{lines}\n]}}')
 
 
-def _print_table(catalogue: Catalogue, rows: Sequence[int]) -> None:
-    columns = [_cells(catalogue, name, rows) for name in _SHOWN]
-    if rows:
+def _print_table(entries: Sequence[Entry], count: int) -> None:
+    columns = [[_cell(name, entry) for entry in entries] for name in _SHOWN]
+    if entries:
         headed = zip(_SHOWN.items(), columns, strict=True)
         padded = [_padded(name, [heading, *cells]) for (name, heading), cells in headed]
         print("\n".join(map("  ".join, zip(*padded, strict=True))))
-    problems = [k for k in rows if catalogue.column("problem")[k]]
-    for row in problems:
-        where = printable(catalogue.column("path")[row])
-        print(f"hilctl: {where}: {printable(catalogue.column('problem')[row])}", file=sys.stderr)
+    problems = [entry for entry in entries if entry["problem"]]
+    for entry in problems:
+        where = printable(entry["path"])
+        print(f"hilctl: {where}: {printable(entry['problem'])}", file=sys.stderr)
     unreadable = f", {len(problems)} of them unreadable" if problems else ""
-    print(f"{len(rows)} of {len(catalogue)} recordings{unreadable}")
+    print(f"{len(entries)} of {count} recordings{unreadable}")
 
 
 def _padded(name: str, cells: list[str]) -> list[str]:
@@ -97,25 +98,15 @@ def _padded(name: str, cells: list[str]) -> list[str]:
     return cells if name == "path" else [cell.ljust(width) for cell in cells]
 
 
-def _cells(catalogue: Catalogue, name: str, rows: Sequence[int]) -> list[str]:
-    values = catalogue.column(name)
-    if name == "code":  # what has no end says why
-        states = catalogue.column("state")
-        return [short_name(values[k] or states[k]) for k in rows]
+def _cell(name: str, entry: Entry) -> str:
+    value = entry[name]
+    if name == "code":  # a run without an end has a state that says why
+        return short_name(value or entry["state"])
     if name == LABELS_FACT:
-        return [_labels(values[k]) for k in rows]
+        return short_name(", ".join(f"{key} {each}" for key, each in value.items())) or _MISSING
     if name == "started":
-        return [short_name((values[k] or _MISSING)[:_TO_SECONDS].replace("T", " ")) for k in rows]
-    if name == "path":
-        return [printable(values[k]) for k in rows]
-    return [_text(values[k]) for k in rows]
-
-
-@cache  # most runs of a lab share theirs
-def _labels(text: str | None) -> str:
-    if not text or text == "{}":
-        return _MISSING
-    return short_name(", ".join(f"{key} {value}" for key, value in json.loads(text).items()))
+        return short_name((value or _MISSING)[:_TO_SECONDS].replace("T", " "))
+    return printable(value) if name == "path" else _text(value)
 
 
 @cache

@@ -27,11 +27,11 @@ from google.protobuf.message import DecodeError
 from mcap.records import Attachment, Channel, Message, Metadata, Schema
 from mcap.writer import CompressionType, Writer
 
+from hilctl.analysis.catalogue import entry_of
 from hilctl.analysis.export import export
 from hilctl.analysis.overview import overview
 from hilctl.analysis.replay import replay
 from hilctl.analysis.report import summarize
-from hilctl.analysis.run_entry import entry_of
 from hilctl.analysis.run_page import page
 from hilctl.base.errors import ConfigError, HilctlError
 from hilctl.base.segments import Segment

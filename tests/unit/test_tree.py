@@ -18,7 +18,7 @@ WITHOUT = {
     "experiment/run_parts": "a contract; run/test_carried_out.py runs what keeps it",
     "loop/host": "a contract and a record; loop/test_loop.py runs the loop on a double of it",
     "loop/plan": "two records of plain values; loop/test_loop.py fills and reads all of them",
-    "recording/facts": "names; analysis/test_run_entry.py reads all of them",
+    "recording/facts": "names; analysis/test_catalogue.py reads all of them",
     "run/protocol": "words and one function; run/test_requests.py holds both sides to it",
     "recording/data": "records of plain values; recording/test_reader.py fills them",
 }

@@ -1,28 +1,38 @@
-"""All recordings below a folder: none hidden, each read once, and found by what it says."""
+"""All recordings in a folder: none hidden, each read once, and found by what is known of it."""
 
 import fcntl
 import json
 import os
 import shutil
+import sqlite3
 from pathlib import Path
 
 import pytest
+from mcap.writer import Writer
 
-from hilctl.analysis import catalogue, catalogue_cache
-from hilctl.analysis.catalogue import Catalogue, read_catalogue
-from hilctl.analysis.run_entry import COLUMNS
+from hilctl.analysis import catalogue
+from hilctl.analysis.catalogue import (
+    COLUMNS,
+    entry_of,
+    keys_of,
+    read_catalogue,
+    select,
+    unreadable,
+)
+from hilctl.analysis.report import summarize
 from hilctl.base.errors import InputError
+from hilctl.recording.facts import END_FIGURES, HOLDS_FACT, LABELS_FACT, RECORDINGS
+from hilctl.recording.reader import read
 
 GOLDEN = Path(__file__).parents[3] / "recordings" / "golden"
+TERFENOL = GOLDEN / "terfenol_compensated.mcap"
 NAMES = ["piezo_compensated", "terfenol_compensated", "terfenol_uncompensated"]
 
 
-@pytest.fixture(params=["cached", "without pyarrow"])
-def folder(request, tmp_path, monkeypatch):
-    """A folder of recordings, and a cache of this test's own; or no cache at all."""
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """Return a folder of recordings; the cache is this test's own."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    if request.param == "without pyarrow":
-        monkeypatch.setattr(catalogue_cache, "pa", None)
     made = tmp_path / "recordings"
     made.mkdir()
     for number, name in enumerate(NAMES):
@@ -45,17 +55,23 @@ def entries_read(monkeypatch):
     return paths
 
 
+def paths_of(entries):
+    return [entry["path"] for entry in entries]
+
+
+def states_of(entries):
+    return {entry["path"]: entry["state"] for entry in entries}
+
+
 def test_a_finished_recording_is_read_once(folder, entries_read):
     first = read_catalogue(folder)
-    assert first.column("path") == [f"day {k}/run.mcap" for k in range(3)]
-    assert sorted(entries_read) == first.column("path")
+    assert paths_of(first) == [f"day {k}/run.mcap" for k in range(3)]
+    assert sorted(entries_read) == paths_of(first)
     del entries_read[:]
-    second = read_catalogue(folder)
-    assert [second.entry(k) for k in range(3)] == [first.entry(k) for k in range(3)]
-    assert len(entries_read) == (0 if catalogue_cache.pa else 3)
+    assert read_catalogue(folder) == first
+    assert entries_read == []
 
 
-@pytest.mark.parametrize("folder", ["cached"], indirect=True)
 @pytest.mark.parametrize("change", ["newer", "larger", "moved", "gone", "new"])
 def test_what_has_changed_is_read_again(folder, entries_read, change):
     read_catalogue(folder)
@@ -74,14 +90,11 @@ def test_what_has_changed_is_read_again(folder, entries_read, change):
     fresh = read_catalogue(folder)
     expected = {"moved": ["day 1/other.mcap"], "gone": [], "new": ["a.mcap"]}
     assert entries_read == expected.get(change, ["day 1/run.mcap"])
-    assert fresh.column("path") == sorted(fresh.column("path"))
+    assert paths_of(fresh) == sorted(paths_of(fresh))
     assert len(fresh) == {"gone": 2, "new": 4}.get(change, 3)
     del entries_read[:]
-    again = read_catalogue(folder)
+    assert read_catalogue(folder) == fresh
     assert entries_read == []
-    assert [again.entry(k) for k in range(len(again))] == [
-        fresh.entry(k) for k in range(len(fresh))
-    ]
 
 
 def test_what_can_not_be_read_is_listed_and_looked_at_anew(folder):
@@ -100,20 +113,47 @@ def test_what_can_not_be_read_is_listed_and_looked_at_anew(folder):
     with torn.open("r+b") as writer:
         fcntl.flock(writer, fcntl.LOCK_EX)
         found = read_catalogue(folder)
-    states = dict(zip(found.column("path"), found.column("state"), strict=True))
-    problems = dict(zip(found.column("path"), found.column("problem"), strict=True))
-    assert states == {
+    problems = {entry["path"]: entry["problem"] for entry in found}
+    assert states_of(found) == {
         **dict.fromkeys([f"day {k}/run.mcap" for k in range(3)], "finished"),
         **dict.fromkeys(["text.mcap", "pipe.mcap", "link.mcap", r"\xff\xfe.mcap"], "unreadable"),
         "torn.mcap": "recording",
     }
     assert problems["pipe.mcap"] == "is not a file"
     assert problems["link.mcap"] == "can't be read: No such file or directory"
-    again = read_catalogue(folder)
-    assert again.column("state")[again.column("path").index("torn.mcap")] == "unfinished"
+    assert states_of(read_catalogue(folder))["torn.mcap"] == "unfinished"
     torn.write_bytes(whole)
-    last = read_catalogue(folder)
-    assert last.column("state")[last.column("path").index("torn.mcap")] == "finished"
+    assert states_of(read_catalogue(folder))["torn.mcap"] == "finished"
+
+
+@pytest.mark.parametrize("damage", [b"", b"hello", "half", "no table"])
+def test_a_damaged_cache_is_rebuilt(folder, entries_read, damage):
+    first = read_catalogue(folder)
+    (cache,) = (folder.parent / "cache" / "hilctl").iterdir()
+    whole = cache.read_bytes()
+    assert cache.parent.stat().st_mode & 0o077 == 0
+    if damage == "no table":
+        cache.unlink()
+        sqlite3.connect(cache).close()
+    else:
+        cache.write_bytes(whole[: len(whole) // 2] if damage == "half" else damage)
+    del entries_read[:]
+    assert read_catalogue(folder) == first
+    assert len(entries_read) == 3
+    assert cache.read_bytes() == whole
+
+
+def test_a_relative_cache_folder_is_ignored(folder, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", "relative")
+    monkeypatch.setenv("HOME", str(folder.parent))
+    read_catalogue(folder)
+    assert len([*(folder.parent / ".cache" / "hilctl").iterdir()]) == 1
+
+
+def test_a_cache_that_cannot_be_written_is_a_warning(folder, monkeypatch, caplog):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(folder / "day 0" / "run.mcap"))
+    assert len(read_catalogue(folder)) == 3
+    assert len(caplog.records) == 1
 
 
 @pytest.mark.parametrize(
@@ -121,39 +161,119 @@ def test_what_can_not_be_read_is_listed_and_looked_at_anew(folder):
     [
         ("", [1, 2, 0]),
         ("frequency_hz > 50", [1, 2]),
-        ("frequency_hz > 50 and compensator == 'none'", [2]),
+        ("frequency_hz > 50 AND compensator == 'none'", [2]),
         ("device.load_kg == 0", [1, 2]),
         ("label.sample == 'A7'", []),
-        ("label.sample == None", [1, 2, 0]),
+        ("label.sample is null", [1, 2, 0]),
         ("peak_error_percent > 0", []),
     ],
 )
-def test_rows_are_found_in_the_order_of_their_beginning(folder, where, days):
+def test_recordings_are_selected_in_the_order_of_their_start(folder, where, days):
+    assert paths_of(select(read_catalogue(folder), where)) == [f"day {k}/run.mcap" for k in days]
+
+
+def test_recordings_without_the_key_to_sort_by_are_last(folder):
     found = read_catalogue(folder)
-    assert [found.column("path")[k] for k in found.rows(where)] == [
-        f"day {k}/run.mcap" for k in days
-    ]
+    assert select(found, sort="frequency_hz") == found
+    assert select(found, sort="size_bytes", reverse=True) == [found[k] for k in (1, 0, 2)]
+    assert select(found, sort="device.load_kg")[-1] == found[0]
 
 
-def test_rows_sort_by_any_key_and_those_without_it_come_last(folder):
-    found = read_catalogue(folder)
-    assert found.rows(sort="frequency_hz") == [0, 1, 2]
-    assert found.rows(sort="size_bytes", reverse=True) == [1, 0, 2]
-    assert found.rows(sort="device.load_kg")[-1] == 0
-    with pytest.raises(InputError, match=r"sise_bytes: .*did you mean size_bytes"):
-        found.rows(sort="sise_bytes")
+def test_numbers_sort_before_texts():
+    values = ["b", 3, "a"]
+    entries = [entry(f"{k}", labels={"x": values[k]}) for k in range(3)]
+    assert paths_of(select(entries, sort="label.x")) == ["1", "2", "0"]
+    assert "label.x" in keys_of(entries)
 
 
-def test_texts_and_numbers_under_one_label_sort(folder):
-    found = read_catalogue(folder)
-    columns = {name: found.column(name) for name in COLUMNS}
-    mixed = Catalogue({**columns, "labels": ['{"x": "b"}', '{"x": 3}', '{"x": "a"}']})
-    assert mixed.rows(sort="label.x") == [1, 2, 0]
-    keys = mixed.keys()
-    assert "label.x" in keys
+def entry(path="a", **known):
+    return unreadable(path, 1, 2, "") | known
 
 
-def test_a_folder_that_is_none_is_an_input_error(tmp_path):
+ONE = entry(
+    frequency_hz=120.0,
+    name="sine",
+    simulated=True,
+    labels={"sample": "A7", "class": 3, "batch no": "it's", "größe": 1.5, "half": "\ud800"},
+    options={"device.link.host": "rig", "waveform.window": True},
+)
+
+
+@pytest.mark.parametrize(
+    "where",
+    [
+        'frequency_hz>100 and label.sample=="A7"',
+        "frequency_hz between 100 and 120",
+        "name in ('sine', \"chirp\") and not name == 'device'",
+        'name like "%in%" and name glob "s*"',
+        "label.class = 3 and label.größe > 1",
+        "[label.batch no] = 'it''s' and [label.batch no] = \"it's\"",
+        "simulated and simulated == true",
+        "reason is null and name is not null",
+        "device.link.host == 'rig' and waveform.window",
+        "name != 'label.sample' -- a comment",
+        "lower(label.sample) || 'x' = 'a7x'",
+    ],
+)
+def test_a_condition_is_a_condition_in_sql(where):
+    assert select([ONE], where) == [ONE]
+    assert select([ONE], f"not ({where}\n)") == []
+
+
+@pytest.mark.parametrize("where", ['reason == "x"', 'reason != "x"', "label.other > 3"])
+def test_what_is_unknown_meets_neither_a_condition_nor_its_opposite(where):
+    assert select([ONE], where) == []
+    assert select([ONE], f"not ({where})") == []
+
+
+@pytest.mark.parametrize(
+    "where",
+    [
+        "freqency_hz > 1",
+        "name == None",
+        "foo.bar > 1",
+        "name > > 3",
+        "name = ?",
+        "(" * 500,
+        "\0",
+        "\udcff",
+        "\x1b[2J(",
+        "1; DROP TABLE recordings",
+        "1; ATTACH 'x' AS y",
+        "EXISTS (SELECT 1 FROM sqlite_master)",
+        "EXISTS (SELECT 1 FROM pragma_table_info('recordings'))",
+        "(WITH RECURSIVE a(x) AS (SELECT 1 UNION SELECT x + 1 FROM a) SELECT max(x) FROM a)",
+        "load_extension('x')",
+        "1) UNION SELECT * FROM recordings",
+    ],
+)
+def test_any_other_condition_is_an_input_error_with_the_keys(where):
+    with pytest.raises(
+        InputError, match=r"frequency_hz, .*label\.sample, .*waveform\.window"
+    ) as error:
+        select([ONE], where)
+    assert str(error.value).isprintable()
+    assert "--where" in str(error.value)
+
+
+@pytest.mark.parametrize("where", ["1) UNION SELECT 'x' /*", "1) UNION SELECT 99 /*"])
+def test_a_condition_selects_only_recordings(where):
+    assert select([ONE], where) == [ONE]
+
+
+def test_an_unknown_key_to_sort_by_is_an_input_error():
+    with pytest.raises(InputError, match=r"--sort 'sise_bytes': .*sise_bytes.* size_bytes"):
+        select([ONE], sort="sise_bytes")
+
+
+def test_a_label_without_recordings_is_a_warning(caplog):
+    """It may be a label of later runs."""
+    assert select([ONE], "label.smaple == 'A7' and name == 'label.other'") == []
+    assert "label.smaple" in caplog.text
+    assert len(caplog.records) == 1
+
+
+def test_a_folder_that_cannot_be_listed_is_an_input_error(tmp_path):
     (tmp_path / "file").write_text("")
     for name, problem in (("none", "No such file"), ("file", "Not a directory")):
         with pytest.raises(InputError, match=f"{name}: can't be listed: {problem}"):
@@ -161,25 +281,114 @@ def test_a_folder_that_is_none_is_an_input_error(tmp_path):
     assert len(read_catalogue(tmp_path)) == 0
 
 
-def test_lines_of_json_are_the_entries(folder):
-    """Whatever letters a label has, in ASCII."""
-    known = read_catalogue(folder)
-    known.column("labels")[0] = '{"operator": "Zo\u00eb"}'
-    lines = list(known.json_lines([2, 0]))
-    assert [json.loads(line) for line in lines] == [known.entry(2), known.entry(0)]
-    assert json.loads(lines[1])["labels"] == {"operator": "Zo\u00eb"}
-    assert all(line.isascii() for line in lines)
+RUN = {
+    "name": "made",
+    "simulated": "true",
+    "sample_rate_hz": "1000.0",
+    LABELS_FACT: '{"sample": "A7", "t": 21.5}',
+    HOLDS_FACT: "[]",
+    "device": "dac",
+    "device.load_kg": "3.7",
+    "device.serial": "0012",
+    "device.noise": "True",
+    "device.creep": "None",
+    "device.nan": "NaN",
+    "device.list": "[1]",
+    "waveform.kind": "sine",
+    "segments": json.dumps(
+        [
+            {"label": f"sine {k}", "start": 100 * k, "stop": 100 * k + 100, "period": period,
+             "steady_start": 100 * k, "steady_stop": 100 * k + 100}
+            for k, period in enumerate((10.0, 0.0, 4.0))
+        ]
+    ),
+}  # fmt: skip
+END = {
+    "code": "completed",
+    "output_safe": "false",
+    "recorded_samples": "290",
+    "missing_samples": "10",
+    "late_ticks": "-1",
+    "skipped_ticks": "3",
+    "peak_error_percent": "0.5",
+    "loop_area": "inf",
+    "rms_error_percent": "x",
+}
 
 
-def test_lines_of_json_hold_no_number_that_is_none(folder):
-    """Python writes and reads them; nobody else has to."""
-    known = read_catalogue(folder)
-    known.column("labels")[0] = '{"gain": NaN, "limit": Infinity}'
-    known.column("duration_s")[0] = float("inf")
-    (line,) = known.json_lines([0])
+def made_entry(tmp_path, run, end):
+    path = tmp_path / RECORDINGS
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start("", "")
+        writer.add_metadata("hilctl.run", run)
+        if end:
+            writer.add_metadata("hilctl.end", end)
+        writer.finish()
+    return entry_of(path, "sub/a.mcap", 7, 8)
 
-    def refuse(constant):
-        raise ValueError(constant)
 
-    found = json.loads(line, parse_constant=refuse)
-    assert (found["labels"], found["duration_s"]) == ({"gain": None, "limit": None}, None)
+def test_facts_become_values(tmp_path):
+    """Numbers and truth values where facts say so; what is damaged is not known."""
+    found = made_entry(tmp_path, RUN, END)
+    assert list(found) == list(COLUMNS)
+    assert found.pop(LABELS_FACT) == {"sample": "A7", "t": 21.5}
+    assert found.pop("options") == {
+        "device.load_kg": 3.7,
+        "device.serial": "0012",
+        "device.noise": True,
+        "device.nan": "NaN",
+        "device.list": "[1]",
+        "waveform.kind": "sine",
+    }
+    assert {name: value for name, value in found.items() if value is not None} == {
+        "path": "sub/a.mcap",
+        "size_bytes": 7,
+        "mtime_ns": 8,
+        "state": "finished",
+        "name": "made",
+        "device": "dac",
+        "simulated": True,
+        "sample_rate_hz": 1000.0,
+        "waveform": "sine 0 and 2 more",
+        "frequency_hz": 250.0,
+        "duration_s": 0.3,
+        "code": "completed",
+        "output_safe": False,
+        "recorded_samples": 290,
+        "missing_samples": 10,
+        "skipped_ticks": 3,
+        "peak_error_percent": 0.5,
+    }
+    for name, value in found.items():
+        assert value is None or type(value) is COLUMNS[name]
+
+
+def test_a_recording_agrees_with_its_report():
+    found, report = entry_of(TERFENOL, "a.mcap", 1, 2), summarize(read(TERFENOL)).to_mapping()
+    same = {"name", "device", "reason", "sample_rate_hz", "recorded_samples", "skipped_ticks"}
+    assert {name: found[name] for name in same} == {name: report[name] for name in same}
+    assert found["waveform"] == report["segments"][0]["label"]
+    assert found["frequency_hz"] == report["segments"][0]["frequency_hz"]
+    assert set(END_FIGURES) <= report.keys()
+
+
+@pytest.mark.parametrize(
+    ("change", "problem"),
+    [
+        ({LABELS_FACT: "3"}, "metadata hilctl.run: labels must be texts and numbers by name"),
+        ({"segments": "[{}]"}, "metadata hilctl.run: segments: 0.label: Field required"),
+    ],
+)
+def test_a_recording_that_nobody_can_read_says_why(tmp_path, change, problem):
+    """It is what every other command says of it."""
+    found = made_entry(tmp_path, {**RUN, **change}, END)
+    assert found["state"] == "unreadable"
+    assert found["problem"].startswith(problem)
+
+
+def test_what_is_no_recording_has_its_place_and_its_problem(tmp_path):
+    (tmp_path / "a").write_text("hello")
+    found = entry_of(tmp_path / "a", "a.mcap", 5, 6)
+    assert found == unreadable("a.mcap", 5, 6, "is not an MCAP file, or its start is lost")
+    assert list(found) == list(COLUMNS)

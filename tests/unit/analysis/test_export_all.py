@@ -8,8 +8,8 @@ import pytest
 from pyarrow import dataset, parquet
 
 from hilctl.analysis import export_all, export_files
+from hilctl.analysis.catalogue import unreadable
 from hilctl.analysis.export_all import place_of
-from hilctl.analysis.run_entry import unreadable
 from hilctl.base.errors import InputError
 from hilctl.recording.reader import read
 
