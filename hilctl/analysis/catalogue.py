@@ -82,6 +82,7 @@ _TOKEN = re.compile(
     | \b(?P<dotted>(?:label|device|waveform)(?:\.\w+)+)""",
     re.VERBOSE,
 )
+_CHAIN = re.compile(r"'[^']*'|(?P<chain>[<>]=?\s*[^\s<>=()']+\s*[<>])")
 
 
 def keys_of(entries: Iterable[Entry]) -> list[str]:
@@ -116,6 +117,9 @@ def select(
     condition, direction = condition or "TRUE", "DESC" if reverse else "ASC"
     order = f"({key}) IS NULL, ({key}) {direction}, path"
     try:
+        # SQLite takes 10 < x < 100 for (10 < x) < 100, which is always true.
+        if any(found["chain"] for found in _CHAIN.finditer(condition)):
+            raise ValueError("two comparisons need AND between them: x > 10 AND x < 100")
         with closing(_table(entries)) as db:
             db.set_authorizer(_authorize)  # both texts can only read the table
             met = {*db.execute(f"SELECT rowid FROM recordings WHERE ({condition}\n)")}  # noqa: S608

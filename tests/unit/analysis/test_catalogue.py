@@ -230,6 +230,8 @@ def test_what_is_unknown_meets_neither_a_condition_nor_its_opposite(where):
     "where",
     [
         "freqency_hz > 1",
+        "10 < frequency_hz < 100",
+        "10<=frequency_hz<100",
         "name == None",
         "foo.bar > 1",
         "name > > 3",
