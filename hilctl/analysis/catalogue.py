@@ -117,9 +117,7 @@ def select(
     condition, direction = condition or "TRUE", "DESC" if reverse else "ASC"
     order = f"({key}) IS NULL, ({key}) {direction}, path"
     try:
-        # SQLite takes 10 < x < 100 for (10 < x) < 100, which is always true.
-        if any(found["chain"] for found in _CHAIN.finditer(condition)):
-            raise ValueError("two comparisons need AND between them: x > 10 AND x < 100")
+        _refuse_chains(condition)
         with closing(_table(entries)) as db:
             db.set_authorizer(_authorize)  # both texts can only read the table
             met = {*db.execute(f"SELECT rowid FROM recordings WHERE ({condition}\n)")}  # noqa: S608
@@ -131,6 +129,12 @@ def select(
     for name in sorted(names.difference(keys_of(entries)) if names else ()):
         _log.warning("no recording here has %s", printable(name))
     return [entries[row[0] - 1] for row in rows if row in met]
+
+
+def _refuse_chains(condition: str) -> None:
+    """Raise ValueError for ``10 < x < 100``, which SQLite takes for ``(10 < x) < 100``."""
+    if any(found["chain"] for found in _CHAIN.finditer(condition)):
+        raise ValueError("two comparisons need AND between them: x > 10 AND x < 100")
 
 
 def _table(entries: Iterable[Entry], place: str = ":memory:") -> sqlite3.Connection:
