@@ -90,7 +90,7 @@ class FakeInfo:
     """What the loop asks of a device's info."""
 
     measures_command: bool = False
-    in_order: bool = False
+    simulated: bool = False
     confirms: bool = True
     arm_s: float = 0.0
 

@@ -51,9 +51,6 @@ class DeviceInfo:
         watchdog_reason: Why that is not the experiment's safe value; empty where it is.
         safe_note: What is wrong with the safe value of this device, in words: a message with it
             takes longer than 0.2 s, or the device cannot confirm it; empty if nothing is.
-        in_order: Whether it executes commands in the order in which they were sent, across
-            connections too, as a device on a serial line does. Otherwise a command that was never
-            answered may be executed after a later one that was.
         confirms: Whether an answer of the device is evidence of the command that it answers.
         details: Anything worth keeping with a recording (serial numbers, physical parameters).
     """
@@ -78,7 +75,6 @@ class DeviceInfo:
     arm_s: float = 0.0
     watchdog_reason: str = ""
     safe_note: str = ""
-    in_order: bool = False
     confirms: bool = True
     details: Mapping[str, str] = field(default_factory=dict)
 

@@ -461,7 +461,7 @@ class Loop:
         # Before the device: its time-outs would look like a hanging loop to the supervisor.
         self._host.closing()
         limits = self._limiter.limits
-        pending = not self._device.info.in_order
+        pending = not self._device.info.simulated
         goal = SafeGoal(limits.safe, limits.ramp_per_s, self._limiter.last, pending)
         # The coil first: the samples stand in shared memory, and nothing is lost by waiting.
         output = drive_to_safe(

@@ -90,7 +90,7 @@ def put_safe(
         raise ConfigError([Problem(str(path), "device", "is required, with a key kind")])
     info = device.info
     died, relief = _earlier_run(info.holds)
-    goal = SafeGoal(safe.value, 1.0, None, pending=died and not info.in_order)
+    goal = SafeGoal(safe.value, 1.0, None, pending=died)
     output = SafeOutput(device, goal, clock)
     with ExitStack() as stack:
         locks: list[int] = []
@@ -158,8 +158,9 @@ def _drive(
             except LocalError as error:
                 output.error = str(error)
             now_s = clock()
-            watched = watches and output.state == "set" and now_s < give_up_s + HOLD_S
-            if output.final or (now_s >= give_up_s and not watched):
+            if output.final or (output.state == "set" and not watches):
+                return
+            if now_s >= give_up_s + (HOLD_S if output.state == "set" else 0.0):
                 return
             sleep(output.pause_s)
     except KeyboardInterrupt:

@@ -133,7 +133,7 @@ def run_job(
         host.closing()
     except BaseException as error:
         limits = config.command_limits()
-        pending = bool(page.get(Field.EXCHANGING)) and not device.info.in_order
+        pending = bool(page.get(Field.EXCHANGING)) and not device.info.simulated
         goal = SafeGoal(limits.safe, limits.ramp_per_s, ring.last_command(), pending)
         found = drive_to_safe(device, goal, on_write=page.note_safe_write)
         if found.state != "confirmed":

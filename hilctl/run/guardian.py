@@ -171,9 +171,9 @@ def safe_goal(ring: SampleRing, device: Device, value: float, ramp_per_s: float)
         start = ring.last_command()
     # A loop that has ended without a confirmed output lost its device in an exchange.
     unanswered = page.get(Field.EXCHANGING) or page.get(Field.PHASE) == Phase.ENDED
-    return SafeGoal(
-        value, ramp_per_s, None if info.simulated else start, bool(unanswered) and not info.in_order
-    )
+    if info.simulated:  # another process has a simulation of its own
+        return SafeGoal(value, ramp_per_s, None, pending=False)
+    return SafeGoal(value, ramp_per_s, start, bool(unanswered))
 
 
 def act(

@@ -211,7 +211,7 @@ def _base_folders(*, make: bool) -> list[Path]:
 
 def _is_own(path: Path) -> bool:
     with suppress(OSError):
-        return path.lstat().st_uid == os.geteuid()
+        return hasattr(os, "geteuid") and path.lstat().st_uid == os.geteuid()
     return False
 
 
@@ -255,6 +255,8 @@ def _removed_files(process: str = "[0-9]*") -> dict[Path, Path]:
         The name that each file had, and where it can be opened now.
     """
     found: dict[Path, Path] = {}
+    if not hasattr(os, "geteuid"):  # Windows has no runs
+        return found
     for opened in Path("/proc").glob(f"{process}/fd"):
         with suppress(OSError):  # it has ended, or is not this user's
             own = opened.stat().st_uid == os.geteuid()

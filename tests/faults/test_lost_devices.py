@@ -75,20 +75,23 @@ def test_the_guardian_goes_on_after_the_command_and_says_so(abandoned):
     time.sleep(AWAY_S)
     abandoned.come_back()
     abandoned.await_output(0.0, within_s=5.0)
-    deadline = time.monotonic() + 30.0
-    while active():  # the guardian confirms it, and leaves nothing behind
-        assert time.monotonic() < deadline
+    (run,) = active()
+    assert run["output_state"] == "set"  # the command that was never answered may still follow
 
 
+@pytest.mark.long
 def test_safe_by_hand_relieves_the_guardian_and_gives_back_what_it_cannot_do(abandoned):
     returned, found = hilctl("safe", abandoned.experiment)
     assert (returned, found["output_state"], found["guardian_active"]) == (3, "unknown", True)
     assert [run["state"] for run in active()] == ["setting the safe value"]
     abandoned.come_back()
     returned, found = hilctl("safe", abandoned.experiment)
-    assert (returned, found["output_state"], found["guardian_active"]) == (0, "confirmed", False)
+    assert (returned, found["output_state"], found["guardian_active"]) == (3, "set", True)
     assert abandoned.writes_a()[-1] == pytest.approx(0.0, abs=1e-5)
-    assert active() == []
+    deadline = time.monotonic() + 90.0
+    while active():  # the guardian confirms it, and leaves nothing behind
+        assert time.monotonic() < deadline
+        time.sleep(1.0)
 
 
 def test_a_new_run_relieves_the_guardian_once_it_starts(abandoned):

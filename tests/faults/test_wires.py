@@ -104,17 +104,17 @@ def test_pulled_cable_leaves_it_to_the_watchdog(emulate, run):
 
 
 @pytest.mark.parametrize(
-    ("fault", "words", "safe"),
+    ("fault", "words", "state"),
     [
-        ("silence", "no answer within 2 s", True),
+        ("silence", "no answer within 2 s", "set"),
         pytest.param(
-            "exception", "function 23 refused with exception 4", True, marks=pytest.mark.long
+            "exception", "function 23 refused with exception 4", "set", marks=pytest.mark.long
         ),
-        ("corrupt", "CRC of 9 bytes is wrong", True),
-        ("unplug", "port lost, unplugged?", False),
+        ("corrupt", "CRC of 9 bytes is wrong", "set"),
+        ("unplug", "port lost, unplugged?", "unknown"),
     ],
 )
-def test_rtu_fault_ends_the_run(emulate, run, profile, fault, words, safe):
+def test_rtu_fault_ends_the_run(emulate, run, profile, fault, words, state):
     """The same on a serial line, where a pulled adapter takes its port along."""
     module = profile("rtu_module")
     device = emulate(module, "--fault", f"{fault}@120")
@@ -122,10 +122,10 @@ def test_rtu_fault_ends_the_run(emulate, run, profile, fault, words, safe):
     started = run(options, sample_rate_hz=150)
     printed = started.end()
     writes = device.log.events("OUT")
-    assert printed["output_safe"] is safe
+    assert printed["output_state"] == state
     assert printed["reason"].startswith(f"modbus_dac {module} at {device.address}: ")
     assert words in printed["reason"]
-    if safe:
+    if state == "set":
         assert writes[-1]["current_a"] == 0.0
     started.assert_put_out(writes)
 

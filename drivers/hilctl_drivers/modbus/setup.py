@@ -262,7 +262,6 @@ class ModbusSetup:
             watchdog_timeout_s=options.watchdog_timeout_s,
             arm_s=0.0 if options.watchdog == "none" else arm_s(writer.profile, options.output),
             watchdog_reason=options.watchdog_reason,
-            in_order=options.serial_port is not None,
             confirms=not self.unconfirmed,
             safe_note=self.unconfirmed,
             details=details,

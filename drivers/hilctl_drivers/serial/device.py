@@ -133,7 +133,6 @@ def _info(setup: SerialSetup, wire: SerialWire) -> DeviceInfo:
         arm_s=0.0 if options.watchdog == "none" else wire.arm_s,
         watchdog_reason=options.watchdog_reason,
         safe_note="; ".join(filter(None, (_late_note(setup, wire), wire.unconfirmed))),
-        in_order=True,
         confirms=not wire.unconfirmed,
         details=details,
     )

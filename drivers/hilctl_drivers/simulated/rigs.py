@@ -178,7 +178,6 @@ _COMMON: dict[str, Any] = {
     "fifo_depth": FIFO_DEPTH,
     "measures_command": True,
     "simulated": True,
-    "in_order": True,
 }
 
 

@@ -206,7 +206,7 @@ def test_reference_that_is_not_a_number_ramps_down(bad):
 
 def test_lost_device_is_made_safe():
     """When exchanges fail the ramp goes by single writes, and the reason is kept."""
-    rig = Rig(np.full(1000, 2.0), device=FakeDevice(break_at=60, info=FakeInfo(in_order=True)))
+    rig = Rig(np.full(1000, 2.0), device=FakeDevice(break_at=60, info=FakeInfo(simulated=True)))
     outcome = rig.run()
     assert (outcome.code, outcome.output) == ("fault", "confirmed")
     assert outcome.reason == "fake: no answer within 0.1 s"
@@ -249,7 +249,7 @@ class WatchedDevice(FakeDevice):
     arm_fails: bool = False
     armed_ns: list[int] = field(default_factory=list)
     exchanged_ns: list[int] = field(default_factory=list)
-    info: FakeInfo = field(default_factory=lambda: FakeInfo(in_order=True, arm_s=0.004))
+    info: FakeInfo = field(default_factory=lambda: FakeInfo(simulated=True, arm_s=0.004))
 
     def arm(self):
         self.armed_ns.append(self.clock.now_ns())

@@ -33,7 +33,7 @@ class Device:
     def __init__(self, loop, error=None):
         self.loop, self.error, self.asked = loop, error, []
 
-    info = SimpleNamespace(in_order=True, simulated=False)
+    info = SimpleNamespace(simulated=False)
 
     def make_safe(self, value):
         with suppress(subprocess.TimeoutExpired):  # one that was killed may still be dying
@@ -44,7 +44,7 @@ class Device:
 
 
 @pytest.fixture
-def guarded(tmp_path):
+def guarded(tmp_path, monkeypatch):
     """A process that stands for the loop, and a function that guards it until it is gone."""
     loop = subprocess.Popen(SLEEP)
     ring = SampleRing.create(tmp_path / "ring", slots=4, block=1, state_size=1)
@@ -56,6 +56,8 @@ def guarded(tmp_path):
     pidfd = os.pidfd_open(loop.pid)
     before = signal.getsignal(signal.SIGTERM)
     made = SimpleNamespace(loop=loop, page=page, ring=ring, device=Device(loop), pidfd=pidfd)
+
+    monkeypatch.setattr("hilctl.loop.safe_output.HOLD_S", 0.0)
 
     def guard(hang_s=60.0):
         limits = SilenceLimits(hang_s, hang_s, 60.0, hang_s)

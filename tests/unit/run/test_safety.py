@@ -41,7 +41,7 @@ class Run:
         self.now_ns, self.fail_start, self.error = 10**9, None, None
         self.watched = []
         device = SimpleNamespace(
-            info=SimpleNamespace(simulated=simulated, in_order=True), make_safe=self.make_safe
+            info=SimpleNamespace(simulated=simulated), make_safe=self.make_safe
         )
         timing = SimpleNamespace(hang_s=None, max_late_s=1.0)
         config = SimpleNamespace(
