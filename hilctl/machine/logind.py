@@ -1,7 +1,6 @@
 """Settings of systemd-logind: whether a background run outlives the log-out of its user."""
 
 import os
-import pwd
 
 from hilctl.machine.files import Finding, Machine
 
@@ -26,6 +25,8 @@ def log_out(machine: Machine) -> Finding:
         return Finding(name, "ok", "removes nothing (RemoveIPC=no)")
     if user <= _SYSTEM_USERS:
         return Finding(name, "ok", "removes nothing of a system user")
+    import pwd  # Windows, on which offline commands import this module, has none
+
     try:
         login = pwd.getpwuid(user).pw_name
     except KeyError:
