@@ -30,8 +30,6 @@ has moved; 3 a run that ended by a fault, a device that answers what can't be, o
 be characterised; 128 + n a run stopped by signal n.
 """
 
-import atexit
-import gc
 import signal
 import sys
 import time
@@ -51,10 +49,6 @@ ACTING = (
 )
 """Commands that move an actuator, or change a run."""
 
-_SEARCHED_OBJECTS = 500_000
-"""New objects after which Python searches for garbage: more than any command imports."""
-_SEARCHED_BEFORE = gc.get_threshold()
-
 OF_LINUX = {"fcntl", "grp", "pty", "pwd", "resource", "termios", "tty"}
 """Modules of Python that other systems lack."""
 
@@ -62,10 +56,6 @@ OF_LINUX = {"fcntl", "grp", "pty", "pwd", "resource", "termios", "tty"}
 def main() -> None:
     """Run the command line; every error raised on purpose becomes a message and an exit code."""
     take_volume(sys.argv)
-    # What is imported comes by the hundred thousand objects, with no garbage among them: to search
-    # it again and again takes a tenth of the time, and at the end a fifth of a second.
-    gc.set_threshold(_SEARCHED_OBJECTS)
-    atexit.register(gc.freeze)
     acts = any(name in ACTING for name in sys.argv[1:2])
     with (
         plain_streams(acts=acts),
@@ -99,15 +89,6 @@ def _clock_can_be_read() -> bool:
     except OverflowError:
         return False
     return True
-
-
-def search_garbage() -> None:
-    """Have Python search for garbage as it does by itself, but not in what is there already.
-
-    For commands that stay or compute: once they have imported what they need.
-    """
-    gc.freeze()
-    gc.set_threshold(*_SEARCHED_BEFORE)
 
 
 @contextmanager

@@ -146,39 +146,6 @@ def test_a_shell_completes_the_options_of_every_command(words, some):
     assert set(ended.stdout.split()) >= some, ended.stderr
 
 
-def test_a_command_never_searches_for_garbage(tmp_path):
-    """Neither in what it imports nor when it ends: there is none, and it takes long."""
-    code = """
-import atexit, gc
-from hilctl.cli import main
-def searches():
-    return sum(each["collections"] for each in gc.get_stats())
-before = searches()
-atexit.register(lambda: print(searches() - before, gc.get_freeze_count() > 0))
-main()
-"""
-    ended = in_a_process(code, "report", str(tmp_path / "absent.mcap"))
-    assert (ended.returncode, ended.stdout) == (2, "0 True\n")
-
-
-@pytest.mark.parametrize(("name", "called"), [("run", "run"), ("learn", "learn")])
-def test_commands_that_stay_search_for_garbage_as_python_does(tmp_path, name, called):
-    code = f"""
-import gc, sys
-own = gc.get_threshold()
-from hilctl import api
-from hilctl.base.errors import InputError
-from hilctl.cli import main
-def stays(*_, **__):
-    raise InputError(str(gc.get_threshold() == own))
-api.{called} = stays
-main()
-"""
-    words = (str(tmp_path / "absent.yaml"), "--output", str(tmp_path / "x.mcap"))
-    ended = in_a_process(code, name, *words)
-    assert (ended.returncode, ended.stderr) == (2, "hilctl: True\n")
-
-
 @pytest.mark.parametrize("words", [["--help"], ["status"], ["stop", "--all"]])
 def test_help_status_and_stop_import_nothing_heavy(words):
     code = """
