@@ -5,8 +5,6 @@ schemas have, and the help of commands. Into ``decisions``: a page a record.
 """
 
 import ast
-import contextlib
-import io
 import json
 import re
 import shutil
@@ -16,7 +14,6 @@ from typing import Any
 
 from hilctl import api
 from hilctl.analysis.definitions import DEFINITIONS
-from hilctl.cli import QUICK, quick
 from hilctl.cli.commands import COMMANDS, load
 
 ROOT = Path(__file__).parents[1]
@@ -185,11 +182,6 @@ def commands_page() -> str:
 
 
 def _command(name: str) -> str:
-    if name in QUICK:  # typer knows nothing of those that read their own arguments
-        printed = io.StringIO()
-        with contextlib.redirect_stdout(printed), contextlib.suppress(SystemExit):
-            quick(name, ["--help"])
-        return f"## {name}\n\n```text\n{printed.getvalue()}```\n"
     inner = getattr(load(name), "commands", {})
     blocks = [f"## {name}\n", _typer(name, f"hilctl {name}")]
     for each in inner:

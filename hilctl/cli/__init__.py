@@ -3,13 +3,12 @@
 A command is imported when it is called, and imports its heavy parts itself, so that ``--help`` is
 quick.
 
-application.py  what all commands hang on
-commands.py    which commands there are, and where each one's function is
+commands.py    the application: which commands there are, and where each one's function is
 options.py     options that they share; output.py  JSON, and what all of them say
 examples.py    a demonstration, examples to copy; starting.py  a first experiment
 running.py     start and check runs; shown by run_view.py
 compiling.py   says what is compiled meanwhile
-steering.py    status, set, mark and stop, in a tenth of a second; shown by status_view.py
+steering.py    status, set, mark and stop; shown by status_view.py
 watching.py    a run in the terminal: watcher.py  keys and screens, watch_view.py  what is on them,
                braille.py  curves, terminal.py  the terminal itself
 live.py        the page of runs that are going on
@@ -31,15 +30,12 @@ has moved; 3 a run that ended by a fault, a device that answers what can't be, o
 be characterised; 128 + n a run stopped by signal n.
 """
 
-import atexit
-import gc
 import signal
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
-from importlib import import_module
-from typing import Any, NoReturn
+from typing import NoReturn
 
 from hilctl.base.errors import ConfigError, HilctlError, InputError, RunError
 from hilctl.base.remedy import reason
@@ -47,41 +43,19 @@ from hilctl.cli.output import print_json
 from hilctl.cli.streams import plain_streams
 from hilctl.cli.volume import heard_as_asked, print_origin, take_volume
 
-STEERING = ("status", "set", "mark", "stop")
-"""Commands about runs that are going on."""
-READING = ("report", "replay", "export")
-"""Commands about recordings that are there."""
-QUICK = (*STEERING, *READING, "list")
-"""Commands that nobody wants to wait for: they go past the application, which takes longer to
-import than most of them take to run."""
 ACTING = (
     *("run", "set", "mark", "stop", "safe"),
     *("characterise", "campaign", "sweep", "learn", "demo"),
 )
 """Commands that move an actuator, or change a run."""
 
-_SEARCHED_OBJECTS = 500_000
-"""New objects after which Python searches for garbage: more than any command imports."""
-_SEARCHED_BEFORE = gc.get_threshold()
-
 OF_LINUX = {"fcntl", "grp", "pty", "pwd", "resource", "termios", "tty"}
 """Modules of Python that other systems lack."""
-
-
-def __getattr__(name: str) -> Any:
-    """Import the application when it is asked for."""
-    if name != "app":
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return import_module("hilctl.cli.application").app
 
 
 def main() -> None:
     """Run the command line; every error raised on purpose becomes a message and an exit code."""
     take_volume(sys.argv)
-    # What is imported comes by the hundred thousand objects, with no garbage among them: to search
-    # it again and again takes a tenth of the time, and at the end a fifth of a second.
-    gc.set_threshold(_SEARCHED_OBJECTS)
-    atexit.register(gc.freeze)
     acts = any(name in ACTING for name in sys.argv[1:2])
     with (
         plain_streams(acts=acts),
@@ -117,15 +91,6 @@ def _clock_can_be_read() -> bool:
     return True
 
 
-def search_garbage() -> None:
-    """Have Python search for garbage as it does by itself, but not in what is there already.
-
-    For commands that stay or compute: once they have imported what they need.
-    """
-    gc.freeze()
-    gc.set_threshold(*_SEARCHED_BEFORE)
-
-
 @contextmanager
 def _memory_said_once() -> Iterator[None]:
     """Withhold what Python remarks of errors that nobody can catch where memory has run out.
@@ -147,26 +112,9 @@ def _memory_said_once() -> Iterator[None]:
 
 
 def _command() -> None:
-    if len(sys.argv) > 1 and sys.argv[1] in QUICK:
-        raise SystemExit(quick(sys.argv[1], sys.argv[2:]))
-    from hilctl.cli.application import app
+    from hilctl.cli.commands import app
 
     app()
-
-
-def quick(name: str, words: Sequence[str]) -> int:
-    """Run one of the commands in :data:`QUICK`, and return its exit code."""
-    if name in STEERING:
-        from hilctl.cli.steering import steer
-
-        return steer(name, words)
-    if name in READING:
-        from hilctl.cli.reading import read_recording
-
-        return read_recording(name, words)
-    from hilctl.cli.listing import list_recordings
-
-    return list_recordings(words)
 
 
 def machine_refused(error: Exception) -> str:

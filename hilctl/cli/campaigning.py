@@ -11,7 +11,6 @@ import typer
 
 from hilctl.base.errors import ConfigError, InputError, Problem
 from hilctl.base.yaml.document import Document
-from hilctl.cli import search_garbage
 from hilctl.cli.options import AsJson, ExperimentFile, Settings
 from hilctl.cli.output import print_json
 
@@ -133,7 +132,6 @@ def _do(
 
     with shown_progress("campaign", quiet=as_json) as on_progress:
         host = SeriesHost(on_progress=on_progress, on_note=_note)
-        search_garbage()
         host = host if as_json else replace(host, on_row=print_row)
         try:
             result = run_steps(

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from hilctl.base.errors import RunError
-from hilctl.cli import search_garbage
 from hilctl.cli.options import AsJson, ExperimentFile, LabelTexts, Overwrite, Settings, with_labels
 from hilctl.cli.output import print_json
 
@@ -75,7 +74,6 @@ def _characterised(experiment: Path, output: Path, **asked: Any) -> "Characteris
     from hilctl.run.step import StepStoppedError
 
     try:
-        search_garbage()
         return api.characterise(experiment, output, **asked)
     except (StepStoppedError, KeyboardInterrupt) as error:
         number = getattr(error, "signal", signal.SIGINT)

@@ -1,19 +1,19 @@
-"""Which commands there are, and a group that imports one only when it is called.
+"""The application: which commands there are, and a group that imports one only when it is called.
 
 A name stands for where its function is, so that a command may come from ``hilctl_drivers``, which
 ``hilctl`` never imports, and ``--help`` costs no more than this table.
 """
 
-import argparse
-import inspect
 from importlib import import_module
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import typer
 from typer.core import TyperCommand, TyperGroup
 
+from hilctl import __version__
 from hilctl.base.errors import InputError, RunError
-from hilctl.cli import OF_LINUX, QUICK, machine_refused, quick
+from hilctl.cli import OF_LINUX, machine_refused
+from hilctl.cli.volume import QUIET, VERBOSE
 
 
 class CommandEntry(NamedTuple):
@@ -177,41 +177,6 @@ class CommandTable(TyperGroup):
             raise RunError(machine_refused(error)) from error
 
 
-class _Quick(TyperCommand):
-    """A command that reads its own arguments, for whoever comes by the application all the same."""
-
-    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Leave them to it."""
-        ctx.args = args
-        return args
-
-    def invoke(self, ctx: Any) -> Any:
-        """Run it."""
-        raise typer.Exit(quick(str(self.name), ctx.args))
-
-
-def _options(parser: argparse.ArgumentParser) -> list[Any]:
-    """Return the options of a command that reads its own arguments, for shells to complete."""
-
-    def takes_them(**_options: Any) -> None:
-        pass
-
-    parameters = [
-        inspect.Parameter(
-            each.dest,
-            inspect.Parameter.KEYWORD_ONLY,
-            default=typer.Option(None, *each.option_strings, help=each.help),
-            annotation=bool if each.nargs == 0 else str,
-        )
-        for each in parser._actions  # noqa: SLF001, argparse has no other way to them
-        if each.option_strings and each.dest != "help"
-    ]
-    setattr(takes_them, "__signature__", inspect.Signature(parameters))  # noqa: B010, no other has it
-    alone = typer.Typer(add_completion=False)
-    alone.command()(takes_them)
-    return typer.main.get_command(alone).params
-
-
 def load(name: str) -> Any:
     """Return a command of the table, ready to be called.
 
@@ -220,14 +185,11 @@ def load(name: str) -> Any:
     """
     module_name, _, attribute = COMMANDS[name].place.partition(":")
     try:
-        module = import_module(module_name)
-        found = getattr(module, attribute)
+        found = getattr(import_module(module_name), attribute)
     except (ImportError, AttributeError) as error:
         if error.name in OF_LINUX:
             raise
         raise InputError(f"{name} can't be loaded: {error}") from error
-    if name in QUICK:
-        return _Quick(name, help=found.__doc__, params=_options(module.parser_of(name)))
     if isinstance(found, typer.Typer):
         group = typer.main.get_group(found)
         group.name = name
@@ -235,3 +197,36 @@ def load(name: str) -> Any:
     alone = typer.Typer(add_completion=False, rich_markup_mode=None, context_settings=HELP_NAMES)
     alone.command(name)(found)
     return typer.main.get_command(alone)
+
+
+app = typer.Typer(
+    name="hilctl",
+    cls=CommandTable,
+    help="Real-time hysteresis compensation for smart-material actuators.",
+    no_args_is_help=True,
+    add_completion=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,  # rich takes longer to import than all of the rest
+    context_settings=HELP_NAMES,
+)
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        print(f"hilctl {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _root(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
+    ] = False,
+    quiet: Annotated[
+        bool, typer.Option(QUIET, help="Every command: only warnings and errors; or --json.")
+    ] = False,
+    verbose: Annotated[
+        bool, typer.Option(VERBOSE, help="Every command: the whole log, and where errors arose.")
+    ] = False,
+) -> None:
+    del version, quiet, verbose  # those two are taken before, wherever they stand

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hilctl.cli import search_garbage
 from hilctl.cli.options import AsJson, ExperimentFile, LabelTexts, Overwrite, Settings, with_labels
 from hilctl.cli.output import finish_orphans, print_json
 
@@ -38,7 +37,6 @@ def learn(
 
     finish_orphans()
     chosen = runs_folder(output, folder)
-    search_garbage()
     learned = api.learn(
         experiment,
         output,

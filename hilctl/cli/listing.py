@@ -1,16 +1,18 @@
-"""The command that lists recordings. No typer, no rich: both take longer to import than it runs."""
+"""The command that lists recordings."""
 
-import argparse
 import json
 import sys
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+import typer
 
 from hilctl.analysis.catalogue import Entry, keys_of, read_catalogue, select
 from hilctl.base.finite_json import finite_json
 from hilctl.base.printable import printable, short_name
+from hilctl.cli.options import AsJson
 from hilctl.cli.output import finish_orphans
 from hilctl.recording.facts import LABELS_FACT, RECORDINGS
 
@@ -32,42 +34,36 @@ _NUMBERS = {"duration_s", "peak_hysteresis_percent", "peak_error_percent", "skip
 _TO_SECONDS = len("2000-01-01T00:00:00")
 
 
-def list_recordings(words: Sequence[str]) -> int:
-    """List the recordings below a folder, by what their first and last bytes say."""
-    given = parser_of("list").parse_args(words)
+def list_recordings(
+    folder: Annotated[
+        Path, typer.Argument(metavar="FOLDER", help="Folder with recordings, at any depth.")
+    ] = Path(RECORDINGS),
+    where: Annotated[
+        str, typer.Option(metavar="WHERE", help="Condition that a run must meet, in SQL.")
+    ] = "",
+    sort: Annotated[str, typer.Option(metavar="KEY", help="Key to sort by.")] = "started",
+    reverse: Annotated[
+        bool, typer.Option("--reverse", help="The largest or newest first.")
+    ] = False,
+    keys: Annotated[
+        bool, typer.Option("--keys", help="Print the keys of these recordings.")
+    ] = False,
+    as_json: AsJson = False,
+) -> None:
+    """List the recordings below a folder, by what their first and last bytes say.
+
+    Example: --where 'frequency_hz > 100 and label.sample == "A7"'
+    """
     finish_orphans()
-    catalogue = read_catalogue(given.folder)
-    if given.keys:
+    catalogue = read_catalogue(folder)
+    if keys:
         print("\n".join(map(printable, keys_of(catalogue))))
-        return 0
-    entries = select(catalogue, given.where, given.sort, reverse=given.reverse)
-    if given.json:
-        _print_json(entries, len(catalogue), given.folder)
+        return
+    entries = select(catalogue, where, sort, reverse=reverse)
+    if as_json:
+        _print_json(entries, len(catalogue), folder)
     else:
         _print_table(entries, len(catalogue))
-    return 0
-
-
-def parser_of(name: str) -> argparse.ArgumentParser:
-    """Return what reads the words of the command."""
-    parser = argparse.ArgumentParser(
-        f"hilctl {name}",
-        description=list_recordings.__doc__,
-        epilog="Example: --where 'frequency_hz > 100 and label.sample == \"A7\"'",
-        allow_abbrev=False,
-    )
-    parser.add_argument(
-        "folder", nargs="?", type=Path, default=Path(RECORDINGS), metavar="FOLDER",
-        help=f"Folder with recordings, at any depth; {RECORDINGS} where not given.",
-    )  # fmt: skip
-    parser.add_argument("--where", default="", help="Condition that a run must meet, in SQL.")
-    parser.add_argument(
-        "--sort", default="started", metavar="KEY", help="Key to sort by; started where not given."
-    )
-    parser.add_argument("--reverse", action="store_true", help="The largest or newest first.")
-    parser.add_argument("--keys", action="store_true", help="Print the keys of these recordings.")
-    parser.add_argument("--json", action="store_true", help="Print one JSON object for programs.")
-    return parser
 
 
 def _print_json(entries: Sequence[Entry], count: int, folder: Path) -> None:

@@ -4,7 +4,6 @@ from typing import Annotated
 
 import typer
 
-from hilctl.cli import search_garbage
 from hilctl.cli.options import AsJson
 from hilctl.cli.output import print_json
 
@@ -59,7 +58,6 @@ def live(
         what = "Foxglove server" if foxglove else "live page"
         print_json({"url": url}) if as_json else print(f"{what}: {url}", flush=True)
 
-    search_garbage()
     if foxglove:
         serve_foxglove(chosen, over, on_url, port)
     else:

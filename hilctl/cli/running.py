@@ -11,7 +11,6 @@ from typing import Annotated
 import typer
 
 from hilctl.base.errors import HilctlError, InputError
-from hilctl.cli import search_garbage
 from hilctl.cli.compiling import compiling_shown
 from hilctl.cli.options import AsJson, ExperimentFile, LabelTexts, Overwrite, Settings, with_labels
 from hilctl.cli.output import finish_orphans, print_json
@@ -88,7 +87,6 @@ def _run(
         _watched(wanted=watch),
         LiveView(quiet=quiet, addresses=addresses) as view,
     ):
-        search_garbage()
         result = api.run(
             experiment, output, settings=settings, overwrite=overwrite, on_progress=view.update
         )

@@ -1,7 +1,4 @@
-"""Where runs stand, what was changed and how they stopped, in plain lines.
-
-Nothing of rich, which takes longer to import than all the rest of these commands.
-"""
+"""Where runs stand, what was changed and how they stopped, in plain lines."""
 
 from collections.abc import Sequence
 from typing import Any

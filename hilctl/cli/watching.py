@@ -12,7 +12,6 @@ from typing import Annotated
 import typer
 
 from hilctl.base.errors import RunError
-from hilctl.cli import search_garbage
 from hilctl.cli.streams import plain_streams
 from hilctl.cli.terminal import taken_terminal
 from hilctl.cli.watcher import Watcher
@@ -43,7 +42,6 @@ def watch(
 def _watched(run: RunFolder) -> str | None:
     """Show a run; return how it has ended, None where it goes on."""
     feed = RunFeed(run)
-    search_garbage()
     with taken_terminal() as screen:
         Watcher(feed, screen, time.monotonic).run()
     if not feed.ended:

@@ -1,14 +1,11 @@
 """What the documents name is there: files, commands, options, sections."""
 
-import contextlib
-import io
 import re
 import shlex
 from functools import cache
 
 import pytest
 
-from hilctl.cli import QUICK, quick
 from hilctl.cli.commands import COMMANDS, load
 from tests.documents.walkthrough import ROOT
 
@@ -42,11 +39,6 @@ def anchors(text):
 @cache
 def options(name):
     """Return the options of a command and of those within it."""
-    if name in QUICK:
-        printed = io.StringIO()
-        with contextlib.redirect_stdout(printed), contextlib.suppress(SystemExit):
-            quick(name, ["--help"])
-        return set(OPTION.findall(printed.getvalue()))
     command = load(name)
     found = {"--help"}
     for each in (command, *getattr(command, "commands", {}).values()):

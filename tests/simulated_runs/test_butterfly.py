@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from hilctl.analysis.replay import replay
 from hilctl.analysis.report import summarize
-from hilctl.cli import app
+from hilctl.cli.commands import app
 from hilctl.identify.data.cycles import average_cycle
 from hilctl.identify.data.records import SteadyLoop
 from hilctl.identify.fit_model import fit_model

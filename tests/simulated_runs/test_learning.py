@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from hilctl.analysis.replay import replay
 from hilctl.analysis.report import summarize
-from hilctl.cli import app
+from hilctl.cli.commands import app
 from hilctl.experiment.correction import load_correction
 from hilctl.experiment.load import load_experiment
 from hilctl.learning.session import Session

@@ -8,9 +8,13 @@ import pytest
 from mcap.writer import Writer
 
 from hilctl.base.errors import InputError
-from hilctl.cli.listing import list_recordings
+from hilctl.cli.commands import load
 
 GOLDEN = Path(__file__).parents[3] / "recordings" / "golden"
+
+
+def list_recordings(words):
+    return load("list")(words, standalone_mode=False)
 
 
 @pytest.fixture(autouse=True)
@@ -37,7 +41,7 @@ def folder(tmp_path):
 
 
 def test_the_table_has_a_line_a_run_and_nothing_that_steers_a_terminal(folder, capsys):
-    assert list_recordings([str(folder)]) == 0
+    list_recordings([str(folder)])
     out, err = capsys.readouterr()
     lines = out.splitlines()
     assert [line.split("  ")[0] for line in lines[1:5]] == [

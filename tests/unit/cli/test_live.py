@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import pytest
 from typer.testing import CliRunner
 
-from hilctl.cli.application import app
+from hilctl.cli.commands import app
 from hilctl.run.run_folder import run_folder
 
 

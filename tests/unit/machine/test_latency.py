@@ -145,7 +145,7 @@ def test_command_line(monkeypatch, capsys):
     """doctor prints one JSON object, and its exit code is the verdict."""
     from typer.testing import CliRunner
 
-    from hilctl.cli import app
+    from hilctl.cli.commands import app
     from hilctl.machine import diagnosis
 
     experiment = Path(__file__).parents[3] / "configs" / "demo.yaml"

@@ -354,7 +354,7 @@ def test_command_line_requires_real_time(monkeypatch):
     """--require-rt is a setting of the experiment, beside those given with --set."""
     from typer.testing import CliRunner
 
-    from hilctl.cli import app
+    from hilctl.cli.commands import app
     from hilctl.run import start
 
     asked = []

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from hilctl.cli import app
+from hilctl.cli.commands import app
 from hilctl_drivers.emulator.command import Place, serve
 from hilctl_drivers.emulator.faults import parse_fault
 from hilctl_drivers.emulator.options import EmulatorOptions
