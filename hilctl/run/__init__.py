@@ -25,8 +25,7 @@ description.py     what a run says of itself to those who look on
 requests.py        requests to a run, over control_socket.py; stopping.py a signal to stop;
                    client.py sends them, protocol.py has their words; detached.py starts runs in
                    the background
-changes.py         gain, offset and inverse on their way to the loop; change_worker.py works
-                   them out
+changes.py         gain, offset and inverse on their way to the loop
 systemd.py         readiness and watchdog of a service
 probe.py           whether a device answers, and whether that can be true
 orphans.py         what dead runs left behind; dead_runs.py  finished before anything is read

@@ -23,14 +23,16 @@ from hilctl.base.errors import RunError
 from hilctl.base.values import Values, in_memory
 from hilctl.experiment.check import Checked
 from hilctl.loop.window import window_size
-from hilctl.run.change_worker import SUPERVISORS
 from hilctl.run.ring import SampleRing
 from hilctl.run.run_folder import RunFolder
 from hilctl.run.shared_page import Field, SharedPage
+from hilctl.run.stopping import HANG_UP, JOB_CONTROL, STOP_SIGNAL
 
 _PIECE = 1 << 16
 _POLL_S = 0.02
 _DEATH_S = 1.0
+_SUPERVISORS = (signal.SIGINT, signal.SIGTERM, HANG_UP, STOP_SIGNAL, *JOB_CONTROL)
+"""Signals that may be sent to all of a run's processes, and are the supervisor's to follow."""
 
 
 class WindowFiller:
@@ -119,7 +121,7 @@ class ReferenceProcess:
         args = (theirs, self._connection, values, checked.begun.input_um)
         self._process = fork.Process(target=_work, args=args, daemon=True)
         # Held back until it ignores them: one that comes in between would end it.
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, SUPERVISORS)
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, _SUPERVISORS)
         try:
             self._process.start()
         finally:
@@ -164,9 +166,9 @@ def _work(
 ) -> None:
     """Fill a window until all of the reference has been there, or the supervisor is gone."""
     supervisors.close()  # else the end of its side would never show
-    for number in SUPERVISORS:
+    for number in _SUPERVISORS:
         signal.signal(number, signal.SIG_IGN)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, SUPERVISORS)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, _SUPERVISORS)
     supervisor = os.getppid()
     with suppress(EOFError, OSError):
         place: _Place = connection.recv()

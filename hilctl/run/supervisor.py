@@ -19,7 +19,6 @@ from hilctl.experiment.check import Checked
 from hilctl.loop.pacer import deadline_misses
 from hilctl.machine.memory import ProcessMemory
 from hilctl.machine.realtime import be_ordinary, favoured
-from hilctl.run.change_worker import ChangeWorker
 from hilctl.run.child import LoopChild
 from hilctl.run.control_socket import ControlServer
 from hilctl.run.guardian_process import GuardianRelief
@@ -93,7 +92,6 @@ class Supervisor:
             # ended would cost the result of a run that has ended.
             stack.enter_context(self._signals())
             # Before anything is held or started: a fork has all that its maker has.
-            worker = stack.enter_context(ChangeWorker(self._checked))
             filling = stack.enter_context(ReferenceProcess(self._checked))
             holds = self._checked.loaded.device.info.holds
             relief = GuardianRelief(holds)
@@ -108,7 +106,7 @@ class Supervisor:
                 )
                 ring = self._make_ring(folder)
                 recording = RingRecorder(ring, recorder, config.recording.flush_s)
-                requests = Requests(self._checked, folder, ring.page, recording, worker)
+                requests = Requests(self._checked, folder, ring.page, recording)
                 server = stack.enter_context(ControlServer(folder.socket, requests.answer))
                 child = LoopChild(self._checked, folder, ring, locks + own, self._silence_s)
                 # Open to the end: watchers find it even if the folder is removed.

@@ -84,7 +84,7 @@ def test_a_reference_that_comes_no_more_ends_the_run(experiment):
         for child in children
         if b"loop_process" not in Path(f"/proc/{child}/cmdline").read_bytes()
     ]
-    assert len(forked) >= 2
+    assert forked
     for each in forked:
         os.kill(each, signal.SIGSTOP)
     until = time.monotonic() + 120.0

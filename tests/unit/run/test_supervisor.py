@@ -25,7 +25,6 @@ from hilctl.run.supervisor import Supervisor
 MS = 1_000_000
 STARTED = [
     "ordinary",
-    "worker",
     "filling",
     "devices",
     "claimed",
@@ -36,7 +35,7 @@ STARTED = [
 ]
 READY = [*STARTED, "await ready", "filled", "small", "begin", "favoured", "recording"]
 _UNDONE = ["ordinary again", "server closed", "folder removed", "devices let go"]
-UNDONE = [*_UNDONE, "filling ended", "worker closed"]
+UNDONE = [*_UNDONE, "filling ended"]
 
 
 class Time:
@@ -94,7 +93,6 @@ class Neighbours:
             "time": self.time,
             "be_ordinary": lambda: self.note("ordinary"),
             "favoured": lambda loop: self.around("favoured", "ordinary again", loop),
-            "ChangeWorker": lambda checked: self.around("worker", "worker closed", None),
             "ReferenceProcess": lambda checked: self.around("filling", "filling ended", self),
             "held_devices": lambda holds: self.around("devices", "devices let go", [*holds]),
             "Recorder": lambda *a, overwrite: self.note("claimed", self.recorder),
@@ -305,7 +303,7 @@ def test_signals_are_taken_for_as_long_as_anything_is_begun_or_undone(stage):
 
     stage.log = Log()
     stage.run()
-    assert {"worker", "filling", "worker closed", "filling ended"} < taken.keys()
+    assert {"filling", "filling ended"} < taken.keys()
     assert [what for what, held in taken.items() if not held] == ["ordinary"]
     assert signal.getsignal(signal.SIGINT) is before
 
@@ -326,9 +324,7 @@ def test_whatever_fails_before_the_start_signal_leaves_nothing(stage, number):
         expected.append("safety closed")
     if number > READY.index("claimed"):
         expected.append("given back")
-    undo = dict(
-        zip(("favoured", "server", "folder", "devices", "filling", "worker"), UNDONE, strict=True)
-    )
+    undo = dict(zip(("favoured", "server", "folder", "devices", "filling"), UNDONE, strict=True))
     expected += [undone for begun, undone in undo.items() if READY.index(begun) < number]
     assert stage.log[number + 1 :] == expected
     if stage.ring is not None:
@@ -386,7 +382,7 @@ def test_what_breaks_afterwards_costs_neither_coil_nor_recording(stage):
     assert stage.log[len(READY) :][:4] == [
         "requests", "serve", "broken off: a bug", "progress ended",
     ]  # fmt: skip
-    assert stage.log[-7:] == ["safety closed", *UNDONE]
+    assert stage.log[-6:] == ["safety closed", *UNDONE]
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, STOP_SIGNAL])
@@ -517,4 +513,4 @@ def test_memory_that_is_not_to_be_had_is_told(stage, monkeypatch):
     monkeypatch.setattr(SampleRing, "create", create)
     with pytest.raises(RunError, match="ring: no memory: No space left on device; less recording"):
         stage.run()
-    assert stage.log[-5:] == ["given back", *UNDONE[2:]]
+    assert stage.log[-4:] == ["given back", *UNDONE[2:]]
