@@ -14,7 +14,6 @@ loop_process.py    the loop's process; carried_out.py  what it does with its job
                    host.py  its side of the shared memory,
                    waiting_loop.py  started before its run is known
 starting.py        where the output is before a run
-reference_window.py  a reference that is longer than memory, worked out ahead of the loop
 ring.py            sample blocks in shared memory, behind shared_page.py
 recorder.py        into the recording; metadata.py what it says of the run, end_figures.py of
                    what came out

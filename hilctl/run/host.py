@@ -10,7 +10,7 @@ from hilctl.base.samples import Head
 from hilctl.kernels import tick
 from hilctl.loop.host import Direct, StraightLine, Tuning
 from hilctl.run.ring import SampleRing
-from hilctl.run.shared_page import Field, Phase, SharedPage, Stop
+from hilctl.run.shared_page import Field, Phase, Stop
 
 # Plain numbers: looking up an enumeration's member takes longer than writing it.
 _HEARTBEAT_NS, _NEXT_SAMPLE = int(Field.LOOP_HEARTBEAT_NS), int(Field.NEXT_SAMPLE)
@@ -121,22 +121,3 @@ class RingHost:
     def supervised(self) -> bool:
         """Return whether the supervisor is still there."""
         return os.getppid() == self._supervisor
-
-
-class SharedWindow:
-    """A window that another process fills; see :class:`hilctl.loop.window.Window`.
-
-    Args:
-        page: Says how far it is filled.
-        samples: Samples of the waveform.
-    """
-
-    def __init__(self, page: SharedPage, samples: int) -> None:
-        self._page, self.samples = page, samples
-        self._ready = 0
-
-    def has(self, stop: int) -> bool:
-        """Return whether all samples before ``stop`` are there."""
-        if stop > self._ready:
-            self._ready = self._page.observe(Field.REFERENCE_READY)
-        return stop <= self._ready

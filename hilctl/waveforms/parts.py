@@ -7,9 +7,8 @@ from itertools import accumulate
 
 import numpy as np
 
-from hilctl.base.arrays import F64
-from hilctl.base.values import CHUNK, Values
-from hilctl.waveforms.shapes import telling_samples
+from hilctl.base.arrays import CHUNK, F64
+from hilctl.waveforms.shapes import Values, telling_samples
 
 
 @dataclass(frozen=True, slots=True)
