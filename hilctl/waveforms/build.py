@@ -10,7 +10,7 @@ from hilctl.base.arrays import CHUNK, F64, chunks
 from hilctl.base.errors import InputError
 from hilctl.base.segments import Segment
 from hilctl.waveforms import shapes, spec
-from hilctl.waveforms.parts import Joined, Repeat, Softened, telling
+from hilctl.waveforms.parts import Repeat, soften, telling
 from hilctl.waveforms.table import read_samples
 
 
@@ -44,7 +44,7 @@ class Reference:
 class _Part:
     """One waveform of a reference, and whether its steady part is known to repeat."""
 
-    values: shapes.Values
+    values: F64
     segment: Segment
     repeats: bool
 
@@ -65,11 +65,9 @@ def build(waveform: spec.AnyWaveform, sample_rate_hz: float, folder: Path) -> Re
         raise InputError("unit is required: um, A or V")
     with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is refused below
         parts, repeat = _parts(waveform, waveform.unit, sample_rate_hz, folder)
-        joined = Joined([part.values for part in parts], repeat)
-        values = np.empty(joined.size)
-        for start in range(0, values.size, CHUNK):
-            stop = min(start + CHUNK, values.size)
-            values[start:stop] = joined[start:stop]
+        values = parts[0].values
+        if len(parts) * repeat > 1:
+            values = np.concatenate([part.values for part in parts] * repeat)
         values.flags.writeable = False
         repeats = _repeats(parts, repeat) if values.size > shapes.LONG else ()
         told = telling(values.size, repeats)
@@ -115,7 +113,6 @@ def _parts(
 
 
 def _part(w: spec.SinglePart, name: str, unit: str, sample_rate_hz: float, folder: Path) -> _Part:
-    values: shapes.Values
     if w.kind == "file":
         values, period = read_samples(w, sample_rate_hz, folder)
         label = f"file {Path(w.path).name}"
@@ -126,14 +123,22 @@ def _part(w: spec.SinglePart, name: str, unit: str, sample_rate_hz: float, folde
                 f"{name}: every frequency must be below half the sample rate, "
                 f"{sample_rate_hz / 2.0:.10g} Hz: {highest_hz:.10g} Hz"
             )
-        values, period = shapes.sampled(w, sample_rate_hz), period_s * sample_rate_hz
+        values, period = _computed(shapes.sampled(w, sample_rate_hz)), period_s * sample_rate_hz
     n = values.size
     soft_start, soft_end = _soft_samples(w, name, n, sample_rate_hz)
     period = period if math.isfinite(period) else 0.0
     segment = Segment(label, 0, n, soft_start, n - soft_end, period)
-    softened = Softened(values, w.rest, soft_start, soft_end)
+    soften(values, w.rest, soft_start, soft_end)
     # What a file says of its period is its author's word.
-    return _Part(softened, segment, period > 0.0 and w.kind != "file")
+    return _Part(values, segment, period > 0.0 and w.kind != "file")
+
+
+def _computed(values: shapes.Values) -> F64:
+    """Return an array of values that are computed part by part: float64[n]."""
+    whole = np.empty(values.size)
+    for start in range(0, whole.size, CHUNK):
+        whole[start : start + CHUNK] = values[start : start + CHUNK]
+    return whole
 
 
 def _soft_samples(w: spec.SinglePart, name: str, n: int, sample_rate_hz: float) -> tuple[int, int]:
