@@ -63,7 +63,7 @@ class RunConnection:
     ) -> dict[str, Any]:
         """Change the reference or the inverse over a ramp; what is None stays as it is.
 
-        It returns once the change is worked out and on its way; ``begins_at_sample`` says when.
+        It returns once the change is accepted; ``begins_at_sample`` is its first sample.
 
         Args:
             gain: Factor of the reference.

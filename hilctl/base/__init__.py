@@ -1,6 +1,6 @@
 """What all rooms share; it knows none of them.
 
-arrays.py    array types; values.py  arrays, or what stands for one that is longer than memory
+arrays.py    array types, and long arrays piece by piece
 device.py    the contract of a device and of a clock; units.py  of its commands
 errors.py    every exception that is raised on purpose
 strict.py    base of every pydantic model; plain.py  stands in for it where nothing is checked

@@ -1,5 +1,6 @@
 """Array types named once, so that signatures say what they hold."""
 
+from collections.abc import Iterator
 from typing import TypeAlias
 
 import numpy as np
@@ -19,3 +20,13 @@ I64: TypeAlias = npt.NDArray[np.int64]
 
 U8: TypeAlias = npt.NDArray[np.uint8]
 """A uint8 array, used for bytes."""
+
+CHUNK = 1_000_000
+"""Values that are processed together, so that temporary arrays stay small."""
+
+
+def chunks(values: F64, parts: tuple[slice, ...] | None = None) -> Iterator[F64]:
+    """Yield values in pieces of :data:`CHUNK` at most: all of them, or those of some parts."""
+    for part in parts or (slice(0, values.size),):
+        for start in range(part.start, part.stop, CHUNK):
+            yield values[start : min(start + CHUNK, part.stop)]

@@ -51,7 +51,7 @@ def within(limits: CampaignLimits, keys: Keys) -> tuple[Keys, F64]:
         Its keys, and every command: float64[n].
     """
     for _ in range(_TRIES):
-        command = reference_of(limits, keys).array().copy()  # kernels take no read-only one
+        command = reference_of(limits, keys).values.copy()  # kernels take no read-only one
         scale = limits.scale(command)
         if scale >= 1.0:
             break

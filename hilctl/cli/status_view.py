@@ -34,17 +34,11 @@ def _status_lines(run: dict[str, Any]) -> dict[str, str]:
 
 
 def print_change(name: str, answer: dict[str, Any]) -> None:
-    """Print what a change of the reference comes to, and how far it was worked out before."""
+    """Print the reference and inverse that a change leads to."""
     inverse = f", inverse {answer['inverse']}" if answer["inverse"] else ""
     values = f"gain {answer['gain']:g}, offset {answer['offset']:g}{inverse}"
     values += f", over {answer['over_s']:g} s"
-    checked = f"every command of the next {answer['checked_s']:.3g} s is within the limits"
-    if answer["checked_to_the_end"]:
-        checked += ", to the end of the run"
-    else:
-        checked += "; the rest was tried only where the reference goes furthest"
     print(f"{name}: {values}")
-    print(f"  {checked}")
 
 
 def print_stopped(stopped: Sequence[dict[str, Any]], wait_s: float) -> None:

@@ -148,8 +148,8 @@ class TrialDevice:
             DeviceError: The device refuses something.
         """
         loaded = replace(self._loaded, model=model)
-        begun = begin(model, self.sample_rate_hz, reference.array())
-        values = (reference.array(), begun.input_um[:], begun.state)
+        begun = begin(model, self.sample_rate_hz, reference.values)
+        values = (reference.values, begun.input_um[:], begun.state)
         plan = replace(
             assemble(loaded, *values, paced=False),
             # A model that is far off is to be judged, and not to be stopped.

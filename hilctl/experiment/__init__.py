@@ -11,7 +11,6 @@ check.py          the whole run worked out beforehand, held against device, mode
 model_range.py    whether the reference stays within what the model was identified on
 pace.py           whether no timer is quick enough for its ticks
 forecast.py       what a run will do, by all of its commands; whole_run.py  works those out
-tuned.py          what it would with another gain and offset
 interlocks.py     interlocks, feedback.py feedback and adaptation.py adaptation, by the file's keys
 device.py         the device that it names; registry.py  devices by name
 inventory.py      what there is on this machine; examples.py  what comes with hilctl, to copy

@@ -9,7 +9,6 @@ import numpy as np
 from hilctl.base.arrays import F64
 from hilctl.base.errors import Problem
 from hilctl.base.segments import Segment
-from hilctl.base.values import Values
 from hilctl.experiment.feedback import LOOP_DELAY, delays
 from hilctl.experiment.file import Experiment
 from hilctl.loop.adaptation import Adaptation, AdaptationBounds, DisplacementOperator
@@ -140,7 +139,7 @@ def _shortest_s(loaded: "LoadedExperiment", preview: int) -> float:
 
 
 def worst_inputs(
-    config: Experiment, operator: DisplacementOperator | None, input_um: Values
+    config: Experiment, operator: DisplacementOperator | None, input_um: F64
 ) -> Iterator["WorstInput"]:
     """Give the compensator's input with the adaptation at its bounds, where they make it largest.
 
@@ -170,9 +169,7 @@ class WorstInput:
         led: Samples on the way there, at most n.
     """
 
-    def __init__(
-        self, operator: DisplacementOperator, input_um: Values, worst: F64, led: int
-    ) -> None:
+    def __init__(self, operator: DisplacementOperator, input_um: F64, worst: F64, led: int) -> None:
         self._operator, self._input_um, self._worst, self._led = operator, input_um, worst, led
         self._memory = operator.at_rest(float(input_um[0:1][0]))
 

@@ -13,7 +13,6 @@ import numpy as np
 
 from hilctl.base.arrays import F64
 from hilctl.base.errors import ConfigError, DataError, InputError, ModelError, Problem
-from hilctl.base.values import Values
 from hilctl.experiment.adaptation import (
     adaptation_problems,
     adaptation_warnings,
@@ -176,7 +175,7 @@ def _findings(loaded: LoadedExperiment, reference: Reference) -> RangeFindings:
     return range_findings(known, reference)
 
 
-def _corrected(loaded: LoadedExperiment, reference: Reference, problems: list[Problem]) -> Values:
+def _corrected(loaded: LoadedExperiment, reference: Reference, problems: list[Problem]) -> F64:
     """Return the reference with what has been learned: float64[n]; itself where nothing has."""
     correction = loaded.correction
     if correction is None:

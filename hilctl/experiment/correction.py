@@ -13,12 +13,11 @@ from typing import Annotated, Any
 import numpy as np
 import numpy.typing as npt
 
-from hilctl.base.arrays import C128, F64, I64
+from hilctl.base.arrays import C128, CHUNK, F64, I64
 from hilctl.base.errors import InputError
 from hilctl.base.files import TextFiles, write_text
 from hilctl.base.segments import Segment
 from hilctl.base.strict import Field, Strict, model_validator
-from hilctl.base.values import Added, Values, held
 from hilctl.base.yaml.document import load_document
 from hilctl.base.yaml.plain import dump
 from hilctl.models.base import HysteresisModel
@@ -109,7 +108,7 @@ class Correction(Strict):
     cycles: Annotated[tuple[LearnedCycle, ...], Field(min_length=1)]
     provenance: Mapping[str, str] = Field(default_factory=dict)
 
-    def added(self, reference: Reference, model: HysteresisModel | None) -> Values:
+    def added(self, reference: Reference, model: HysteresisModel | None) -> F64:
         """Return a run's reference with the correction of every sample: float64[n], in um.
 
         That grows and shrinks with the waveform's soft start and end; where there is no soft start,
@@ -134,16 +133,14 @@ class Correction(Strict):
             known = "; ".join(cycle.label for cycle in self.cycles)
             raise InputError(f"was learned for another waveform: {known}")
 
-        def correction(start: int, stop: int) -> F64:
-            out = np.zeros(stop - start)
-            for segment, cycle in found:
-                first, last = max(start, segment.start), min(stop, segment.stop)
-                if first < last:
-                    index = np.arange(first, last) - segment.start
-                    out[first - start : last - start] = cycle.at(index) * envelope(segment, index)
-            return out
-
-        return held(Added(reference.values, correction, reference.values.size))
+        correction = np.zeros(reference.values.size)
+        for segment, cycle in found:
+            for start in range(segment.start, segment.stop, CHUNK):
+                stop = min(start + CHUNK, segment.stop)
+                index = np.arange(start, stop) - segment.start
+                correction[start:stop] = cycle.at(index) * envelope(segment, index)
+        correction += reference.values
+        return correction
 
 
 class CorrectionFile(Strict):
@@ -160,7 +157,7 @@ def evaluate(coefficients: C128, points: int) -> F64:
     return np.fft.irfft(spectrum * points, points)
 
 
-def signature(values: Values, segment: Segment) -> F64 | None:
+def signature(values: F64, segment: Segment) -> F64 | None:
     """Return one steady period of a reference at 64 even phases, in its unit.
 
     Args:
@@ -183,7 +180,7 @@ def signature(values: Values, segment: Segment) -> F64 | None:
     return cycle
 
 
-def fits(cycle: LearnedCycle, values: Values, segment: Segment) -> bool:
+def fits(cycle: LearnedCycle, values: F64, segment: Segment) -> bool:
     """Return whether a cycle was learned for a segment: same period, same wanted displacement."""
     wanted = signature(values, segment)
     if wanted is None or not _alike(cycle.period_samples, segment.period):

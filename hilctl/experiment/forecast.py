@@ -175,29 +175,27 @@ class CommandFigures:
 
     Args:
         config: The experiment.
-        last: Command before the first of them; None where there is none to step from.
+        last: Command before the first of them.
         heat_a2: Running mean square of the coil current before them, in A^2.
 
     Attributes:
         low: Lowest command.
         high: Highest command.
-        last: Command before the next ones; None where they are not to be held against one.
+        last: Command before the next ones.
         heat: The thermal budget.
     """
 
-    def __init__(self, config: Experiment, last: float | None, heat_a2: float) -> None:
+    def __init__(self, config: Experiment, last: float, heat_a2: float) -> None:
         self.last = last
-        self.low = math.inf if last is None else last
-        self.high = -math.inf if last is None else last
+        self.low = self.high = last
         self.heat = CoilHeat(config.limits, config.sample_rate_hz, heat_a2)
         self._rate_hz = config.sample_rate_hz
         self._step = 0.0
 
     def add(self, command: F64) -> None:
         """Go on with the next commands: float64[n], n > 0."""
-        before = command[0] if self.last is None else self.last
         with np.errstate(over="ignore", invalid="ignore"):  # what comes of it is refused
-            steps = np.abs(np.diff(command, prepend=before))
+            steps = np.abs(np.diff(command, prepend=self.last))
         self.low = float(np.minimum(self.low, command.min()))  # keeps a NaN, where min() would not
         self.high = float(np.maximum(self.high, command.max()))
         self._step = float(np.maximum(self._step, steps.max()))

@@ -74,23 +74,13 @@ class CoilHeat:
             self.add(np.ascontiguousarray(current[part]))
             self._last = float(samples.command[part[-1]])
 
-    def repeat(self, cycle: F64, times: int) -> None:
-        """Go on with a cycle (float64[n], in A) again and again."""
-        if self._tau_s is None or times < 1:
-            return
-        before_a2 = self.heat_a2
-        self.add(cycle)
-        self.pass_over(before_a2, cycle.size, times - 2)
-        # From cycle to cycle it rises or falls: the highest is in the first or last.
-        self.add(cycle)
-
     def pass_over(self, before_a2: float, samples: int, times: int) -> None:
         """Take a cycle that was added for added that many times more, but for the highest in it.
 
         Args:
             before_a2: Heat before it, in A^2.
             samples: How many it has.
-            times: How often; -1 takes it out again.
+            times: How often.
         """
         if self._tau_s is None:
             return
@@ -98,12 +88,6 @@ class CoilHeat:
             before_a2, self.heat_a2, samples / self._rate_hz, self._tau_s, times
         )
         self._samples += times * samples
-
-    def expect(self, heat_a2: float) -> None:
-        """Take a heat that was not worked out command by command for what is to come."""
-        self.highest_a2 = max(self.highest_a2, heat_a2)
-        if self.used_s is None and heat_a2 > self._budget_a2:
-            self.used_s = self._samples / self._rate_hz
 
     @property
     def rms_a(self) -> float | None:

@@ -13,7 +13,6 @@ import numpy as np
 from hilctl.base.arrays import F64
 from hilctl.base.errors import DataError
 from hilctl.base.samples import Flag
-from hilctl.base.values import Added, Values, held
 from hilctl.loop.compensator import Compensator
 from hilctl.models.base import HysteresisModel
 
@@ -38,7 +37,7 @@ class Begun:
             against it; None where it is not.
     """
 
-    input_um: Values
+    input_um: F64
     preview: int
     state_size: int
     state: F64 | None = None
@@ -61,27 +60,24 @@ class InitialState:
     stands_um: float
     run_id: str
 
-    def lead_in(self, input_um: Values, samples: int) -> Values:
+    def lead_in(self, input_um: F64, samples: int) -> F64:
         """Return the compensator's input, begun from where the actuator stands.
 
         Args:
             input_um: float64[n].
             samples: Samples that the way takes; the whole of ``input_um`` where that is shorter.
         """
-        away_um = self.stands_um - float(input_um[:1][0])
-
-        def way(start: int, stop: int) -> F64:
-            part = np.arange(start, stop) / samples
-            led: F64 = 0.5 * (1.0 + np.cos(np.pi * part)) * away_um
-            return led
-
-        return held(Added(input_um, way, min(samples, input_um.size)))
+        away_um = self.stands_um - float(input_um[0])
+        led = input_um.copy()
+        part = np.arange(min(samples, input_um.size)) / samples
+        led[: part.size] += 0.5 * (1.0 + np.cos(np.pi * part)) * away_um
+        return led
 
 
 def begin(
     model: HysteresisModel | None,
     sample_rate_hz: float,
-    values: Values,
+    values: F64,
     before: InitialState | None = None,
     begins: str = "at rest",
 ) -> Begun:

@@ -5,12 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hilctl.base.arrays import F64
+from hilctl.base.arrays import F64, chunks
 from hilctl.base.segments import Segment
-from hilctl.base.values import Values, chunks, in_memory
 from hilctl.models.base import IdentifiedRange
 from hilctl.waveforms.build import Reference
-from hilctl.waveforms.shapes import telling_samples
+from hilctl.waveforms.shapes import LONG, telling_samples
 
 WINDOW_S = 0.2
 FEWEST_SAMPLES = 256  # of a window
@@ -53,7 +52,7 @@ class RangeFindings:
 
 
 def spectrum(
-    values: Values,
+    values: F64,
     sample_rate_hz: float,
     least_move: float = 0.0,
     told: tuple[slice, ...] | None = None,
@@ -80,7 +79,7 @@ def spectrum(
     return Spectrum(main * step_hz, highest * step_hz, step_hz)
 
 
-def _windows(values: Values, size: int, parts: tuple[slice, ...]) -> Iterator[F64]:
+def _windows(values: F64, size: int, parts: tuple[slice, ...]) -> Iterator[F64]:
     """Give windows that overlap by half, of each part, some at a time: float64[k, size]."""
     hop = max(size // 2, 1)
     for part in parts:
@@ -150,10 +149,10 @@ def _motion_warnings(known: IdentifiedRange, reference: Reference) -> Iterator[s
         )
 
 
-def _move_um(values: Values, segment: Segment) -> float:
+def _move_um(values: F64, segment: Segment) -> float:
     """Return the steady peak-to-peak motion of a segment, by its first periods where it repeats."""
     start, stop = segment.steady_start, segment.steady_stop
-    if segment.period > 0.0 and not in_memory(values):
+    if segment.period > 0.0 and values.size > LONG:
         stop = min(stop, start + telling_samples(segment.period))
     spans = [(each.min(), each.max()) for each in chunks(values, (slice(start, stop),))]
     return float(np.max(spans) - np.min(spans)) if spans else 0.0

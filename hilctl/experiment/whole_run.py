@@ -1,9 +1,8 @@
 """All commands of a run, worked out from its first sample to its last; what repeats, once.
 
-Where a reference does not fit in memory, it repeats, as a rule: hours of it would take minutes to
-work out. So cycles are passed over once two after each other came out the same: so much the same
-that, were each of the others to differ from the one before by as much, the last would still be the
-same.
+A long reference repeats, as a rule, and to compute all of it would take minutes. So cycles are
+passed over when two in a row came out the same: so much the same that, were each of the others to
+differ from the one before by as much, the last would still be the same.
 """
 
 import math
@@ -12,10 +11,10 @@ from typing import Protocol
 
 import numpy as np
 
-from hilctl.base.arrays import F64
-from hilctl.base.values import CHUNK, fit
+from hilctl.base.arrays import CHUNK, F64
 from hilctl.loop.compensator import Compensator
 from hilctl.waveforms.parts import Repeat
+from hilctl.waveforms.shapes import LONG
 
 _MOST_PERIODS = 1024
 _LEAST_CYCLE = 65_536
@@ -122,7 +121,7 @@ def whole_cycle(period: float, samples: int) -> int:
     """
     for periods in range(1, _MOST_PERIODS + 1):
         length = periods * period
-        if not fit(length) or 4 * length > samples:
+        if length > LONG or 4 * length > samples:
             return 0
         if abs(length - round(length)) * (samples / length) <= _WHOLE:
             times = max(1, math.ceil(_LEAST_CYCLE / length))

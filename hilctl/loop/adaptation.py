@@ -20,10 +20,9 @@ from typing import Any, Self
 
 import numpy as np
 
-from hilctl.base.arrays import F64
+from hilctl.base.arrays import F64, chunks
 from hilctl.base.errors import InputError
 from hilctl.base.events import ADAPTED, Event, adapted_text
-from hilctl.base.values import Values, chunks
 from hilctl.kernels import adaptation as kernel
 from hilctl.kernels.jit import load
 from hilctl.loop.block import Block
@@ -80,7 +79,7 @@ class DisplacementOperator:
 
     @classmethod
     def over(
-        cls, reference_um: Values, bounds: AdaptationBounds, told: tuple[slice, ...] | None = None
+        cls, reference_um: F64, bounds: AdaptationBounds, told: tuple[slice, ...] | None = None
     ) -> Self:
         """Return that of a reference: the plays and the centre are those of its span.
 
@@ -140,7 +139,7 @@ class DisplacementOperator:
         offset_um, shares = self.bounds[kernel.OFFSET], self.bounds[kernel.GAIN :].sum()
         return float(offset_um + 2.0 * shares * self.settings[kernel.HALF_UM])
 
-    def _take_apart(self, reference_um: Values, told: tuple[slice, ...] | None) -> None:
+    def _take_apart(self, reference_um: F64, told: tuple[slice, ...] | None) -> None:
         """Have each regressor without what those before it have: Gram and Schmidt's way."""
         m, n = self.bounds.size, 0
         sums, products, found = np.zeros(m), np.zeros((m, m)), np.zeros(m)

@@ -4,7 +4,6 @@ import numpy as np
 
 from hilctl.base.arrays import F64
 from hilctl.base.errors import ModelError
-from hilctl.base.values import Ahead, Values, held
 from hilctl.models.base import HysteresisModel, Operator, Stage
 
 
@@ -21,14 +20,17 @@ class Compensator:
         self.preview = self._operator.preview if self._operator else 0
         """Samples by which its input must run ahead of the commands."""
 
-    def ahead(self, reference: Values) -> Values:
+    def ahead(self, reference: F64) -> F64:
         """Return what to feed for a reference (float64[n]): itself, ``preview`` samples ahead.
 
         The last value stands for those that come after it.
         """
-        return held(Ahead(reference, self.preview)) if self.preview else reference
+        if not self.preview:
+            return reference
+        after = np.repeat(reference[-1:], min(self.preview, reference.size))
+        return np.concatenate((reference[self.preview :], after))
 
-    def begin(self, reference: Values) -> None:
+    def begin(self, reference: F64) -> None:
         """Run through what comes before the first command: ``preview`` samples of the reference.
 
         So the first command belongs to a reference that has stood at its first value until then.

@@ -28,16 +28,15 @@ def feed(
         start: The first of them in the waveform.
     """
     reference, input_um = part
-    at = start % plan.reference.size  # all of a block stands in one piece
-    stop = at + reference.size
+    stop = start + reference.size
     if factors is None:
-        reference[:] = plan.reference[at:stop]
+        reference[:] = plan.reference[start:stop]
         # The reference itself, as a rule: a copy of what was copied is the quicker one.
         own = plan.input_um is not plan.reference
-        input_um[:] = plan.input_um[at:stop] if own else reference
+        input_um[:] = plan.input_um[start:stop] if own else reference
     else:
-        tune(factors, plan.reference[at:stop], reference)
-        tune(factors, plan.input_um[at:stop], input_um)
+        tune(factors, plan.reference[start:stop], reference)
+        tune(factors, plan.input_um[start:stop], input_um)
     before.correct(input_um, start)
     if plan.feedback is not None:
         plan.feedback.follow(block, input_um)
@@ -59,7 +58,7 @@ def pass_over(plan: Plan, before: Beginning, tuner: Tuner, start: int, stop: int
         start: The first of them in the waveform.
         stop: The first after them.
     """
-    passed = plan.input_um.take(np.arange(start, stop), mode="wrap")
+    passed = plan.input_um[start:stop].copy()
     factors = tuner.advance(passed.size)
     if factors is not None:
         tune(factors, passed, passed)

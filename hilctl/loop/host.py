@@ -32,8 +32,7 @@ class Tuning:
         gain: Factor of the reference.
         offset: Added to it, in the waveform's unit.
         samples: Samples that the change takes.
-        begins_at: Sample that it begins at, so that it can be worked out before; at the next block
-            where that one has gone by.
+        begins_at: Sample that it begins at; if that has passed, it begins with the next block.
         inverse_share: Part of the inverse in the command, from 0 to 1; the rest is the line's.
         line: What the rest is made of.
     """

@@ -192,9 +192,6 @@ class Loop:
         if usual is None or not follows or self._end - first_sample < self._plan.block:
             return False
         start = first_sample - self._before.waveform_at
-        window = self._plan.window
-        if window is not None and not window.has(start + self._plan.block):
-            return False
         invalid = usual.begin(self._pacer, first_sample, start, self._start_ns)
         if invalid == ASKED:
             return False
@@ -236,8 +233,7 @@ class Loop:
         self._next_sample += skipped
         if self._phase is _FOLLOWING:
             at, stop = self._before.waveform_at, min(self._next_sample, self._end)
-            if self._ready(stop):
-                pass_over(self._plan, self._before, self._tuner, start - at, stop - at)
+            pass_over(self._plan, self._before, self._tuner, start - at, stop - at)
         return skipped
 
     def _claim(self, skipped: int, *, due: bool = True) -> Block:
@@ -263,18 +259,10 @@ class Loop:
             return
         if late := self._pacer.too_late():
             self._leave("fault", "late", late)
-        elif not self._ready(min(self._next_sample + self._plan.block, self._end)):
-            text = "the reference was not worked out in time"
-            self._leave("fault", "reference_late", f"{text} at sample {self._next_sample}")
         elif stop:
             self._leave("stopped", "stopped", stop)
         elif self._phase is _Phase.FOLLOWING and (tuning := self._host.tuning()):
             self._tune(tuning)
-
-    def _ready(self, stop: int) -> bool:
-        """Return whether the reference is there up to a sample of the run."""
-        window = self._plan.window
-        return window is None or window.has(stop - self._before.waveform_at)
 
     def _follow_from_here(self) -> None:
         """Enter the waveform; its first tick still waits for a whole period."""

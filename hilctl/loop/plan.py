@@ -12,7 +12,6 @@ from hilctl.loop.interlocks import InterlockContext, InterlockSettings
 from hilctl.loop.limiter import CommandLimits
 from hilctl.loop.pacer import LatePolicy, LateRules
 from hilctl.loop.safe_output import OutputState
-from hilctl.loop.window import Window
 
 Code: TypeAlias = Literal["completed", "stopped", "fault"]
 
@@ -46,10 +45,9 @@ class Plan:
     """What a run does.
 
     Attributes:
-        reference: float64[n], in the waveform's unit; a window of it where there is one.
+        reference: float64[n], in the waveform's unit.
         input_um: float64[n], the compensator's input: the reference as far ahead as it previews,
-            and whatever is added to it; the reference itself where nothing compensates. A window
-            of it where there is one.
+            and whatever is added to it; the reference itself where nothing compensates.
         block: Samples in each exchange.
         latency_blocks: Exchanges from a block's commands to its displacements.
         sample_rate_hz: Samples a second.
@@ -65,7 +63,6 @@ class Plan:
         adaptation: Adapts the compensator's model; None where nothing does.
         conditioning: What comes before the waveform; None where nothing does.
         keep_all: Whether a block that finds no room in the ring ends the run.
-        window: How far the windows are filled; None where reference and input are there as a whole.
     """
 
     reference: F64
@@ -85,9 +82,8 @@ class Plan:
     adaptation: Adaptation | None = None
     conditioning: Conditioning | None = None
     keep_all: bool = True
-    window: Window | None = None
 
     @property
     def samples(self) -> int:
         """Samples of the waveform."""
-        return self.reference.size if self.window is None else self.window.samples
+        return self.reference.size

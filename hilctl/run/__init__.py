@@ -14,7 +14,6 @@ loop_process.py    the loop's process; carried_out.py  what it does with its job
                    host.py  its side of the shared memory,
                    waiting_loop.py  started before its run is known
 starting.py        where the output is before a run
-reference_window.py  a reference that is longer than memory, worked out ahead of the loop
 ring.py            sample blocks in shared memory, behind shared_page.py
 recorder.py        into the recording; metadata.py what it says of the run, end_figures.py of
                    what came out
@@ -24,8 +23,7 @@ description.py     what a run says of itself to those who look on
 requests.py        requests to a run, over control_socket.py; stopping.py a signal to stop;
                    client.py sends them, protocol.py has their words; detached.py starts runs in
                    the background
-changes.py         gain, offset and inverse on their way to the loop; change_worker.py works
-                   them out
+changes.py         gain, offset and inverse on their way to the loop
 systemd.py         readiness and watchdog of a service
 probe.py           whether a device answers, and whether that can be true
 orphans.py         what dead runs left behind; dead_runs.py  finished before anything is read

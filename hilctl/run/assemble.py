@@ -15,7 +15,6 @@ from hilctl.loop.compensator import Compensator
 from hilctl.loop.conditioning import Conditioning
 from hilctl.loop.pacer import LatePolicy, LateRules
 from hilctl.loop.plan import Plan
-from hilctl.loop.window import Window
 
 _ALWAYS_LATE_S = 2.0
 _MISSED_WINDOW_S = 10.0
@@ -29,7 +28,6 @@ def assemble(
     conditioning: Conditioning | None = None,
     *,
     operator: DisplacementOperator | None = None,
-    window: Window | None = None,
     paced: bool = True,
     heat_a2: float = 0.0,
 ) -> Plan:
@@ -37,12 +35,11 @@ def assemble(
 
     Args:
         parts: Of the experiment.
-        reference: float64[n], in the waveform's unit; a window of it where there is one.
-        input_um: float64[n], the compensator's input; the same.
+        reference: float64[n], in the waveform's unit.
+        input_um: float64[n], the compensator's input.
         state: The compensator's memory before the first sample; at rest where None.
         conditioning: What comes before the waveform; None for nothing.
         operator: What its adaptation adapts; None where nothing is adapted.
-        window: How far windows are filled; None where reference and input are there as a whole.
         paced: Whether the run keeps real time; else no tick is late.
         heat_a2: Heat of the coil before it, in A^2.
     """
@@ -68,14 +65,11 @@ def assemble(
         start_policy="spaced" if host_paced else policy,
         # By time, not by ticks: a device that takes its time for each would be at it for long.
         ramp_policy="skip" if host_paced else policy,
-        late_rules=_late_rules(config, window.samples if window else reference.size)
-        if paced
-        else LateRules(),
+        late_rules=_late_rules(config, reference.size) if paced else LateRules(),
         feedback=make_feedback(config, compensator, info.latency_blocks),
         adaptation=make_adaptation(config, operator, compensator),
         conditioning=conditioning,
         keep_all=config.recording.on_failure == "stop",
-        window=window,
     )
 
 

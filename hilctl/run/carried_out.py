@@ -24,7 +24,7 @@ from hilctl.machine.realtime import (
 )
 from hilctl.machine.usage import ProcessUsage
 from hilctl.run.assemble import assemble
-from hilctl.run.host import RingHost, SharedWindow
+from hilctl.run.host import RingHost
 from hilctl.run.job import Job
 from hilctl.run.ring import SampleRing
 from hilctl.run.shared_page import Field, PageText, Phase, SharedPage
@@ -98,7 +98,6 @@ def run_job(
         job.state,
         conditioning,
         operator=job.adapted,
-        window=SharedWindow(page, job.samples) if job.samples > reference.size else None,
         heat_a2=job.heat_a2,
     )
     loop = Loop(plan, device, host)

@@ -1,59 +1,46 @@
 """Changes of gain, offset and inverse on their way to the loop, one after another.
 
-Each is worked out from where the loop stands, and only once the loop has taken the one before: so
-the second follows the first, and none is written over. Nothing here waits.
+Each is checked by a bound on its amplitude when the loop has taken the one before: so the second
+follows the first, and none is overwritten. Nothing here waits.
 """
 
+import math
 from collections import deque
 from collections.abc import Mapping
-from copy import copy
-from dataclasses import dataclass
-from typing import Any, Literal, Protocol
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
 
 from hilctl.base.errors import InputError
-from hilctl.experiment.check import Checked
+from hilctl.experiment.check import Checked, command_problems, reference_problems
 from hilctl.experiment.straight import fade_refusal
-from hilctl.experiment.tuned import TunedForecast
-from hilctl.loop.host import Tuning
-from hilctl.loop.tuning import Tuner
-from hilctl.run.change_worker import WantedChange
-from hilctl.run.run_folder import RunFolder
+from hilctl.loop.compensator import Compensator
 from hilctl.run.shared_page import Field, SharedPage
 
 _SHARES: dict[str | None, float] = {"in": 1.0, "out": 0.0}
 _MOST_WAITING = 16
-_LEAD_S = 0.5
-_TRIES = 3
-
-
-class WorksOut(Protocol):
-    """What works changes out; see :class:`hilctl.run.change_worker.ChangeWorker`."""
-
-    def begin(self, wanted: WantedChange) -> None:
-        """Have a change worked out."""
-        ...
-
-    def result(self) -> TunedForecast | None:
-        """Return what came of it; None while it is being worked out."""
-        ...
+_LEAD_S = 0.05
+"""Time from the answer to the first sample of a change."""
+_CYCLE = 2000
+"""Samples per cycle of the sine from which the command range is computed."""
 
 
 @dataclass(slots=True)
 class RequestedChange:
-    """A change that somebody waits for.
+    """A change whose request waits for its answer.
 
     Attributes:
-        gain: Factor of the reference; left as it is where None.
-        offset: Added to the reference; left as it is where None.
+        gain: Factor of the reference; unchanged if None.
+        offset: Added to the reference; unchanged if None.
         over_s: Time that the change takes.
-        inverse: Whether the inverse is to be ``in`` or ``out``; left as it is where None.
+        inverse: Whether the inverse is to be ``in`` or ``out``; unchanged if None.
     """
 
     gain: float | None
     offset: float | None
     over_s: float
     inverse: Literal["in", "out"] | None = None
-    tries: int = 0
     _answer: Mapping[str, Any] | None = None
     _refusal: str = ""
 
@@ -81,27 +68,17 @@ class Changes:
 
     Args:
         checked: The experiment.
-        folder: The run's folder, with its ring.
         page: Shared with the loop.
-        worker: Works them out.
 
     Attributes:
         gain: Factor of the reference that the last change has led to, or leads to.
         offset: What is added to it, likewise.
     """
 
-    def __init__(
-        self, checked: Checked, folder: RunFolder, page: SharedPage, worker: WorksOut
-    ) -> None:
+    def __init__(self, checked: Checked, page: SharedPage) -> None:
         self.gain, self.offset, self._inverse_share = 1.0, 0.0, 1.0
-        self._checked, self._folder, self._page = checked, folder, page
-        self._worker = worker
+        self._checked, self._page = checked, page
         self._waiting: deque[RequestedChange] = deque()
-        self._current: RequestedChange | None = None
-        # What the loop's own tuner does, by the samples at which it took the changes.
-        self._tuner, self._tuner_at = Tuner(), 0
-        self._placed: Tuning | None = None
-        self._heat_a2 = (checked.forecast.heating_rms_a or 0.0) ** 2
 
     @property
     def inverse(self) -> str | None:
@@ -131,18 +108,14 @@ class Changes:
     def attend(self) -> None:
         """Go on with what can go on; to be called often."""
         if why := self._too_late():
-            self._refuse_all(why)
+            for change in self._waiting:
+                change.refuse(why)
+            self._waiting.clear()
             return
         page = self._page
-        # Only after the loop has taken it may the change before be written over.
-        if page.get(Field.TUNE_WANTED) != page.observe(Field.TUNE_TAKEN):
-            return
-        self._note_taken()
-        if self._current is None and self._waiting:
-            self._current = self._waiting.popleft()
-            self._work_out(self._current)
-        elif self._current is not None:
-            self._conclude(self._current)
+        # Only after the loop has taken it may the change before be overwritten.
+        if self._waiting and page.get(Field.TUNE_WANTED) == page.observe(Field.TUNE_TAKEN):
+            self._make(self._waiting.popleft())
 
     def _too_late(self) -> str:
         """Return why no change can be made any more, or an empty text."""
@@ -152,83 +125,98 @@ class Changes:
             return "the waveform is over; the run is on its way to the safe value"
         return ""
 
-    def _refuse_all(self, why: str) -> None:
-        for change in (*self._waiting, *filter(None, [self._current])):
+    def _make(self, change: RequestedChange) -> None:
+        """Put a change on the page for the loop, or refuse it."""
+        gain = self.gain if change.gain is None else change.gain
+        offset = self.offset if change.offset is None else change.offset
+        share = _SHARES.get(change.inverse, self._inverse_share)
+        bypassed = min(share, self._inverse_share) < 1.0
+        if why := bound_refusal(self._checked, gain, offset, bypassed=bypassed):
             change.refuse(why)
-        self._waiting.clear()
-        self._current = None
-
-    def _note_taken(self) -> None:
-        if self._placed is not None:
-            taken_at = self._page.get(Field.TUNE_TAKEN_AT)
-            self._tuner.pass_over(taken_at - self._tuner_at)
-            self._tuner.move(self._placed)
-            self._tuner_at, self._placed = taken_at, None
-
-    def _work_out(self, change: RequestedChange) -> None:
-        rate_hz = self._checked.loaded.config.sample_rate_hz
-        wanted = WantedChange(
-            ring=str(self._folder.ring),
-            gain=self.gain if change.gain is None else change.gain,
-            offset=self.offset if change.offset is None else change.offset,
-            inverse_share=_SHARES.get(change.inverse, self._inverse_share),
-            samples=max(1, round(change.over_s * rate_hz)),
-            lead_s=_LEAD_S * 2**change.tries,
-            tuner=copy(self._tuner),
-            tuner_at=self._tuner_at,
-            heat_a2=self._heat_a2,
-        )
-        change.tries += 1
-        try:
-            self._worker.begin(wanted)
-        except InputError as error:
-            self._give_up(change, str(error))
-
-    def _conclude(self, change: RequestedChange) -> None:
-        try:
-            found = self._worker.result()
-        except InputError as error:
-            self._give_up(change, str(error))
             return
-        if found is None:
+        page, config = self._page, self._checked.loaded.config
+        lead = max(1, round(_LEAD_S * config.sample_rate_hz))
+        blocks = math.ceil((page.get(Field.NEXT_SAMPLE) + lead) / config.block) + 1
+        begins_at = blocks * config.block
+        if begins_at >= self._checked.forecast.samples:
+            change.refuse("the waveform is over before the change could begin")
             return
-        next_sample = self._page.get(Field.NEXT_SAMPLE) + self._checked.loaded.config.block
-        if next_sample <= found.tuning.begins_at:
-            self._place(found)
-            change.accept(_answer(change, found, self.inverse))
-            self._current = None
-        elif change.tries < _TRIES:  # the loop has gone by: what was worked out no longer holds
-            self._work_out(change)
-        else:
-            self._give_up(change, "this machine is too busy to work it out in time: try again")
-
-    def _give_up(self, change: RequestedChange, why: str) -> None:
-        change.refuse(why)
-        self._current = None
-
-    def _place(self, found: TunedForecast) -> None:
-        page, tuning = self._page, found.tuning
-        page.put_float(Field.TUNE_GAIN, tuning.gain)
-        page.put_float(Field.TUNE_OFFSET, tuning.offset)
-        page.put_float(Field.TUNE_INVERSE_SHARE, tuning.inverse_share)
-        page.put_float(Field.TUNE_LINE_SLOPE, tuning.line.slope)
-        page.put_float(Field.TUNE_LINE_AT_ZERO, tuning.line.at_zero)
-        page.put(Field.TUNE_SAMPLES, tuning.samples)
-        page.put(Field.TUNE_BEGINS_AT, tuning.begins_at)
+        page.put_float(Field.TUNE_GAIN, gain)
+        page.put_float(Field.TUNE_OFFSET, offset)
+        page.put_float(Field.TUNE_INVERSE_SHARE, share)
+        if line := self._checked.forecast.line:
+            page.put_float(Field.TUNE_LINE_SLOPE, line.slope)
+            page.put_float(Field.TUNE_LINE_AT_ZERO, line.at_zero)
+        page.put(Field.TUNE_SAMPLES, max(1, round(change.over_s * config.sample_rate_hz)))
+        page.put(Field.TUNE_BEGINS_AT, begins_at)
         # Last: the loop reads the numbers above as soon as it sees a new count.
         page.publish(Field.TUNE_WANTED, page.get(Field.TUNE_WANTED) + 1)
-        self.gain, self.offset, self._placed = tuning.gain, tuning.offset, tuning
-        self._inverse_share = tuning.inverse_share
-        self._heat_a2 = max(self._heat_a2, found.heat_a2)
+        self.gain, self.offset, self._inverse_share = gain, offset, share
+        change.accept(
+            {
+                "gain": gain,
+                "offset": offset,
+                "inverse": self.inverse,
+                "over_s": change.over_s,
+                "begins_at_sample": begins_at,
+            }
+        )
 
 
-def _answer(change: RequestedChange, found: TunedForecast, inverse: str | None) -> dict[str, Any]:
-    return {
-        "gain": found.tuning.gain,
-        "offset": found.tuning.offset,
-        "inverse": inverse,
-        "over_s": change.over_s,
-        "begins_at_sample": found.tuning.begins_at,
-        "checked_s": found.checked_s,
-        "checked_to_the_end": found.to_the_end,
-    }
+def bound_refusal(checked: Checked, gain: float, offset: float, *, bypassed: bool) -> str:
+    """Return why a reference of this gain and offset would leave the limits, or an empty text.
+
+    The whole range of the reference counts, also what has passed. Its command range is bounded; its
+    slew and heat are not: the loop's limiter and interlocks hold those.
+
+    Args:
+        checked: The experiment.
+        gain: Factor of the reference.
+        offset: Added to it.
+        bypassed: Whether the straight line gives commands too.
+    """
+    low, high = sorted(gain * end + offset for end in checked.reference.span)
+    problems = reference_problems(checked.loaded, checked.reference.unit, low, high)
+    commands = [*command_range(checked, low, high, gain)]
+    if bypassed and (line := checked.forecast.line):
+        commands += [line.slope * end + line.at_zero for end in (low, high)]
+    bound = replace(
+        checked.forecast,
+        command_min=float(np.min(commands)),  # keeps a NaN, where min() would not
+        command_max=float(np.max(commands)),
+        slew_per_s=0.0,
+        budget_used_s=None,
+    )
+    problems += command_problems(checked.loaded, bound)
+    return "; ".join(f"{problem.rule}, got {problem.value}" for problem in problems)
+
+
+def command_range(checked: Checked, low: float, high: float, gain: float) -> tuple[float, float]:
+    """Return the lowest and highest command for a reference from ``low`` to ``high``.
+
+    It is the range of a sine between them. The checked run differs from a sine over its own range,
+    by its rate and its history; that difference is added, times the gain.
+    """
+    found = _sine_commands(checked, low, high)
+    line = checked.forecast.line
+    if line is None:  # no model, so the commands are the reference; or a constant reference
+        return found
+    # The ends of the line are the lowest and highest command of the checked waveform.
+    known = sorted(line.slope * end + line.at_zero for end in checked.reference.span)
+    sine = _sine_commands(checked, *checked.reference.span)
+    more = [gain * (known[end] - sine[end]) for end in (0, 1)]
+    if gain < 0.0:
+        more.reverse()
+    return found[0] + more[0], found[1] + more[1]
+
+
+def _sine_commands(checked: Checked, low: float, high: float) -> tuple[float, float]:
+    """Return the lowest and highest command in the second cycle of a sine from rest."""
+    phase = np.arange(2 * _CYCLE) * (2.0 * np.pi / _CYCLE)
+    values = 0.5 * (low + high) + 0.5 * (high - low) * np.sin(phase)
+    values = np.clip(values, low, high)  # rounding must not leave a limit
+    compensator = Compensator(checked.loaded.model, checked.loaded.config.sample_rate_hz)
+    commands = np.empty_like(values)
+    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is refused
+        compensator.process(values, commands)
+    return float(commands[_CYCLE:].min()), float(commands[_CYCLE:].max())

@@ -10,14 +10,14 @@ from hilctl.base.samples import Head
 from hilctl.kernels import tick
 from hilctl.loop.host import Direct, StraightLine, Tuning
 from hilctl.run.ring import SampleRing
-from hilctl.run.shared_page import Field, Phase, SharedPage, Stop
+from hilctl.run.shared_page import Field, Phase, Stop
 
 # Plain numbers: looking up an enumeration's member takes longer than writing it.
 _HEARTBEAT_NS, _NEXT_SAMPLE = int(Field.LOOP_HEARTBEAT_NS), int(Field.NEXT_SAMPLE)
 _LATE_TICKS, _STOP = int(Field.LATE_TICKS), int(Field.STOP)
 _SUPERVISOR_HEARTBEAT_NS = int(Field.SUPERVISOR_HEARTBEAT_NS)
 _TUNE_WANTED, _TUNE_TAKEN = int(Field.TUNE_WANTED), int(Field.TUNE_TAKEN)
-_TUNE_BEGINS_AT, _TUNE_TAKEN_AT = int(Field.TUNE_BEGINS_AT), int(Field.TUNE_TAKEN_AT)
+_TUNE_BEGINS_AT = int(Field.TUNE_BEGINS_AT)
 
 _LONGEST_NS = 2**62
 _FIELDS = {
@@ -103,8 +103,8 @@ class RingHost:
         numbers, page = self._numbers, self._page
         if numbers[_TUNE_WANTED] == numbers[_TUNE_TAKEN]:
             return None
-        wanted, now = page.observe(Field.TUNE_WANTED), numbers[_NEXT_SAMPLE]
-        if now < numbers[_TUNE_BEGINS_AT]:
+        wanted = page.observe(Field.TUNE_WANTED)
+        if numbers[_NEXT_SAMPLE] < numbers[_TUNE_BEGINS_AT]:
             return None
         tuning = Tuning(
             page.get_float(Field.TUNE_GAIN),
@@ -114,7 +114,6 @@ class RingHost:
             page.get_float(Field.TUNE_INVERSE_SHARE),
             StraightLine(*map(page.get_float, (Field.TUNE_LINE_SLOPE, Field.TUNE_LINE_AT_ZERO))),
         )
-        numbers[_TUNE_TAKEN_AT] = now
         # Taken only once it has been read: the supervisor may write the next one from here on.
         page.publish(Field.TUNE_TAKEN, wanted)
         return tuning
@@ -122,22 +121,3 @@ class RingHost:
     def supervised(self) -> bool:
         """Return whether the supervisor is still there."""
         return os.getppid() == self._supervisor
-
-
-class SharedWindow:
-    """A window that another process fills; see :class:`hilctl.loop.window.Window`.
-
-    Args:
-        page: Says how far it is filled.
-        samples: Samples of the waveform.
-    """
-
-    def __init__(self, page: SharedPage, samples: int) -> None:
-        self._page, self.samples = page, samples
-        self._ready = 0
-
-    def has(self, stop: int) -> bool:
-        """Return whether all samples before ``stop`` are there."""
-        if stop > self._ready:
-            self._ready = self._page.observe(Field.REFERENCE_READY)
-        return stop <= self._ready

@@ -16,10 +16,8 @@ import numpy as np
 from hilctl.base.arrays import F64
 from hilctl.base.device import Device
 from hilctl.base.errors import RunError
-from hilctl.base.values import Values, in_memory
 from hilctl.experiment.file import Experiment
 from hilctl.loop.adaptation import DisplacementOperator
-from hilctl.loop.window import window_size
 from hilctl.models.base import HysteresisModel
 from hilctl.run.waiting_loop import CHECKING, PLAIN
 
@@ -75,9 +73,8 @@ class Job:
         model: The compensator's model; None where nothing compensates.
         device: Not opened, pickled; or what it is made from.
         ring: File of the ring.
-        reference: File of the reference samples, or of a window of them.
-        input_um: File of the compensator's input, or of a window of it.
-        samples: Samples of the waveform: of a window, there are more than it has.
+        reference: File of the reference samples.
+        input_um: File of the compensator's input.
         state: float64[s], the compensator's memory before the first sample; None where it is at
             rest.
         heat_a2: Heat of the coil before the run, in A^2.
@@ -93,7 +90,6 @@ class Job:
     ring: Path
     reference: str
     input_um: str
-    samples: int
     state: F64 | None
     heat_a2: float
     stands_um: float | None
@@ -115,14 +111,12 @@ class Job:
         from hilctl.run.description import RunDescription
 
         begun, values = checked.begun, checked.reference.values
-        loaded, size = checked.loaded, values.size
-        if not in_memory(values):
-            size = window_size(loaded.config.block, loaded.config.sample_rate_hz)
+        loaded = checked.loaded
         reference = input_um = folder.reference
-        _save(reference, values, size)
+        _save(reference, values)
         if begun.input_um is not values:
             input_um = folder.input_um
-            _save(input_um, begun.input_um, size)
+            _save(input_um, begun.input_um)
         RunDescription.of(checked).write(folder.description)
         return cls(
             config=loaded.config,
@@ -131,7 +125,6 @@ class Job:
             ring=folder.ring,
             reference=str(reference),
             input_um=str(input_um),
-            samples=values.size,
             state=begun.state,
             heat_a2=checked.heat_a2,
             stands_um=begun.stands_um,
@@ -173,10 +166,10 @@ def _device(loaded: "LoadedExperiment") -> bytes | DeviceText:
     return DeviceText(loaded.yaml_text, loaded.files.texts, str(loaded.folder.resolve()))
 
 
-def _save(path: Path, values: Values, size: int) -> None:
-    """Leave an array, or the first samples of a window, float64[size]."""
+def _save(path: Path, values: F64) -> None:
+    """Leave an array, float64[n]."""
     try:
-        np.save(path, values[0:size])
+        np.save(path, values)
     except OSError as error:  # numpy's own has no errno: "8000 requested and 512 written"
         hint = "less recording.ring_s, or a shorter waveform, needs less of it"
         raise RunError(f"{path}: no memory: {error.strerror or error}; {hint}") from None

@@ -10,7 +10,7 @@ from hilctl.base.errors import InputError
 from hilctl.base.events import MARK, Event
 from hilctl.base.strict import Strict
 from hilctl.experiment.check import Checked
-from hilctl.run.changes import Changes, RequestedChange, WorksOut
+from hilctl.run.changes import Changes, RequestedChange
 from hilctl.run.protocol import MAX_MARK
 from hilctl.run.ring_recorder import RingRecorder
 from hilctl.run.run_folder import RunFolder, facts_of
@@ -73,7 +73,6 @@ class Requests:
         folder: The run's folder.
         page: Shared with the loop.
         recording: Takes what the loop exchanges.
-        worker: Works changes of the reference out.
     """
 
     def __init__(
@@ -82,13 +81,12 @@ class Requests:
         folder: RunFolder,
         page: SharedPage,
         recording: RingRecorder,
-        worker: WorksOut,
     ) -> None:
         self._checked = checked
         self._folder = folder
         self._page = page
         self._recording, self._recorder = recording, recording.recorder
-        self._changes = Changes(checked, folder, page, worker)
+        self._changes = Changes(checked, page)
         self.attend = self._changes.attend
         """Goes on with changes that are under way; to be called often."""
 

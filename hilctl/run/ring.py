@@ -25,7 +25,7 @@ from typing import Any, Self
 import numpy as np
 import numpy.typing as npt
 
-from hilctl.base.arrays import F64, I64
+from hilctl.base.arrays import I64
 from hilctl.base.samples import ANSWERS, COLUMNS, LAST_SAMPLE, LONGEST_NS, Batch, Flag, Head
 from hilctl.loop.block import COMMAND, Block
 from hilctl.run.run_folder import RunFolder
@@ -39,7 +39,6 @@ _ENDED_AT, _EXCHANGING = int(Field.ENDED_AT), int(Field.EXCHANGING)
 _SEQUENCE, _FIRST_SAMPLE = int(Head.SEQUENCE), int(Head.FIRST_SAMPLE)
 _HEAD_NUMBERS = len(Head)
 _MAGIC = 0x48494C43_52494E48
-_LOOKS = 10
 _BATCH_SAMPLES = 8192
 """About how many samples are taken out together: what becomes of them is ten times their memory."""
 _TYPES = (np.int64, np.float64, np.float64, np.uint32)
@@ -257,26 +256,6 @@ class SampleRing:
             passed += 1
         self._tail += passed
         return passed
-
-    def newest_state(self) -> tuple[int, F64] | None:
-        """Return where the loop stands; takes nothing out, so that any process may call it.
-
-        Returns:
-            First sample of the newest block that is whole, and float64[state_size], the state kept
-            with it; None before the first, and where the loop was quicker than the look.
-        """
-        for _ in range(_LOOKS):
-            number = self.page.observe(Field.HEAD) - 1
-            if number < 0:
-                return None
-            slot = number % self.slots
-            first, state = int(self._area.heads[slot, Head.FIRST_SAMPLE]), self._area.states[slot]
-            state = state.copy()
-            # Looked at again: the loop may have begun a new block in this slot meanwhile.
-            sequence = self._area.heads[slot, Head.SEQUENCE]
-            if sequence == number + 1 and self.page.observe(Field.SENT) - number < self.slots:
-                return first, state
-        return None
 
     def look(self, since: int) -> tuple[Batch, int]:
         """Copy the blocks from number ``since`` on; takes nothing out, any process may call it.

@@ -19,13 +19,11 @@ from hilctl.experiment.check import Checked
 from hilctl.loop.pacer import deadline_misses
 from hilctl.machine.memory import ProcessMemory
 from hilctl.machine.realtime import be_ordinary, favoured
-from hilctl.run.change_worker import ChangeWorker
 from hilctl.run.child import LoopChild
 from hilctl.run.control_socket import ControlServer
 from hilctl.run.guardian_process import GuardianRelief
 from hilctl.run.progress import ProgressThread
 from hilctl.run.recorder import Recorder
-from hilctl.run.reference_window import ReferenceProcess
 from hilctl.run.requests import Requests
 from hilctl.run.result import Progress, RunResult
 from hilctl.run.ring import SampleRing
@@ -92,9 +90,6 @@ class Supervisor:
             # last: whoever finds the run's folder may send one, and impatience while processes are
             # ended would cost the result of a run that has ended.
             stack.enter_context(self._signals())
-            # Before anything is held or started: a fork has all that its maker has.
-            worker = stack.enter_context(ChangeWorker(self._checked))
-            filling = stack.enter_context(ReferenceProcess(self._checked))
             holds = self._checked.loaded.device.info.holds
             relief = GuardianRelief(holds)
             locks: list[int] = []
@@ -108,13 +103,13 @@ class Supervisor:
                 )
                 ring = self._make_ring(folder)
                 recording = RingRecorder(ring, recorder, config.recording.flush_s)
-                requests = Requests(self._checked, folder, ring.page, recording, worker)
+                requests = Requests(self._checked, folder, ring.page, recording)
                 server = stack.enter_context(ControlServer(folder.socket, requests.answer))
                 child = LoopChild(self._checked, folder, ring, locks + own, self._silence_s)
                 # Open to the end: watchers find it even if the folder is removed.
                 stack.enter_context(folder.description.open("rb"))
                 run = folder, ring, child, recording
-                safety, start_ns = self._start(stack, *run, locks + own, filling)
+                safety, start_ns = self._start(stack, *run, locks + own)
                 started = StartedRun(self._checked, ring, child, safety, recording)
             except BaseException:
                 if recorder is not None:
@@ -139,7 +134,6 @@ class Supervisor:
         child: LoopChild,
         recording: RingRecorder,
         locks: list[int],
-        filling: ReferenceProcess,
     ) -> tuple[Safety, int]:
         """Wait for loop and guardian to be ready, and begin the recording.
 
@@ -152,7 +146,6 @@ class Supervisor:
             guardian = guardian_starter(checked, folder, ring, child.pid, locks)
             safety = Safety(checked, ring, child, guardian, recording.record_event)
             child.await_ready(lambda: self._stop_signal != 0)
-            filling.begin(folder, page)
             # It is started after the loop, to watch its process, and ready long before it.
             self._await_guardian(safety)
             ProcessMemory().stay_small()  # all is compiled

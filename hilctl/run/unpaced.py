@@ -10,23 +10,19 @@ from pathlib import Path
 
 import numpy as np
 
-from hilctl.base.arrays import F64
 from hilctl.base.device import Clock, Device
 from hilctl.base.errors import HilctlError, InputError
 from hilctl.base.events import Event
 from hilctl.base.samples import ANSWERS, Batch, Samples
-from hilctl.base.values import in_memory
 from hilctl.experiment.check import Checked
 from hilctl.loop.block import Block
 from hilctl.loop.host import Tuning
 from hilctl.loop.loop import Loop
 from hilctl.loop.pacer import Lateness
 from hilctl.loop.plan import Outcome, Plan
-from hilctl.loop.window import Window, window_size
 from hilctl.run.assemble import assemble
 from hilctl.run.metadata import end_facts
 from hilctl.run.recorder import Recorder
-from hilctl.run.reference_window import OwnWindow, WindowFiller
 from hilctl.run.result import RunResult
 from hilctl.run.starting import starting_output
 
@@ -159,15 +155,13 @@ def run_unpaced(checked: Checked, output: Path, *, overwrite: bool = False) -> R
 
 def _run(checked: Checked, recorder: Recorder) -> tuple[Outcome, Lateness]:
     loaded, begun = checked.loaded, checked.begun
-    reference, input_um, window = _planned(checked)
     plan = assemble(
         loaded,
-        reference,
-        input_um,
+        checked.reference.values,
+        begun.input_um,
         begun.state,
         checked.conditioning(),
         operator=checked.operator,
-        window=window,
         paced=False,
         heat_a2=checked.heat_a2,
     )
@@ -185,18 +179,6 @@ def _run(checked: Checked, recorder: Recorder) -> tuple[Outcome, Lateness]:
         recorder.give_back()
         raise
     return _drive(loop, loaded.device, host)
-
-
-def _planned(checked: Checked) -> tuple[F64, F64, Window | None]:
-    """Return reference and input as a whole, or windows of them, and what fills those."""
-    values, input_um = checked.reference.values, checked.begun.input_um
-    if in_memory(values):
-        return values, values if input_um is values else input_um[:], None
-    config = checked.loaded.config
-    reference = np.empty(window_size(config.block, config.sample_rate_hz))
-    own = reference if input_um is values else np.empty_like(reference)
-    filler = WindowFiller(values, input_um, (reference, own))
-    return reference, own, OwnWindow(filler, config.block)
 
 
 def run_in_memory(plan: Plan, device: Device) -> tuple[Outcome, Samples]:

@@ -2,7 +2,7 @@
 
 spec.py     pydantic models of each kind
 shapes.py   pure: one kind and a sample rate -> label, spectrum, samples
-parts.py    bent ends, sequences and repeats, worked out part by part
+parts.py    soft starts and ends, and what repeats
 table.py    waveforms read from CSV, NPY and MCAP files
 build.py    a whole reference: shape, soft start and end, sequences, segments to judge
 """

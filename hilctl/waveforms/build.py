@@ -6,12 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from hilctl.base.arrays import F64
+from hilctl.base.arrays import CHUNK, F64, chunks
 from hilctl.base.errors import InputError
 from hilctl.base.segments import Segment
-from hilctl.base.values import Values, chunks, fit
 from hilctl.waveforms import shapes, spec
-from hilctl.waveforms.parts import Joined, Repeat, Softened, telling
+from hilctl.waveforms.parts import Repeat, soften, telling
 from hilctl.waveforms.table import read_samples
 
 
@@ -20,15 +19,15 @@ class Reference:
     """The samples of a run's waveform.
 
     Attributes:
-        values: float64[n], read-only, in ``unit``: an array where they fit in memory.
+        values: float64[n], read-only, in ``unit``.
         unit: ``um``, ``A`` or ``V``.
         sample_rate_hz: Samples a second.
         segments: Which samples belong to which waveform, and which of them are steady.
         span: Lowest and highest value.
-        repeats: What repeats in one that does not fit in memory.
+        repeats: What repeats in a long one.
     """
 
-    values: Values
+    values: F64
     unit: spec.WaveformUnit
     sample_rate_hz: float
     segments: tuple[Segment, ...]
@@ -40,27 +39,18 @@ class Reference:
         """Parts that show all there is to see: all of it, but for what repeats again and again."""
         return telling(self.values.size, self.repeats)
 
-    def array(self) -> F64:
-        """Return all of its values, where they fit in memory at all: float64[n].
-
-        Raises:
-            InputError: They do not.
-        """
-        shapes.check_whole(self.values.size)
-        return self.values[:]
-
 
 @dataclass(frozen=True, slots=True)
 class _Part:
     """One waveform of a reference, and whether its steady part is known to repeat."""
 
-    values: Values
+    values: F64
     segment: Segment
     repeats: bool
 
 
 def build(waveform: spec.AnyWaveform, sample_rate_hz: float, folder: Path) -> Reference:
-    """Work out every sample of a waveform, or what works them out where they do not fit in memory.
+    """Compute every sample of a waveform.
 
     Args:
         waveform: What the experiment asks for; its unit must be given.
@@ -75,14 +65,11 @@ def build(waveform: spec.AnyWaveform, sample_rate_hz: float, folder: Path) -> Re
         raise InputError("unit is required: um, A or V")
     with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is refused below
         parts, repeat = _parts(waveform, waveform.unit, sample_rate_hz, folder)
-        values: Values = Joined([part.values for part in parts], repeat)
-        repeats: tuple[Repeat, ...] = ()
-        if not fit(values.size):
-            repeats = _repeats(parts, repeat)
-        else:
-            # A part that is whole and alone may be an array of its own, and a file's.
-            values = np.array(values[0 : values.size])
-            values.flags.writeable = False
+        values = parts[0].values
+        if len(parts) * repeat > 1:
+            values = np.concatenate([part.values for part in parts] * repeat)
+        values.flags.writeable = False
+        repeats = _repeats(parts, repeat) if values.size > shapes.LONG else ()
         told = telling(values.size, repeats)
         spans = [(each.min(), each.max()) for each in chunks(values, told)]
     span = float(np.min(spans)), float(np.max(spans))  # keeps a NaN, where min() would not
@@ -126,7 +113,6 @@ def _parts(
 
 
 def _part(w: spec.SinglePart, name: str, unit: str, sample_rate_hz: float, folder: Path) -> _Part:
-    values: Values
     if w.kind == "file":
         values, period = read_samples(w, sample_rate_hz, folder)
         label = f"file {Path(w.path).name}"
@@ -137,14 +123,22 @@ def _part(w: spec.SinglePart, name: str, unit: str, sample_rate_hz: float, folde
                 f"{name}: every frequency must be below half the sample rate, "
                 f"{sample_rate_hz / 2.0:.10g} Hz: {highest_hz:.10g} Hz"
             )
-        values, period = shapes.sampled(w, sample_rate_hz), period_s * sample_rate_hz
+        values, period = _computed(shapes.sampled(w, sample_rate_hz)), period_s * sample_rate_hz
     n = values.size
     soft_start, soft_end = _soft_samples(w, name, n, sample_rate_hz)
     period = period if math.isfinite(period) else 0.0
     segment = Segment(label, 0, n, soft_start, n - soft_end, period)
-    softened = Softened(values, w.rest, soft_start, soft_end)
+    soften(values, w.rest, soft_start, soft_end)
     # What a file says of its period is its author's word.
-    return _Part(softened, segment, period > 0.0 and w.kind != "file")
+    return _Part(values, segment, period > 0.0 and w.kind != "file")
+
+
+def _computed(values: shapes.Values) -> F64:
+    """Return an array of values that are computed part by part: float64[n]."""
+    whole = np.empty(values.size)
+    for start in range(0, whole.size, CHUNK):
+        whole[start : start + CHUNK] = values[start : start + CHUNK]
+    return whole
 
 
 def _soft_samples(w: spec.SinglePart, name: str, n: int, sample_rate_hz: float) -> tuple[int, int]:

@@ -1,85 +1,32 @@
-"""What a reference is put together from, worked out part by part: bent ends, sequences, repeats."""
+"""What a reference is put together from: soft starts and ends, and what repeats in it."""
 
-from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import accumulate
 
 import numpy as np
 
-from hilctl.base.arrays import F64
-from hilctl.base.values import CHUNK, Values
+from hilctl.base.arrays import CHUNK, F64
 from hilctl.waveforms.shapes import telling_samples
 
 
-@dataclass(frozen=True, slots=True)
-class Softened:
-    """Values whose first and last ones are bent to rest.
+def soften(values: F64, rest: float, start: int, end: int) -> None:
+    """Bend the first and the last values to rest, in place.
 
-    Attributes:
-        values: What is bent.
-        rest: The value that it begins at and ends at.
+    Args:
+        values: float64[n].
+        rest: The value that they begin at and end at.
         start: How many are bent at the start.
         end: How many at the end; none of them twice.
     """
-
-    values: Values
-    rest: float
-    start: int
-    end: int
-
-    @property
-    def size(self) -> int:
-        """How many there are."""
-        return self.values.size
-
-    def __getitem__(self, part: slice, /) -> F64:
-        first, stop, _ = part.indices(self.size)
-        bent = np.array(self.values[first:stop])
-        ends_at = self.size - self.end
-        if (n := min(stop, self.start) - first) > 0:
-            grown = _raised_cosine(np.arange(first, first + n), self.start)
-            bent[:n] = self.rest + grown * (bent[:n] - self.rest)
-        if (n := stop - max(first, ends_at)) > 0:
-            index = np.arange(stop - n, stop)
-            left = _raised_cosine(self.size - 1 - index, self.end)
-            bent[bent.size - n :] = self.rest + left * (bent[bent.size - n :] - self.rest)
-        return bent
+    first, last = values[:start], values[values.size - end :]
+    first[:] = rest + _raised_cosine(start) * (first - rest)
+    last[:] = rest + _raised_cosine(end)[::-1] * (last - rest)
 
 
-def _raised_cosine(index: np.ndarray[tuple[int], np.dtype[np.int64]], n: int) -> F64:
-    """Return values of a raised cosine that grows from 0 to 1 over ``n`` samples: float64[m]."""
-    values: F64 = 0.5 - 0.5 * np.cos(np.pi * index / max(n, 1))
+def _raised_cosine(n: int) -> F64:
+    """Return a raised cosine that grows from 0 to 1: float64[n]."""
+    values: F64 = 0.5 - 0.5 * np.cos(np.pi * np.arange(n) / max(n, 1))
     return values
-
-
-class Joined:
-    """Values one after the other, all of them again and again.
-
-    Args:
-        parts: What is joined.
-        repeat: How often.
-    """
-
-    def __init__(self, parts: Sequence[Values], repeat: int) -> None:
-        self._parts = tuple(parts)
-        self._ends = tuple(accumulate(part.size for part in parts))
-        self.once = self._ends[-1]
-        """How many there are before they repeat."""
-        self.size = self.once * repeat
-        """How many there are."""
-
-    def __getitem__(self, part: slice, /) -> F64:
-        at, stop, _ = part.indices(self.size)
-        found = []
-        while at < stop:
-            place = at % self.once
-            i = bisect_right(self._ends, place)
-            begins = self._ends[i] - self._parts[i].size
-            taken = min(stop - at, self._ends[i] - place)
-            found.append(self._parts[i][place - begins : place - begins + taken])
-            at += taken
-        return found[0] if len(found) == 1 else np.concatenate([np.empty(0), *found])
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,20 +3,19 @@
 import math
 from dataclasses import dataclass
 from fractions import Fraction
+from typing import Protocol
 
 import numpy as np
 
-from hilctl.base.arrays import F64, I64
+from hilctl.base.arrays import CHUNK, F64, I64
 from hilctl.base.errors import InputError
-from hilctl.base.values import CHUNK, Values, chunks, fit
 from hilctl.waveforms import spec
 
-MAX_WHOLE = 100_000_000
-"""Most samples of what is made as a whole, a file's or random sines: 0.8 GB, and a few times that
-while it is made."""
+MAX_SAMPLES = 100_000_000
+"""Most samples of a waveform: 0.8 GB, 33 minutes at 50 kHz."""
 
-MAX_SAMPLES = 10**12
-"""Most samples of a waveform: half a year at 50 kHz."""
+LONG = 400_000
+"""Samples above which a waveform is checked by one of its repetitions."""
 
 _TELLING_CYCLES = 8
 _LONGEST_PERIOD = 2**31  # samples; so that their products are no more than an integer holds
@@ -33,25 +32,15 @@ def sample_count(duration_s: float, sample_rate_hz: float) -> int:
 
 
 def check_length(samples: float) -> None:
-    """Refuse what nobody can mean.
+    """Refuse a waveform that is too long.
 
     Raises:
         InputError: There are more than :data:`MAX_SAMPLES`.
     """
     if samples > MAX_SAMPLES:
-        raise InputError(f"has {samples:.10g} samples, more than {MAX_SAMPLES}: shorten it")
-
-
-def check_whole(samples: float) -> None:
-    """Refuse what is made as a whole, and does not fit in memory.
-
-    Raises:
-        InputError: There are more than :data:`MAX_WHOLE`.
-    """
-    if samples > MAX_WHOLE:
         raise InputError(
-            f"has {samples:.10g} samples, more than the {MAX_WHOLE} that fit in memory: "
-            "shorten it and repeat it in a sequence, or lower sample_rate_hz"
+            f"has {samples:.10g} samples, more than the {MAX_SAMPLES} that fit in memory: "
+            "shorten it, or lower sample_rate_hz"
         )
 
 
@@ -88,16 +77,28 @@ def outline(w: spec.Shape, unit: str) -> tuple[str, float, float]:
             return w.kind, 0.0, 0.0
 
 
+class Values(Protocol):
+    """Values that are computed part by part: the same bits, however divided; an array is one."""
+
+    @property
+    def size(self) -> int:
+        """How many there are."""
+        ...
+
+    def __getitem__(self, part: slice, /) -> F64:
+        """Return those of a part, float64[stop - start]; not to be written to."""
+        ...
+
+
 def sampled(w: spec.Shape, sample_rate_hz: float) -> Values:
     """Return every sample of a waveform, offset included and not yet softened: float64[n].
 
     Raises:
-        InputError: They are too many, or do not fit in memory where they are made as a whole.
+        InputError: They are too many.
     """
     size = sample_count(_duration_s(w), sample_rate_hz)
     match w:
         case spec.RandomSines():
-            check_whole(size)
             return w.offset + _random(w, size)
         case spec.Multisine():
             scale = _multisine_scale(w, sample_rate_hz, size)
@@ -258,12 +259,13 @@ def _multisine(w: spec.Multisine, at: _Instants) -> F64:
 def _multisine_scale(w: spec.Multisine, sample_rate_hz: float, size: int) -> float:
     """Return what gives a multisine its amplitude, by its peak over the samples that tell it."""
     told = size
-    if not fit(size):
+    if size > LONG:
         period = outline(w, "")[2] * sample_rate_hz
-        told = min(size, telling_samples(period) if math.isfinite(period) else MAX_WHOLE)
+        told = min(size, telling_samples(period) if math.isfinite(period) else size)
     without = w.model_copy(update={"offset": 0.0})
     plain = _Shaped(without, sample_rate_hz, told, _period(w, sample_rate_hz))
-    peak = max(float(np.max(np.abs(each))) for each in chunks(plain))
+    parts = (plain[start : start + CHUNK] for start in range(0, told, CHUNK))
+    peak = max(float(np.max(np.abs(part))) for part in parts)
     return 1.0 if peak == 0.0 else w.amplitude / peak
 
 

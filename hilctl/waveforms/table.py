@@ -12,7 +12,7 @@ from hilctl.base.errors import InputError
 from hilctl.base.remedy import no_such_file, reason
 from hilctl.base.segments import SHORTEST_PERIOD
 from hilctl.base.text_table import MAX_COLUMNS, TextTable, check_rows, column_index
-from hilctl.waveforms.shapes import check_whole
+from hilctl.waveforms.shapes import check_length
 from hilctl.waveforms.spec import FileWaveform
 
 _RATE_TOLERANCE = 1e-6
@@ -74,7 +74,7 @@ def _resampled(w: FileWaveform, path: Path, raw: F64, rate_hz: float, sample_rat
             "set resample to linear or cubic, or sample_rate_hz to the file's"
         )
     t_file = np.arange(raw.size) / rate_hz
-    check_whole(float(t_file[-1]) * sample_rate_hz)
+    check_length(float(t_file[-1]) * sample_rate_hz)
     n = int(t_file[-1] * sample_rate_hz + 1e-9) + 1
     t = np.arange(n) / sample_rate_hz
     if w.resample == "linear":
@@ -149,6 +149,6 @@ def _check_count(path: Path, count: int) -> None:
     if count < 2:
         raise InputError(f"{path}: needs at least two rows from first_row to last_row")
     try:
-        check_whole(count)
+        check_length(count)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None

@@ -132,7 +132,7 @@ def identified(rig: Rig, kind: str, seed: int) -> tuple[FittedModel, float]:
     """Return a model of the campaign on one rig, and the processor time it took."""
     experiment = load_experiment(CAMPAIGN)
     waveform = build(experiment.config.waveform, RATE_HZ, CAMPAIGN.parent)
-    command = waveform.array().copy()
+    command = waveform.values.copy()
     measured = driven(rig.at_rest(noise=True, seed=seed), command)
     records = [History("campaign", command, measured, RATE_HZ)]
     start = time.process_time()

@@ -63,7 +63,7 @@ def command(options=""):
 
 @pytest.mark.parametrize("option", ["", "--watch"])
 def test_ctrl_z_neither_suspends_a_run_nor_hides_how_to_end_it(shell, tmp_path, option):
-    """The supervisor still sees requests, and changes are worked out."""
+    """The supervisor still sees requests, and makes changes."""
     shell.type(command(option))
     await_state("running")
     shell.type("\x1a")

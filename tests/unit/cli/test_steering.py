@@ -61,8 +61,7 @@ def test_all_runs_are_stopped_and_each_is_told(going, capsys):
 
 
 def test_set_says_what_was_taken(going, capsys):
-    answer = {"gain": 0.5, "offset": -2.0, "over_s": 1.5, "checked_s": 3.0}
-    answer |= {"checked_to_the_end": True, "inverse": None}
+    answer = {"gain": 0.5, "offset": -2.0, "over_s": 1.5, "inverse": None}
     asked = []
 
     def set_run(run, **wanted):

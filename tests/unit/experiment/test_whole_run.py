@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hilctl.base import values
+from hilctl.base import arrays
 from hilctl.base.arrays import F64
 from hilctl.experiment import check as check_module
 from hilctl.experiment import whole_run
@@ -16,7 +16,7 @@ from hilctl.experiment.whole_run import WholeRun, whole_cycle
 from hilctl.loop.compensator import Compensator
 from hilctl.models.base import HysteresisModel
 from hilctl.models.files import load_model
-from hilctl.waveforms import parts, shapes
+from hilctl.waveforms import build, parts, shapes
 from hilctl.waveforms.parts import Repeat
 from tests.published import terfenol_rdpi
 from tests.unit.experiment.test_forecast import DISPLACEMENT, MODEL, checked
@@ -57,7 +57,8 @@ class Counter:
 
 def forecast(name: str, model: HysteresisModel, monkeypatch: pytest.MonkeyPatch) -> Forecast:
     """Return what is forecast of a run that does not fit in memory."""
-    monkeypatch.setattr(values, "IN_MEMORY", 100_000)
+    monkeypatch.setattr(shapes, "LONG", 100_000)
+    monkeypatch.setattr(whole_run, "LONG", 100_000)
     monkeypatch.setattr(whole_run, "_LEAST_CYCLE", 2000)
     return checked(DISPLACEMENT, *LONG[name], *BUDGET, model=model).forecast
 
@@ -120,10 +121,11 @@ def test_long_work_is_told(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     """Where much of it has to be worked out, and not where it repeats."""
-    for module in (values, shapes, parts):
+    for module in (arrays, build, shapes, parts):
         monkeypatch.setattr(module, "CHUNK", 1000)
     monkeypatch.setattr(check_module, "_MANY", 100_000)
-    monkeypatch.setattr(values, "IN_MEMORY", 100_000)
+    monkeypatch.setattr(shapes, "LONG", 100_000)
+    monkeypatch.setattr(whole_run, "LONG", 100_000)
     waveform = "waveform.duration_s=40.0" if repeats else CHIRP
     checked(DISPLACEMENT, waveform, model=terfenol_rdpi())
     texts = [each.getMessage().partition(": ")[2] for each in caplog.records]
@@ -138,7 +140,7 @@ def test_long_work_is_told(
         (200_000.0, 10**9, 200_000),
         (200_000.0, 799_999, 0),
         (100.0 * math.sqrt(2.0), 10**9, 0),
-        (values.IN_MEMORY + 1.0, 10**12, 0),
+        (shapes.LONG + 1.0, 10**12, 0),
     ],
 )
 def test_whole_cycles(period: float, samples: int, cycle: int) -> None:

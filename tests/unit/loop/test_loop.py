@@ -48,7 +48,6 @@ class Rig:
             late_rules=LateRules(**{**late, **options.get("late", {})}),
             conditioning=options.get("conditioning"),
             keep_all=options.get("keep_all", False),
-            window=options.get("window"),
         )
         self.loop = Loop(plan, self.device, self.host)
 
@@ -631,39 +630,7 @@ def test_skipped_ticks_move_a_fade_on():
     assert rig.host.columns[at][1][0] == pytest.approx(expected, rel=1e-12)
 
 
-class FilledTo:
-    """A window that holds all samples, and says that they come as a test has it."""
-
-    def __init__(self, samples, filled):
-        self.samples = samples
-        self._filled = filled
-
-    def has(self, stop):
-        return stop <= self._filled
-
-
-@pytest.mark.parametrize("block", [1, 10])
-def test_a_reference_that_is_not_there_in_time_ends_the_run(block):
-    """By the ramp, at the first block that is not there as a whole; nothing else is put out."""
-    rig = Rig(np.full(200, 2.0), block=block, window=FilledTo(200, 123))
-    outcome = rig.run()
-    at = 123 if block == 1 else 120
-    assert outcome.code == "fault"
-    assert outcome.reason == f"the reference was not worked out in time at sample {at}"
-    assert rig.host.events[0].code == "reference_late"
-    assert rig.device.commands[at - 1] == 2.0
-    assert rig.device.commands[at] == 2.0 - LIMITS.ramp_per_s / RATE_HZ
-    assert rig.device.commands[-1] == 0.0
-
-
-def test_skipped_samples_that_are_not_there_end_the_run_too():
-    clock = FakeClock(stall_ns={50: 40_000_000})
-    rig = Rig(np.full(200, 2.0), clock=clock, window=FilledTo(200, 60))
-    assert rig.run().reason.startswith("the reference was not worked out in time at sample 9")
-    assert rig.device.commands[-1] == 0.0
-
-
-def test_a_window_s_last_block_may_be_no_whole_one():
-    rig = Rig(np.full(204, 2.0), block=10, window=FilledTo(204, 204))
+def test_the_last_block_may_be_no_whole_one():
+    rig = Rig(np.full(204, 2.0), block=10)
     assert rig.run().code == "completed"
     assert rig.device.commands[203:205] == [2.0, 2.0 - LIMITS.ramp_per_s / RATE_HZ]

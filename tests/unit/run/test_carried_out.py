@@ -3,7 +3,6 @@
 import json
 import os
 import time
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -232,24 +231,6 @@ def test_it_leaves_what_the_run_took_of_the_machine(prepared, monkeypatch):
     made.loop_does(lambda loop, start_ns: OUTCOME)
     assert made.run() == OUTCOME
     assert made.page.usage() == ProcessUsage(60, 9, 3, 1, 4).since(ProcessUsage(50, 7, 1, 1, 1))
-
-
-@pytest.mark.parametrize("more", [0, 1])
-def test_a_waveform_that_is_longer_than_what_lies_in_the_folder_has_a_window(
-    prepared, monkeypatch, more
-):
-    made, windows = prepared(), []
-    made.job = replace(made.job, samples=made.job.samples + more)
-    made.loop_does(lambda loop, start_ns: OUTCOME)
-    assemble = carried_out.assemble
-
-    def assembled(*args, window, **options):
-        windows.append(window)
-        return assemble(*args, window=window, **options)
-
-    monkeypatch.setattr(carried_out, "assemble", assembled)
-    assert made.run() == OUTCOME
-    assert (windows != [None]) == bool(more)
 
 
 @pytest.mark.parametrize(

@@ -1,47 +1,67 @@
-"""Changes of gain and offset: one after another, each from where the one before has led."""
+"""Changes of gain, offset and inverse: one after another, each within a bound on its amplitude."""
 
-from dataclasses import dataclass, field
+from dataclasses import replace
 from mmap import mmap
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
+from hilctl.base.device import DeviceInfo
 from hilctl.base.errors import InputError
-from hilctl.experiment.tuned import TunedForecast
-from hilctl.loop.host import StraightLine, Tuning
-from hilctl.run.changes import Changes, RequestedChange
+from hilctl.base.yaml.document import Document
+from hilctl.experiment.check import check
+from hilctl.experiment.load import resolve
+from hilctl.models.staged import FieldLag, StagedModel
+from hilctl.run.changes import Changes, RequestedChange, bound_refusal, command_range
 from hilctl.run.shared_page import SIZE, Field, SharedPage, Stop
+from tests.published import terfenol_rdpi
 
-SAMPLES, RATE_HZ, BLOCK = 100_000, 1000.0, 10
-LINE = StraightLine(0.1, -2.0)
+RATE_HZ, BLOCK, SAMPLES = 10_000.0, 10, 20_000
+LEAD = 500 + BLOCK
+TEXT = """\
+name: changed
+device: {kind: simulated_terfenol}
+sample_rate_hz: 10000
+waveform: WAVEFORM
+compensator: COMPENSATOR
+limits: {peak_current_a: PEAK, slew_a_per_s: 1.0e+6, stroke_um: [-75.0, 60.0]}
+"""
+SINE = """{kind: sine, unit: UNIT, amplitude: AMPLITUDE, offset: OFFSET, frequency_hz: HZ,
+  duration_s: 2.0, soft_start_s: 0.5}"""
+INFO = DeviceInfo(
+    name="fake",
+    description="a device that does nothing",
+    command_unit="A",
+    command_min=-8.0,
+    command_max=8.0,
+    sensor_min_um=-100.0,
+    sensor_max_um=100.0,
+    max_rate_hz=20e3,
+    buffered=True,
+    fifo_depth=1000,
+)
+MODEL = str(Path(__file__).parents[3] / "configs" / "models" / "terfenol_rdpi.yaml")
+RDPI = terfenol_rdpi()
+LOOKING_AHEAD = StagedModel.around(RDPI, lag=FieldLag(tau_s=2e-3))
 
 
-@dataclass
-class FakeWorker:
-    """Answers when it is told to; keeps what it was asked."""
+class DescribedDevice:
+    info = INFO
 
-    asked: list = field(default_factory=list)
-    answer: object = None
-    gone: bool = False
 
-    def begin(self, wanted):
-        if self.gone:
-            raise InputError("it is gone")
-        self.asked.append(wanted)
+def checked(model=None, amplitude=4.0, offset=0.0, hz=10.0, peak_a=7.0, limits=""):
+    text = TEXT.replace("WAVEFORM", SINE).replace("UNIT", "A" if model is None else "um")
+    for name, value in {"AMPLITUDE": amplitude, "OFFSET": offset, "HZ": hz, "PEAK": peak_a}.items():
+        text = text.replace(name, str(value))
+    text = text.replace("COMPENSATOR", "none" if model is None else f"{{model: {MODEL}}}")
+    text = text.replace("stroke_um", limits + "stroke_um") + f"block: {BLOCK}\n"
+    loaded = resolve(Document("x.yaml", text), Path())
+    return check(replace(loaded, device=DescribedDevice(), model=model))
 
-    def result(self):
-        answer, self.answer = self.answer, None
-        if isinstance(answer, Exception):
-            raise answer
-        return answer
 
-    def approve(self, begins_at, heat_a2=0.0):
-        """Let the change that was asked for last be within the limits."""
-        wanted = self.asked[-1]
-        share = wanted.inverse_share
-        tuning = Tuning(wanted.gain, wanted.offset, wanted.samples, begins_at, share, LINE)
-        self.answer = TunedForecast(tuning, 2.5, False, heat_a2)
+@pytest.fixture(scope="module")
+def experiment():
+    return checked(RDPI)
 
 
 @pytest.fixture
@@ -52,21 +72,11 @@ def page():
 
 
 @pytest.fixture
-def worker():
-    return FakeWorker()
+def changes(experiment, page):
+    return Changes(experiment, page)
 
 
-@pytest.fixture
-def changes(page, worker):
-    forecast = SimpleNamespace(samples=SAMPLES, heating_rms_a=2.0, line=LINE)
-    limits = SimpleNamespace(tracking_error_um=None)
-    config = SimpleNamespace(sample_rate_hz=RATE_HZ, block=BLOCK, limits=limits)
-    loaded = SimpleNamespace(config=config, model=object())
-    checked = SimpleNamespace(forecast=forecast, loaded=loaded)
-    return Changes(checked, SimpleNamespace(ring=Path("ring")), page, worker)
-
-
-def change(changes, gain=None, offset=None, over_s=2.0, inverse=None):
+def change(changes, gain=None, offset=None, over_s=0.2, inverse=None):
     made = RequestedChange(gain, offset, over_s, inverse)
     changes.add(made)
     changes.attend()
@@ -76,97 +86,47 @@ def change(changes, gain=None, offset=None, over_s=2.0, inverse=None):
 def take(page, at):
     """Let the loop take the change on the page, at a sample."""
     page.put(Field.NEXT_SAMPLE, at)
-    page.put(Field.TUNE_TAKEN_AT, at)
     page.put(Field.TUNE_TAKEN, page.get(Field.TUNE_WANTED))
 
 
-def test_a_change_reaches_the_loop_whole_once_it_is_worked_out(changes, page, worker):
+def test_a_change_reaches_the_loop_whole(changes, page):
     made = change(changes, gain=0.5)
-    (wanted,) = worker.asked
-    assert (wanted.gain, wanted.offset, wanted.samples, wanted.ring) == (0.5, 0.0, 2000, "ring")
-    assert (wanted.tuner.gain, wanted.tuner_at, wanted.heat_a2) == (1.0, 0, 4.0)
-    changes.attend()
-    assert made.answer() is None
-    assert page.get(Field.TUNE_WANTED) == 0
-    worker.approve(600)
-    changes.attend()
     assert made.answer() == {
         "gain": 0.5,
         "offset": 0.0,
         "inverse": "in",
-        "over_s": 2.0,
-        "begins_at_sample": 600,
-        "checked_s": 2.5,
-        "checked_to_the_end": False,
+        "over_s": 0.2,
+        "begins_at_sample": 500 + LEAD,
     }
     assert (page.get_float(Field.TUNE_GAIN), page.get_float(Field.TUNE_OFFSET)) == (0.5, 0.0)
     numbers = (Field.TUNE_SAMPLES, Field.TUNE_BEGINS_AT, Field.TUNE_WANTED)
-    assert [page.get(each) for each in numbers] == [2000, 600, 1]
+    assert [page.get(each) for each in numbers] == [2000, 500 + LEAD, 1]
     assert (changes.gain, changes.offset) == (0.5, 0.0)
 
 
-def test_the_second_of_two_follows_the_first(changes, page, worker):
-    """It is not begun before the loop has taken the first, and begins where that stands then."""
+def test_the_second_of_two_follows_the_first(changes, page):
+    """It is not made before the loop has taken the first."""
     first, second = change(changes, gain=0.5), change(changes, offset=3.0)
-    worker.approve(600, heat_a2=9.0)
     for _ in range(3):
         changes.attend()
     assert first.answer() is not None
     assert second.answer() is None
-    assert len(worker.asked) == 1
-    take(page, 610)
-    changes.attend()
-    wanted = worker.asked[1]
-    assert (wanted.gain, wanted.offset, wanted.heat_a2) == (0.5, 3.0, 9.0)
-    assert wanted.tuner_at == 610
-    wanted.tuner.pass_over(1000)
-    assert wanted.tuner.gain == pytest.approx(0.75)
-    worker.approve(1700)
-    changes.attend()
-    assert page.get(Field.TUNE_WANTED) == 2
-    assert second.answer()["gain"] == 0.5
-    # A third one finds the second under way, from where that took over.
-    take(page, 1610)
-    change(changes, gain=1.0)
-    assert worker.asked[2].tuner.gain == pytest.approx(0.75)
-    assert worker.asked[2].offset == 3.0
-
-
-def test_a_refusal_changes_nothing_and_the_next_has_its_turn(changes, page, worker):
-    before = bytes(page.numbers)
-    first, second = change(changes, gain=9.0), change(changes, offset=1.0)
-    worker.answer = InputError("too much")
-    changes.attend()
-    with pytest.raises(InputError, match="set: too much"):
-        first.answer()
-    assert bytes(page.numbers) == before
-    changes.attend()
-    assert worker.asked[-1].gain == 1.0
-    worker.gone = True
-    change(changes, gain=2.0)
-    worker.answer = InputError("it is gone")
-    for _ in range(3):
-        changes.attend()
-    with pytest.raises(InputError, match="it is gone"):
-        second.answer()
-
-
-def test_what_the_loop_has_gone_by_is_worked_out_again_with_more_time(changes, page, worker):
-    """Never put on the page too late; in the end it is refused."""
-    made = change(changes, gain=0.5)
-    for lead_s in (0.5, 1.0, 2.0):
-        assert worker.asked[-1].lead_s == lead_s
-        worker.approve(500 + BLOCK - 1)
-        assert made.answer() is None
-        changes.attend()
-    assert len(worker.asked) == 3
-    with pytest.raises(InputError, match="too busy"):
-        made.answer()
-    assert page.get(Field.TUNE_WANTED) == 0
-    change(changes, gain=0.5)
-    worker.approve(500 + BLOCK)
-    changes.attend()
     assert page.get(Field.TUNE_WANTED) == 1
+    take(page, 1013)
+    changes.attend()
+    answer = second.answer()
+    assert (answer["gain"], answer["offset"]) == (0.5, 3.0)
+    assert answer["begins_at_sample"] == 1020 + LEAD
+    assert page.get(Field.TUNE_WANTED) == 2
+
+
+def test_a_refusal_changes_nothing_and_the_next_has_its_turn(changes, page):
+    before = bytes(page.numbers)
+    first = change(changes, gain=90.0)
+    assert bytes(page.numbers) == before
+    with pytest.raises(InputError, match=r"set: .*limits\.stroke_um"):
+        first.answer()
+    assert change(changes, offset=1.0).answer()["gain"] == 1.0
 
 
 @pytest.mark.parametrize(
@@ -176,11 +136,9 @@ def test_what_the_loop_has_gone_by_is_worked_out_again_with_more_time(changes, p
         (Field.NEXT_SAMPLE, SAMPLES, "the waveform is over"),
     ],
 )
-def test_the_end_of_the_run_refuses_all_that_wait(changes, page, worker, number, value, said):
-    """Also where the loop has not taken the one before."""
+def test_the_end_of_the_run_refuses_all_that_wait(changes, page, number, value, said):
+    """Also if the loop has not taken the one before."""
     first, second, third = (change(changes, gain=0.1 * each) for each in (1, 2, 3))
-    worker.approve(600)
-    changes.attend()
     page.put(number, value)
     changes.attend()
     assert first.answer() is not None
@@ -191,19 +149,15 @@ def test_the_end_of_the_run_refuses_all_that_wait(changes, page, worker, number,
         change(changes, gain=1.0)
 
 
-def test_the_end_of_the_run_refuses_what_is_being_worked_out(changes, page, worker):
-    """What comes of it then is put nowhere."""
-    made = change(changes, gain=0.5)
-    worker.approve(600)
-    page.put(Field.STOP, Stop.REQUEST)
-    changes.attend()
-    with pytest.raises(InputError, match="on its way"):
-        made.answer()
+def test_a_change_that_could_not_begin_is_refused(changes, page):
+    page.put(Field.NEXT_SAMPLE, SAMPLES - LEAD)
+    with pytest.raises(InputError, match="before the change could begin"):
+        change(changes, gain=0.5).answer()
     assert page.get(Field.TUNE_WANTED) == 0
 
 
 def test_a_queue_that_is_full_takes_no_more(changes):
-    """The first is being worked out, sixteen wait."""
+    """The first is on the page, sixteen wait."""
     for _ in range(17):
         change(changes, gain=1.0)
     with pytest.raises(InputError, match="16 changes are waiting"):
@@ -215,30 +169,66 @@ def test_a_change_of_nothing_is_refused(changes):
         change(changes)
 
 
-def test_the_inverse_goes_out_and_stays_there_until_it_is_wanted_in(changes, page, worker):
+def test_the_inverse_goes_out_and_stays_there_until_it_is_wanted_in(changes, page, experiment):
     """A change of the gain in between leaves it where it is."""
-    shares = [Field.TUNE_INVERSE_SHARE, Field.TUNE_LINE_SLOPE, Field.TUNE_LINE_AT_ZERO]
+    line = experiment.forecast.line
+    numbers = [Field.TUNE_INVERSE_SHARE, Field.TUNE_LINE_SLOPE, Field.TUNE_LINE_AT_ZERO]
     for at, wanted, share in (
-        (600, {"inverse": "out"}, 0.0),
-        (700, {"gain": 0.5}, 0.0),
-        (
-            800,
-            {"inverse": "in"},
-            1.0,
-        ),
+        (2000, {"inverse": "out"}, 0.0),
+        (4000, {"gain": 0.5}, 0.0),
+        (6000, {"inverse": "in"}, 1.0),
     ):
         made = change(changes, **wanted)
-        assert worker.asked[-1].inverse_share == share
-        worker.approve(at)
-        changes.attend()
         assert made.answer()["inverse"] == changes.inverse == ("in" if share else "out")
-        assert [page.get_float(each) for each in shares] == [share, 0.1, -2.0]
+        assert [page.get_float(each) for each in numbers] == [share, line.slope, line.at_zero]
         take(page, at)
 
 
-def test_an_inverse_that_is_not_there_can_not_go_out(changes, page):
-    changes._checked.loaded.model = None
+def test_an_inverse_that_is_not_there_can_not_go_out(page):
+    changes = Changes(checked(), page)
     with pytest.raises(InputError, match="set: inverse: the experiment has no compensator"):
         change(changes, inverse="out")
     assert changes.inverse is None
     assert page.get(Field.TUNE_WANTED) == 0
+
+
+@pytest.mark.parametrize(
+    ("gain", "offset", "refused"),
+    [
+        (1.0, 0.0, False),
+        (1.25, 0.0, False),
+        (-1.25, 0.0, False),
+        (1.2501, 0.0, True),
+        (-1.2501, 0.0, True),
+        (1.0, 1.0, False),
+        (1.0, 1.0001, True),
+        (0.0, -5.0, False),
+        (0.0, -5.0001, True),
+        (1e6, 1e6, True),
+    ],
+)
+def test_without_a_model_the_bound_is_exact(gain, offset, refused):
+    made = checked(peak_a=5.0)
+    assert bool(bound_refusal(made, gain, offset, bypassed=False)) == refused
+
+
+def test_the_straight_line_is_bounded_while_it_gives_commands():
+    made = checked(RDPI, 10.0, -10.0, peak_a=5.5)
+    assert bound_refusal(made, 0.3, 30.0, bypassed=False) == ""
+    assert "5.5 A" in bound_refusal(made, 0.3, 30.0, bypassed=True)
+
+
+@pytest.mark.parametrize("model", [RDPI, LOOKING_AHEAD])
+@pytest.mark.parametrize("hz", [2.0, 50.0])
+@pytest.mark.parametrize(
+    ("gain", "offset"), [(1.0, 0.0), (0.3, 5.0), (2.0, 0.0), (-1.5, -3.0), (1.0, 10.0)]
+)
+def test_thecommand_range_is_that_of_a_run_with_the_new_amplitude(model, hz, gain, offset):
+    """To within a few percent: what a history and a rate do to another amplitude is estimated."""
+    made = checked(model, 10.0, -10.0, hz)
+    low, high = sorted(gain * end + offset for end in made.reference.span)
+    after = checked(model, abs(gain) * 10.0, gain * -10.0 + offset, hz)
+    line = after.forecast.line
+    known = sorted(line.slope * end + line.at_zero for end in after.reference.span)
+    found = command_range(made, low, high, gain)
+    assert found == pytest.approx(known, abs=0.05 * (known[1] - known[0]))

@@ -44,7 +44,7 @@ def recording():
 @pytest.fixture
 def requests(checked, page, recording, tmp_path):
     with run_folder("demo", tmp_path / "a.mcap", 12.0) as (folder, _):
-        yield Requests(checked, folder, page, recording, SimpleNamespace())
+        yield Requests(checked, folder, page, recording)
 
 
 def asked(requests, **message):

@@ -25,8 +25,6 @@ from hilctl.run.supervisor import Supervisor
 MS = 1_000_000
 STARTED = [
     "ordinary",
-    "worker",
-    "filling",
     "devices",
     "claimed",
     "folder",
@@ -34,9 +32,8 @@ STARTED = [
     "child",
     "guardian",
 ]
-READY = [*STARTED, "await ready", "filled", "small", "begin", "favoured", "recording"]
-_UNDONE = ["ordinary again", "server closed", "folder removed", "devices let go"]
-UNDONE = [*_UNDONE, "filling ended", "worker closed"]
+READY = [*STARTED, "await ready", "small", "begin", "favoured", "recording"]
+UNDONE = ["ordinary again", "server closed", "folder removed", "devices let go"]
 
 
 class Time:
@@ -94,8 +91,6 @@ class Neighbours:
             "time": self.time,
             "be_ordinary": lambda: self.note("ordinary"),
             "favoured": lambda loop: self.around("favoured", "ordinary again", loop),
-            "ChangeWorker": lambda checked: self.around("worker", "worker closed", None),
-            "ReferenceProcess": lambda checked: self.around("filling", "filling ended", self),
             "held_devices": lambda holds: self.around("devices", "devices let go", [*holds]),
             "Recorder": lambda *a, overwrite: self.note("claimed", self.recorder),
             "run_folder": self.run_folder,
@@ -171,12 +166,7 @@ class Neighbours:
             assert stopped()
         self.note("await ready")
 
-    def begin(self, *args):
-        if args[0] is self.folder:
-            return self.note("filled")
-        return self.begin_recording(*args)
-
-    def begin_recording(self, start_unix_ns, set_up, waveform_at):
+    def begin(self, start_unix_ns, set_up, waveform_at):
         assert (set_up, waveform_at) == ({"rt.fifo": "done: 50"}, 40)
         self.begun.append((start_unix_ns, self.time.now_ns))
         self.time.now_ns += self.begin_takes_ns.pop(0) if self.begin_takes_ns else 0
@@ -305,7 +295,7 @@ def test_signals_are_taken_for_as_long_as_anything_is_begun_or_undone(stage):
 
     stage.log = Log()
     stage.run()
-    assert {"worker", "filling", "worker closed", "filling ended"} < taken.keys()
+    assert {"devices", "devices let go"} < taken.keys()
     assert [what for what, held in taken.items() if not held] == ["ordinary"]
     assert signal.getsignal(signal.SIGINT) is before
 
@@ -326,9 +316,7 @@ def test_whatever_fails_before_the_start_signal_leaves_nothing(stage, number):
         expected.append("safety closed")
     if number > READY.index("claimed"):
         expected.append("given back")
-    undo = dict(
-        zip(("favoured", "server", "folder", "devices", "filling", "worker"), UNDONE, strict=True)
-    )
+    undo = dict(zip(("favoured", "server", "folder", "devices"), UNDONE, strict=True))
     expected += [undone for begun, undone in undo.items() if READY.index(begun) < number]
     assert stage.log[number + 1 :] == expected
     if stage.ring is not None:
@@ -386,7 +374,7 @@ def test_what_breaks_afterwards_costs_neither_coil_nor_recording(stage):
     assert stage.log[len(READY) :][:4] == [
         "requests", "serve", "broken off: a bug", "progress ended",
     ]  # fmt: skip
-    assert stage.log[-7:] == ["safety closed", *UNDONE]
+    assert stage.log[-5:] == ["safety closed", *UNDONE]
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, STOP_SIGNAL])
@@ -512,4 +500,4 @@ def test_memory_that_is_not_to_be_had_is_told(stage, monkeypatch):
     monkeypatch.setattr(SampleRing, "create", create)
     with pytest.raises(RunError, match="ring: no memory: No space left on device; less recording"):
         stage.run()
-    assert stage.log[-5:] == ["given back", *UNDONE[2:]]
+    assert stage.log[-3:] == ["given back", *UNDONE[2:]]

@@ -1,4 +1,4 @@
-"""References that do not fit in memory: the same samples, and what tells all of them."""
+"""Long references: the same samples however divided, and what tells all of them."""
 
 from collections.abc import Callable
 from typing import Any
@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hilctl.base import values
+from hilctl.base import arrays
+from hilctl.base.arrays import chunks
 from hilctl.base.errors import InputError
-from hilctl.base.values import chunks, in_memory
-from hilctl.waveforms import parts, shapes
+from hilctl.waveforms import build, parts, shapes
 from hilctl.waveforms.build import Reference
 from hilctl.waveforms.parts import Repeat, telling
 
@@ -41,9 +41,9 @@ WAVES: list[dict[str, Any]] = [
 
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let nothing fit in memory, and little be looked at together."""
-    monkeypatch.setattr(values, "IN_MEMORY", 1000)
-    for module in (values, shapes, parts):
+    """Let everything be long, and little be processed together."""
+    monkeypatch.setattr(shapes, "LONG", 1000)
+    for module in (arrays, build, shapes, parts):
         monkeypatch.setattr(module, "CHUNK", 97)
 
 
@@ -63,15 +63,9 @@ def test_the_same_samples_however_long(
     whole = made(1000.0, **keys)
     request.getfixturevalue("small")
     long = made(1000.0, **keys)
-    assert in_memory(whole.values)
-    assert not in_memory(long.values)
-    n = whole.values.size
-    assert (long.values.size, long.segments) == (n, whole.segments)
-    for size in (1, 313, 2048, n):
-        divided = [long.values[start : start + size] for start in range(0, n, size)]
-        assert np.concatenate(divided).tobytes() == long.values[0:n].tobytes()
+    assert (long.values.size, long.segments) == (whole.values.size, whole.segments)
     bound = 1e-12 if keys["kind"] == "multisine" else 0.0
-    np.testing.assert_allclose(long.values[0:n], whole.values[:], rtol=bound, atol=bound)
+    np.testing.assert_allclose(long.values, whole.values, rtol=bound, atol=bound)
     assert long.span == pytest.approx(whole.span, rel=5e-3)
 
 
@@ -80,7 +74,7 @@ def test_what_repeats_is_told_by_some_of_it(made: Made, small: None) -> None:
     long = made(1000.0, **WAVES[0] | {"duration_s": 1000.0}, **SOFT)
     told = np.concatenate([*chunks(long.values, long.telling)])
     assert told.size < 5000 < long.values.size
-    everything = long.values[:]
+    everything = long.values
     assert told[:310].tolist() == everything[:310].tolist()
     assert told[-170:].tolist() == everything[-170:].tolist()
     assert long.span == pytest.approx((everything.min(), everything.max()), rel=1e-3)
@@ -104,7 +98,7 @@ def test_what_does_not_repeat_is_told_by_all_of_it(made: Made, small: None) -> N
 
 def test_telling_parts() -> None:
     """Nothing twice, nothing left out but the middle of what repeats."""
-    n, chunk = 10**9, values.CHUNK
+    n, chunk = 10**9, parts.CHUNK
     (all_of_it,) = telling(n, ())
     assert (all_of_it.start, all_of_it.stop) == (0, n)
     two = (Repeat(100, 4 * 10**8, 500.0), Repeat(5 * 10**8, n, 1e7 / 3.0))
@@ -114,18 +108,6 @@ def test_telling_parts() -> None:
     assert second.stop == 5 * 10**8 + chunk + -(-8 * 10**7 // 3)
     assert (last.start, last.stop) == (n - chunk, n)
     assert telling(n, (Repeat(0, chunk, 500.0),)) == (slice(0, n),)
-
-
-def test_where_an_array_is_needed_a_long_one_is_made_or_refused(
-    made: Made, small: None, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    assert made(1000.0, **WAVES[4]).array().size == 4000
-    monkeypatch.setattr(shapes, "MAX_WHOLE", 3999)
-    with pytest.raises(
-        InputError, match="4000 samples, more than the 3999 that fit in memory: shorten it"
-    ):
-        made(1000.0, **WAVES[4]).array()
-    assert made(1000.0, **WAVES[4] | {"duration_s": 1.0}).array().size == 1000
 
 
 def test_a_value_that_is_none_is_refused_wherever_it_is(made: Made, small: None) -> None:

@@ -319,7 +319,7 @@ class TestRate:
         """A file that would become too long is refused before memory is asked for."""
         text = refusal_of_length(read)
         assert text.startswith("has 1.99e+14 samples, more than the 100000000")
-        monkeypatch.setattr(shapes, "MAX_WHOLE", 300)
+        monkeypatch.setattr(shapes, "MAX_SAMPLES", 300)
         with pytest.raises(InputError, match="has 398 samples, more than the 300"):
             read(rows(WAVE), file_rate_hz=500.0, resample="linear")
 
@@ -396,7 +396,7 @@ class TestNpy:
 
     def test_too_large(self, read: Read, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         """More rows than fit in memory are refused before they are read."""
-        monkeypatch.setattr(shapes, "MAX_WHOLE", 100)
+        monkeypatch.setattr(shapes, "MAX_SAMPLES", 100)
         text = refusal(read, npy(tmp_path, WAVE), "w.npy", file_rate_hz=RATE_HZ)
         assert text.startswith("has 200 samples, more than the 100 that fit in memory")
 
