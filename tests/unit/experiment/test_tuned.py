@@ -10,7 +10,7 @@ import pytest
 
 from hilctl.base.device import DeviceInfo
 from hilctl.base.errors import ConfigError
-from hilctl.base.yaml.document import Document
+from hilctl.base.yaml import Document
 from hilctl.experiment import tuned
 from hilctl.experiment.check import check
 from hilctl.experiment.load import resolve
