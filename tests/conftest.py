@@ -15,7 +15,7 @@ import pytest
 from hypothesis import settings
 
 from hilctl.base.private import memory_folder
-from hilctl.base.yaml import document
+from hilctl.base.yaml import io
 from hilctl.experiment import registry
 from hilctl.kernels.jit import is_kernel, load
 from hilctl.run.guardian_process import signal_guardian
@@ -145,7 +145,7 @@ def read_once():
     """
     with pytest.MonkeyPatch.context() as patch:
         for module, name in (
-            (document, "compose"), (profile, "parse_profile"), (registry, "entry_points"),
+            (io, "compose"), (profile, "parse_profile"), (registry, "entry_points"),
         ):  # fmt: skip
             patch.setattr(module, name, lru_cache(maxsize=256)(getattr(module, name)))
         yield

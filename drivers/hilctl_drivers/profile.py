@@ -18,8 +18,7 @@ from pydantic_core import PydanticKnownError
 
 from hilctl.base.errors import ConfigError, InputError, Problem
 from hilctl.base.files import TextFiles
-from hilctl.base.yaml.document import Document
-from hilctl.base.yaml.messages import broken_rules, did_you_mean, loc_of
+from hilctl.base.yaml import Document, broken_rules, did_you_mean, loc_of
 from hilctl_drivers.profile_parts import BaseProfile
 
 FOLDER = Path(__file__).parent / "profiles"

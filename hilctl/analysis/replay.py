@@ -15,7 +15,7 @@ from hilctl.base.arrays import F64, U32
 from hilctl.base.errors import DataError, ModelError
 from hilctl.base.events import INVERSE, Event
 from hilctl.base.samples import NO_WAVEFORM, Flag, Samples
-from hilctl.base.yaml.document import Document
+from hilctl.base.yaml import Document
 from hilctl.experiment.file import Experiment
 from hilctl.loop.compensator import Compensator
 from hilctl.loop.host import StraightLine

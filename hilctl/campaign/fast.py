@@ -12,7 +12,7 @@ from pathlib import Path
 
 from hilctl.base.errors import HilctlError, InputError
 from hilctl.base.files import TextFiles, write_file
-from hilctl.base.yaml.document import Document
+from hilctl.base.yaml import Document
 from hilctl.campaign.folder import new_recording, standing_runs
 from hilctl.campaign.plan import PlannedStep, SeriesPlan, planned
 from hilctl.campaign.session import Series, SeriesHost, SeriesResult, is_harmless

@@ -9,7 +9,7 @@ from mcap.writer import MCAP0_MAGIC
 
 from hilctl.base.errors import ConfigError, DataError, InputError
 from hilctl.base.locks import HAS_LOCKS, take_lock
-from hilctl.base.yaml.document import load_document
+from hilctl.base.yaml import load_document
 from hilctl.campaign.steps import CampaignSteps, base_problem, settings_of
 from hilctl.experiment.parts import RecordingConfig
 from hilctl.recording.ends import read_ends, recordings_in

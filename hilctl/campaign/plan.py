@@ -7,7 +7,7 @@ from pathlib import Path
 
 from hilctl.base.errors import ConfigError, InputError, Problem
 from hilctl.base.files import TextFiles
-from hilctl.base.yaml.messages import Loc
+from hilctl.base.yaml import Loc
 from hilctl.campaign.steps import CampaignSteps, SeriesStep, base_problem, key_of
 from hilctl.experiment.check import check
 from hilctl.experiment.heat import CoolingCoil, RunHeat

@@ -10,8 +10,7 @@ from typing import Any
 
 from hilctl.base.errors import ConfigError, InputError, Problem
 from hilctl.base.files import TextFiles
-from hilctl.base.yaml.document import Document, load_document
-from hilctl.base.yaml.messages import Loc, dotted
+from hilctl.base.yaml import Document, Loc, dotted, load_document
 from hilctl.campaign.file import CampaignFile
 from hilctl.campaign.vary import MOST_STEPS, Point, groups_of, points
 from hilctl.experiment.load import LoadedExperiment, named_from, resolve

@@ -7,7 +7,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from hilctl.base.yaml.messages import Loc
+from hilctl.base.yaml import Loc
 from hilctl.campaign.file import RunOrder
 
 Point: TypeAlias = Mapping[str, Any]

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from hilctl.base.units import CommandUnit
-from hilctl.base.yaml.document import Document, load_document
+from hilctl.base.yaml import Document, load_document
 from hilctl.characterise.waveforms import Keys
 from hilctl.loop.interlocks import InterlockSettings, Needs
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from hilctl.base.errors import ConfigError, InputError, Problem
-from hilctl.base.yaml.document import Document
+from hilctl.base.yaml import Document
 from hilctl.cli.options import AsJson, ExperimentFile, Settings
 from hilctl.cli.output import print_json
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from hilctl.base.errors import InputError
 from hilctl.base.files import already_there, check_no_input, write_text
-from hilctl.base.yaml.document import Document
+from hilctl.base.yaml import Document
 from hilctl.comparison.trials import (
     InverseTrial,
     TrialDevice,

@@ -18,8 +18,7 @@ from hilctl.base.errors import InputError
 from hilctl.base.files import TextFiles, write_text
 from hilctl.base.segments import Segment
 from hilctl.base.strict import Field, Strict, model_validator
-from hilctl.base.yaml.document import load_document
-from hilctl.base.yaml.plain import dump
+from hilctl.base.yaml import dump, load_document
 from hilctl.models.base import HysteresisModel
 from hilctl.models.files import dump_model
 from hilctl.waveforms.build import Reference

@@ -8,7 +8,7 @@ from pathlib import Path
 from hilctl.base.device import Device, complete
 from hilctl.base.errors import ConfigError, InputError, Problem
 from hilctl.base.files import TextFiles
-from hilctl.base.yaml.document import Document
+from hilctl.base.yaml import Document
 from hilctl.experiment.registry import device_class, known_devices
 
 

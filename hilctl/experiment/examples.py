@@ -10,8 +10,7 @@ from typing import Any
 
 from hilctl.base.errors import InputError
 from hilctl.base.files import read_text, write_text
-from hilctl.base.yaml.document import load_document
-from hilctl.base.yaml.messages import did_you_mean
+from hilctl.base.yaml import did_you_mean, load_document
 from hilctl.experiment.inventory import shipped_profiles
 
 _PACKAGE = Path(__file__).parents[1]

@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from hilctl.base.errors import InputError
-from hilctl.base.yaml.document import load_document
-from hilctl.base.yaml.messages import did_you_mean
+from hilctl.base.yaml import did_you_mean, load_document
 from hilctl.experiment.registry import device_class, known_devices
 
 SHIPPED_PROFILES = "hilctl_drivers.profile:shipped_profiles"

@@ -10,8 +10,7 @@ from typing import TypeVar
 from hilctl.base.device import Device
 from hilctl.base.errors import ConfigError, InputError, Problem
 from hilctl.base.files import TextFiles
-from hilctl.base.yaml.document import Document, load_document
-from hilctl.base.yaml.plain import dump
+from hilctl.base.yaml import Document, dump, load_document
 from hilctl.experiment.correction import Correction, load_correction
 from hilctl.experiment.device import made_device
 from hilctl.experiment.file import Experiment

@@ -11,7 +11,7 @@ from importlib.metadata import entry_points
 
 from hilctl.base.device import Device
 from hilctl.base.errors import InputError
-from hilctl.base.yaml.messages import did_you_mean
+from hilctl.base.yaml import did_you_mean
 
 BUILTIN: dict[str, str] = {
     "simulated_terfenol": "hilctl_drivers.simulated.rigs:SimulatedTerfenol",

@@ -16,10 +16,7 @@ from hilctl.base.device import DeviceInfo
 from hilctl.base.errors import ConfigError, InputError, Problem
 from hilctl.base.files import TextFiles
 from hilctl.base.units import CommandUnit
-from hilctl.base.yaml.commented import commented
-from hilctl.base.yaml.document import Document
-from hilctl.base.yaml.messages import did_you_mean
-from hilctl.base.yaml.plain import dump
+from hilctl.base.yaml import Document, commented, did_you_mean, dump
 from hilctl.experiment.check import check
 from hilctl.experiment.device import made_device
 from hilctl.experiment.inventory import describe, shipped_profiles

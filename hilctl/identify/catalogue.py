@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from hilctl.base.errors import InputError
-from hilctl.base.yaml.messages import did_you_mean
+from hilctl.base.yaml import did_you_mean
 from hilctl.identify.field.fits import fit_field
 from hilctl.identify.generalised_duhem.fits import fit_generalised_duhem
 from hilctl.identify.job import FitJob, FoundModel

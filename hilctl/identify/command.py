@@ -10,7 +10,7 @@ from typing import Any
 from hilctl.base.errors import InputError
 from hilctl.base.files import check_writable, write_text
 from hilctl.base.units import CommandUnit
-from hilctl.base.yaml.document import Document
+from hilctl.base.yaml import Document
 from hilctl.identify.candidates import CandidateError, Choice, choose_kind
 from hilctl.identify.catalogue import entry
 from hilctl.identify.data.files import load_records

@@ -5,8 +5,7 @@ from typing import Annotated, TypeAlias
 
 from hilctl.base.files import TextFiles
 from hilctl.base.strict import Field, Strict
-from hilctl.base.yaml.document import Document, load_document
-from hilctl.base.yaml.plain import dump
+from hilctl.base.yaml import Document, dump, load_document
 from hilctl.models.base import HysteresisModel
 from hilctl.models.refined import Refinable, RefinedModel
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from hilctl.base.errors import ConfigError, Problem, RunError
 from hilctl.base.files import TextFiles
-from hilctl.base.yaml.document import load_document
+from hilctl.base.yaml import load_document
 from hilctl.experiment.device import made_device
 from hilctl.experiment.file import Safe
 from hilctl.loop.safe_output import (

@@ -29,7 +29,7 @@ from typing import Self
 from hilctl.base.device import Device
 from hilctl.base.errors import HilctlError, InputError
 from hilctl.base.files import TextFiles
-from hilctl.base.yaml.document import Document
+from hilctl.base.yaml import Document
 from hilctl.experiment.device import made_device
 from hilctl.loop.safe_output import SafeGoal
 from hilctl.machine.linux import LinuxProcess

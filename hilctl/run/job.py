@@ -46,7 +46,7 @@ class DeviceText:
     def made(self) -> Device:
         """Return the device; nothing is read from disk."""
         from hilctl.base.files import TextFiles
-        from hilctl.base.yaml.document import Document
+        from hilctl.base.yaml import Document
         from hilctl.experiment.device import made_device
 
         document = Document("experiment", self.experiment)

@@ -19,7 +19,7 @@ import numpy as np
 
 from hilctl import __version__
 from hilctl.base.samples import COLUMNS
-from hilctl.base.yaml.plain import dump
+from hilctl.base.yaml import dump
 from hilctl.loop.pacer import Lateness
 from hilctl.loop.plan import Outcome
 from hilctl.machine.diagnosis import machine_facts

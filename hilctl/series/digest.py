@@ -14,7 +14,7 @@ from hilctl.analysis.steady import steady_part
 from hilctl.base.arrays import F64
 from hilctl.base.errors import ConfigError, DataError, InputError, ModelError
 from hilctl.base.segments import Segment
-from hilctl.base.yaml.document import Document
+from hilctl.base.yaml import Document
 from hilctl.characterise.response import SmallSignal
 from hilctl.models.base import HysteresisModel
 from hilctl.models.files import parse_model

@@ -2,8 +2,7 @@
 
 import pytest
 
-from hilctl.base.yaml.document import load_document
-from hilctl.base.yaml.messages import loc_of
+from hilctl.base.yaml import load_document, loc_of
 from hilctl_drivers.board.profile import FrameProfile
 from hilctl_drivers.modbus.channels import EnsureStep, RegisterStep
 from hilctl_drivers.modbus.pdu import read_pdu, rtu_adu, write_single_pdu

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from hilctl.base.errors import ConfigError, InputError, Problem
-from hilctl.base.yaml.document import Document
+from hilctl.base.yaml import Document
 from hilctl.experiment.check import check
 from hilctl.experiment.load import resolve
 from hilctl_drivers.profile import FOLDER, parse_profile

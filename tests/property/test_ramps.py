@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from hilctl.analysis.replay import replay
 from hilctl.base.samples import COLUMNS, Flag, Head, Samples
-from hilctl.base.yaml.document import Document
+from hilctl.base.yaml import Document
 from hilctl.experiment.file import Experiment
 from hilctl.loop.conditioning import Conditioning
 from hilctl.loop.host import Tuning

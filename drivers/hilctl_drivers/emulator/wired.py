@@ -7,7 +7,7 @@ from typing import Any
 
 from hilctl.base.errors import ConfigError, InputError, Problem
 from hilctl.base.files import TextFiles
-from hilctl.base.yaml.document import Document, load_document
+from hilctl.base.yaml import Document, load_document
 from hilctl_drivers.emulator.options import EmulatorOptions
 from hilctl_drivers.emulator.rig import Wiring
 from hilctl_drivers.emulator.setup import Emulator

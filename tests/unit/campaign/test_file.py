@@ -3,7 +3,7 @@
 import pytest
 
 from hilctl.base.errors import ConfigError
-from hilctl.base.yaml.document import Document
+from hilctl.base.yaml import Document
 from hilctl.campaign.file import CampaignFile
 from tests.unit.campaign.conftest import CAMPAIGN
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hilctl.base.errors import InputError
-from hilctl.base.yaml.document import Document
+from hilctl.base.yaml import Document
 from hilctl.comparison.trials import (
     CYCLES,
     TIMED_SAMPLES,

@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from hilctl.base.errors import ConfigError, InputError
-from hilctl.base.yaml.plain import dump
+from hilctl.base.yaml import dump
 from hilctl_drivers.board.profile import FrameProfile
 from hilctl_drivers.modbus.channels import EnsureStep, RegisterStep
 from hilctl_drivers.modbus.profile import ModbusProfile

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hilctl.base.errors import ConfigError
-from hilctl.base.yaml.document import Document
+from hilctl.base.yaml import Document
 from hilctl.experiment.adaptation import (
     adaptation_bounds,
     adapted_operator,

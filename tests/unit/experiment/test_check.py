@@ -13,7 +13,7 @@ from hilctl.base.arrays import F64
 from hilctl.base.device import DeviceInfo, DeviceOptions
 from hilctl.base.errors import ConfigError, DataError
 from hilctl.base.segments import Segment
-from hilctl.base.yaml.document import Document
+from hilctl.base.yaml import Document
 from hilctl.experiment import check as module
 from hilctl.experiment.check import Checked, check, command_problems
 from hilctl.experiment.correction import Correction, LearnedCycle, model_sha256, signature

@@ -8,7 +8,7 @@ import pytest
 from hilctl.base.device import Device, DeviceInfo, DeviceOptions
 from hilctl.base.errors import ConfigError
 from hilctl.base.files import TextFiles
-from hilctl.base.yaml.document import Document
+from hilctl.base.yaml import Document
 from hilctl.experiment import registry
 from hilctl.experiment.device import made_device
 

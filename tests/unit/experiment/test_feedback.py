@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hilctl.base.errors import ConfigError, InputError
-from hilctl.base.yaml.document import Document
+from hilctl.base.yaml import Document
 from hilctl.experiment.check import check
 from hilctl.experiment.feedback import (
     feedback_problems,

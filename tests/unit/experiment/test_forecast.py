@@ -10,7 +10,7 @@ import pytest
 from hilctl.base.arrays import F64
 from hilctl.base.device import DeviceInfo, DeviceOptions
 from hilctl.base.errors import ConfigError
-from hilctl.base.yaml.document import Document
+from hilctl.base.yaml import Document
 from hilctl.experiment.check import Checked, check
 from hilctl.experiment.load import LoadedExperiment, resolve
 from hilctl.models.base import HysteresisModel

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from hilctl.base.errors import ConfigError
-from hilctl.base.yaml.document import Document
+from hilctl.base.yaml import Document
 from hilctl.experiment.check import check
 from hilctl.experiment.device_state import CoilState, DeviceState, write_device_state
 from hilctl.experiment.heat import CoilHeat

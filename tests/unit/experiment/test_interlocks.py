@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hilctl.base.errors import ConfigError
-from hilctl.base.yaml.document import Document
+from hilctl.base.yaml import Document
 from hilctl.experiment.check import check
 from hilctl.experiment.interlocks import interlock_context
 from hilctl.experiment.load import resolve

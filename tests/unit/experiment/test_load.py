@@ -7,7 +7,7 @@ import yaml
 
 from hilctl.base.errors import ConfigError, InputError
 from hilctl.base.files import TextFiles
-from hilctl.base.yaml.document import Document
+from hilctl.base.yaml import Document
 from hilctl.experiment.load import load_experiment, resolve
 
 PROFILE = Path(__file__).parents[2] / "data" / "rtu_module.yaml"

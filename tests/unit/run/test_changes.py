@@ -8,7 +8,7 @@ import pytest
 
 from hilctl.base.device import DeviceInfo
 from hilctl.base.errors import InputError
-from hilctl.base.yaml.document import Document
+from hilctl.base.yaml import Document
 from hilctl.experiment.check import check
 from hilctl.experiment.load import resolve
 from hilctl.models.staged import FieldLag, StagedModel

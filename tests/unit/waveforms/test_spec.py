@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from hilctl.base.errors import ConfigError
-from hilctl.base.yaml.document import Document
+from hilctl.base.yaml import Document
 from hilctl.experiment.load import resolve
 
 EXPERIMENT = """\

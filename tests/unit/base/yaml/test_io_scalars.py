@@ -12,9 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hilctl.base.errors import ConfigError
-from hilctl.base.yaml import plain
-from hilctl.base.yaml.document import Document
-from hilctl.base.yaml.plain import dump
+from hilctl.base.yaml import Document, dump, io
 from hilctl.experiment.load import resolve
 from hilctl.models.files import load_model, parse_model
 from hilctl_drivers.profile import FOLDER, load_profile, parse_profile
@@ -222,6 +220,6 @@ def test_dumped_text_is_as_people_write_it() -> None:
     ],
 )
 def test_too_much_is_refused_at_once(text: str, rule: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(plain, "MAX_VALUES", 500)
+    monkeypatch.setattr(io, "MAX_VALUES", 500)
     with pytest.raises(ConfigError, match=rule):
         Document("large.yaml", text)

@@ -1,0 +1,304 @@
+"""Broken rules in words: where, key, rule, value, and what to do about it.
+
+What people write and YAML has otherwise (a decimal comma, a micro sign, ``1e3`` for a count) is
+read where a model wants a number, or one of a few words, and where there is one way only to read
+it: ``1,5`` is 1.5, but ``1,500`` may be a thousand and a half, and is refused.
+"""
+
+import difflib
+import re
+import types
+import typing
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import Annotated, Any, NamedTuple, TypeAlias
+
+from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails
+
+from hilctl.base.errors import ConfigError, Problem
+
+Loc: TypeAlias = tuple[str | int, ...]
+"""Keys and list indices that lead to a value."""
+
+NUMBERS = {
+    "int": r"[-+]?[0-9]+|0o[0-7]+|0x[0-9a-fA-F]+",
+    "float": r"[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?"
+    r"|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)",
+}
+"""What a number without quotes looks like in YAML 1.2, as regular expressions."""
+
+_COMMA = re.compile(r"([-+]?\d+),(\d+)((?:[eE][-+]?\d+)?)")
+_MICRO = str.maketrans({"\N{MICRO SIGN}": "u", "\N{GREEK SMALL LETTER MU}": "u"})
+_QUOTED = re.compile(r"'([^']+)'")
+_RULES = {
+    "missing": "is required",
+    "extra_forbidden": "unknown key",
+    "float_type": "must be a number",
+    "int_type": "must be a whole number",
+    "int_from_float": "must be a whole number",
+    "string_type": "must be text",
+    "bool_type": "must be true or false",
+    "tuple_type": "must be a list",
+    "dict_type": "must be a mapping of keys to values",
+    "model_type": "must be a mapping of keys to values",
+    "model_attributes_type": "must be a mapping of keys to values",
+    "finite_number": "must be a finite number",
+    "union_tag_not_found": "needs a 'kind'",
+    "greater_than": "must be > {gt}",
+    "greater_than_equal": "must be >= {ge}",
+    "less_than": "must be < {lt}",
+    "less_than_equal": "must be <= {le}",
+    "too_short": "must have at least {min_length} values",
+    "too_long": "must have at most {max_length} values",
+    "value_error": "{error}",
+}
+_WITHOUT_VALUE = {"missing", "value_error", "extra_forbidden", "union_tag_not_found"}
+_WORDS = {"literal_error", "union_tag_invalid"}
+_NUMBER_TYPES = {"float_type", "int_type", "int_from_float"}
+_SPOKEN_BOOLEANS = {"yes", "no", "on", "off", "y", "n"}
+
+
+class _Broken(NamedTuple):
+    """One thing that pydantic says, with the keys that stand in the file.
+
+    Attributes:
+        detail: What it says.
+        loc: Keys and indices, without pydantic's names of choices.
+        parent: The model that the last key is in, where it is in one.
+        of_choice: Whether a value is not of the type of one choice of several.
+    """
+
+    detail: ErrorDetails
+    loc: Loc
+    parent: type[BaseModel] | None
+    of_choice: bool
+
+
+def dotted(loc: Loc) -> str:
+    """Return a location as a dotted key, list indices included."""
+    return ".".join(map(str, loc))
+
+
+def loc_of(key: str) -> Loc:
+    """Return a dotted key as a location; what looks like a number is a list index."""
+    return tuple(int(part) if part.isdecimal() else part for part in key.split("."))
+
+
+def did_you_mean(word: str, known: Iterable[str]) -> str:
+    """Return a hint with the closest known name, or with all of them."""
+    names = sorted(known)
+    close = difflib.get_close_matches(word, names, n=1)
+    if close:
+        return f"did you mean '{close[0]}'?"
+    return f"known: {', '.join(names)}" if names else ""
+
+
+def broken_rules(
+    error: ValidationError, model: type[BaseModel], where: Callable[[Loc], str], at: Loc = ()
+) -> list[Problem]:
+    """Return all that pydantic says of a file, one problem a value.
+
+    Args:
+        error: What pydantic says.
+        model: What it tried to build.
+        where: Gives the ``file:line`` of a location, or of the nearest thing around it.
+        at: Where in the file the model's data stand.
+    """
+    problems: list[Problem] = []
+    broken: list[_Broken] = []
+    for detail in error.errors(include_url=False):
+        cause = detail.get("ctx", {}).get("error")
+        if isinstance(cause, ConfigError):  # read from another file: says itself where it stands
+            problems += cause.problems
+        else:
+            broken.append(_located(model, detail))
+    # A choice that was not meant says nothing, where another one says what is wrong within it.
+    meant = {
+        each.loc[:n] for each in broken if not each.of_choice for n in range(len(each.loc) + 1)
+    }
+    groups: dict[Loc, list[_Broken]] = {}
+    for index, each in enumerate(broken):
+        if not (each.of_choice and each.loc in meant):
+            groups.setdefault(each.loc if each.of_choice else (index, *each.loc), []).append(each)
+    return problems + [_problem(group, where, at) for group in groups.values()]
+
+
+def readings(error: ValidationError, model: type[BaseModel]) -> Iterator[tuple[Loc, Any, bool]]:
+    """Yield what can be read otherwise of what pydantic has refused.
+
+    Args:
+        error: What it says.
+        model: What it tried to build.
+
+    Yields:
+        Where it stands, what it is read as, and whether it is the key that is read otherwise.
+    """
+    for each in (_located(model, detail) for detail in error.errors(include_url=False)):
+        value = None if each.of_choice else _read_as(each.detail, each.parent)
+        if value is not None:
+            yield each.loc, value, each.detail["type"] == "extra_forbidden"
+
+
+def _read_as(detail: ErrorDetails, parent: type[BaseModel] | None) -> float | str | None:
+    kind, given = detail["type"], detail["input"]
+    if kind == "float_type" and isinstance(given, str):
+        return _decimal(given)
+    if kind == "int_type" and isinstance(given, float) and given.is_integer():
+        return int(given) if abs(given) < 2.0**53 else None
+    if kind == "literal_error" and isinstance(given, str):
+        word = given.translate(_MICRO)
+        return word if word != given and repr(word) in _expected(detail) else None
+    if kind == "extra_forbidden" and parent is not None:
+        name = str(detail["loc"][-1])
+        key = name.translate(_MICRO)
+        return key if key != name and key in parent.model_fields else None
+    return None
+
+
+def _decimal(text: str) -> float | None:
+    """Return a number with a decimal comma; None where it may be another one, or is none."""
+    found = _COMMA.fullmatch(text.strip())
+    if found is None:
+        return None
+    whole, part, power = found.groups()
+    digits = whole.lstrip("+-")
+    if len(part) == 3 and len(digits) <= 3 and not digits.startswith("0"):
+        return None
+    return float(f"{whole}.{part}{power}")
+
+
+def _problem(group: list[_Broken], where: Callable[[Loc], str], at: Loc) -> Problem:
+    first = group[0]
+    place = loc = (*at, *first.loc)
+    rule, *others = (_rule(each.detail) for each in group)
+    rule = ", or ".join([rule, *(other.removeprefix("must be ") for other in others)])
+    if first.detail["type"] == "value_error":  # a rule of several keys names the one it is about
+        place = (*loc, *loc_of(rule.split(" ", 1)[0]))
+    known = first.parent.model_fields if first.parent else ()
+    hint = next(filter(None, (_hint(each.detail, known) for each in group)), "")
+    return Problem(where(place), dotted(loc), rule, _value(first.detail), hint)
+
+
+def _rule(detail: ErrorDetails) -> str:
+    kind = detail["type"]
+    if kind in _RULES:
+        return _RULES[kind].format(**detail.get("ctx", {}))
+    if kind in _WORDS:
+        expected = _expected(detail)
+        several = " or " in expected or ", " in expected
+        return f"must be one of {expected}" if several else f"must be {expected}"
+    return detail["msg"][0].lower() + detail["msg"][1:]
+
+
+def _expected(detail: ErrorDetails) -> str:
+    context = detail.get("ctx", {})
+    return str(context.get("expected") or context.get("expected_tags"))
+
+
+def _value(detail: ErrorDetails) -> str:
+    """Return the offending value, short enough for one line; empty where the rule has it."""
+    value, kind = detail["input"], detail["type"]
+    if kind in _WITHOUT_VALUE:
+        return ""
+    if kind == "union_tag_invalid":
+        return repr(detail.get("ctx", {})["tag"])
+    if value is None or isinstance(value, bool):
+        return {None: "nothing", True: "true", False: "false"}[value]
+    text = repr(list(value) if isinstance(value, tuple) else value)
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def _hint(detail: ErrorDetails, known: Iterable[str]) -> str:
+    value, kind = detail["input"], detail["type"]
+    if kind == "extra_forbidden":
+        return did_you_mean(str(detail["loc"][-1]), known)
+    if kind in _WORDS:  # all are listed: name one only where it is near
+        given, words = detail.get("ctx", {}).get("tag", value), _QUOTED.findall(_expected(detail))
+        close = difflib.get_close_matches(str(given), words, n=1, cutoff=0.75)
+        return f"did you mean '{close[0]}'?" if close and len(words) > 1 else ""
+    if kind in _NUMBER_TYPES and isinstance(value, str):
+        return _number_hint(value)
+    if kind in _NUMBER_TYPES and isinstance(value, float) and value.is_integer():
+        return f"write {value:.0f}"
+    if kind == "bool_type" and str(value).lower() in _SPOKEN_BOOLEANS:
+        return "write true or false"
+    if kind == "string_type" and isinstance(value, bool | int | float):
+        return "put it in quotes"
+    return ""
+
+
+def _number_hint(text: str) -> str:
+    if _is_number(text):
+        return "remove the quotes"
+    if _is_number(point := text.replace(",", ".", 1)):
+        return f"{point} or {text.replace(',', '')}? write a decimal point, or none"
+    if text[:1] in set("+-.0123456789"):
+        return "write a plain number, such as 1000, 0.5 or 1e-3"
+    return ""
+
+
+def _is_number(text: str) -> bool:
+    return any(re.fullmatch(pattern, text) for pattern in NUMBERS.values())
+
+
+def _located(model: type[BaseModel], detail: ErrorDetails) -> _Broken:
+    """Follow pydantic's location through the types, and leave out its names of choices."""
+    choices: list[Any] = [model]
+    parent: type[BaseModel] | None = None
+    plain: list[str | int] = []
+    chose = False
+    for part in detail["loc"]:
+        chose = len(choices) > 1
+        if chose:
+            choices = [choice for choice in choices if _is_named(choice, part)]
+        elif part != "[key]":
+            plain.append(part)
+            parent = choices[0] if choices and _is_model(choices[0]) else None
+            choices = _choices(_inner(choices[0], part)) if choices else []
+    kind = detail["type"]
+    if kind == "union_tag_invalid":
+        plain.append("kind")
+    of_choice = chose and (kind == "literal_error" or kind.endswith("_type"))
+    return _Broken(detail, tuple(plain), parent, of_choice)
+
+
+def _is_model(annotation: Any) -> bool:
+    return isinstance(annotation, type) and issubclass(annotation, BaseModel)
+
+
+def _is_named(choice: Any, name: str | int) -> bool:
+    """Return whether pydantic calls a choice so: by its kind, or by its class.
+
+    The class may stand within its validators: ``function-after[_fits(), Flag]``.
+    """
+    if not _is_model(choice):
+        return False
+    if re.search(rf"\b{choice.__name__}\]*$", str(name)):
+        return True
+    kind = choice.model_fields.get("kind")
+    return kind is not None and name in typing.get_args(kind.annotation)
+
+
+def _inner(annotation: Any, part: str | int) -> Any:
+    """Return the type of what stands at a key or an index; None where it is not known."""
+    if _is_model(annotation):
+        field = annotation.model_fields.get(part)
+        return field.annotation if field else None
+    origin, inner = typing.get_origin(annotation), typing.get_args(annotation)
+    if origin in {dict, Mapping}:
+        return inner[1]
+    if origin is not tuple:
+        return None
+    if inner[-1] is Ellipsis:
+        return inner[0]
+    return inner[part] if isinstance(part, int) and part < len(inner) else None
+
+
+def _choices(annotation: Any) -> list[Any]:
+    """Return what a value may be: several types where pydantic's location names the choice."""
+    origin = typing.get_origin(annotation)
+    if origin is Annotated:
+        return _choices(typing.get_args(annotation)[0])
+    if origin in {typing.Union, types.UnionType}:
+        return [each for each in typing.get_args(annotation) if each is not type(None)]
+    return [annotation]

@@ -1,0 +1,364 @@
+r"""YAML 1.2, the plain part: mappings with text keys, lists, and the scalars of its core schema.
+
+A scalar without quotes is, as the core schema says (YAML 1.2.2, section 10.3.2):
+
+    null     ``null``, ``Null``, ``NULL``, ``~``, or nothing at all
+    boolean  ``true``, ``True``, ``TRUE``, ``false``, ``False``, ``FALSE``
+    integer  ``[-+]?[0-9]+`` (``010`` is ten), ``0o[0-7]+``, ``0x[0-9a-fA-F]+``
+    float    ``[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?``, ``[-+]?.inf``, ``.nan``
+             (also ``.Inf``, ``.INF``, ``.NaN``, ``.NAN``)
+    text     everything else: ``yes``, ``on``, ``1:30``, ``1_000``, ``2026-11-21``
+
+Aliases and tags can make loops and values that are neither numbers nor text, so they are refused.
+"""
+
+import json
+import logging
+import math
+import re
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+import yaml
+from pydantic import BaseModel, ValidationError
+from yaml.composer import ComposerError
+
+from hilctl.base.errors import ConfigError, Problem
+from hilctl.base.files import TextFiles
+from hilctl.base.yaml.errors import NUMBERS, Loc, broken_rules, dotted, readings
+
+MAX_DEPTH = 32
+"""Levels of nesting that are read; an experiment has about five."""
+MAX_CHARACTERS = 2_000_000
+"""Longest text that is read; a model of ten thousand operators has a fifth of it."""
+MAX_VALUES = 50_000
+"""Most values, lists and mappings in a text: their parser takes up to 0.1 ms for each."""
+
+Model = TypeVar("Model", bound=BaseModel)
+_log = logging.getLogger(__name__)
+_UNREADABLE = "is not readable YAML"
+_TAG = "tag:yaml.org,2002:"
+
+
+class _PlainLoader(yaml.SafeLoader):
+    """Refuses what is not plain as it reads."""
+
+    yaml_implicit_resolvers = {}  # noqa: RUF012  PyYAML's own way; filled below
+    _depth = 0
+    _values = 0
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        event: Any = self.peek_event()  # type: ignore[no-untyped-call] # not in the stubs
+        is_key = isinstance(parent, yaml.MappingNode) and index is None
+        self._values += not is_key
+        if problem := self._not_plain(event, is_key=is_key):
+            raise ComposerError(None, None, problem, event.start_mark)
+        self._depth += 1
+        node = super().compose_node(parent, index)
+        self._depth -= 1
+        return node
+
+    def _not_plain(self, event: yaml.Event, *, is_key: bool) -> str:
+        if self._values > MAX_VALUES:
+            return f"more than the {MAX_VALUES} values that are read"
+        if isinstance(event, yaml.AliasEvent):
+            return "aliases (*name) are not supported: write the value out"
+        if getattr(event, "tag", None) is not None:
+            return "tags (!name) are not supported: write the plain value"
+        if is_key and not isinstance(event, yaml.ScalarEvent):
+            return "a key must be text"
+        if self._depth > MAX_DEPTH:
+            return f"nested more than {MAX_DEPTH} deep"
+        if isinstance(event, yaml.ScalarEvent) and re.search("[\ud800-\udfff]", event.value):
+            return "holds half a character (an escape from \\ud800 to \\udfff)"
+        return ""
+
+
+class _PlainDumper(yaml.SafeDumper):
+    """Writes no aliases, and quotes every text that YAML 1.1 or 1.2 would read as something else.
+
+    PyYAML's resolvers, which are those of 1.1, stay, so that other programs read the same.
+    """
+
+    def ignore_aliases(self, data: Any) -> bool:
+        return True
+
+
+for _name, _pattern in {
+    "null": r"null|Null|NULL|~|",
+    "bool": r"true|True|TRUE|false|False|FALSE",
+    **NUMBERS,
+}.items():
+    for _class in (_PlainLoader, _PlainDumper):
+        _class.add_implicit_resolver(_TAG + _name, re.compile(rf"(?:{_pattern})\Z"), None)
+
+
+def compose(text: str) -> yaml.Node | None:
+    """Return the text's tree, or None where it holds nothing.
+
+    Raises:
+        yaml.MarkedYAMLError: It is not YAML, more than the plain part of it, or too much; says
+            where.
+    """
+    if len(text) > MAX_CHARACTERS:
+        problem = f"{len(text)} characters, more than the {MAX_CHARACTERS} that are read"
+        raise yaml.MarkedYAMLError(problem=problem)
+    try:
+        loader = _PlainLoader(text)
+    except yaml.reader.ReaderError as error:
+        problem = f"the character U+{ord(text[error.position]):04X} is not allowed"
+        mark = yaml.Mark("", 0, text.count("\n", 0, error.position), 0, None, 0)
+        raise yaml.MarkedYAMLError(problem=problem, problem_mark=mark) from None
+    try:
+        return loader.get_single_node()
+    except (ValueError, OverflowError):
+        problem = "an escape names no character"
+        raise yaml.MarkedYAMLError(problem=problem, problem_mark=loader.get_mark()) from None
+
+
+def _scalar(node: yaml.Node) -> Any:
+    """Return a leaf's value: None, a bool, an int, a float, or text where it is none of them.
+
+    A whole number of more than 64 bits is a float: Python won't write out very long ones.
+    """
+    text: str = node.value
+    match node.tag.removeprefix(_TAG):
+        case "null":
+            return None
+        case "bool":
+            return text.lower() == "true"
+        case "int":
+            try:
+                number = int(text, {"0o": 8, "0x": 16}.get(text[:2], 10))
+                return number if number.bit_length() <= 64 else float(number)
+            except (ValueError, OverflowError):  # thousands of digits
+                return -math.inf if text.startswith("-") else math.inf
+        case "float":
+            return float(text.lower().replace(".inf", "inf").replace(".nan", "nan"))
+    return text
+
+
+def dump(data: Any) -> str:
+    """Return plain data as YAML; read back it is the same, bit for bit, lists as tuples.
+
+    Args:
+        data: Mappings with text keys, lists and tuples, text, None, booleans, floats, and whole
+            numbers of up to 64 bits.
+
+    Raises:
+        yaml.YAMLError: It holds anything else.
+    """
+    return yaml.dump(data, Dumper=_PlainDumper, sort_keys=False, width=100)
+
+
+def commented(data: Mapping[str, Any], comments: Mapping[str, str], above: str = "") -> str:
+    """Return plain data as YAML for people, with short lists in one line; read back it is the same.
+
+    Args:
+        data: What :func:`dump` takes.
+        comments: By dotted key, what stands behind the value, or above a mapping: one line each.
+        above: Dotted key of the data, with a full stop; empty at the top.
+    """
+    lines: list[str] = []
+    for key, value in data.items():
+        name = dump({key: None}).removesuffix(" null\n")
+        comment = f"  # {comments[above + key]}" if above + key in comments else ""
+        if isinstance(value, Mapping) and value:
+            inner = commented(value, comments, f"{above}{key}.").splitlines()
+            lines += [f"{name}{comment}", *(f"  {line}" for line in inner)]
+        elif isinstance(value, list | tuple):
+            lines.append(f"{name} {json.dumps(value, ensure_ascii=False)}{comment}")
+        else:
+            first, *more = dump({key: value}).splitlines()
+            if more and comment:  # behind its first line it would be a part of it
+                lines.append(comment.strip())
+            lines += [first, *more] if more else [f"{first}{comment}"]
+    return "".join(f"{line}\n" for line in lines)
+
+
+class Document:
+    """A YAML file's content with the place of every value.
+
+    Attributes:
+        data: Mappings, tuples and scalars; each change makes it anew.
+        assignments: What :meth:`set` was called with, in order.
+
+    Args:
+        name: File name as it should appear in messages.
+        text: The YAML text.
+        lines: How messages name lines that nobody wrote as such, from the first on; those that
+            are left out or empty are named by file and number.
+
+    Raises:
+        ConfigError: The text is not YAML, holds a key twice, or is not a mapping.
+    """
+
+    def __init__(self, name: str, text: str, lines: Sequence[str] = ()) -> None:
+        self.name = name
+        self.assignments: list[str] = []
+        self._places: dict[Loc, str] = {}
+        self._duplicates: list[Problem] = []
+
+        def place(mark: yaml.Mark) -> str:
+            named = lines[mark.line] if mark.line < len(lines) else ""
+            return named or f"{name}:{mark.line + 1}"
+
+        try:
+            node = compose(text)
+        except yaml.MarkedYAMLError as error:
+            where = place(error.problem_mark) if error.problem_mark else f"{name}:1"
+            raise ConfigError([Problem(where, "", _UNREADABLE, hint=str(error.problem))]) from None
+        if not isinstance(node, yaml.MappingNode):
+            rule = "must hold a mapping of keys to values"
+            raise ConfigError([Problem(f"{name}:1", "", rule)])
+        self.data: dict[str, Any] = self._build(node, (), place)
+        if self._duplicates:
+            raise ConfigError(self._duplicates)
+
+    def _build(self, node: yaml.Node, loc: Loc, place: Callable[[yaml.Mark], str]) -> Any:
+        self._places.setdefault(loc, place(node.start_mark))
+        if isinstance(node, yaml.SequenceNode):
+            return tuple(self._build(item, (*loc, i), place) for i, item in enumerate(node.value))
+        if not isinstance(node, yaml.MappingNode):
+            return _scalar(node)
+        mapping: dict[str, Any] = {}
+        for key, value in node.value:
+            inner, where = (*loc, key.value), place(key.start_mark)
+            if key.value in mapping:
+                rule = f"stands already at {self._places[inner]}"
+                self._duplicates.append(Problem(where, dotted(inner), rule))
+            self._places[inner] = where
+            mapping[key.value] = self._build(value, inner, place)
+        return mapping
+
+    def set(self, assignment: str) -> None:
+        """Apply one ``dotted.key=value`` from the command line; the value is read as YAML.
+
+        Raises:
+            ConfigError: It is not of that form, a part of the key is not a mapping, or the value
+                holds a key twice.
+        """
+        where = f"--set {assignment}"
+        key, equals, text = assignment.partition("=")
+        parts = key.strip().split(".")
+        if not equals or not all(parts) or len(parts) > MAX_DEPTH:
+            raise ConfigError([Problem(where, "", "must be dotted.key=value")])
+        try:
+            node = compose(text)
+        except yaml.MarkedYAMLError as error:
+            problem = Problem(where, key, _UNREADABLE, repr(text), str(error.problem))
+            raise ConfigError([problem]) from None
+        loc: Loc = ()
+        data: Any = self.data
+        for part in parts:
+            if isinstance(data, tuple) and part in map(str, range(len(data))):
+                loc, data = (*loc, int(part)), data[int(part)]
+            elif isinstance(data, dict):
+                loc, data = (*loc, part), data.get(part, {})
+            else:
+                rule = "there is no such key to set"
+                raise ConfigError([Problem(where, dotted((*loc, part)), rule)])
+        self._places = {at: old for at, old in self._places.items() if at[: len(loc)] != loc}
+        for end in range(1, len(loc) + 1):
+            self._places.setdefault(loc[:end], where)
+        value = None if node is None else self._build(node, loc, lambda _: where)
+        self.data = _replaced(self.data, loc, value)
+        self.assignments.append(assignment)
+        if self._duplicates:
+            raise ConfigError([Problem(where, p.key, "stands twice") for p in self._duplicates])
+
+    def holds(self, loc: Loc) -> bool:
+        """Return whether something stands at a location."""
+        return loc in self._places
+
+    def where(self, loc: Loc) -> str:
+        """Return ``file:line`` of a value, or of the nearest thing around it."""
+        ends = range(len(loc), -1, -1)
+        return next((self._places[loc[:end]] for end in ends if self.holds(loc[:end])), self.name)
+
+    def validate(
+        self,
+        model: type[Model],
+        *,
+        at: Loc = (),
+        without: tuple[str, ...] = (),
+        context: Mapping[str, Any] | None = None,
+    ) -> Model:
+        """Build a pydantic model from the document, or from a part of it.
+
+        What can be read in one way only is read so, and stands so in :attr:`data` from then on: see
+        :func:`hilctl.base.yaml.errors.readings`.
+
+        Args:
+            model: What to build.
+            at: Where the part stands; all of the document where empty.
+            without: Keys that are left out: they belong to somebody else.
+            context: What the model's validators find in ``info.context``.
+
+        Raises:
+            ConfigError: One or more rules are broken; all are listed.
+        """
+        while True:
+            data = _at(self.data, at)
+            if without:
+                data = {key: value for key, value in data.items() if key not in without}
+            try:
+                return model.model_validate(data, context=context)
+            except ValidationError as error:
+                plain = [each for each in readings(error, model) if self.holds((*at, *each[0]))]
+                if not plain:
+                    raise ConfigError(broken_rules(error, model, self.where, at)) from None
+            for loc, value, is_key in plain:
+                if is_key:
+                    self._rename((*at, *loc), value)
+                else:
+                    self._read_as((*at, *loc), value)
+
+    def _read_as(self, loc: Loc, value: float | str) -> None:
+        if isinstance(value, float):
+            said = f"{_at(self.data, loc)!r} is read as {value:g}"
+            _log.warning("%s: %s: %s", self.where(loc), dotted(loc), said)
+        self.data = _replaced(self.data, loc, value)
+
+    def _rename(self, loc: Loc, name: str) -> None:
+        new, mapping = (*loc[:-1], name), _at(self.data, loc[:-1])
+        if name in mapping:
+            rule = f"stands already at {self.where(new)}"
+            raise ConfigError([Problem(self.where(loc), dotted(loc), rule)])
+        renamed = {(name if key == loc[-1] else key): value for key, value in mapping.items()}
+        self.data = _replaced(self.data, loc[:-1], renamed)
+        self._places = {
+            (*new, *at[len(loc) :]) if at[: len(loc)] == loc else at: where
+            for at, where in self._places.items()
+        }
+
+
+def load_document(path: Path, files: TextFiles | None = None) -> Document:
+    """Read a YAML file.
+
+    Args:
+        path: The file.
+        files: Where it is read from; the disk where None.
+
+    Raises:
+        InputError: The file can't be read.
+        ConfigError: See :class:`Document`.
+    """
+    return Document(str(path), (files or TextFiles()).read(path))
+
+
+def _at(data: Any, loc: Loc) -> Any:
+    for part in loc:
+        data = data[part]
+    return data
+
+
+def _replaced(data: Any, loc: Loc, value: Any) -> Any:
+    """Return a copy of nested mappings and tuples with another value at one place."""
+    if not loc:
+        return value
+    head, rest = loc[0], loc[1:]
+    if isinstance(data, tuple) and isinstance(head, int):
+        return (*data[:head], _replaced(data[head], rest, value), *data[head + 1 :])
+    return {**data, head: _replaced(data.get(head, {}), rest, value)}
