@@ -200,9 +200,6 @@ class FakeHost:
         self.safe_writes: list[float] = []
         self.closed = False
 
-    def direct(self):
-        return None
-
     def claim(self, *, due=True):
         made = made_block(*self._shape)
         made.due = due

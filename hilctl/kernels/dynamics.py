@@ -198,10 +198,3 @@ def lead_stage(x: F64, parameters: F64, memory: F64, out: F64) -> None:
 def between_stage(x: F64, parameters: F64, memory: F64, out: F64) -> None:
     """Run :func:`between_block`; parameters: part."""
     between_block(x, parameters[0], memory, out)
-
-
-@kernel(STAGE)
-def offset_stage(x: F64, parameters: F64, memory: F64, out: F64) -> None:
-    """Add an offset, the one parameter; there is no memory."""
-    for k in range(x.size):
-        out[k] = x[k] + parameters[0]

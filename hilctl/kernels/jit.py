@@ -20,10 +20,9 @@ _NUMBA: Any = numba.config
 Function = TypeVar("Function", bound=Callable[..., object])
 
 STAGE = "void(float64[::1], float64[::1], float64[::1], float64[::1])"
-"""Signature of a kernel that is a stage by itself: input, parameters, memory, output.
+"""Signature of a kernel whose parameters stand in one array: input, parameters, memory, output.
 
-Whatever its model takes stands in one array of parameters, so that stages of any models can be
-called one after another in one call; output and input may be one array.
+Output and input may be one array.
 """
 
 
@@ -42,7 +41,7 @@ def kernel(
     the result is kept in memory for as long as the machine runs, or not at all.
 
     Where numba is told not to compile (``NUMBA_DISABLE_JIT=1``: for a debugger, or to see what
-    tests reach), the function is left as it is; runs then work, without a call for a whole tick.
+    tests reach), the function is left as it is.
 
     Args:
         signatures: numba signatures, for example ``"void(float64[::1], float64[::1])"``.
@@ -75,15 +74,6 @@ def load(*kernels: Callable[..., object]) -> None:
             each.load()
 
 
-def address(each: Callable[..., object]) -> int:
-    """Return where the machine code of a kernel of one signature stands, for as long as it lives.
-
-    It takes and returns what numba has for the types of that signature, arrays by value.
-    """
-    compiled = cast("_Kernel", each).only()
-    return int(compiled.library.get_pointer_to_function(compiled.fndesc.llvm_cfunc_wrapper_name))
-
-
 def entry(each: Function) -> Function:
     """Return a kernel of one signature as a function that does not look up its arguments' types.
 
@@ -91,11 +81,6 @@ def entry(each: Function) -> Function:
     what they pass. Where numba is told not to compile, it is the function itself.
     """
     return cast("Function", each.only().entry_point) if isinstance(each, _Kernel) else each
-
-
-def is_kernel(value: object) -> bool:
-    """Return whether it is what :func:`kernel` makes."""
-    return isinstance(value, _Kernel)
 
 
 def compile_by(other: Callable[[str, str], None] | None) -> None:

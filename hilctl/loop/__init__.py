@@ -4,12 +4,10 @@ loop.py         block after block until the waveform ends, or something goes wro
 plan.py         what a run does, and how it ended
 beginning.py    what comes before the waveform: ramp, and conditioning.py with the resting offset
 host.py         what the loop needs of its host: time, room for blocks, supervision
-usual.py        a usual tick as a whole: one compiled call before its exchange, one after
 feed.py         what the compensator is fed with
 block.py        one block of samples, in its slot from birth to answer
 pacer.py        absolute deadlines and the policy for late ticks
 tuning.py       gain and offset of a running reference, and the inverse faded out and in
-composed.py     the usual tick's arithmetic in two compiled calls
 compensator.py  the inverse of a model, in the loop's terms
 feedback.py     a controller around the compensator, sample by sample; integral.py, by blocks
 adaptation.py   offset, gain and weights of the model, adapted by the tracking error

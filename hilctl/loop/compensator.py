@@ -4,7 +4,7 @@ import numpy as np
 
 from hilctl.base.arrays import F64
 from hilctl.base.errors import ModelError
-from hilctl.models.base import HysteresisModel, Operator, Stage
+from hilctl.models.base import HysteresisModel, Operator
 
 
 class Compensator:
@@ -48,15 +48,6 @@ class Compensator:
             wanted[:] = input_um
         else:
             self._operator.process(input_um, wanted)
-
-    def stages(self) -> list[Stage] | None:
-        """Return what :meth:`process` runs; None where it is not made of stages alone."""
-        return [] if self._operator is None else self._operator.stages()
-
-    @property
-    def memory(self) -> F64:
-        """The hysteresis memory itself: float64[state_size], updated in place."""
-        return np.empty(0) if self._operator is None else self._operator.memory
 
     def warm_up(self) -> None:
         """Run once and forget it, so that nothing is compiled or loaded during a run."""

@@ -1,13 +1,10 @@
 """What the loop needs from the process around it."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
-from hilctl.base.arrays import I64
 from hilctl.base.device import Clock
 from hilctl.base.events import Event
-from hilctl.base.samples import Batch
 from hilctl.loop.block import Block
 
 
@@ -45,35 +42,12 @@ class Tuning:
     line: StraightLine = StraightLine()
 
 
-@dataclass(frozen=True, slots=True)
-class Direct:
-    """Where the composed calls find a host's room and its supervision.
-
-    They write the numbers that the host's own calls write; see :mod:`hilctl.loop.usual`.
-
-    Attributes:
-        numbers: int64[HOST_NUMBERS], see :mod:`hilctl.kernels.tick`.
-        area: All slots that blocks are born in.
-        supervised: Whether the supervisor is still there.
-        newest: Gives the block that was sent last.
-    """
-
-    numbers: I64
-    area: Batch
-    supervised: Callable[[], bool]
-    newest: Callable[[], Block]
-
-
 class Host(Protocol):
     """Time, room for blocks, and supervision; no call but the clock's sleep may wait."""
 
     @property
     def clock(self) -> Clock:
         """Time."""
-        ...
-
-    def direct(self) -> Direct | None:
-        """Return where composed calls find all that the other calls do; None where they can't."""
         ...
 
     def claim(self, *, due: bool = True) -> Block:

@@ -152,17 +152,17 @@ class Interlocks:
     ) -> None:
         self.context = context
         self.settings = settings
-        self.numbers = _numbers(context, settings, sample_rate_hz)
-        self.memory = np.zeros(kernels.MEMORY)
-        self.memory[kernels.READING] = math.nan
-        self.memory[kernels.COMMAND] = context.safe
-        self.memory[kernels.HEAT] = max(context.heat_a2, context.safe**2)
-        self.next_sample = 0
+        self._numbers = _numbers(context, settings, sample_rate_hz)
+        self._memory = np.zeros(kernels.MEMORY)
+        self._memory[kernels.READING] = math.nan
+        self._memory[kernels.COMMAND] = context.safe
+        self._memory[kernels.HEAT] = max(context.heat_a2, context.safe**2)
+        self._next_sample = 0
         load(kernels.interlock_block)
 
     def begin_at(self, command: float) -> None:
         """Begin with the output at ``command``; its coil is as hot as that keeps it, at least."""
-        memory = self.memory
+        memory = self._memory
         memory[kernels.COMMAND] = command
         memory[kernels.HEAT] = max(memory[kernels.HEAT], command**2)
 
@@ -195,41 +195,15 @@ class Interlocks:
         Returns:
             The first trip in this block, or None.
         """
-        before = self.reach(first_sample, command.size)
+        if first_sample > self._next_sample:
+            self._hold(first_sample - self._next_sample)
+        self._next_sample = first_sample + command.size
+        before = self._memory.item(kernels.COMMAND)
         k = kernels.interlock_block(
-            self.numbers, self.memory, command, reference, displacement_um, measured, flags
+            self._numbers, self._memory, command, reference, displacement_um, measured, flags
         )
-        sent = before, command, measured
-        return self.trip(first_sample, k, sent, (reference, displacement_um), flags)
-
-    def reach(self, first_sample: int, samples: int) -> float:
-        """Pass over what was left out before the next block; return the command before it."""
-        if first_sample > self.next_sample:
-            self._hold(first_sample - self.next_sample)
-        self.next_sample = first_sample + samples
-        return self.memory.item(kernels.COMMAND)
-
-    def trip(
-        self,
-        first_sample: int,
-        k: int,
-        commands: tuple[float, F64, F64],
-        lengths: tuple[F64, F64],
-        flags: U32,
-    ) -> Trip | None:
-        """Say what tripped in a block; float64[n] each, but for the first.
-
-        Args:
-            first_sample: Its first sample.
-            k: Index of the first sample that trips, or -1.
-            commands: Command before it, commands, commands as measured.
-            lengths: References and displacements.
-            flags: uint32[n].
-        """
         if k < 0:
             return None
-        before, command, measured = commands
-        reference, displacement_um = lengths
         if k:
             before = command.item(k - 1)
         sent = (before, command.item(k), measured.item(k))
@@ -238,9 +212,9 @@ class Interlocks:
 
     def _hold(self, samples: int) -> None:
         """Let samples pass that were never exchanged: the output stays, and so do conditions."""
-        memory = self.memory
+        memory = self._memory
         rest = memory[kernels.COMMAND] ** 2
-        cooling = (1.0 - self.numbers[kernels.WARMING]) ** samples
+        cooling = (1.0 - self._numbers[kernels.WARMING]) ** samples
         memory[kernels.HEAT] = rest + (memory[kernels.HEAT] - rest) * cooling
         for run in (kernels.FROZEN_RUN, kernels.DEVIATION_RUN, kernels.TRACKING_RUN):
             if memory[run]:

@@ -6,14 +6,11 @@ Pure: (wanted, previous, limits, time step) to (command, flags). The loop and th
 import math
 from dataclasses import dataclass
 
-import numpy as np
-
 from hilctl.base.arrays import F64, U32
 from hilctl.base.errors import InputError
 from hilctl.base.samples import Flag
 from hilctl.kernels.jit import load
 from hilctl.kernels.limit import limit_block
-from hilctl.kernels.tick import HIGH, LAST, LIMITER_NUMBERS, LOW, STEP
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,8 +47,7 @@ class CommandLimits:
 
 
 _LARGEST_STRIDE = 0.25  # of the way from the far limit to the safe value
-BITS = int(Flag.RANGE_LIMITED), int(Flag.SLEW_LIMITED), int(Flag.INVALID)
-"""Flags that a limit sets: range, slew, a wish that is none."""
+_BITS = int(Flag.RANGE_LIMITED), int(Flag.SLEW_LIMITED), int(Flag.INVALID)
 
 
 class Limiter:
@@ -67,27 +63,14 @@ class Limiter:
 
     def __init__(self, limits: CommandLimits, dt_s: float) -> None:
         self.limits = limits
-        self.numbers = np.empty(LIMITER_NUMBERS)
-        """What a limit takes, by the places in :mod:`hilctl.kernels.tick`, updated in place."""
-        self.numbers[[LAST, LOW, HIGH, STEP]] = (
-            limits.safe,
-            limits.low,
-            limits.high,
-            limits.slew_per_s * dt_s,
-        )
+        self.last = limits.safe
+        """The last command."""
+        self._range = limits.low, limits.high
+        self._max_step = limits.slew_per_s * dt_s
         self._ramp_step = limits.ramp_per_s * dt_s
         furthest = max(limits.high - limits.safe, limits.safe - limits.low)
         self._stride = max(self._ramp_step, _LARGEST_STRIDE * furthest)
         load(limit_block)
-
-    @property
-    def last(self) -> float:
-        """The last command."""
-        return self.numbers.item(LAST)
-
-    @last.setter
-    def last(self, command: float) -> None:
-        self.numbers[LAST] = command
 
     def limit(self, wanted: F64, command: F64, flags: U32) -> int:
         """Fill ``command`` (float64[n]) with what may be put out; add to ``flags`` (uint32[n]).
@@ -95,7 +78,7 @@ class Limiter:
         Returns:
             Index of the first wish that was not finite, or -1.
         """
-        return self._apply(wanted, self.numbers.item(STEP), command, flags)
+        return self._apply(wanted, self._max_step, command, flags)
 
     @property
     def at_rest(self) -> bool:
@@ -133,14 +116,12 @@ class Limiter:
         return self.last == self.limits.safe
 
     def _apply(self, wanted: F64, max_step: float, command: F64, flags: U32) -> int:
-        limits = self.limits
         first_invalid = limit_block(
             wanted,
             self.last,
-            limits.low,
-            limits.high,
+            *self._range,
             max_step,
-            *BITS,
+            *_BITS,
             command,
             flags,
         )

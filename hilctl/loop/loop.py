@@ -22,10 +22,8 @@ from hilctl.base.device import Device, WatchdogDevice
 from hilctl.base.errors import DeviceError
 from hilctl.base.events import OFFSET, Event
 from hilctl.base.samples import Flag, Head
-from hilctl.kernels.tick import ASKED
 from hilctl.loop.beginning import Beginning
 from hilctl.loop.block import Block
-from hilctl.loop.composed import Composed, compose
 from hilctl.loop.feed import feed, pass_over
 from hilctl.loop.host import Host, Tuning
 from hilctl.loop.interlocks import Interlocks, Trip
@@ -34,7 +32,6 @@ from hilctl.loop.pacer import Lateness, Pacer
 from hilctl.loop.plan import Code, Outcome, Plan
 from hilctl.loop.safe_output import OutputState, SafeGoal, describe, drive_to_safe
 from hilctl.loop.tuning import Tuner
-from hilctl.loop.usual import UsualTicks
 
 # Plain numbers: looking up an enumeration's member takes longer than writing it.
 _FIRST_SAMPLE, _SAMPLES = int(Head.FIRST_SAMPLE), int(Head.SAMPLES)
@@ -51,9 +48,10 @@ class _Phase(Enum):
     HOLDING = "holds the safe value until the last answer has come"
 
 
-_AFTER = (_Phase.LEAVING, _Phase.HOLDING)
+# Looked up once: in Python 3.11 each look is a call.
+_STARTING, _CONDITIONING, _FOLLOWING, _LEAVING, _HOLDING = _Phase
+_AFTER = (_LEAVING, _HOLDING)
 _ARM_MARGIN_NS = 1_000_000  # arming that ends too soon costs nothing, and too late a late start
-_FOLLOWING = _Phase.FOLLOWING  # looked up once: in Python 3.11 that is a call
 
 
 class Loop:
@@ -76,15 +74,9 @@ class Loop:
         self._interlocks = Interlocks(plan.interlocks, plan.interlock_settings, plan.sample_rate_hz)
         self._pacer = Pacer(host.clock, period_ns, plan.late_policy, plan.late_rules)
         self._tuner = Tuner()
-        self._composed = compose(plan, self._limiter, self._interlocks)
         # What works out part of the input, and learns from the answers, block by block.
         learners = plan.feedback, plan.adaptation, plan.conditioning
         self._learns = any(each is not None for each in learners)
-        self._usual: UsualTicks | None = None
-        if self._composed and not self._learns and not plan.latency_blocks:
-            direct = host.direct()
-            if direct is not None:
-                self._usual = UsualTicks(self._composed, direct, device, host.clock)
         self._in_flight: deque[Block] = deque()
         self._start_ns = 0
         self._next_sample = 0
@@ -97,7 +89,7 @@ class Loop:
         self._code: Code = "completed"
         self._reason = "waveform completed"
         self._faults: set[str] = set()
-        self._phase = _Phase.FOLLOWING
+        self._phase = _FOLLOWING
 
     @property
     def lateness(self) -> Lateness:
@@ -121,7 +113,7 @@ class Loop:
         self._before = before = Beginning(conditioning, ramp_samples)
         self._end = before.waveform_at + self._plan.samples
         if before.waveform_at:
-            self._phase = _Phase.STARTING if ramp_samples else _Phase.CONDITIONING
+            self._phase = _STARTING if ramp_samples else _CONDITIONING
             self._pacer.policy = self._plan.start_policy
         return before.waveform_at
 
@@ -131,17 +123,17 @@ class Loop:
         Args:
             start_ns: When the first tick is due, by the clock.
         """
-        if self._phase is _Phase.STARTING:
+        if self._phase is _STARTING:
             ramp = self._before.ramp_event(self._limiter.last, self._limiter.limits.safe)
             self._host.record_event(ramp)
-        elif self._phase is _Phase.CONDITIONING:
+        elif self._phase is _CONDITIONING:
             self._record_condition()
         try:
             self._start_ns = start_ns = self._armed(start_ns)
             self._pacer.begin(start_ns)
             while not self._tick():
                 pass
-            self._phase = _Phase.HOLDING
+            self._phase = _HOLDING
             while self._in_flight and self._in_flight[0].due:
                 self._hold()
         except DeviceError as error:
@@ -161,60 +153,35 @@ class Loop:
         return max(start_ns, clock.now_ns())
 
     def _tick(self) -> bool:
-        """Run usual ticks and then another one; return whether the safe value is reached in it."""
-        while not (skipped := self._wait()) and self._usual_tick():
-            pass
-        block = self._claim(skipped)
+        """Run one tick; return whether the safe value is reached in it."""
+        block = self._claim(self._wait())
         # Supervision comes before the commands are worked out: what it asks for holds at once.
         self._supervise()
         done, first_invalid = self._fill(block)
+        first_sample = block.head[_FIRST_SAMPLE]
         self._exchange(block)
-        self._leave_invalid(block.head[_FIRST_SAMPLE], first_invalid)
+        if first_invalid >= 0:
+            at = f"at sample {first_sample + first_invalid}"
+            self._leave("fault", "invalid_command", f"wanted command is not a finite number {at}")
         feedback = self._plan.feedback
         if feedback is not None and feedback.against:
             self._leave("fault", "feedback_sign", feedback.against)
-        if self._phase is _Phase.STARTING and self._next_sample >= self._before.condition_at:
-            self._phase = _Phase.CONDITIONING
-            self._record_condition()
-        if self._phase is _Phase.CONDITIONING and self._next_sample >= self._before.waveform_at:
-            self._follow_from_here()
-            self._take_offset_out()
-            if self._plan.adaptation is not None:
-                self._plan.adaptation.take_noise(self._before.noise_um)
+        if self._phase is not _FOLLOWING:
+            self._go_on()
         if self._learns:
             self._record_adapted()
         return done
 
-    def _usual_tick(self) -> bool:
-        """Run a whole tick that nothing special happens in; False, and nothing done, in others."""
-        usual, first_sample = self._usual, self._next_sample
-        follows = self._phase is _FOLLOWING and self._tuner.idle and not self._missing
-        if usual is None or not follows or self._end - first_sample < self._plan.block:
-            return False
-        start = first_sample - self._before.waveform_at
-        invalid = usual.begin(self._pacer, first_sample, start, self._start_ns)
-        if invalid == ASKED:
-            return False
-        self._on_ramp = False
-        self._next_sample = self._ended_at = first_sample + self._plan.block
-        try:
-            tripped = usual.exchange(first_sample)
-        except DeviceError:  # it may have reached the device: recorded as sent and not answered
-            self._in_flight.append(usual.newest())
-            raise
-        self._interlocks.next_sample = self._next_sample
-        if tripped >= 0:
-            block = usual.newest()
-            self._take(block, usual.trip(block, tripped))
-        if invalid >= 0:
-            self._leave_invalid(first_sample, invalid)
-        return True
-
-    def _leave_invalid(self, first_sample: int, invalid: int) -> None:
-        """Leave where a block has a wish that is none; ``invalid`` is its index, or -1."""
-        if invalid >= 0:
-            reason = f"wanted command is not a finite number at sample {first_sample + invalid}"
-            self._leave("fault", "invalid_command", reason)
+    def _go_on(self) -> None:
+        """Enter the conditioning, or the waveform, where it begins with the next sample."""
+        if self._phase is _STARTING and self._next_sample >= self._before.condition_at:
+            self._phase = _CONDITIONING
+            self._record_condition()
+        if self._phase is _CONDITIONING and self._next_sample >= self._before.waveform_at:
+            self._follow_from_here()
+            self._take_offset_out()
+            if self._plan.adaptation is not None:
+                self._plan.adaptation.take_noise(self._before.noise_um)
 
     def _hold(self) -> None:
         """Hold the safe value for one more block, for the sake of the answer that comes with it."""
@@ -250,23 +217,23 @@ class Loop:
 
     def _supervise(self) -> None:
         """Write the heartbeat, and follow what is requested of the run."""
-        position = max(self._next_sample - self._before.waveform_at, 0)
-        stop = self._host.heartbeat(position, self._pacer.counters.late_ticks)
+        position = self._next_sample - self._before.waveform_at
+        stop = self._host.heartbeat(max(position, 0), self._pacer.counters.late_ticks)
         # The end of the waveform first: a stop or a late tick after it changes nothing any more.
         if self._next_sample >= self._end:
             self._leave("completed", "completed", "waveform completed")
-        if self._phase is _Phase.LEAVING:
+        if self._phase is _LEAVING:
             return
         if late := self._pacer.too_late():
             self._leave("fault", "late", late)
         elif stop:
             self._leave("stopped", "stopped", stop)
-        elif self._phase is _Phase.FOLLOWING and (tuning := self._host.tuning()):
+        elif self._phase is _FOLLOWING and (tuning := self._host.tuning()):
             self._tune(tuning)
 
     def _follow_from_here(self) -> None:
         """Enter the waveform; its first tick still waits for a whole period."""
-        self._phase = _Phase.FOLLOWING
+        self._phase = _FOLLOWING
         if self._pacer.policy == "spaced":
             self._pacer.postpone()
         self._pacer.policy = self._plan.late_policy
@@ -304,7 +271,7 @@ class Loop:
         its end replaces it.
         """
         if self._phase not in _AFTER:
-            self._phase = _Phase.LEAVING
+            self._phase = _LEAVING
             self._pacer.policy = self._plan.ramp_policy
             self._code, self._reason = code, reason
         elif self._code == "completed" and code == "fault":
@@ -326,43 +293,34 @@ class Loop:
             Whether the safe value is reached in it, and the first sample whose wish is not a finite
             number, or -1.
         """
-        plan = self._plan
         if block.skipped:
             block.flags |= _SKIPPED
-        following = self._phase is _Phase.FOLLOWING
-        left = self._end - self._next_sample
-        n = min(left, plan.block) if following else 0
-        if n == plan.block and (composed := self._composed) and self._tuner.idle:
-            self._on_ramp = False
-            return False, self._fill_composed(composed, block)
         # The memory before the block, so that a replay can begin at any gap.
         self._compensator.state(block.memory)
         block.state[-1] = self._limiter.last
-        conditioning = self._phase is _Phase.CONDITIONING
-        block.guarded = following or conditioning
-        if conditioning:
+        phase = self._phase
+        block.guarded = phase is _FOLLOWING or phase is _CONDITIONING
+        if phase is _CONDITIONING:
             return False, self._condition(block)
-        on_ramp, self._on_ramp = self._on_ramp, n < plan.block
+        left = self._end - self._next_sample if phase is _FOLLOWING else 0
+        if left < self._plan.block:
+            return self._fill_end(block, left)
+        self._on_ramp = False
+        parts = (block.reference, block.input_um, block.wanted, block.command, block.flags)
+        return False, self._follow(block, *parts)
+
+    def _fill_end(self, block: Block, n: int) -> tuple[bool, int]:
+        """Fill the last n samples of the waveform, and the ramp behind them; see :meth:`_fill`."""
+        on_ramp, self._on_ramp = self._on_ramp, True
         first_invalid = -1
         if n > 0:
             parts = (block.reference[:n], block.input_um[:n], block.wanted[:n])
             first_invalid = self._follow(block, *parts, block.command[:n], block.flags[:n])
-        if n == plan.block:
-            return False, first_invalid
         block.reference[n:] = block.input_um[n:] = np.nan
         block.wanted[n:] = self._limiter.limits.safe
         skipped = block.skipped if on_ramp else 0
         there = self._limiter.ramp(block.command[n:], block.flags[n:], skipped)
-        return there and self._phase is _Phase.LEAVING, first_invalid
-
-    def _fill_composed(self, composed: Composed, block: Block) -> int:
-        """Work out a block of the waveform that passes as it is; see :meth:`_follow`."""
-        start = self._next_sample - self._before.waveform_at
-        block.composed = True
-        if not self._learns:
-            return composed.plan_block(block, start)
-        feed(self._plan, self._before, None, block, (block.reference, block.input_um), start)
-        return composed.follow_block(block)
+        return there and self._phase is _LEAVING, first_invalid
 
     def _condition(self, block: Block) -> int:
         """Fill a block of the conditioning; return the first wish that is not finite, or -1."""
@@ -382,7 +340,7 @@ class Loop:
     ) -> int:
         """Fill what comes of the reference; return the first wish that is not finite, or -1."""
         tuner = self._tuner
-        factors = tuner.advance(wanted.size)
+        factors = None if tuner.idle else tuner.advance(wanted.size)
         start = self._next_sample - self._before.waveform_at
         feed(self._plan, self._before, factors, block, (reference, input_um), start)
         self._compensator.process(input_um, wanted)
@@ -403,16 +361,15 @@ class Loop:
             # Before the exchange: a loop that is killed in it leaves what it has sent.
             self._host.sending(sent)
             self._ended_at = self._next_sample
-        composed = self._composed if sent.composed else None
-        given, filled = (sent, answered) if composed is None else (composed, composed)
         first_sample = sent.head[_FIRST_SAMPLE]
         before_ns = self._clock.now_ns()
-        self._device.exchange(first_sample, given.command, filled.displacement_um, filled.measured)
+        self._device.exchange(
+            first_sample, sent.command, answered.displacement_um, answered.measured
+        )
         sent.head[_EXCHANGE_NS] = self._clock.now_ns() - before_ns
         if not early:
             in_flight.popleft()
-            judge = self._interlocks.judge if composed is None else composed.judge
-            self._take(answered, judge(answered))
+            self._take(answered, self._interlocks.judge(answered))
 
     def _take(self, block: Block, trip: Trip | None) -> None:
         """Learn from a block whose displacements have come and been judged, and record it."""

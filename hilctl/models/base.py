@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from typing import Annotated, Any, NamedTuple, Self, TypeAlias
+from typing import Annotated, Any, Self, TypeAlias
 
 import numpy as np
 
@@ -10,7 +10,6 @@ from hilctl.base.arrays import F64
 from hilctl.base.errors import ModelError
 from hilctl.base.strict import Field, Strict, field_validator, model_validator
 from hilctl.base.units import CommandUnit
-from hilctl.kernels.dynamics import offset_stage
 from hilctl.kernels.hysteresis import rest_memory
 
 BlockKernel: TypeAlias = Callable[[F64, F64, F64], None]
@@ -24,20 +23,6 @@ MAX_OPERATORS = 10_000
 
 Thresholds: TypeAlias = tuple[Annotated[float, Field(allow_inf_nan=False)], ...]
 Weights: TypeAlias = tuple[Annotated[float, Field(allow_inf_nan=False)], ...]
-
-
-class Stage(NamedTuple):
-    """What an operator, or a part of one, runs: a kernel and the arrays that it takes.
-
-    Attributes:
-        kernel: See :data:`StageKernel`.
-        parameters: float64[p].
-        memory: float64[m], the operator's own.
-    """
-
-    kernel: StageKernel
-    parameters: F64
-    memory: F64
 
 
 class Operator:
@@ -67,7 +52,6 @@ class Operator:
         self._memory = self._rest.copy()
         self._input_offset = input_offset
         self._output_offset = output_offset
-        self._staged: tuple[StageKernel, F64] | None = None
 
     @classmethod
     def staged(
@@ -79,7 +63,7 @@ class Operator:
         input_offset: float = 0.0,
         output_offset: float = 0.0,
     ) -> "Operator":
-        """Return an operator whose kernel is a stage by itself.
+        """Return an operator whose kernel takes its parameters as one array.
 
         Args:
             kernel: See :data:`StageKernel`.
@@ -92,24 +76,7 @@ class Operator:
         def run(block: F64, memory: F64, out: F64) -> None:
             kernel(block, parameters, memory, out)
 
-        made = Operator(run, operators, input_offset=input_offset, output_offset=output_offset)
-        made._staged = kernel, parameters
-        return made
-
-    def stages(self) -> list[Stage] | None:
-        """Return what :meth:`process` runs, one after another; None where that is more than stages.
-
-        They take the operator's memory where it is now, and update it.
-        """
-        own = self._own_stages()
-        if own is None:
-            return None
-        before, after = _offset(self._input_offset), _offset(self._output_offset)
-        return [*before, *own, *after]
-
-    def _own_stages(self) -> list[Stage] | None:
-        """Return the stages between the offsets."""
-        return None if self._staged is None else [Stage(*self._staged, self._memory)]
+        return Operator(run, operators, input_offset=input_offset, output_offset=output_offset)
 
     def process(self, block: F64, out: F64 | None = None) -> F64:
         """Run one block through and remember where it ended.
@@ -154,11 +121,6 @@ class Operator:
             raise ModelError("state must have no infinite value")
         self._memory[:] = state
 
-    @property
-    def memory(self) -> F64:
-        """The memory itself: operator outputs, then the previous input; updated in place."""
-        return self._memory
-
     def keep_in(self, memory: F64) -> None:
         """Keep the memory, as it is now, in a given place from now on."""
         memory[:] = self._memory
@@ -172,10 +134,6 @@ class Operator:
         self._memory[:] = self._rest
         if first_input is not None:
             self.process(np.array([first_input]))
-
-
-def _offset(offset: float) -> list[Stage]:
-    return [Stage(offset_stage, np.array([offset]), np.empty(0))] if offset != 0.0 else []
 
 
 class IdentifiedRange(Strict):

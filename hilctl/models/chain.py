@@ -7,7 +7,7 @@ import numpy as np
 
 from hilctl.base.arrays import F64
 from hilctl.kernels.dynamics import between_stage, delay_block
-from hilctl.models.base import Operator, Stage
+from hilctl.models.base import Operator
 
 _WIDEST = 64
 
@@ -52,16 +52,6 @@ class Chain(Operator):
         """Let time pass with the input as it was last."""
         for stage in self._stages:
             stage.stand(seconds)
-
-    def _own_stages(self) -> list[Stage] | None:
-        """Return those of all its operators, in order."""
-        stages: list[Stage] = []
-        for each in self._stages:
-            parts = each.stages()
-            if parts is None:
-                return None
-            stages += parts
-        return stages
 
     def _run(self, block: F64, memory: F64, out: F64) -> None:
         for stage in self._stages:

@@ -1,14 +1,9 @@
 """The loop's host: the ring for its blocks, and the supervisor behind the ring's page."""
 
-import math
 import os
 
-import numpy as np
-
 from hilctl.base.device import Clock
-from hilctl.base.samples import Head
-from hilctl.kernels import tick
-from hilctl.loop.host import Direct, StraightLine, Tuning
+from hilctl.loop.host import StraightLine, Tuning
 from hilctl.run.ring import SampleRing
 from hilctl.run.shared_page import Field, Phase, Stop
 
@@ -18,31 +13,6 @@ _LATE_TICKS, _STOP = int(Field.LATE_TICKS), int(Field.STOP)
 _SUPERVISOR_HEARTBEAT_NS = int(Field.SUPERVISOR_HEARTBEAT_NS)
 _TUNE_WANTED, _TUNE_TAKEN = int(Field.TUNE_WANTED), int(Field.TUNE_TAKEN)
 _TUNE_BEGINS_AT = int(Field.TUNE_BEGINS_AT)
-
-_LONGEST_NS = 2**62
-_FIELDS = {
-    tick.HEARTBEAT: Field.LOOP_HEARTBEAT_NS,
-    tick.NEXT_SAMPLE: Field.NEXT_SAMPLE,
-    tick.LATE_TICKS: Field.LATE_TICKS,
-    tick.STOP: Field.STOP,
-    tick.SUPERVISOR_HEARTBEAT: Field.SUPERVISOR_HEARTBEAT_NS,
-    tick.TUNE_WANTED: Field.TUNE_WANTED,
-    tick.TUNE_TAKEN: Field.TUNE_TAKEN,
-    tick.SENT: Field.SENT,
-    tick.ANSWERED: Field.HEAD,
-    tick.TAIL: Field.TAIL,
-    tick.ENDED_AT: Field.ENDED_AT,
-    tick.EXCHANGING: Field.EXCHANGING,
-}
-_HEADS = {
-    tick.HEAD_SEQUENCE: Head.SEQUENCE,
-    tick.HEAD_FIRST_SAMPLE: Head.FIRST_SAMPLE,
-    tick.HEAD_SAMPLES: Head.SAMPLES,
-    tick.HEAD_DROPPED_BEFORE: Head.DROPPED_BEFORE,
-    tick.HEAD_DEADLINE_NS: Head.DEADLINE_NS,
-    tick.HEAD_LATE_NS: Head.LATE_NS,
-    tick.HEAD_EXCHANGE_NS: Head.EXCHANGE_NS,
-}
 
 
 class RingHost:
@@ -56,27 +26,15 @@ class RingHost:
     """
 
     def __init__(self, ring: SampleRing, clock: Clock, supervisor: int, silence_s: float) -> None:
+        ring.prepare_blocks()
         self.clock = clock
         self.claim, self.sending, self.answered = ring.claim, ring.sending, ring.answered
         self.record_event = ring.page.push_event
         self.writing_safe = ring.page.note_safe_write
-        self._ring, self._page = ring, ring.page
+        self._page = ring.page
         self._numbers = ring.page.numbers
         self._supervisor = supervisor
         self._silence_ns = silence_s * 1e9
-
-    def direct(self) -> Direct:
-        """Return where composed calls find the ring, its page and the heartbeats."""
-        ring, table = self._ring, np.zeros(tick.HOST_NUMBERS, dtype=np.int64)
-        numbers = np.frombuffer(self._numbers, dtype=np.int64)
-        table[[tick.NUMBERS, tick.FIELDS]] = numbers.ctypes.data, numbers.size
-        table[[tick.HEADS, tick.HEAD_NUMBERS]] = ring.area.heads.ctypes.data, len(Head)
-        # A run that goes on without its supervisor may have it silent for ever.
-        silence_ns = math.floor(min(self._silence_ns, _LONGEST_NS))
-        table[[tick.SLOTS, tick.SILENCE_NS]] = ring.slots, silence_ns
-        for place, number in (_FIELDS | _HEADS).items():
-            table[place] = number
-        return Direct(table, ring.area, self.supervised, ring.newest)
 
     def heartbeat(self, next_sample: int, late_ticks: int) -> str:
         """Write the loop's heartbeat; return why the run should end, or an empty text."""

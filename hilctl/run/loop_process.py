@@ -9,7 +9,7 @@ import signal
 import sys
 from contextlib import ExitStack
 
-from hilctl.kernels import atomics, tick
+from hilctl.kernels import atomics
 from hilctl.kernels.elsewhere import compiled_elsewhere
 from hilctl.kernels.interlock import interlock_block
 from hilctl.kernels.jit import load
@@ -17,17 +17,7 @@ from hilctl.kernels.limit import limit_block
 from hilctl.machine.realtime import be_ordinary
 from hilctl.run.waiting_loop import PLAIN, received_job
 
-_EVERY_RUN = (
-    atomics.publish,
-    atomics.observe,
-    limit_block,
-    interlock_block,
-    tick.follow_block,
-    tick.plan_block,
-    tick.answer_block,
-    tick.begin_tick,
-    tick.end_tick,
-)
+_EVERY_RUN = (atomics.publish, atomics.observe, limit_block, interlock_block)
 
 
 def main() -> int:

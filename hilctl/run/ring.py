@@ -39,6 +39,8 @@ _ENDED_AT, _EXCHANGING = int(Field.ENDED_AT), int(Field.EXCHANGING)
 _SEQUENCE, _FIRST_SAMPLE = int(Head.SEQUENCE), int(Head.FIRST_SAMPLE)
 _HEAD_NUMBERS = len(Head)
 _MAGIC = 0x48494C43_52494E48
+_MOST_BLOCKS = 50_000
+"""Most blocks that are made before the first tick: each takes 1.3 kB."""
 _BATCH_SAMPLES = 8192
 """About how many samples are taken out together: what becomes of them is ten times their memory."""
 _TYPES = (np.int64, np.float64, np.float64, np.uint32)
@@ -88,6 +90,7 @@ class SampleRing:
         self._area = self._views(state_size)
         self._heads = memoryview(self._area.heads.data.cast("B")).cast("q")
         self._spares_used = 0
+        self._blocks: list[Block] = []
         self._tail = self._released = self.page.get(Field.TAIL)
 
     @classmethod
@@ -139,6 +142,15 @@ class SampleRing:
             offset += _padded(size)
         return Batch(*parts)
 
+    def prepare_blocks(self) -> None:
+        """Make the blocks of the slots before the first tick, for the producer."""
+        count = min(self.slots + self._spare, _MOST_BLOCKS)
+        self._blocks = [self._block(slot) for slot in range(count)]
+
+    def _block(self, slot: int) -> Block:
+        at = slot * _HEAD_NUMBERS
+        return Block(self._heads[at : at + _HEAD_NUMBERS], self._area, slot)
+
     def claim(self, *, due: bool = True) -> Block:
         """Return the slot that the next block is to be born in, see :class:`hilctl.loop.host.Host`.
 
@@ -151,17 +163,9 @@ class SampleRing:
             slot, number = self.slots + self._spares_used % self._spare, -1
             self._spares_used += 1
             self._clean(slice(slot, slot + 1))
-        return self._block(slot, number, due=due)
-
-    @property
-    def area(self) -> Batch:
-        """All slots, and the spare ones after them."""
-        return self._area
-
-    def newest(self) -> Block:
-        """Return the block that was sent last; its slot is its own, and the sender asks."""
-        number = self._numbers[_SENT] - 1
-        return self._block(number % self.slots, number)
+        block = self._blocks[slot] if slot < len(self._blocks) else self._block(slot)
+        block.number, block.due = number, due
+        return block
 
     def last_command(self) -> float | None:
         """Return the command that the device is at, as far as the ring tells; for any process.
@@ -183,12 +187,6 @@ class SampleRing:
         ):
             return None
         return float(self._area.columns[slot, COMMAND, -1])
-
-    def _block(self, slot: int, number: int, *, due: bool = True) -> Block:
-        at = slot * _HEAD_NUMBERS
-        block = Block(self._heads[at : at + _HEAD_NUMBERS], self._area, slot)
-        block.number, block.due = number, due
-        return block
 
     def sending(self, block: Block) -> None:
         """Note that a block is on its way to the device, before it is."""

@@ -66,17 +66,14 @@ class BatchHost:
         # No slot is used again before the batch that its block is in has been taken.
         slots = _BLOCKS_A_BATCH + 2 * (plan.latency_blocks + 1)
         self._room = Batch.empty(slots, plan.block, plan.compensator.state_size + 1)
+        heads = [head.data.cast("B").cast("q") for head in self._room.heads]
+        self._blocks = [Block(head, self._room, slot) for slot, head in enumerate(heads)]
         self._claimed = self._first = self._answered = 0
         self._on_batch, self._on_event, self._stop = on_batch, on_event, stop
 
-    def direct(self) -> None:
-        """Return None: blocks are gathered call by call."""
-
     def claim(self, *, due: bool = True) -> Block:
         """Return room for the next block."""
-        slot, room = self._claimed % self._room.heads.shape[0], self._room
-        head = room.heads[slot].data.cast("B").cast("q")
-        block = Block(head, room, slot)
+        block = self._blocks[self._claimed % len(self._blocks)]
         block.number, block.due = self._claimed if due else -1, due
         self._claimed += 1
         return block

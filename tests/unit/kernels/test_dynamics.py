@@ -187,9 +187,3 @@ def test_a_stage_is_its_block_with_parameters_in_a_row(stage, block, parameters,
     np.testing.assert_array_equal(ends[0][0], ends[1][0])
     np.testing.assert_array_equal(ends[0][1], ends[1][1])
     assert (ends[0][0] != SIGNAL).any()
-
-
-def test_an_offset_is_added():
-    out = np.empty(3)
-    dynamics.offset_stage(np.array([1.0, -2.0, 0.5]), np.array([0.25]), np.empty(0), out)
-    assert out.tolist() == [1.25, -1.75, 0.75]

@@ -3,13 +3,32 @@
 import numpy as np
 
 from hilctl.loop.beginning import Beginning
+from hilctl.loop.compensator import Compensator
 from hilctl.loop.feed import feed, pass_over
 from hilctl.loop.host import Tuning
+from hilctl.loop.interlocks import InterlockContext
+from hilctl.loop.limiter import CommandLimits
+from hilctl.loop.plan import Plan
 from hilctl.loop.tuning import Factors, Tuner
 from tests.fakes import made_block
-from tests.unit.loop.test_composed import plan
+from tests.published import terfenol_rdpi
 
 BEFORE = Beginning(None, 0)
+RATE_HZ = 1000.0
+
+
+def plan(model=None, block=7):
+    reference = 14.0 * np.sin(2 * np.pi * 25.0 * np.arange(84) / RATE_HZ)
+    return Plan(
+        reference=reference,
+        input_um=reference + 1.0 if model else reference,
+        block=block,
+        latency_blocks=0,
+        sample_rate_hz=RATE_HZ,
+        compensator=Compensator(model, RATE_HZ),
+        limits=CommandLimits(-5.0, 5.0, 2000.0, 0.0, 100.0),
+        interlocks=InterlockContext(stroke_um=(-60.0, 60.0)),
+    )
 
 
 def fed(made, factors=None, start=10, n=7):
@@ -20,17 +39,17 @@ def fed(made, factors=None, start=10, n=7):
 
 def test_reference_and_input_as_they_were_planned():
     """Each its own samples; the reference stands for both where there is one only."""
-    made = plan(block=7)
+    made = plan(terfenol_rdpi())
     block = fed(made)
     assert block.reference.tolist() == made.reference[10:17].tolist()
     assert block.input_um.tolist() == made.input_um[10:17].tolist()
-    alone = plan("none", block=7)
+    alone = plan()
     assert fed(alone).input_um.tolist() == alone.reference[10:17].tolist()
 
 
 def test_both_are_tuned():
     """By the same gain and offset; samples beyond the part are left alone."""
-    made = plan(block=7)
+    made = plan(terfenol_rdpi())
     block = fed(made, Factors(0.5, 2.0, 1.0), n=4)
     assert block.reference[:4].tolist() == (0.5 * made.reference[10:14] + 2.0).tolist()
     assert block.input_um[:4].tolist() == (0.5 * made.input_um[10:14] + 2.0).tolist()
@@ -39,7 +58,7 @@ def test_both_are_tuned():
 
 def test_what_is_passed_over_moves_the_compensator():
     """As if it had been put out, tuned as it would have been."""
-    passed, followed = plan(), plan()
+    passed, followed = plan(terfenol_rdpi()), plan(terfenol_rdpi())
     tuner = Tuner()
     tuner.move(Tuning(0.5, 2.0, 0))
     pass_over(passed, BEFORE, tuner, 10, 20)

@@ -81,29 +81,6 @@ def test_a_chain_begins_where_its_operators_stood():
     assert chain.state().tolist() == left.tolist()
 
 
-def test_the_stages_of_a_chain_are_those_of_its_operators():
-    """In order, with its own offsets around them, and memories that the chain goes on from."""
-    creep = Creep(time_constants_s=(0.01, 0.3), shares=(0.02, 0.04))
-    chain = Chain([between(0.5), creep.inverse(1000.0), between(0.25)], input_offset=3.0,
-                  output_offset=-0.5)  # fmt: skip
-    stages = chain.stages()
-    assert stages is not None
-    whole = chain.process(SIGNAL)
-    left = chain.state()
-    chain.reset()
-    out = SIGNAL
-    for kernel, parameters, memory in stages:
-        block, out = out, np.empty(SIGNAL.size)
-        kernel(block, parameters, memory, out)
-    np.testing.assert_array_equal(out, whole)
-    np.testing.assert_array_equal(chain.state(), left)
-
-
-def test_a_chain_of_which_one_is_more_than_stages_has_none():
-    assert delayed(2).stages() is None
-    assert Chain([between(0.5), delayed(2), between(0.5)]).stages() is None
-
-
 def test_what_creeps_in_a_chain_goes_on_while_it_stands():
     creep = Creep(time_constants_s=(0.01, 0.3), shares=(0.02, 0.04))
     alone, within = creep.forward(1000.0), creep.forward(1000.0)

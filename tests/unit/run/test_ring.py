@@ -341,7 +341,7 @@ def test_cursors_are_published_after_what_they_say(tmp_path, monkeypatch):
         publish = page.publishes
 
         def spied(numbers, field, value):
-            heads, flags = ring.area.heads[:, Head.SEQUENCE], ring.area.flags[:, 0]
+            heads, flags = ring._area.heads[:, Head.SEQUENCE], ring._area.flags[:, 0]
             seen.append((Field(field), value, heads.max().item(), heads.min().item(), flags.max()))
             publish(numbers, field, value)
 
