@@ -1,6 +1,7 @@
 """Show a live run in the terminal: ``hilctl watch``, and the view of ``hilctl run --watch``."""
 
 import os
+import re
 import select
 import signal
 import subprocess
@@ -113,10 +114,8 @@ def print_lines(feed: RunFeed) -> None:
         events, seen = feed.events_since(seen)
         for event in events:
             print(_event(event, feed), flush=True)
-        frames += 1
-        if frames % _LINE_FRAMES == 0:
-            status = feed.status()
-            facts = (f"{status['t_s']:.1f} s", status["state"], *_facts(status))
+        if (frames := frames + 1) % _LINE_FRAMES == 0:
+            facts = (f"{feed.status()['t_s']:.1f} s", feed.state, *_facts(feed.status()))
             print("  ".join(filter(None, facts)), flush=True)
         time.sleep(_FRAME_S)
 
@@ -145,9 +144,8 @@ class View:
             termios.tcsetattr(keyboard, termios.TCSADRAIN, before)
 
     def press(self, raw: bytes) -> None:
-        """Act on pressed keys; ignore arrows and the like, which are Escape and more."""
-        keys = raw.decode("utf-8", "ignore")
-        for key in keys if keys == "\x1b" or not keys.startswith("\x1b") else "":
+        """Act on pressed keys, but not on arrows and the like, which are Escape and more."""
+        for key in re.sub(r"\x1b[\[O][0-9;]*.", "", raw.decode("utf-8", "ignore")):
             self._act(key) if self._mark is None else self._type(key, self._mark)
 
     def _act(self, key: str) -> None:
@@ -183,7 +181,7 @@ class View:
         def ask() -> None:
             try:
                 done = request(self.feed.folder, **values)
-                self.message = f"{what}: done" if done else f"{what}: the run is over"
+                self.message = f"{what}: {'done' if done else 'the run is over'}"
             except HilctlError as error:
                 self.message = f"{what}: refused: {error}"
 
@@ -200,7 +198,7 @@ class View:
             f"gain {status['gain']:g}  offset {status['offset']:g}",
             *_facts(status),
             "limits: "
-            + "  ".join(f"{g['name']} {100.0 * g['used']:.0f} %" for g in status["gauges"]),
+            + "  ".join(f"{g['name']} {g['used'] * 100:.0f} %" for g in status["gauges"]),
             *events + [""] * (_EVENTS - len(events)),
             self.message if mark is None else f"mark: {mark}_   (Enter sets it, Esc cancels)",
             "s stop  i inverse  +- gain  m mark  t trigger  [] time  q leave",
@@ -214,23 +212,24 @@ class View:
         from plotext import figure, marker  # takes a quarter of a second to import
 
         scope, window_s = self.feed.scope, WINDOWS_S[self._window]
-        window = scope.triggered() if self._triggered else None
+        cycles = scope.triggered() if self._triggered else None
+        window = cycles or scope.rolling(window_s)
+        scale, second = (1e3, "ms") if window.t_s[-1] - window.t_s[0] < 1.0 else (1.0, "s")
         unit = "um" if self.feed.loop_input == "reference" else self.feed.description.command_unit
         figure.clear().subplots(1, 2).plot_size(width, height).theme("colorless")
-        figure.subplot(1, 1).title("newest cycles, ms" if window else f"last {window_s:g} s, ms")
+        shown = "newest cycles" if cycles else f"last {window_s:g} s"
+        figure.subplot(1, 1).title(f"{shown}, axis in {second}")
         figure.subplot(1, 2).title(f"against {self.feed.loop_input}, {unit}")
-        window = window or scope.rolling(window_s)
         curves = [(2, *scope.loops(), "orange")]
         for name, colour in (("reference", "blue"), ("displacement", "orange")):
             ends = np.stack((window.buckets.low[ROW[name]], window.buckets.high[ROW[name]]))
-            curves.append((1, np.repeat(window.t_s * 1e3, 2), ends.T.ravel(), colour))
+            curves.append((1, np.repeat(window.t_s * scale, 2), ends.T.ravel(), colour))
         for column, x, y, colour in curves:
             finite = np.isfinite(x) & np.isfinite(y)
             if finite.any():
-                dots, plot = marker("braille", colour), figure.subplot(1, column)
-                curve = plot.signal(x[finite].tolist(), y[finite].tolist(), marker=dots)
-                curve.lines()
-                plot.draw(curve)
+                plot = figure.subplot(1, column)
+                curve = plot.signal(x[finite], y[finite], marker=marker("braille", colour))
+                plot.draw(curve.lines())
         return Text.from_ansi(str(figure.build().string()).rstrip("\n"), no_wrap=True)
 
 
