@@ -9,8 +9,7 @@ examples.py    a demonstration, examples to copy; starting.py  a first experimen
 running.py     start and check runs; shown by run_view.py
 compiling.py   says what is compiled meanwhile
 steering.py    status, set, mark and stop; shown by status_view.py
-watching.py    a run in the terminal: watcher.py  keys and screens, watch_view.py  what is on them,
-               braille.py  curves, terminal.py  the terminal itself
+watch.py       a live run in the terminal, with keys to stop and change it
 live.py        the page of runs that are going on
 listing.py     recordings below a folder, found by what they say
 reading.py     judge, replay and export recordings; report_view.py

@@ -63,7 +63,7 @@ COMMANDS: dict[str, CommandEntry] = {
         "hilctl.cli.steering:stop", "End a run by its safe ramp, close, and record why."
     ),
     "watch": CommandEntry(
-        "hilctl.cli.watching:watch",
+        "hilctl.cli.watch:watch",
         "Show a run in the terminal as it goes on, with keys to stop and change it.",
     ),
     "live": CommandEntry(

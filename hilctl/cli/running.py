@@ -113,7 +113,7 @@ def _watched(*, wanted: bool) -> Iterator[None]:
     if not wanted:
         yield
         return
-    from hilctl.cli.watching import watched_beside
+    from hilctl.cli.watch import watched_beside
 
     with watched_beside():
         yield
