@@ -11,7 +11,8 @@ import pytest
 from hilctl import api
 from hilctl.api import connection
 from hilctl.base.errors import InputError, RunError
-from tests.unit.cli.test_steering import HEAVY
+
+HEAVY = ("numba", "scipy", "matplotlib")
 
 
 @pytest.fixture
