@@ -107,6 +107,7 @@ class SafeOutput:
     ) -> None:
         self._device, self._goal = device, goal
         self._clock, self._on_write = clock, on_write
+        self._pending = goal.pending
         self._began_s: float | None = None
         self._held_since_s: float | None = None
         self._sends = 0
@@ -142,8 +143,10 @@ class SafeOutput:
             patient = now_s - self._began_s > PATIENCE_S
             self.pause_s = _LATER_RETRY_S if patient else _RETRY_S
             self.state, self.error = "unknown", str(error)
-            # A device that was silent until now may find older commands beside the next one.
+            # A device that was silent until now may find older commands beside the next one, this
+            # value of the ramp too.
             self._held_since_s = None
+            self._pending |= value != self._goal.value
             return
         if value != self._goal.value:
             self.state, self.error, self.pause_s = "unknown", "on the safe ramp", _RAMP_S
@@ -160,7 +163,7 @@ class SafeOutput:
         if self._held_since_s is None:
             self._held_since_s = now_s
         held = now_s - self._held_since_s >= HOLD_S
-        return "confirmed" if held or not self._goal.pending else "set"
+        return "confirmed" if held or not self._pending else "set"
 
     def _value(self, passed_s: float) -> float:
         goal = self._goal

@@ -83,7 +83,7 @@ def test_without_a_last_command_there_is_no_ramp():
 def test_it_is_set_within_one_retry_of_the_return_of_the_device(down_s):
     amplifier = Amplifier()
     amplifier.down_until_s = amplifier.now_s + down_s
-    assert driven(amplifier, until_s=1e4).state == "confirmed"
+    assert driven(amplifier, until_s=1e4).state == "confirmed"  # after it has held
     (at_s, value), *_ = amplifier.writes
     assert value == 0.0
     assert at_s <= amplifier.down_until_s + 0.51
@@ -95,6 +95,14 @@ def test_confirmed_is_not_said_before_an_older_command_may_be_executed(late_s):
     output = driven(amplifier, pending=True)
     assert (output.state, amplifier.older, amplifier.output) == ("confirmed", None, 0.0)
     assert amplifier.now_s >= 100.0 + HOLD_S
+
+
+def test_a_value_of_the_ramp_without_answer_may_be_executed_late_too():
+    amplifier = Amplifier(older=(102.3, 3.0))
+    amplifier.down_until_s = amplifier.now_s + 1.0
+    output = driven(amplifier)
+    assert (output.state, amplifier.older, amplifier.output) == ("confirmed", None, 0.0)
+    assert amplifier.now_s >= 101.0 + HOLD_S
 
 
 def test_until_then_it_is_set_and_repeated():
