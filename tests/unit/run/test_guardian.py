@@ -312,6 +312,7 @@ def test_it_prepares_for_a_machine_that_does_nothing_else(written, guarded, monk
     monkeypatch.setattr(guardian, "LinuxProcess", lambda: process)
     monkeypatch.setattr(GuardianJob, "device", lambda job: guarded.device)
     written.page.put(Field.GO, 1)
+    written.page.put_float(Field.OUTPUT_AT_START, 0.25)
     written.page.put(Field.PHASE, Phase.RUNNING)
     guarded.loop.kill()
     assert written.call("", guarded.pidfd) == 0
