@@ -280,7 +280,8 @@ def test_a_run_that_loses_the_board_leaves_by_the_one_way_out(board, fault):
     driven = board(faults=[f"{fault}@40"], watchdog={"timeout_s": 3.0, "safe_command": 0.0})
     outcome, host = run_loop(driven, 100_000)
     assert outcome.code == "fault"
-    assert outcome.safe == (fault != "unplug")
+    # A command that was never answered may still be executed.
+    assert outcome.output == ("unknown" if fault == "unplug" else "set")
     flags = np.concatenate(host.flags)
     assert flags.size == outcome.ended_at
     unanswered = (flags & Flag.SENSOR_INVALID) != 0
