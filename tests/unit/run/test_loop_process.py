@@ -63,9 +63,9 @@ OF_OTHERS = ("scipy.linalg", "scipy.special", "mcap", "google.protobuf", "rich",
             (*BULKY, *OF_OTHERS, "pydantic", "pydantic_core", "hilctl.base.yaml"),
         ),
         ("hilctl.cli.run_view", BULKY),
-        ("hilctl.cli.steering, hilctl.run.client", (*BULKY, *OF_OTHERS, "numpy", "pydantic")),
+        ("hilctl.run.client", (*BULKY, *OF_OTHERS, "numpy", "pydantic")),
     ],
-    ids=["loop", "plain loop", "supervisor", "steering"],
+    ids=["loop", "plain loop", "supervisor", "client"],
 )
 def test_it_has_nothing_that_only_others_need(modules, left_out):
     """The loop's is locked in memory; a stop is not to wait for what it does not use."""
