@@ -16,7 +16,6 @@ from collections.abc import Callable
 from typing import Any, TypeAlias, cast
 
 from numba import config, types
-from numba.core.typing.templates import Signature
 from numba.extending import intrinsic
 
 from hilctl.base.arrays import I64
@@ -39,7 +38,7 @@ def _typed_store(_context: Any, numbers: Any, index: Any, value: Any) -> _Typed:
         builder.fence("seq_cst")
         return context.get_dummy_value()
 
-    return Signature(types.void, (numbers, index, value), None), generate
+    return types.void(numbers, index, value), generate
 
 
 def _typed_load(_context: Any, numbers: Any, index: Any) -> _Typed:
@@ -48,7 +47,7 @@ def _typed_load(_context: Any, numbers: Any, index: Any) -> _Typed:
         place = _place(context, builder, typed.args[0], values)
         return builder.load_atomic(place, "acquire", _BYTES)
 
-    return Signature(types.int64, (numbers, index), None), generate
+    return types.int64(numbers, index), generate
 
 
 def _plain_store(numbers: I64, index: int, value: int) -> None:
