@@ -201,13 +201,24 @@ class AttackedRun:
         """Return what the device has put out until now."""
         return DeviceLog.read(self._log, 1.0 / self._wire.rate_hz, self._wire.start_a)
 
-    def close(self) -> None:
-        """End whatever is left of it: all processes that have its environment."""
+    def processes(self) -> list[int]:
+        """Return all processes that have its environment, except the emulator.
+
+        A supervisor starts a new guardian for one that was killed, so they are not known before.
+        """
         mine = f"HILCTL_RUNS={self._environment['HILCTL_RUNS']}".encode()
+        found = []
         for each in Path("/proc").glob("[0-9]*"):
             with suppress(OSError):
                 if mine in (each / "environ").read_bytes().split(b"\0"):
-                    os.kill(int(each.name), signal.SIGKILL)
+                    found.append(int(each.name))
+        return [each for each in found if each != self.emulator.pid]
+
+    def close(self) -> None:
+        """Kill all that is left of it."""
+        for each in [*self.processes(), self.emulator.pid]:
+            with suppress(ProcessLookupError):
+                os.kill(each, signal.SIGKILL)
         self.process.wait()
         self.emulator.wait()
 

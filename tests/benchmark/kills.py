@@ -18,6 +18,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from hilctl.base.errors import HilctlError
+from hilctl.loop.safe_output import HOLD_S
 from hilctl.recording.reader import read
 from hilctl.run.shared_page import Field, Phase, SharedPage
 from tests.benchmark.attacked import (
@@ -33,7 +34,7 @@ from tests.benchmark.other_reader import verdict
 
 SLOW_WRITE = Path(__file__).with_name("slow_write.c")
 OBSERVED_S = 1.0
-END_S = 30.0
+END_S = HOLD_S + 30.0
 STAYS = ", does not end"
 MODULES = {"loop": b"hilctl.run.loop_process", "guardian": b"hilctl.run.guardian"}
 PHASES = ("start", "ramp in", "condition", "run", "set", "ramp out", "close", "recovery")
@@ -150,7 +151,7 @@ def attack(
     for number in (signal.SIGCONT, signal.SIGTERM):  # a supervisor that was stopped ends its run
         with suppress(ProcessLookupError):
             run.process.send_signal(number)
-    said += _await_end(run, [*processes.values()])
+    said += _await_end(run)
     run.recover()
     ends = "loop" in plan or plan.get("supervisor") == "kill" or phase in {"ramp out", "close"}
     due_ns = hit_ns if ends else stop_ns
@@ -172,13 +173,13 @@ def _hit_recovery(run: AttackedRun, chance: random.Random) -> str:
     return f"{what} the next command"
 
 
-def _await_end(run: AttackedRun, processes: list[int]) -> str:
+def _await_end(run: AttackedRun) -> str:
     """Wait until all processes are gone, and return STAYS if they are not; then they are killed.
 
-    What is stopped goes on once the supervisor has ended.
+    A process that is stopped continues once the supervisor has ended.
     """
     deadline = time.monotonic() + END_S
-    while left := [each for each in processes if _lives(each)]:
+    while left := run.processes():
         ended = run.process.poll() is not None
         if time.monotonic() > deadline:
             for each in left:
@@ -189,12 +190,6 @@ def _await_end(run: AttackedRun, processes: list[int]) -> str:
                 os.kill(each, signal.SIGCONT)
         time.sleep(0.02)
     return ""
-
-
-def _lives(process: int) -> bool:
-    with suppress(OSError):
-        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    return False
 
 
 def judged(run: AttackedRun, phase: str, done: tuple[str, int, int | None, float]) -> Attack:
