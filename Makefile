@@ -50,5 +50,5 @@ $(VENV)/.ready: $(VENV)/.core requirements-dev.txt
 	@touch $@
 
 clean:
-	rm -rf $(VENV) docs/_build docs/_generated docs/decisions .mypy_cache .pytest_cache .ruff_cache .import_linter_cache .hypothesis
+	rm -rf $(VENV) docs/_build docs/_generated .mypy_cache .pytest_cache .ruff_cache .import_linter_cache .hypothesis
 	find . -name __pycache__ -prune -exec rm -rf {} +

@@ -1,7 +1,7 @@
 """What the pages take from elsewhere, so that it is written once: run by conf.py before each build.
 
 Into ``_generated``: the sections of the repository's own documents, tables of the keys that the
-schemas have, and the help of commands. Into ``decisions``: a page a record.
+schemas have, and the help of commands.
 """
 
 import ast
@@ -35,7 +35,6 @@ PAGES = {
     "configs/README.md": "/reference/experiment.md",
     "recordings/README.md": "/reference/recording.md",
     "examples/README.md": "/howto/examples.md",
-    ".github/decisions": "/decisions.md",
 }
 """Pages that show what a document links to."""
 
@@ -65,9 +64,6 @@ def gather_all(docs: Path) -> None:
     _write(generated / "api_returned.md", returned_page())
     terms = "\n".join(f"**{term}**\n: {meaning}\n" for term, meaning in DEFINITIONS)
     _write(generated / "definitions.md", terms)
-    shutil.rmtree(docs / "decisions", ignore_errors=True)
-    for record in sorted((ROOT / ".github" / "decisions").glob("*.md")):
-        _write(docs / "decisions" / record.name, record.read_text())
 
 
 def _write(path: Path, text: str) -> None:
