@@ -41,7 +41,7 @@ html_static_path = ["static"]
 html_css_files = ["hilctl.css"]
 html_show_sourcelink = False
 html_copy_source = False
-ALONE = ("tutorial", "safety", "faq", "glossary", "how_it_works", "contributing", "changelog")
+ALONE = ("tutorial", "safety", "faq", "glossary", "architecture", "contributing", "changelog")
 html_sidebars = {page: [] for page in ("index", *ALONE)}  # pages without others beside them
 html_theme_options = {
     "navigation_with_keys": False,
