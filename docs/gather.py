@@ -24,7 +24,6 @@ DOCUMENTS = {
     "recordings": "recordings/README.md",
     "examples": "examples/README.md",
     "contributing": "CONTRIBUTING.md",
-    "changelog": "CHANGELOG.md",
 }
 """Documents that pages show, by the name of the folder of their sections."""
 
