@@ -21,7 +21,7 @@ DOCUMENTS = sorted(
 )
 LINK = re.compile(r"\]\((?!https?:|mailto:)([^)#\s]*)(?:#([^)\s]+))?\)")
 FILE = re.compile(r"`((?:configs|docs|drivers|examples|hilctl|recordings|tests)/[\w./@-]+\w)`")
-SHELL = re.compile(r"^ *```sh\n(.*?)^ *```$|^((?: {4,}.*\n)+)", re.MULTILINE | re.DOTALL)
+SHELL = re.compile(r"^ *```sh\n(.*?)^ *```$|^((?: {4,}[^\n]*\n)+)", re.MULTILINE | re.DOTALL)
 COMMAND = re.compile(r"^ *hilctl (.+)$", re.MULTILINE)
 OF_ITSELF = {"--install-completion"}
 """Options of hilctl itself, which typer adds."""
