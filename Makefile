@@ -1,4 +1,4 @@
-# The two commands: `make run` and `make test`. Each sets up all that it needs in .venv.
+# `make run` and `make test` create .venv with all requirements.
 
 PYTHON ?= python3
 VENV := .venv
@@ -11,15 +11,15 @@ run: $(VENV)/.core
 	$(BIN)/hilctl run configs/demo.yaml
 
 test: $(VENV)/.ready
-	@echo "Takes 3 to 4 minutes of processor time, shared by up to 4 cores; whole runs: make test-slow."
+	@echo "Takes 3 to 4 minutes of processor time on up to 4 cores. Complete runs: make test-slow."
 	$(BIN)/pytest -n auto --maxprocesses 4 --dist loadfile -m "not slow"
 
 test-slow: $(VENV)/.ready
-	@echo "Takes about 13 minutes on two cores: whole runs, in processes of their own."
+	@echo "Takes about 13 minutes on two cores: complete runs, in separate processes."
 	$(BIN)/pytest -n 2 --dist loadfile -m "slow and not long"
 
 test-long: $(VENV)/.ready
-	@echo "Takes more than half an hour: campaigns, published figures, rigs of other physics, and what repeats other runs."
+	@echo "Takes more than half an hour: campaigns, published values, rigs of other physics."
 	$(BIN)/pytest -n 2 --dist loadfile -m long
 
 lint: $(VENV)/.ready
@@ -33,8 +33,8 @@ docs: $(VENV)/.ready
 	$(BIN)/sphinx-build --fail-on-warning --keep-going --fresh-env --quiet docs docs/_build/html
 	@echo "docs/_build/html/index.html"
 
-# The pip of $(PYTHON), where it has one of 22.3 or newer, installs the locked one with the rest:
-# venv's own takes six seconds to unpack and compile.
+# The pip of $(PYTHON), if it is 22.3 or newer, installs the locked pip with the rest:
+# the pip of venv takes six seconds to unpack and compile.
 $(VENV)/.core: pyproject.toml requirements.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
 		|| { echo "hilctl needs Python 3.11 or newer: make PYTHON=python3.11"; exit 1; }
@@ -50,5 +50,5 @@ $(VENV)/.ready: $(VENV)/.core requirements-dev.txt
 	@touch $@
 
 clean:
-	rm -rf $(VENV) docs/_build docs/_generated docs/decisions .mypy_cache .pytest_cache .ruff_cache .import_linter_cache .hypothesis
+	rm -rf $(VENV) docs/_build docs/_generated .mypy_cache .pytest_cache .ruff_cache .import_linter_cache .hypothesis
 	find . -name __pycache__ -prune -exec rm -rf {} +

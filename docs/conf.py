@@ -1,7 +1,7 @@
 """Settings of the documentation: `make docs`.
 
-Beside it: gather.py  what the pages take from elsewhere; figures.py  their pictures; mathml.py
-equations that need nothing from the network.
+gather.py collects text from other files, figures.py draws figures, and mathml.py renders equations
+without network access.
 """
 
 import sys
@@ -10,7 +10,7 @@ from pathlib import Path
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE))
 
-import figures  # noqa: E402  # the folder of the pages is no package
+import figures  # noqa: E402  # docs is not a package
 import gather  # noqa: E402
 
 import hilctl  # noqa: E402
@@ -41,8 +41,8 @@ html_static_path = ["static"]
 html_css_files = ["hilctl.css"]
 html_show_sourcelink = False
 html_copy_source = False
-ALONE = ("tutorial", "safety", "faq", "glossary", "how_it_works", "contributing", "changelog")
-html_sidebars = {page: [] for page in ("index", *ALONE)}  # pages without others beside them
+ALONE = ("tutorial", "safety", "faq", "glossary", "architecture", "contributing", "changelog")
+html_sidebars = {page: [] for page in ("index", *ALONE)}  # pages without siblings
 html_theme_options = {
     "navigation_with_keys": False,
     "header_links_before_dropdown": 7,

@@ -1,7 +1,7 @@
-"""The figures of the pages, drawn by the code that they are about.
+"""Draw the figures of the pages with the code of hilctl.
 
-conf.py draws those of the theory before each build, into ``_generated/figures``; those of whole
-runs are kept: ``python docs/figures.py`` draws ``pictures/before_and_after.png`` anew.
+conf.py draws the figures of the theory before each build, into ``_generated/figures``. Figures of
+runs are stored: ``python docs/figures.py`` redraws ``pictures/before_and_after.png``.
 """
 
 import tempfile
@@ -43,7 +43,7 @@ def draw_all(folder: Path) -> None:
     """Draw the figures of the theory, as SVG.
 
     Args:
-        folder: Where they go; made where it is not there.
+        folder: Output folder; created if it is missing.
     """
     folder.mkdir(parents=True, exist_ok=True)
     with mpl.rc_context({**STYLE, "svg.fonttype": "none", "text.parse_math": True}):
@@ -52,7 +52,7 @@ def draw_all(folder: Path) -> None:
 
 
 def draw_before_and_after(path: Path) -> None:
-    """Draw what the tutorial makes: the loop of a run without the inverse, and of one with it.
+    """Draw the result of the tutorial: the loop of a run without and with the inverse.
 
     Args:
         path: PNG file to write.
@@ -74,20 +74,20 @@ def draw_before_and_after(path: Path) -> None:
 
 
 def panels(count: int, *, height: float = 2.4) -> tuple[Figure, list[Axes]]:
-    """Return a figure of panels side by side."""
+    """Return a figure with panels side by side."""
     figure = Figure(figsize=(6.9, height))
     return figure, [figure.add_subplot(1, count, i + 1) for i in range(count)]
 
 
 def dying(cycles: int, amplitude: float, each: int = 400) -> F64:
-    """Return a sine whose amplitude falls in a line to a fifth: major loop, minor loops within."""
+    """Return a sine whose amplitude decreases to a fifth: a major loop with minor loops."""
     phase = np.linspace(0.0, 2.0 * np.pi * cycles, cycles * each)
     envelope: F64 = amplitude * np.linspace(1.0, 0.2, phase.size) * np.sin(phase)
     return envelope
 
 
 def steady(model: HysteresisModel, v: F64, rate_hz: float = RATE_HZ) -> tuple[F64, F64]:
-    """Return the last of three cycles: input, and what the model makes of it."""
+    """Return the last of three cycles: input and output of the model."""
     y = model.forward(rate_hz).process(np.tile(v, 3))
     return v, y[-v.size :]
 
@@ -99,19 +99,19 @@ def sine(amplitude: float, samples: int = 600) -> F64:
 
 
 def one_play(threshold: float) -> PpiModel:
-    """Return a play alone, as near as a model comes to it: no direct part but a rest."""
+    """Return a model close to a single play: its direct weight is negligible."""
     return PpiModel(direct=1e-9, weights=(1.0,), thresholds=(threshold,))
 
 
 def named(axes: Axes, title: str, x: str, y: str) -> None:
-    """Name a panel and its axes."""
+    """Set the title and axis labels of a panel."""
     axes.set_title(title)
     axes.set_xlabel(x)
     axes.set_ylabel(y)
 
 
 def play_and_stop() -> Figure:
-    """Play and stop of one threshold, under an input that dies away."""
+    """Draw play and stop of one threshold with a decaying input."""
     figure, (over, left, right) = panels(3)
     v = dying(3, 1.0)
     play = one_play(0.3).forward(RATE_HZ).process(v)
@@ -133,7 +133,7 @@ def play_and_stop() -> Figure:
 
 
 def plays_and_their_inverse() -> Figure:
-    """A sum of plays, its inverse, and one after the other."""
+    """Draw a sum of plays, its inverse, and both in series."""
     figure, (left, middle, right) = panels(3)
     model = PpiModel(direct=0.5, weights=(0.4, 0.3, 0.3), thresholds=(0.15, 0.35, 0.6))
     v = dying(3, 1.0)
@@ -149,7 +149,7 @@ def plays_and_their_inverse() -> Figure:
 
 
 def rate_dependent_plays() -> Figure:
-    """Loops of the rate-dependent model at three frequencies."""
+    """Draw loops of the rate-dependent model at three frequencies."""
     model = load_model(MODELS / "terfenol_rdpi.yaml")
     assert isinstance(model, RdpiModel)
     figure, (left, right) = panels(2)
@@ -170,7 +170,7 @@ def rate_dependent_plays() -> Figure:
 
 
 def deadbands() -> Figure:
-    """The memoryless function of deadbands of a shipped model, and its inverse."""
+    """Draw the memoryless function of deadbands of a shipped model and its inverse."""
     model = omega()
     figure, (left, right) = panels(2)
     x = np.linspace(-16.0, 60.0, 400)
@@ -192,7 +192,7 @@ def omega() -> IntegratedModel:
 
 
 def integrated() -> Figure:
-    """The integrated model at three frequencies, and the command that its inverse makes."""
+    """Draw the integrated model at three frequencies, and the commands of its inverse."""
     model = omega()
     figure, (left, right) = panels(2)
     for frequency_hz, colour in zip((1.0, 100.0, 250.0), COLOURS, strict=False):
@@ -208,7 +208,7 @@ def integrated() -> Figure:
 
 
 def stages() -> Figure:
-    """What the linear stages do by themselves: the field lag to a step, the structure to a sine."""
+    """Draw the field lag after a step, and the frequency response of the structure."""
     figure, (left, right) = panels(2)
     rate_hz = 200_000.0
     step = np.concatenate((np.zeros(40), np.ones(360)))
@@ -231,7 +231,7 @@ def stages() -> Figure:
 
 
 def staged_inverse() -> Figure:
-    """What the inverse of the staged model leaves of a triangle, whose corners it must round."""
+    """Draw a triangle after the inverse of the staged model, which rounds its corners."""
     model = load_model(MODELS / "terfenol_staged.yaml")
     figure, (left, middle, right) = panels(3)
     rate_hz, period = 50_000.0, 500
@@ -254,7 +254,7 @@ def staged_inverse() -> Figure:
 
 
 def preisach() -> Figure:
-    """Weights on the triangle of a shipped model, and small loops inside a large one."""
+    """Draw the weights on the triangle of a shipped model, and small loops inside a large one."""
     model = load_model(MODELS / "terfenol_staged_preisach.yaml")
     assert isinstance(model, StagedModel)
     inner = model.hysteresis
@@ -274,7 +274,7 @@ def preisach() -> Figure:
 
 
 def other_operators() -> Figure:
-    """Loops of models from the literature, under an input that dies away."""
+    """Draw loops of models from the literature with a decaying input."""
     figure = Figure(figsize=(6.9, 4.4))
     shapes: dict[str, HysteresisModel] = {
         "Krasnosel'skii-Pokrovskii": KrasnoselskiiPokrovskiiModel(
@@ -299,7 +299,7 @@ def other_operators() -> Figure:
 
 
 def butterfly() -> Figure:
-    """Loops of a rod without a bias, and of one that a bias keeps on one side."""
+    """Draw loops of a rod without a bias, and of one confined to one side by a bias."""
     figure, (left, right) = panels(2)
     for axes, bias, amplitude in ((left, 0.0, 1.0), (right, 0.9, 0.6)):
         model = ButterflyModel(
@@ -314,14 +314,14 @@ def butterfly() -> Figure:
 
 
 def small_loops(model: HysteresisModel, axes: Axes, colour: str, up: float, small: float) -> None:
-    """Draw a rise, then small loops at its end, again and again."""
+    """Draw a rise, then repeated small loops at its end."""
     rise = np.linspace(0.0, up, 400)
     v = np.concatenate((rise, up - small * (1.0 - np.cos(np.linspace(0.0, 12.0 * np.pi, 2400)))))
     axes.plot(v, model.forward(RATE_HZ).process(v), color=colour)
 
 
 def small_loops_compared() -> Figure:
-    """Six small loops after a rise: plays close at once, drags and slopes by place creep."""
+    """Draw six small loops after a rise: those of plays close immediately, the others creep."""
     figure, (left, middle, right) = panels(3)
     plays = PpiModel(direct=1.0, weights=(0.5, 0.5), thresholds=(0.05, 0.2))
     small_loops(plays, left, COMMAND, 0.6, 0.15)

@@ -1,7 +1,7 @@
-"""What the pages take from elsewhere, so that it is written once: run by conf.py before each build.
+"""Collect text that pages include from other files, before each build; called by conf.py.
 
-Into ``_generated``: the sections of the repository's own documents, tables of the keys that the
-schemas have, and the help of commands. Into ``decisions``: a page a record.
+Writes to ``_generated``: sections of the documents of the repository, tables of the keys of the
+schemas, and the help of commands.
 """
 
 import ast
@@ -24,9 +24,8 @@ DOCUMENTS = {
     "recordings": "recordings/README.md",
     "examples": "examples/README.md",
     "contributing": "CONTRIBUTING.md",
-    "changelog": "CHANGELOG.md",
 }
-"""Documents that pages show, by the name of the folder of their sections."""
+"""Documents that pages include, by the folder of their sections."""
 
 PAGES = {
     "CONTRIBUTING.md": "/contributing.md",
@@ -35,9 +34,8 @@ PAGES = {
     "configs/README.md": "/reference/experiment.md",
     "recordings/README.md": "/reference/recording.md",
     "examples/README.md": "/howto/examples.md",
-    ".github/decisions": "/decisions.md",
 }
-"""Pages that show what a document links to."""
+"""Page of each document that another one links to."""
 
 _SECTION = re.compile(r"^#{1,2} (.+)$", re.MULTILINE)
 _LINK = re.compile(r"\[([^\]]+)\]\((?!https?:|#)([^)#]+)(#[^)]*)?\)")
@@ -46,7 +44,7 @@ _LITERAL = re.compile(r"``(.+?)``")
 
 
 def gather_all(docs: Path) -> None:
-    """Write all that pages include.
+    """Write all texts that pages include.
 
     Args:
         docs: Folder of the pages.
@@ -65,9 +63,6 @@ def gather_all(docs: Path) -> None:
     _write(generated / "api_returned.md", returned_page())
     terms = "\n".join(f"**{term}**\n: {meaning}\n" for term, meaning in DEFINITIONS)
     _write(generated / "definitions.md", terms)
-    shutil.rmtree(docs / "decisions", ignore_errors=True)
-    for record in sorted((ROOT / ".github" / "decisions").glob("*.md")):
-        _write(docs / "decisions" / record.name, record.read_text())
 
 
 def _write(path: Path, text: str) -> None:
@@ -76,14 +71,14 @@ def _write(path: Path, text: str) -> None:
 
 
 def sections(document: Path, docs: Path) -> Iterator[tuple[str, str]]:
-    """Split a document where headings of the first two levels stand.
+    """Split a document at the headings of its first two levels.
 
     Returns:
-        Of each section its heading in small letters with hyphens, and its text without the
-        heading. Links lead to pages; what no page shows stands there as the name of a file.
+        Per section its heading in lower case with hyphens, and its text without the
+        heading. Links refer to pages; a file without a page is replaced by its name.
 
     Raises:
-        ValueError: There is no such file.
+        ValueError: A link refers to a missing file.
     """
     parts = _SECTION.split(document.read_text(encoding="utf-8"))
     for heading, text in zip(parts[1::2], parts[2::2], strict=True):
@@ -91,7 +86,7 @@ def sections(document: Path, docs: Path) -> Iterator[tuple[str, str]]:
         def page(found: re.Match[str]) -> str:
             target = (document.parent / found[2]).resolve()
             if not target.exists():
-                raise ValueError(f"{document}: leads to what is not there: {found[2]}")
+                raise ValueError(f"{document}: link to a missing file: {found[2]}")
             if target.is_relative_to(docs):
                 return f"[{found[1]}](/{target.relative_to(docs)}{found[3] or ''})"
             name = str(target.relative_to(ROOT))
@@ -102,7 +97,7 @@ def sections(document: Path, docs: Path) -> Iterator[tuple[str, str]]:
 
 
 def keys_page(schema: dict[str, Any]) -> str:
-    """Return tables of all keys of a schema: its own, then those of each mapping within."""
+    """Return tables of all keys of a schema: top level, then each nested mapping."""
     blocks = [_table(schema)] if "properties" in schema else [f"{_values(schema)}\n"]
     for name, part in schema["$defs"].items():
         if "properties" in part:
@@ -147,7 +142,7 @@ _RULES = {
 
 
 def _values(value: dict[str, Any]) -> str:
-    """Say in a few words which values a key takes."""
+    """Return a short description of the values of a key."""
     if "$ref" in value:
         name = value["$ref"].rpartition("/")[2]
         return f"[{name.removeprefix('device_')}](#{_anchor(name)})"
@@ -177,7 +172,7 @@ def _kind(value: dict[str, Any]) -> str:
 
 
 def commands_page() -> str:
-    """Return a section a command, with its help."""
+    """Return one section per command with its help."""
     return "\n".join(map(_command, COMMANDS))
 
 
@@ -197,7 +192,7 @@ def _typer(place: str, name: str) -> str:
 
 
 def api_page() -> str:
-    """Return a section with every public name of ``hilctl.api``, and what its docstring says."""
+    """Return a section with every public name of ``hilctl.api`` and its docstring."""
     blocks = ["```{eval-rst}", ".. currentmodule:: hilctl.api", ""]
     for name in api.__all__:
         kind = "class" if isinstance(getattr(api, name), type) else "function"
@@ -206,9 +201,9 @@ def api_page() -> str:
 
 
 def returned_page() -> str:
-    """Return what the functions of ``hilctl.api`` return, as their annotations have it.
+    """Return the result classes of the functions of ``hilctl.api`` from their annotations.
 
-    The modules import these classes for the type checker only, so it is read from their text.
+    The modules import these classes for the type checker only, so they are read from the source.
     """
     found: dict[str, str] = {}
     for module in sorted((ROOT / "hilctl" / "api").glob("*.py")):
@@ -229,7 +224,7 @@ def returned_page() -> str:
 
 
 def __getattr__(name: str) -> Any:
-    """Return a command, for the directive that shows its help."""
+    """Return a command for the directive that renders its help."""
     if name not in COMMANDS:
         raise AttributeError(name)
     return load(name)

@@ -10,7 +10,9 @@ from hilctl.cli.commands import COMMANDS, load
 from tests.documents.walkthrough import ROOT
 
 DOCS = ROOT / "docs"
-BUILT = ("_build", "_generated", "decisions")
+BUILT = ("_build", "_generated")
+DECISIONS = ROOT / "docs" / "decisions"
+"""Records name files of their time, which later ones have moved or deleted."""
 DOCUMENTS = sorted(
     path
     for place in (".", "configs", "docs", "drivers", "examples", "recordings", "tests")
@@ -19,7 +21,7 @@ DOCUMENTS = sorted(
 )
 LINK = re.compile(r"\]\((?!https?:|mailto:)([^)#\s]*)(?:#([^)\s]+))?\)")
 FILE = re.compile(r"`((?:configs|docs|drivers|examples|hilctl|recordings|tests)/[\w./@-]+\w)`")
-SHELL = re.compile(r"^ *```sh\n(.*?)^ *```$|^((?: {4,}.*\n)+)", re.MULTILINE | re.DOTALL)
+SHELL = re.compile(r"^ *```sh\n(.*?)^ *```$|^((?: {4,}[^\n]*\n)+)", re.MULTILINE | re.DOTALL)
 COMMAND = re.compile(r"^ *hilctl (.+)$", re.MULTILINE)
 OF_ITSELF = {"--install-completion"}
 """Options of hilctl itself, which typer adds."""
@@ -52,7 +54,7 @@ def test_links_lead_somewhere(path):
     for target, anchor in LINK.findall(path.read_text(encoding="utf-8")):
         base = DOCS if target.startswith("/") else path.parent
         found = (base / target.lstrip("/")) if target else path
-        if "_generated" in found.parts or "decisions" in found.parts:
+        if "_generated" in found.parts:
             continue  # made by the build, which says what is missing
         assert found.exists(), target
         if anchor and not anchor.startswith("key-"):
@@ -61,6 +63,8 @@ def test_links_lead_somewhere(path):
 
 @pytest.mark.parametrize("path", DOCUMENTS, ids=named)
 def test_files_are_there(path):
+    if path.parent == DECISIONS:
+        return
     folders = (ROOT, path.parent)
     for name in FILE.findall(path.read_text(encoding="utf-8")):
         if not name.startswith("docs/_build"):
