@@ -17,7 +17,7 @@ from hypothesis import settings
 from hilctl.base.private import memory_folder
 from hilctl.base.yaml import io
 from hilctl.experiment import registry
-from hilctl.kernels.jit import load
+from hilctl.kernels.jit import ensure_compiled
 from hilctl.run.guardian_process import signal_guardian
 from hilctl.run.run_folder import runs
 from hilctl_drivers import profile
@@ -59,7 +59,7 @@ def pytest_configure(config):
         for path in sorted(root.glob("hilctl*/**/*.py")):
             if "jit import kernel" in path.read_text(encoding="utf-8"):
                 name = ".".join(path.relative_to(root).with_suffix("").parts)
-                load(*vars(import_module(name)).values())
+                ensure_compiled(*vars(import_module(name)).values())
 
 
 def pytest_ignore_collect(collection_path, config):

@@ -7,7 +7,7 @@ commands.py    the application: which commands there are, and where each one's f
 options.py     options that they share; output.py  JSON, and what all of them say
 examples.py    a demonstration, examples to copy; starting.py  a first experiment
 running.py     start and check runs; shown by run_view.py
-compiling.py   says what is compiled meanwhile
+compile_progress.py   progress of compiling kernels
 steering.py    status, set, mark and stop; shown by status_view.py
 watch.py       a live run in the terminal, with keys to stop and change it
 live.py        the page of runs that are going on

@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 from hilctl.base.errors import HilctlError, InputError
-from hilctl.cli.compiling import compiling_shown
+from hilctl.cli.compile_progress import compile_progress
 from hilctl.cli.options import AsJson, ExperimentFile, LabelTexts, Overwrite, Settings, with_labels
 from hilctl.cli.output import finish_orphans, print_json
 
@@ -63,7 +63,7 @@ def _loop_ahead(experiment: Path) -> Iterator[None]:
     if not experiment.is_file():
         yield  # and is refused in words
         return
-    with started_ahead(), compiling_shown():
+    with started_ahead(), compile_progress():
         yield
 
 

@@ -24,7 +24,7 @@ from hilctl.base.arrays import F64, chunks
 from hilctl.base.errors import InputError
 from hilctl.base.events import ADAPTED, Event, adapted_text
 from hilctl.kernels import adaptation as kernel
-from hilctl.kernels.jit import load
+from hilctl.kernels.jit import ensure_compiled
 from hilctl.loop.block import Block
 
 THRESHOLDS = (0.15, 0.4, 0.7)
@@ -216,7 +216,7 @@ class Adaptation:
         self._fed: F64 | None = None
         self._seen: F64 | None = None
         self._event_after = math.ceil(_EVENT_S * rate_hz)
-        load(kernel.adapted_input, kernel.adapt_block)
+        ensure_compiled(kernel.adapted_input, kernel.adapt_block)
         self._said, self._said_at = np.zeros(m), 0
         self._ready = False
         if noise_um is not None:

@@ -17,7 +17,7 @@ from hilctl.base.strict import Field, Strict
 from hilctl.base.units import CommandUnit
 from hilctl.kernels import interlock as kernels
 from hilctl.kernels.interlock import InterlockFlag
-from hilctl.kernels.jit import load
+from hilctl.kernels.jit import ensure_compiled
 from hilctl.loop.block import Block
 
 TripCode: TypeAlias = Literal[
@@ -158,7 +158,7 @@ class Interlocks:
         self._memory[kernels.COMMAND] = context.safe
         self._memory[kernels.HEAT] = max(context.heat_a2, context.safe**2)
         self._next_sample = 0
-        load(kernels.interlock_block)
+        ensure_compiled(kernels.interlock_block)
 
     def begin_at(self, command: float) -> None:
         """Begin with the output at ``command``; its coil is as hot as that keeps it, at least."""

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from hilctl.base.arrays import F64, U32
 from hilctl.base.errors import InputError
 from hilctl.base.samples import Flag
-from hilctl.kernels.jit import load
+from hilctl.kernels.jit import ensure_compiled
 from hilctl.kernels.limit import limit_block
 
 
@@ -70,7 +70,7 @@ class Limiter:
         self._ramp_step = limits.ramp_per_s * dt_s
         furthest = max(limits.high - limits.safe, limits.safe - limits.low)
         self._stride = max(self._ramp_step, _LARGEST_STRIDE * furthest)
-        load(limit_block)
+        ensure_compiled(limit_block)
 
     def limit(self, wanted: F64, command: F64, flags: U32) -> int:
         """Fill ``command`` (float64[n]) with what may be put out; add to ``flags`` (uint32[n]).

@@ -6,7 +6,6 @@ It prints nothing and writes no file: all it has to say goes into the ring's pag
 import json
 import os
 import time
-from collections.abc import Callable
 
 from hilctl.base.errors import HilctlError, InputError, RunError
 from hilctl.experiment.condition import conditioning_of
@@ -31,17 +30,16 @@ from hilctl.run.shared_page import Field, PageText, Phase, SharedPage
 from hilctl.run.starting import starting_output
 
 
-def carry_out(data: bytes, all_compiled: Callable[[], None]) -> int:
+def carry_out(data: bytes) -> int:
     """Carry out a job, and leave what came of it in the ring's page; return the exit code.
 
     Args:
         data: See :meth:`hilctl.run.job.Job.to_bytes`.
-        all_compiled: See :func:`run_job`.
     """
     job = Job.from_bytes(data)
     ring = SampleRing(job.ring, at_once=True)
     try:
-        return _carry_out(job, ring, all_compiled)
+        return _carry_out(job, ring)
     finally:
         if os.getppid() != job.supervisor:
             from hilctl.run.run_folder import keep_removed  # of no use to any other run
@@ -49,10 +47,10 @@ def carry_out(data: bytes, all_compiled: Callable[[], None]) -> int:
             keep_removed()
 
 
-def _carry_out(job: Job, ring: SampleRing, all_compiled: Callable[[], None]) -> int:
+def _carry_out(job: Job, ring: SampleRing) -> int:
     page = ring.page
     try:
-        outcome = run_job(job, ring, job.parts(), all_compiled)
+        outcome = run_job(job, ring, job.parts())
     except InputError as error:  # before anything has moved
         return _failed(page, str(error), Phase.REFUSED)
     except HilctlError as error:
@@ -70,19 +68,13 @@ def _failed(page: SharedPage, text: str, phase: Phase = Phase.FAILED) -> int:
     return 1
 
 
-def run_job(
-    job: Job,
-    ring: SampleRing,
-    parts: RunParts,
-    all_compiled: Callable[[], None] = lambda: None,
-) -> Outcome:
+def run_job(job: Job, ring: SampleRing, parts: RunParts) -> Outcome:
     """Run a job, from set-up to the closed device.
 
     Args:
         job: What to run, and for whom.
         ring: Where samples go.
         parts: Of the experiment.
-        all_compiled: Called before the first tick, when no more kernel is needed.
 
     Raises:
         HilctlError: It could not start, or broke; the output was put at its safe value.
@@ -110,9 +102,7 @@ def run_job(
     try:
         output = starting_output(device, config.safe.at_start)
         waveform_at = loop.begin_at(output)
-        # A device may load kernels of its own when it is opened.
-        all_compiled()
-        ProcessMemory().release()
+        ProcessMemory().release()  # once open: a device may compile kernels of its own
         page.put_float(Field.OUTPUT_AT_START, output)
         page.put(Field.REAL_TIME, int(any(s.name == "fifo" and s.outcome == "done" for s in steps)))
         page.put(Field.WAVEFORM_AT, waveform_at)

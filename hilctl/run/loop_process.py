@@ -7,12 +7,10 @@ what every run needs: whether it is to check anything is known with the job.
 
 import signal
 import sys
-from contextlib import ExitStack
 
 from hilctl.kernels import atomics
-from hilctl.kernels.elsewhere import compiled_elsewhere
 from hilctl.kernels.interlock import interlock_block
-from hilctl.kernels.jit import load
+from hilctl.kernels.jit import ensure_compiled
 from hilctl.kernels.limit import limit_block
 from hilctl.machine.realtime import be_ordinary
 from hilctl.run.waiting_loop import PLAIN, received_job
@@ -25,14 +23,12 @@ def main() -> int:
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)  # the supervisor decides, and the loop ramps down
     be_ordinary()  # as its maker is by the time that it has a job
-    with ExitStack() as compiling:
-        compiling.enter_context(compiled_elsewhere())
-        load(*_EVERY_RUN)  # while the supervisor checks
-        job = received_job(sys.stdin.fileno())
-        if not job:
-            return 0  # there is no run for this one
-        if job.startswith(PLAIN):
-            import hilctl.base.plain  # noqa: F401  before what would import pydantic
-        from hilctl.run.carried_out import carry_out
+    ensure_compiled(*_EVERY_RUN)  # while the supervisor checks
+    job = received_job(sys.stdin.fileno())
+    if not job:
+        return 0  # there is no run for this one
+    if job.startswith(PLAIN):
+        import hilctl.base.plain  # noqa: F401  before what would import pydantic
+    from hilctl.run.carried_out import carry_out
 
-        return carry_out(job, compiling.close)
+    return carry_out(job)

@@ -230,17 +230,15 @@ class SharedPage:
     def publishes(self) -> Callable[[I64, int, int], None]:
         """:func:`hilctl.kernels.atomics.publish`, for the page's numbers."""
         from hilctl.kernels.atomics import publish
-        from hilctl.kernels.jit import entry
 
-        return entry(publish)
+        return publish
 
     @cached_property
     def observes(self) -> Callable[[I64, int], int]:
         """:func:`hilctl.kernels.atomics.observe`, for the page's numbers."""
         from hilctl.kernels.atomics import observe
-        from hilctl.kernels.jit import entry
 
-        return entry(observe)
+        return observe
 
     def publish(self, field: Field, value: int) -> None:
         """Set a number that says of others that they are there, after them."""

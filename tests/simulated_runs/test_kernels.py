@@ -28,15 +28,15 @@ from hilctl.run import unpaced
 from hilctl.run.start import checked_experiment
 
 folder, runs = Path(sys.argv[1]), json.loads(sys.argv[2])
-drive, load, late = unpaced._drive, jit._Kernel._compile_declared, []
+drive, compiled, late = unpaced._drive, jit._Kernel._compile, []
 
 
 def watch(*args):
-    jit._Kernel._compile_declared = lambda self: (late.append(self.py_func.__name__), load(self))
+    jit._Kernel._compile = lambda self: (late.append(self.py_func.__name__), compiled(self))[1]
     try:
         return drive(*args)
     finally:
-        jit._Kernel._compile_declared = load
+        jit._Kernel._compile = compiled
 
 
 unpaced._drive = watch

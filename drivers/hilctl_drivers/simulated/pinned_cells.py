@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hilctl.base.arrays import F64
-from hilctl.kernels.jit import entry, kernel
+from hilctl.kernels.jit import ensure_compiled, kernel
 from hilctl_drivers.simulated.rods import Coil, RodParameters, Rods
 
 
@@ -173,7 +173,7 @@ class PinnedCells(Rods):
         )
         self._cells = parameters.table()
         self._state = np.zeros(1)
-        self._follow = entry(_follow)
+        ensure_compiled(_follow)
 
     def rest(self) -> float:
         """Put every cell at the bias field."""
@@ -183,4 +183,4 @@ class PinnedCells(Rods):
 
     def follow(self, halves_a: F64, free_um: F64) -> None:
         """Advance step by step."""
-        self._follow(halves_a, free_um, self._state, self._cells, self._coil, self._curve)
+        _follow(halves_a, free_um, self._state, self._cells, self._coil, self._curve)

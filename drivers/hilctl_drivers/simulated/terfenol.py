@@ -14,7 +14,7 @@ import numpy as np
 
 from hilctl.base.arrays import F64
 from hilctl.base.exponential import exponential
-from hilctl.kernels.jit import entry
+from hilctl.kernels.jit import ensure_compiled
 from hilctl_drivers.simulated.extras import Creep, SecondMode, Thermal, VoltageLimit
 from hilctl_drivers.simulated.pinned_cells import PinnedCellsParameters
 from hilctl_drivers.simulated.plant import CHUNK, Plant
@@ -160,7 +160,7 @@ class TerfenolActuator(Plant):
         self._substeps = math.ceil(1.0 / (sample_rate_hz * parameters.step_max_s) - 1e-9)
         step_s = 1.0 / (sample_rate_hz * self._substeps)
         self._amplifier = _amplifier(parameters, step_s)
-        self._amplify, self._respond = entry(amplify), entry(respond)
+        ensure_compiled(amplify, respond)
         bias = parameters.magnet_field_a_per_m + parameters.coil_factor_per_m * bias_a
         self._rods = parameters.rods.rods(Coil(parameters.coil_factor_per_m, bias, step_s))
         self._sensor = (
@@ -222,13 +222,13 @@ class TerfenolActuator(Plant):
         halves, free = self._parts
         if free.size != steps:  # the views are kept: one block is as long as the next
             self._parts = halves, free = self._halves[: 2 * steps + 1], self._free[:steps]
-        self._amplify(command, measured, halves, self._current, self._amplifier, self._substeps)
+        amplify(command, measured, halves, self._current, self._amplifier, self._substeps)
         self._rods.follow(halves, free)
         if self._creep.size:
             creep(free, self._creep, self._rest_um)
         if self._thermal is not None:  # the sensor takes no notice of it
             warm(halves, noise_um, self._warmth, self._thermal, self._substeps)
-        self._respond(
+        respond(
             free,
             noise_um,
             displacement_um,

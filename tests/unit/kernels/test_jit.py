@@ -1,14 +1,13 @@
 """What compilation must not change: bits, block cuts, types."""
 
 import os
-import subprocess
-import sys
-from pathlib import Path
+import pickle
 
 import numba
 import numpy as np
 import pytest
 
+from hilctl import kernels
 from hilctl.kernels import hysteresis, jit
 from hilctl.kernels.limit import limit_block
 
@@ -138,71 +137,50 @@ def test_a_strided_view_is_refused():
 
 
 @pytest.fixture
-def in_memory(tmp_path, monkeypatch):
-    """A user's folder in memory, and nothing else that could be written."""
-    cache = numba.core.caching
-    for locator in (cache.InTreeCacheLocator, cache.UserWideCacheLocator):
-        monkeypatch.setattr(locator, "get_cache_path", lambda self: "/proc/closed")
-    monkeypatch.setattr(numba.config, "CACHE_DIR", "")
-    monkeypatch.setenv("NUMBA_CACHE_DIR", "")
-    monkeypatch.setattr(jit, "user_folders", lambda: [Path("/proc/closed"), tmp_path / "own"])
-    jit._cache_in_memory.cache_clear()
-    yield tmp_path / "own" / "kernels"
-    jit._cache_in_memory.cache_clear()
-    monkeypatch.undo()
-    numba.config.reload_config()
+def cache(tmp_path, monkeypatch):
+    """Return a cache folder for the kernels of one test."""
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path))
+    return tmp_path
 
 
 def double(value: float) -> float:
     return 2.0 * value
 
 
-def test_kept_in_memory_where_no_folder_can_be_written(in_memory):
-    """A user with a read-only home waits for the compiler once, and so does the loop's process."""
-    assert jit.kernel("float64(float64)")(double)(1.5) == 3.0
-    assert list(in_memory.rglob("*.nbc"))
-    assert os.environ["NUMBA_CACHE_DIR"] == str(in_memory)
-    again = jit.kernel("float64(float64)")(double)
-    jit.load(again)
-    assert sum(again.stats.cache_hits.values()) == 1
+double_kernel = jit.kernel("float64(float64)")(double)
 
 
-def test_compiled_where_nothing_can_be_kept(in_memory, monkeypatch):
-    """Not even memory: it takes longer, and runs."""
-    monkeypatch.setattr(jit, "user_folders", lambda: [Path("/proc/closed")])
-    assert jit.kernel("float64(float64)")(double)(1.5) == 3.0
-    assert not in_memory.exists()
+@jit.kernel("float64(int64)")
+def twice(value: int) -> float:
+    return double_kernel(value)
 
 
-def test_full_disk_keeps_no_kernel_from_being_compiled(tmp_path, in_memory, monkeypatch):
-    """What numba's own folder has no room for goes into memory."""
-    full = tmp_path / "full"
-    monkeypatch.setattr(numba.core.caching.InTreeCacheLocator, "get_cache_path", lambda _: full)
-    save = numba.core.caching.IndexDataCacheFile.save
-
-    def save_where_there_is_room(self, key, data):
-        if full in Path(self._index_path).parents:
-            raise OSError(28, "No space left on device")
-        save(self, key, data)
-
-    monkeypatch.setattr(numba.core.caching.IndexDataCacheFile, "save", save_where_there_is_room)
-    assert jit.kernel("float64(float64)")(double)(1.5) == 3.0
-    assert list(in_memory.rglob("*.nbc"))
+def stats_of_first_call(function=double):
+    """Return numba's cache statistics of a new kernel, called once."""
+    made = jit.kernel("float64(float64)")(function)
+    assert made(1.5) == 3.0
+    return made.dispatcher.stats
 
 
-def item(values: np.ndarray, at: int) -> float:
-    return values[at]
+def test_second_process_loads_the_kernel_from_the_cache(cache):
+    assert sum(stats_of_first_call().cache_misses.values()) == 1
+    assert sum(stats_of_first_call().cache_hits.values()) == 1
 
 
-def test_compiled_where_the_working_folder_has_been_deleted(tmp_path, monkeypatch, in_memory):
-    """What is named from the root can be run from there; names from the folder stay unknown."""
-    gone = tmp_path / "gone"
-    gone.mkdir()
-    monkeypatch.chdir(gone)
-    gone.rmdir()
-    assert jit.kernel("float64(float64[::1], int64)")(item)(np.array([0.5, 1.5]), 1) == 1.5
-    with pytest.raises(FileNotFoundError):
-        Path.cwd()
+def test_compiled_without_a_cache_folder():
+    """numba finds no folder for a function that has no source file."""
+    names = {}
+    exec("def double(value):\n    return 2.0 * value", names)
+    assert not stats_of_first_call(names["double"]).cache_path
+
+
+def test_compiled_with_a_full_disk(cache, monkeypatch):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "replace", full)
+    assert not stats_of_first_call().cache_path
+    assert not [path for path in cache.rglob("*") if path.is_file()]
 
 
 def emptied(whole: bytes) -> bytes:
@@ -223,58 +201,61 @@ def random_bytes(whole: bytes) -> bytes:
 
 @pytest.mark.parametrize("suffix", ["nbi", "nbc"])
 @pytest.mark.parametrize("damage", [emptied, halved, zeroed, random_bytes])
-def test_damaged_cache_file_is_replaced(in_memory, suffix, damage):
-    assert jit.kernel("float64(float64)")(double)(1.5) == 3.0
-    (file,) = in_memory.rglob(f"*.{suffix}")
+def test_damaged_cache_file_is_replaced(cache, suffix, damage):
+    stats_of_first_call()
+    (file,) = cache.rglob(f"*.{suffix}")
     file.write_bytes(damage(file.read_bytes()))
-    again = jit.kernel("float64(float64)")(double)
-    assert again(1.5) == 3.0
-    assert sum(again.stats.cache_misses.values()) == 1
-    repaired = jit.kernel("float64(float64)")(double)
-    assert repaired(1.5) == 3.0
-    assert sum(repaired.stats.cache_hits.values()) == 1
+    assert sum(stats_of_first_call().cache_misses.values()) == 1
+    assert sum(stats_of_first_call().cache_hits.values()) == 1
 
 
-def test_mistake_in_a_kernel_is_said(in_memory):
-    """What has nothing to do with the cache is not passed over."""
+@pytest.mark.parametrize("package", [False, True])
+@pytest.mark.parametrize("home", [False, True])
+@pytest.mark.parametrize("chosen", ["", "/chosen"])
+def test_kernels_are_cached_in_memory_if_no_other_folder_is_writable(
+    tmp_path, monkeypatch, package, home, chosen
+):
+    monkeypatch.setenv("XDG_CACHE_HOME", "/home/cache")
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+    if chosen:
+        monkeypatch.setenv("NUMBA_CACHE_DIR", chosen)
+    monkeypatch.setattr(os, "access", lambda path, _: home if path == "/home/cache" else package)
+    monkeypatch.setattr(
+        kernels, "user_folders", lambda: [tmp_path / "no" / "place", tmp_path / "own"]
+    )
+    kernels._set_cache_folder()
+    in_memory = not (package or home or chosen)
+    expected = str(tmp_path / "own" / "kernels") if in_memory else chosen
+    assert os.environ.get("NUMBA_CACHE_DIR", "") == expected
+
+
+def test_mistake_in_a_kernel_is_raised(cache):
     wrong = jit.kernel("float64(unicode_type)")(double)
     for _ in range(2):
         with pytest.raises(numba.TypingError):
             wrong(1.5)
 
 
-def test_nothing_is_compiled_before_it_is_wanted(in_memory):
-    """A process waits for no kernel but its own."""
+def test_nothing_is_compiled_before_the_first_use(cache):
     deferred = jit.kernel("float64(float64)")(double)
-    assert not deferred.overloads
-    assert not in_memory.exists()
-    jit.load(deferred)
-    jit.load(deferred)
-    assert [str(types) for types in deferred.overloads] == ["(float64,)"]
+    assert not list(cache.iterdir())
+    jit.ensure_compiled(deferred, double, None)
+    compiled = deferred.dispatcher
+    jit.ensure_compiled(deferred)
+    assert deferred.dispatcher is compiled
+    assert [str(types) for types in compiled.overloads] == ["(float64,)"]
 
 
-def test_a_kept_kernel_is_loaded_without_what_compiling_takes():
-    """numba registers that first otherwise, in half of the time in which a run begins."""
-    jit.load(limit_block)  # it is kept now
-    code = """if True:
-        import sys
-        from hilctl.kernels import jit, limit
-        jit.load(limit.limit_block)
-        print("numba.np.npyimpl" in sys.modules, [*limit.limit_block.stats.cache_hits.values()])
-    """
-    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert ran.stdout.split() == ["False", "[1]"], ran.stderr
+def test_kernels_compile_the_kernels_that_they_call(cache):
+    """With their declared signatures: an integer argument is converted."""
+    assert twice(2) == 4.0
+    assert [str(types) for types in double_kernel.dispatcher.overloads] == ["(float64,)"]
 
 
-def test_called_with_a_type_that_casts():
-    """The first call takes what later ones take: an integer for a number."""
+def test_another_process_gets_the_kernel_by_its_name():
+    assert pickle.loads(pickle.dumps(limit_block)) is limit_block
+
+
+def test_called_with_a_type_that_casts(cache):
+    """The first call converts an integer to a number, as later calls do."""
     assert jit.kernel("float64(float64)")(double)(2) == 4.0
-
-
-def test_what_is_no_kernel_is_its_own_entry():
-    """As where numba is told not to compile: who calls by entries works there, too."""
-
-    def plain(x):
-        return x
-
-    assert jit.entry(plain) is plain

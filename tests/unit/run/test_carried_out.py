@@ -123,17 +123,6 @@ def test_a_start_that_is_refused_moves_nothing(broken, output):
     assert page.get(Field.PHASE) == Phase.STARTING
 
 
-def test_nothing_is_compiled_any_more_when_the_device_is_open(prepared):
-    """What compiles has ended before the memory is given back, and long before the first tick."""
-    made = prepared()
-    made.loop_does(lambda self, start_ns: 1 / 0)
-    with pytest.raises(ZeroDivisionError):
-        carried_out.run_job(
-            made.job, made.ring, made.parts, lambda: made.device.events.append("compiled")
-        )
-    assert made.device.events[:4] == ["prepare", "open", "compiled", "small"]
-
-
 @pytest.mark.parametrize(("output", "ramps"), [(0.0, False), (5.0, True)])
 def test_the_waveform_begins_after_the_ramp(broken, output, ramps):
     """The recorder needs to know before the first sample: the page says it."""
@@ -245,18 +234,16 @@ def test_it_leaves_what_the_run_took_of_the_machine(prepared, monkeypatch):
 )
 def test_all_that_it_has_to_say_is_in_the_page(prepared, monkeypatch, raised, code, phase, text):
     """The supervisor tells by the phase what is there: an outcome, a refusal, or a fault."""
-    made, done = prepared(), []
+    made = prepared()
 
-    def run_job(job, ring, parts, all_compiled):
+    def run_job(job, ring, parts):
         assert (job.ring, job.config, parts.config) == (made.job.ring, *[made.job.config] * 2)
-        all_compiled()
         if raised is not None:
             raise raised
         return OUTCOME
 
     monkeypatch.setattr(carried_out, "run_job", run_job)
-    assert carried_out.carry_out(made.job.to_bytes(), lambda: done.append("compiled")) == code
-    assert done == ["compiled"]
+    assert carried_out.carry_out(made.job.to_bytes()) == code
     assert made.page.get(Field.PHASE) == phase
     assert made.page.read_text(PageText.ERROR) == text
     assert made.page.outcome() == (OUTCOME if code == 0 else None)

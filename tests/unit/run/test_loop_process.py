@@ -8,21 +8,17 @@ from types import SimpleNamespace
 
 import pytest
 
-from hilctl.kernels import jit
 from hilctl.run import carried_out, loop_process
 from hilctl.run.waiting_loop import CHECKING
 
 
 def test_a_job_is_carried_out_with_all_signals_ignored(monkeypatch):
-    """Once what every run needs is there; what compiles ends when the job says so."""
+    """Once the kernels of every run are compiled."""
     ignored, done = {}, []
 
-    def carry_out(job, all_compiled):
+    def carry_out(job):
         assert job == CHECKING + b"what to do"
         assert done == ["ordinary", "loaded"]
-        assert jit._Elsewhere.compile is not None
-        all_compiled()
-        assert jit._Elsewhere.compile is None
         return 7
 
     ours, theirs = socket.socketpair()
@@ -31,7 +27,7 @@ def test_a_job_is_carried_out_with_all_signals_ignored(monkeypatch):
     standard_input = SimpleNamespace(fileno=theirs.detach)
     monkeypatch.setattr(loop_process.sys, "stdin", standard_input)
     monkeypatch.setattr(loop_process, "be_ordinary", lambda: done.append("ordinary"))
-    monkeypatch.setattr(loop_process, "load", lambda *kernels: done.append("loaded"))
+    monkeypatch.setattr(loop_process, "ensure_compiled", lambda *kernels: done.append("loaded"))
     monkeypatch.setattr(loop_process.signal, "signal", ignored.__setitem__)
     monkeypatch.setattr(carried_out, "carry_out", carry_out)
     assert loop_process.main() == 7
@@ -50,7 +46,7 @@ def test_a_process_that_gets_no_job_ends_as_if_it_had_none(monkeypatch):
 
 BULKY = ("scipy.optimize", "scipy.signal", "scipy.sparse", "matplotlib", "pandas")
 LOOP = "hilctl.run.loop_process, hilctl.run.carried_out"
-OF_OTHERS = ("scipy.linalg", "scipy.special", "mcap", "google.protobuf", "rich", "typer")
+OF_OTHERS = ("scipy.special", "mcap", "google.protobuf", "rich", "typer")
 
 
 @pytest.mark.slow
@@ -71,7 +67,7 @@ def test_it_has_nothing_that_only_others_need(modules, left_out):
     """The loop's is locked in memory; a stop is not to wait for what it does not use."""
     program = f"import sys, {modules};"
     if "loop_process" in modules:  # numba imports some with its first kernel
-        program += "from hilctl.kernels import jit, limit; jit.load(limit.limit_block);"
+        program += "from hilctl.kernels import jit, limit; jit.ensure_compiled(limit.limit_block);"
     program += f"print([name for name in {left_out} if name in sys.modules])"
     words = [sys.executable, "-P", "-c", program]
     assert subprocess.run(words, capture_output=True, text=True, check=True).stdout == "[]\n"

@@ -5,9 +5,8 @@ import io
 import numba
 import pytest
 
-from hilctl.cli.compiling import compiling_shown
+from hilctl.cli.compile_progress import compile_progress
 from hilctl.cli.volume import Volume
-from hilctl.kernels import jit
 
 
 class Terminal(io.StringIO):
@@ -39,10 +38,10 @@ def at_terminal(monkeypatch):
 
 def test_each_kernel_is_named(at_terminal):
     terminal = at_terminal()
-    with compiling_shown():
+    with compile_progress():
         pass
     assert terminal.getvalue() == ""  # nothing was compiled
-    with compiling_shown():
+    with compile_progress():
         compile_something()
         compile_something()
     lines = terminal.getvalue().splitlines()
@@ -52,16 +51,8 @@ def test_each_kernel_is_named(at_terminal):
     assert len(terminal.getvalue().splitlines()) == 3
 
 
-def test_what_another_process_compiles_is_named_too(at_terminal):
-    terminal = at_terminal()
-    with compiling_shown():
-        assert jit._Elsewhere.compile is not None
-        jit._Elsewhere.compile("hilctl.kernels.limit", "limit_block")
-    assert terminal.getvalue().splitlines()[1:] == ["  limit_block"]
-
-
 def test_no_program_reads_it(capsys):
-    with compiling_shown():
+    with compile_progress():
         compile_something()
     assert capsys.readouterr().err == ""
 
@@ -69,6 +60,6 @@ def test_no_program_reads_it(capsys):
 def test_nor_who_wants_quiet(at_terminal, monkeypatch):
     terminal = at_terminal()
     monkeypatch.setattr(Volume, "quiet", True)
-    with compiling_shown():
+    with compile_progress():
         compile_something()
     assert terminal.getvalue() == ""
