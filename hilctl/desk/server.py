@@ -28,9 +28,8 @@ from hilctl.desk.frames import frame_of, nearest_window_s
 from hilctl.desk.signals import SIGNALS
 from hilctl.desk.static import file_response, plain_response
 from hilctl.desk.viewer import MAX_MESSAGE_BYTES, PageMessage, Viewer, answer_text
-from hilctl.run.control_socket import ask
+from hilctl.run.client import ask, request_stop
 from hilctl.run.run_folder import RunFolder
-from hilctl.run.stopping import request_stop
 
 _log = logging.getLogger(__name__)
 

@@ -19,7 +19,7 @@ WITHOUT = {
     "loop/host": "a contract and a record; loop/test_loop.py runs the loop on a double of it",
     "loop/plan": "two records of plain values; loop/test_loop.py fills and reads all of them",
     "recording/facts": "names; analysis/test_catalogue.py reads all of them",
-    "run/protocol": "words and one function; run/test_requests.py holds both sides to it",
+    "run/protocol": "constants and small functions; run/test_requests.py and test_client.py use it",
     "recording/data": "records of plain values; recording/test_reader.py fills them",
 }
 """Modules without a file of their own, and where they are tested instead."""
