@@ -8,7 +8,7 @@ from typing import Any, cast
 
 from hilctl.base.errors import InputError
 from hilctl.base.yaml import did_you_mean, load_document
-from hilctl.experiment.registry import device_class, known_devices
+from hilctl.experiment.device import device_class, known_devices
 
 SHIPPED_PROFILES = "hilctl_drivers.profile:shipped_profiles"
 

@@ -4,8 +4,8 @@ import json
 from typing import Any
 
 from hilctl.base.device import DeviceOptions
+from hilctl.experiment.device import device_class, known_devices
 from hilctl.experiment.file import Experiment
-from hilctl.experiment.registry import device_class, known_devices
 
 
 def experiment_schema() -> dict[str, Any]:

@@ -13,7 +13,7 @@ collect.py       runs of a folder or of files, each read once
 dimension.py     pure: what varied, and in which words
 trend.py         pure: a figure against what varied, with linear fit and direction
 headline.py      what came out, in a line or two
-sheets.py        which figures apply; loop_sheets.py, trend_sheets.py, response_sheets.py draw them
+sheets.py        selection of figures, step and frequency responses; loop_sheets.py, trend_sheets.py
 look.py          how runs are told apart in figures
 files.py         figures as files
 page.py          one page of many runs; result.py  the same for programs

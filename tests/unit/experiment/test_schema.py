@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from hilctl.experiment import registry
+from hilctl.experiment import device as registry
 from hilctl.experiment.schema import schema_text
 
 CONFIGS = Path(__file__).parents[3] / "configs"

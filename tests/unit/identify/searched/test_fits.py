@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 
 from hilctl.identify.data.cycles import find_cycles
+from hilctl.identify.data.files import read_table
 from hilctl.identify.data.records import History
-from hilctl.identify.data.tables import read_table
 from hilctl.identify.fit_model import FittedModel, fit_model
 from hilctl.identify.judge import judge
 from hilctl.identify.settings import FitSettings

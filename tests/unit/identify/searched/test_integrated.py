@@ -11,7 +11,7 @@ from hilctl.identify.data.records import SteadyLoop
 from hilctl.identify.fit_data import FitData
 from hilctl.identify.searched.integrated import ExponentialProblem
 from hilctl.identify.settings import FitSettings
-from hilctl.models.published import exponential_integrated
+from hilctl.models.integrated import exponential_integrated
 
 Loops = Callable[..., list[SteadyLoop]]
 

@@ -13,7 +13,7 @@ from hilctl.identify.fit_data import FitData
 from hilctl.identify.fit_model import fit_model
 from hilctl.identify.searched.plays import PlaysProblem
 from hilctl.identify.settings import FitSettings
-from hilctl.models.published import exponential_integrated
+from hilctl.models.integrated import exponential_integrated
 
 Loops = Callable[..., list[SteadyLoop]]
 
