@@ -5,11 +5,10 @@ device.py    the contract of a device and of a clock; units.py  of its commands
 errors.py    every exception that is raised on purpose
 strict.py    base of every pydantic model; plain.py  stands in for it where nothing is checked
 files.py     texts, each read once; files written whole or not at all
-private.py   folders that belong to one user alone
+private.py   folders that belong to one user alone, and locks on files
 samples.py   a sample's columns and flags, and blocks of samples
 events.py    what a run records beside its samples
 segments.py  which samples of a run are judged
-exponential.py of a matrix, without SciPy
 metrics.py   pure: folding onto one cycle, peak hysteresis, loop area, errors, sensor noise
 remedy.py    what the system says of files and ports, and what to do about it
 printable.py texts from files as people may be shown them

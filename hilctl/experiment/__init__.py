@@ -1,6 +1,6 @@
 """The experiment: its file, what the file refers to, and whether it may start. Moves nothing.
 
-file.py           pydantic models of the file; parts.py and limits.py its parts
+file.py           pydantic models of the file; parts.py  its parts
 labels.py         what a lab finds a run by
 load.py           from a file to the experiment with all that it refers to
 correction.py     what learning has added to the compensator's input
@@ -12,7 +12,7 @@ model_range.py    whether the reference stays within what the model was identifi
 forecast.py       what a run will do, by all of its commands; whole_run.py  works those out
 interlocks.py     interlocks, feedback.py feedback and adaptation.py adaptation, by the file's keys
 device.py         the device that it names, from the table of devices
-inventory.py      what there is on this machine; examples.py  what comes with hilctl, to copy
+inventory.py      devices on this machine, JSON schema of the file
+examples.py       what comes with hilctl, to copy
 starting.py       a first experiment for a device
-schema.py         the file's JSON schema
 """

@@ -5,7 +5,7 @@ settings.py    every choice of a fit, once; the published ones
 catalogue.py   every kind of model: its name, how it is identified, what data that takes
 fit_model.py   fit a model of any kind, with its provenance
 job.py         what a fit takes, and what it returns
-judge.py       how far a model is from data
+judge.py       how far a model is from data; weights of loops by hysteresis
 held_out.py    the same on data that its fit did not see
 verdict.py     what a model is worth, or why it is none
 found_range.py the motions that it was identified on
@@ -15,7 +15,6 @@ model_size.py  number of plays by loops held out; lag of a table
 workers.py     independent fits over threads, processes or a Dask cluster
 fit_data.py    all data ready for the kernels
 linear.py      weights by bounded linear least squares; densities held smooth
-geometry.py    weights of loops by hysteresis
 
 data           loops and histories, from recordings and tables
 searched       thresholds searched from several starts

@@ -2,8 +2,7 @@
 
 base.py        what every model has; the streaming operator
 plays.py       sums of plays and their inverse: the Prandtl-Ishlinskii model (PPI), and the
-               rate-dependent one (RDPI)
-spi.py         a PPI compensated by stop operators (SPI)
+               rate-dependent one (RDPI); a PPI compensated by stop operators (SPI)
 deadband.py    memoryless function of deadband operators and its inverse
 integrated.py  the integrated model: RDPI, then deadbands, and its inverse; its published
                parametrisations

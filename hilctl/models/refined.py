@@ -26,9 +26,8 @@ from hilctl.models.duhem import DuhemModel
 from hilctl.models.generalised import GeneralisedModel
 from hilctl.models.integrated import IntegratedModel
 from hilctl.models.kp import KrasnoselskiiPokrovskiiModel
-from hilctl.models.plays import PpiModel, RdpiModel
+from hilctl.models.plays import PpiModel, RdpiModel, SpiModel
 from hilctl.models.preisach import PreisachModel
-from hilctl.models.spi import SpiModel
 from hilctl.models.staged import StagedModel
 from hilctl.models.structure import Structure
 

@@ -13,8 +13,8 @@ collect.py       runs of a folder or of files, each read once
 dimension.py     pure: what varied, and in which words
 trend.py         pure: a figure against what varied, with linear fit and direction
 headline.py      what came out, in a line or two
-sheets.py        selection of figures, step and frequency responses; loop_sheets.py, trend_sheets.py
+sheets.py        selection of figures, figures as files, step and frequency responses;
+                 loop_sheets.py, trend_sheets.py draw the others
 look.py          how runs are told apart in figures
-files.py         figures as files
-page.py          one page of many runs; result.py  the same for programs
+page.py          one page of many runs, and the same for programs
 """

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from hilctl.identify.geometry import weight_roots
 from hilctl.identify.job import FitJob, FoundModel
+from hilctl.identify.judge import weight_roots
 from hilctl.identify.searched.integrated import ExponentialProblem
 from hilctl.identify.searched.plays import PlaysProblem
 from hilctl.identify.searched.search import SearchProblem, refine_peak, search

@@ -3,8 +3,8 @@
 import numpy as np
 
 from hilctl.base.arrays import F64
-from hilctl.identify.geometry import weight_roots
 from hilctl.identify.job import FitJob, FoundModel
+from hilctl.identify.judge import weight_roots
 from hilctl.identify.linear import numbered, smooth_densities
 from hilctl.identify.literature.operators import cells_below
 from hilctl.identify.staged.confidence import at_bound, standard_errors

@@ -132,7 +132,8 @@ def test_bits_are_those_of_a_kernel_compiled_here(tmp_path):
     code = """
 import sys, numpy as np
 from contextlib import nullcontext
-from hilctl.kernels import jit, creep
+from hilctl.kernels import jit
+from hilctl.kernels import dynamics as creep
 from hilctl.kernels.elsewhere import compiled_elsewhere
 with compiled_elsewhere() if sys.argv[1] == "elsewhere" else nullcontext():
     jit.load(creep.creep_stage)

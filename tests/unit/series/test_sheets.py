@@ -3,11 +3,19 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from matplotlib.figure import Figure
 
+from hilctl.base.errors import InputError
 from hilctl.characterise.response import SmallSignal
 from hilctl.series.collect import RunSeries
-from hilctl.series.sheets import frequency_sheet, sheets_of, step_sheet
+from hilctl.series.sheets import (
+    applying_sheets,
+    frequency_sheet,
+    sheets_of,
+    step_sheet,
+    write_sheets,
+)
 
 
 def test_they_are_found_from_what_varied(crossed, compensated):
@@ -67,3 +75,24 @@ def test_magnitude_and_phase_measured_and_fitted(make_run, make_digest):
 def test_runs_without_either_have_none(crossed):
     assert step_sheet(crossed) is None
     assert frequency_sheet(crossed) is None
+
+
+@pytest.mark.slow
+def test_each_figure_is_a_file_of_each_format(crossed, tmp_path):
+    few = replace(crossed, runs=crossed.runs[:3])
+    folder = tmp_path / "figures"
+    written = write_sheets(applying_sheets(few), folder, ["svg"], "single", overwrite=False)
+    assert [path.name for path in written] == [
+        "hysteresis_against_frequency.svg",
+        "loops_by_frequency.svg",
+    ]
+    assert all(path.is_file() for path in written)
+    assert all(caption.endswith(".") for caption in written.values())
+    with pytest.raises(InputError, match="exists already"):
+        write_sheets(applying_sheets(few), folder, ["svg"], "single", overwrite=False)
+
+
+def test_no_figure_is_refused(crossed):
+    nothing = replace(crossed, runs=())
+    with pytest.raises(InputError, match="no completed run"):
+        applying_sheets(nothing)
