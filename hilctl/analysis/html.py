@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from hilctl.analysis.sheet import Sheet, drawn
 from hilctl.analysis.vector import svg
 from hilctl.base.files import write_text
-from hilctl.base.printable import printable
+from hilctl.base.formatting import printable
 
 _CSS = """
 :root { color-scheme: light dark; --ink: #1c1c1c; --quiet: #666; --paper: #fff; --line: #ddd;

@@ -12,7 +12,7 @@ from hilctl.analysis.provenance import FAULT, provenance_rows
 from hilctl.analysis.report import worst_segment
 from hilctl.analysis.sheet import Sheet
 from hilctl.base.events import Event
-from hilctl.base.quantity import quantity
+from hilctl.base.formatting import quantity
 from hilctl.recording.data import Recording
 
 _MOST_EVENTS = 200

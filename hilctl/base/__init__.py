@@ -11,7 +11,7 @@ events.py    what a run records beside its samples
 segments.py  which samples of a run are judged
 metrics.py   pure: folding onto one cycle, peak hysteresis, loop area, errors, sensor noise
 remedy.py    what the system says of files and ports, and what to do about it
-printable.py texts from files as people may be shown them
+formatting.py  numbers with units, printable texts, and JSON
 text_table.py  columns of CSV and its relatives, mistakes with their line
 yaml/        plain YAML in, with the line of every value and all problems at once
 

@@ -22,7 +22,7 @@ from rich.text import Text
 
 from hilctl.base.errors import HilctlError, RunError
 from hilctl.base.events import Event
-from hilctl.base.printable import printable
+from hilctl.base.formatting import printable
 from hilctl.cli.console import console
 from hilctl.cli.streams import plain_streams
 from hilctl.desk.feed import RunFeed

@@ -22,7 +22,7 @@ from websockets.http11 import Request, Response
 from websockets.typing import Subprotocol
 
 from hilctl.base.errors import HilctlError, InputError, RunError
-from hilctl.base.finite_json import finite_json
+from hilctl.base.formatting import finite_json
 from hilctl.base.remedy import ADDRESS_REMEDIES, reason
 from hilctl.desk.admission import PROTOCOL, Admission, PendingConnections, bounded
 from hilctl.desk.feed import RunFeed

@@ -8,7 +8,7 @@ from typing import Any
 
 from hilctl.analysis import html
 from hilctl.analysis.html import definitions_of
-from hilctl.base.quantity import quantity, unit_text
+from hilctl.base.formatting import quantity, unit_text
 from hilctl.series.collect import RunSeries, SeriesRun
 from hilctl.series.headline import headline
 from hilctl.series.sheets import sheets_of

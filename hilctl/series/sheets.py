@@ -14,7 +14,7 @@ from hilctl.analysis.vector import write_figure
 from hilctl.base.arrays import C128, F64
 from hilctl.base.errors import InputError
 from hilctl.base.files import already_there
-from hilctl.base.quantity import quantity, significant
+from hilctl.base.formatting import quantity, significant
 from hilctl.series import loop_sheets, trend_sheets
 from hilctl.series.collect import OnRead, RunSeries, SeriesRun
 from hilctl.series.dimension import Dimension

@@ -22,7 +22,7 @@ class RunFigure:
     Attributes:
         name: Its column in the table.
         text: What it is, for people.
-        unit: Its unit; ``%`` or as in :func:`hilctl.base.quantity.quantity`.
+        unit: Its unit; ``%`` or as in :func:`hilctl.base.formatting.quantity`.
         short: Heading where there is no room for more.
         value: Takes it from a run; None where it has none.
     """
