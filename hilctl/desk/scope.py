@@ -27,7 +27,9 @@ class Buckets:
 
 
 class Envelope:
-    """The newest buckets of a run.
+    """The newest buckets of a run, with the lowest, highest and first value of each signal.
+
+    The range of each bucket is drawn, so an outlier is visible in an hour as well as in a second.
 
     Args:
         origin: Sample with which bucket 0 begins.

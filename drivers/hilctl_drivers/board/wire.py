@@ -16,8 +16,8 @@ from hilctl_drivers.board.profile import FrameProfile, FramesLink, FrameStreamin
 from hilctl_drivers.board.session import BoardFacts, BoardSession, Readings
 from hilctl_drivers.serial.setup import SerialSetup
 from hilctl_drivers.serial.wire import SerialWire, check_stands, refuse
-from hilctl_drivers.wire.errors import WatchdogTripped
 from hilctl_drivers.wire.framing import binary_framing
+from hilctl_drivers.wire.links import WatchdogTripped
 from hilctl_drivers.wire.serial_port import SerialLink
 from hilctl_drivers.wire.timing import RateLimit, WireTime, check_feeds
 

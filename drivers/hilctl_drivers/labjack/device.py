@@ -25,7 +25,7 @@ from hilctl_drivers.modbus.safe_write import Connect, ModbusSafeWrite
 from hilctl_drivers.modbus.session import ModbusSession
 from hilctl_drivers.modbus.setup import ModbusPeer
 from hilctl_drivers.modbus.watchdog import ModbusGuard
-from hilctl_drivers.wire.errors import Refused
+from hilctl_drivers.wire.links import Refused
 from hilctl_drivers.wire.timing import RateLimit
 
 

@@ -20,8 +20,7 @@ from hilctl_drivers.modbus.safe_write import Connect, ModbusSafeWrite
 from hilctl_drivers.modbus.session import ModbusSession
 from hilctl_drivers.modbus.setup import ModbusOptions, ModbusPeer, ModbusSetup
 from hilctl_drivers.modbus.watchdog import ModbusGuard
-from hilctl_drivers.wire.errors import Refused
-from hilctl_drivers.wire.links import NoAnswerError, naming
+from hilctl_drivers.wire.links import NoAnswerError, Refused, naming
 from hilctl_drivers.wire.serial_port import SerialLink
 
 Swap: TypeAlias = Callable[[bytes], bytes]

@@ -12,8 +12,7 @@ from hilctl_drivers.text.lines import parse_number
 from hilctl_drivers.text.profile import AsciiInput, AsciiOutput, AsciiProfile
 from hilctl_drivers.text.session import AsciiSession
 from hilctl_drivers.text.timing import arm_s, exchange_time, feed_time, query_time
-from hilctl_drivers.wire.errors import WatchdogTripped
-from hilctl_drivers.wire.links import naming
+from hilctl_drivers.wire.links import WatchdogTripped, naming
 from hilctl_drivers.wire.timing import RateLimit, WireTime, check_feeds
 
 _NO_EVIDENCE = (

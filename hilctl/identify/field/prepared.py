@@ -23,6 +23,8 @@ LEAST = 0.01  # part of the noise that a smoothing has to take away to say how m
 def smoothed(displacement_um: F64, width: float, rate_hz: float) -> F64:
     """Return the displacement and its first two derivatives by time: float64[3, n].
 
+    A window that is narrow enough for the fastest loop leaves most of the sensor noise. In small
+    and slow loops noise reverses the path where the actuator did not, which would bend a model.
     Of what a wider smoothing takes away more, that part is kept by which it is more than noise (J.
     S. Lee, IEEE Trans. Pattern Anal. Mach. Intell. 2 (1980) 165). How much noise would be is known
     from what the first smoothing takes away.

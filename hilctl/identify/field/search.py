@@ -48,7 +48,10 @@ class Bare:
 
 
 class Polish:
-    """A sum of squares over stages and thresholds.
+    """A sum of squares over the stages and thresholds of the whole model; its weights follow.
+
+    A search on fewer operators ends at their optimum, which is not that of all of them: small loops
+    need a slightly different lag, and thresholds beside those at which the rods yield.
 
     Args:
         rows_of: From stages, float64[9], to the rows.

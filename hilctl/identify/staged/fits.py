@@ -29,7 +29,11 @@ STILL = 0.05  # part of a cell that a play must move through in some record to h
 def with_triangle(
     data: StagedFitData, model: StagedModel, lines: int, scale: F64, least_slope: float
 ) -> StagedModel:
-    """Put a triangle in the place of a staged model's hysteresis.
+    """Replace the hysteresis of a staged model by a Preisach triangle.
+
+    The sum of plays and the deadbands after it bend both branches of a loop alike. A triangle of
+    relays bends every play by itself. Once lag, structure and delay are known, its densities act
+    linearly on the displacement, so they need neither start nor search.
 
     Args:
         data: The data.

@@ -9,7 +9,7 @@ from hilctl_drivers.emulator.labjack_stream import LabJackInput
 from hilctl_drivers.labjack import stream
 from hilctl_drivers.labjack.frames import ModbusFeedback, ReadFrame, WriteFrame
 from hilctl_drivers.profile import load_profile
-from hilctl_drivers.wire.errors import Refused
+from hilctl_drivers.wire.links import Refused
 from tests.fakes import InProcess
 
 SETTINGS = {
