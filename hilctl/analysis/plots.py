@@ -23,11 +23,11 @@ from hilctl.analysis.canvas import (
 )
 from hilctl.analysis.sheet import Panel, Sheet
 from hilctl.analysis.steady import SteadyPart, steady_part, steady_samples
-from hilctl.base.arrays import F64, I64
 from hilctl.base.formatting import quantity, short_name
 from hilctl.base.metrics import MAX_BINS, fold
 from hilctl.base.samples import Samples
 from hilctl.base.segments import Segment
+from hilctl.base.types import F64, I64
 from hilctl.recording.data import Recording
 
 MOST_HARMONICS = 20

@@ -1,7 +1,7 @@
 """What all rooms share; it knows none of them.
 
-arrays.py    array types, and long arrays piece by piece
-device.py    the contract of a device and of a clock; units.py  of its commands
+types.py     array types, the unit of commands, and long arrays in chunks
+device.py    the contract of a device and of a clock
 errors.py    every exception that is raised on purpose
 strict.py    base of every pydantic model; plain.py  stands in for it where nothing is checked
 files.py     texts, each read once; files written whole or not at all

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import OptimizeResult, least_squares
 
-from hilctl.base.arrays import C128, F64
 from hilctl.base.errors import DataError
+from hilctl.base.types import C128, F64
 from hilctl.characterise.problem import RigProblemError
 from hilctl.recording.data import Recording
 

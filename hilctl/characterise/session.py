@@ -13,10 +13,9 @@ from functools import cached_property
 from pathlib import Path
 from typing import TypeAlias
 
-from hilctl.base.arrays import F64
 from hilctl.base.errors import DataError, InputError, RunError
 from hilctl.base.files import check_writable, write_text
-from hilctl.base.units import CommandUnit
+from hilctl.base.types import F64, CommandUnit
 from hilctl.base.yaml import Document, load_document
 from hilctl.characterise.limits import CampaignLimits, limits_of
 from hilctl.characterise.modelling import identified, judged

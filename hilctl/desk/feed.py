@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from hilctl.base.arrays import F64, I64
 from hilctl.base.errors import RunError
 from hilctl.base.events import Event
 from hilctl.base.samples import Batch, Head
+from hilctl.base.types import F64, I64
 from hilctl.desk.figures import FigureValues, RunningFigures
 from hilctl.desk.headroom import Gauge, Headroom
 from hilctl.desk.scope import Scope

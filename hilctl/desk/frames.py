@@ -14,8 +14,8 @@ from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
-from hilctl.base.arrays import F64
 from hilctl.base.events import Event
+from hilctl.base.types import F64
 from hilctl.desk.feed import RunFeed
 from hilctl.desk.scope import WINDOWS_S, Scope
 from hilctl.desk.signals import SIGNALS

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hilctl.base.arrays import F64, I64
 from hilctl.base.samples import NO_WAVEFORM
 from hilctl.base.segments import Segment
+from hilctl.base.types import F64, I64
 from hilctl.desk.signals import ROW, SIGNALS, Traces
 
 

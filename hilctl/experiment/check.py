@@ -11,9 +11,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hilctl.base.arrays import F64
 from hilctl.base.device import DeviceInfo
 from hilctl.base.errors import ConfigError, DataError, InputError, ModelError, Problem
+from hilctl.base.types import F64
 from hilctl.experiment.adaptation import (
     adaptation_problems,
     adaptation_warnings,

@@ -11,7 +11,7 @@ from hilctl.base.strict import (
     WithJsonSchema,
     model_validator,
 )
-from hilctl.base.units import CommandUnit
+from hilctl.base.types import CommandUnit
 from hilctl.loop.interlocks import InterlockSettings
 from hilctl.loop.pacer import USUAL_MISSED_SHARE
 from hilctl.recording.facts import RECORDINGS

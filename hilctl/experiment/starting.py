@@ -15,7 +15,7 @@ from typing import Any
 from hilctl.base.device import DeviceInfo
 from hilctl.base.errors import ConfigError, InputError, Problem
 from hilctl.base.files import TextFiles
-from hilctl.base.units import CommandUnit
+from hilctl.base.types import CommandUnit
 from hilctl.base.yaml import Document, commented, did_you_mean, dump
 from hilctl.experiment.check import check
 from hilctl.experiment.device import known_devices, made_device

@@ -9,7 +9,7 @@ from typing import Any, Protocol, TypeVar
 
 from hilctl.base.errors import InputError
 from hilctl.base.files import check_writable, write_text
-from hilctl.base.units import CommandUnit
+from hilctl.base.types import CommandUnit
 from hilctl.base.yaml import Document
 from hilctl.identify.candidates import CandidateError, Choice, choose_kind
 from hilctl.identify.catalogue import entry

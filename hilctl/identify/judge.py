@@ -6,9 +6,9 @@ from typing import Any, Literal
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from hilctl.base.arrays import F64
 from hilctl.base.errors import DataError
 from hilctl.base.metrics import loop_area, peak_hysteresis_percent
+from hilctl.base.types import F64
 from hilctl.identify.data.records import Record, Records, SteadyLoop
 from hilctl.identify.fit_data import PERIODS, FitData
 from hilctl.identify.staged.fit_data import StagedFitData

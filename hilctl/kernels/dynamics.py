@@ -17,7 +17,7 @@ import math
 
 import numpy as np
 
-from hilctl.base.arrays import F64
+from hilctl.base.types import F64
 from hilctl.kernels.jit import STAGE, kernel
 
 # Share of the fastest change the lag allows that its inverse asks for; towards 1 the command that

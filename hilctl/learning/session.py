@@ -11,9 +11,9 @@ from typing import TypeAlias
 import numpy as np
 
 from hilctl import __version__
-from hilctl.base.arrays import C128
 from hilctl.base.errors import ConfigError, HilctlError, InputError, Problem, RunError
 from hilctl.base.segments import Segment
+from hilctl.base.types import C128
 from hilctl.experiment.check import Checked
 from hilctl.experiment.correction import (
     Correction,

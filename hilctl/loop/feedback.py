@@ -17,9 +17,9 @@ from typing import Protocol
 
 import numpy as np
 
-from hilctl.base.arrays import F64
 from hilctl.base.errors import InputError
 from hilctl.base.samples import Flag
+from hilctl.base.types import F64
 from hilctl.loop.block import Block
 
 _INVERSE_OUT = int(Flag.INVERSE_OUT)

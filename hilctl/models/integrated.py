@@ -4,8 +4,8 @@ from typing import Literal
 
 import numpy as np
 
-from hilctl.base.arrays import F64
 from hilctl.base.strict import Field
+from hilctl.base.types import F64
 from hilctl.kernels.hysteresis import integrated_forward, integrated_inverse_stage
 from hilctl.models.base import Operator
 from hilctl.models.deadband import DeadbandFunction

@@ -4,9 +4,9 @@ from typing import Literal, Self
 
 import numpy as np
 
-from hilctl.base.arrays import F64
 from hilctl.base.errors import ModelError
 from hilctl.base.strict import Field, model_validator
+from hilctl.base.types import F64
 from hilctl.kernels.hysteresis import play_sum, play_sum_stage, stop_sum_stage
 from hilctl.models.base import (
     HysteresisModel,

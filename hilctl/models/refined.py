@@ -7,8 +7,8 @@ from typing import Annotated, Any, Literal, Self, TypeAlias
 
 import numpy as np
 
-from hilctl.base.arrays import F64
 from hilctl.base.strict import Field, Strict, model_validator
+from hilctl.base.types import F64
 from hilctl.kernels.residual import Tables, residual_forward, residual_inverse
 from hilctl.models.base import (
     HysteresisModel,

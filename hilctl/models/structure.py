@@ -4,9 +4,9 @@ import math
 
 import numpy as np
 
-from hilctl.base.arrays import C128, F64
 from hilctl.base.errors import ModelError
 from hilctl.base.strict import Field, Strict
+from hilctl.base.types import C128, F64
 from hilctl.kernels.dynamics import exponential, mode_stage, structure_block, unmode_stage
 from hilctl.models.base import Operator
 

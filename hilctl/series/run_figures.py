@@ -7,10 +7,10 @@ import numpy as np
 
 from hilctl.analysis.report import summarize, worst_segment
 from hilctl.analysis.steady import steady_part
-from hilctl.base.arrays import F64
 from hilctl.base.events import OFFSET
 from hilctl.base.samples import Samples
 from hilctl.base.segments import Segment
+from hilctl.base.types import F64
 from hilctl.characterise.problem import RigProblemError
 from hilctl.characterise.response import SmallSignal, small_signal
 from hilctl.recording.data import Recording

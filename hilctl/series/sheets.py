@@ -11,10 +11,10 @@ from matplotlib.figure import Figure
 from hilctl.analysis.canvas import QUIET
 from hilctl.analysis.sheet import ColumnWidth, Panel, Sheet, drawn
 from hilctl.analysis.vector import write_figure
-from hilctl.base.arrays import C128, F64
 from hilctl.base.errors import InputError
 from hilctl.base.files import already_there
 from hilctl.base.formatting import quantity, significant
+from hilctl.base.types import C128, F64
 from hilctl.series import loop_sheets, trend_sheets
 from hilctl.series.collect import OnRead, RunSeries, SeriesRun
 from hilctl.series.dimension import Dimension

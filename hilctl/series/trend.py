@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from hilctl.base.arrays import F64
+from hilctl.base.types import F64
 from hilctl.series.collect import RunSeries, SeriesRun
 from hilctl.series.dimension import Dimension
 

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from hilctl.base.arrays import CHUNK, F64, chunks
 from hilctl.base.errors import InputError
 from hilctl.base.segments import Segment
+from hilctl.base.types import CHUNK, F64, chunks
 from hilctl.waveforms import shapes, spec
 from hilctl.waveforms.table import read_samples
 

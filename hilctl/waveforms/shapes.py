@@ -6,8 +6,8 @@ from fractions import Fraction
 
 import numpy as np
 
-from hilctl.base.arrays import CHUNK, F64, I64
 from hilctl.base.errors import InputError
+from hilctl.base.types import CHUNK, F64, I64
 from hilctl.waveforms import spec
 
 MAX_SAMPLES = 100_000_000

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from hilctl.base.arrays import F64
+from hilctl.base.types import F64
 from hilctl.waveforms import spec
 from hilctl.waveforms.shapes import sampled
 

@@ -7,9 +7,8 @@ ROOT = UNIT.parents[1]
 PACKAGES = {Path(): ROOT / "hilctl", Path("drivers"): ROOT / "drivers" / "hilctl_drivers"}
 
 WITHOUT = {
-    "base/arrays": "names of array types; nothing runs",
+    "base/types": "names of types; waveforms/test_build.py reads arrays in chunks",
     "base/device": "the contract of devices: tests/contract/test_devices.py holds each to it",
-    "base/units": "a name of a type; nothing runs",
     "base/events": "one record of plain values; seen in run/test_shared_page.py",
     "cli/options": "types of options; cli/test_commands.py loads every command that has them",
     "drivers/contract": "the checks of tests/contract; test_bad_devices.py makes each of them fail",

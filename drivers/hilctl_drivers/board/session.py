@@ -7,8 +7,8 @@ from struct import Struct
 
 import numpy as np
 
-from hilctl.base.arrays import F64
 from hilctl.base.errors import DeviceError, InputError
+from hilctl.base.types import F64
 from hilctl_drivers.board import frames as board
 from hilctl_drivers.board.profile import FrameChannel, FrameProfile
 from hilctl_drivers.wire.framing import CobsFraming, Framing, binary_framing

@@ -8,8 +8,8 @@ is how long this machine may stall. The first sample is put out once that many a
 
 import numpy as np
 
-from hilctl.base.arrays import F64
 from hilctl.base.errors import DeviceError
+from hilctl.base.types import F64
 from hilctl_drivers.board import frames as board
 from hilctl_drivers.board.frames import WATCHDOG_REPLY, WATCHDOG_REQUEST, exchange_sizes
 from hilctl_drivers.board.profile import FrameProfile, FramesLink, FrameStreaming

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from hilctl.base.arrays import F64
+from hilctl.base.types import F64
 from hilctl_drivers.emulator.fifo import SampleFifo
 from hilctl_drivers.emulator.modbus_device import Declined, EmulatedModbus
 from hilctl_drivers.emulator.rig import Rig, WriteLog

@@ -12,9 +12,9 @@ from typing import ClassVar
 
 import numpy as np
 
-from hilctl.base.arrays import F64
 from hilctl.base.device import DeviceOptions
 from hilctl.base.errors import DeviceError
+from hilctl.base.types import F64
 from hilctl_drivers.device import DacDevice
 from hilctl_drivers.labjack.frames import ModbusFeedback, ReadFrame, WriteFrame
 from hilctl_drivers.labjack.session import StreamSession

@@ -10,9 +10,9 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import ClassVar, TypeAlias
 
-from hilctl.base.arrays import F64
 from hilctl.base.device import DeviceOptions
 from hilctl.base.errors import DeviceError
+from hilctl.base.types import F64
 from hilctl_drivers.device import DacDevice
 from hilctl_drivers.modbus.look import look
 from hilctl_drivers.modbus.pdu import feedback_pdu, read_pdu, write_read_pdu

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from hilctl.base.arrays import F64
+from hilctl.base.types import F64
 from hilctl.kernels.dynamics import exponential
 from hilctl.kernels.jit import entry
 from hilctl_drivers.simulated.extras import Creep, SecondMode, Thermal, VoltageLimit

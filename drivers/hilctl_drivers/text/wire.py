@@ -3,8 +3,8 @@
 import re
 from string import Formatter
 
-from hilctl.base.arrays import F64
 from hilctl.base.errors import DeviceError, InputError, UnconfirmedError
+from hilctl.base.types import F64
 from hilctl_drivers.profile_parts import Range
 from hilctl_drivers.serial.setup import SerialSetup
 from hilctl_drivers.serial.wire import SerialWire, check_stands

@@ -6,11 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from hilctl.base.arrays import F64
 from hilctl.base.errors import DataError, InputError
 from hilctl.base.samples import Flag
 from hilctl.base.text_table import Column, TextTable
-from hilctl.base.units import CommandUnit
+from hilctl.base.types import F64, CommandUnit
 from hilctl.identify.data.cycles import find_cycles, loops_from_pieces
 from hilctl.identify.data.records import History, Record
 from hilctl.identify.settings import IdentifySettings

@@ -8,7 +8,7 @@ from typing import Generic, TypeVar
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
-from hilctl.base.arrays import F64, I64
+from hilctl.base.types import F64, I64
 from hilctl.identify.data.records import History
 from hilctl.identify.field.columns import bare_displacement, corners
 from hilctl.identify.field.rows import Motion

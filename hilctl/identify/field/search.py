@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hilctl.base.arrays import F64, I64
+from hilctl.base.types import F64, I64
 from hilctl.identify.field.descent import Place, settle
 from hilctl.identify.field.prepared import Prepared
 from hilctl.identify.field.rows import Rows, chosen

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from hilctl.base.arrays import F64
+from hilctl.base.types import F64
 from hilctl.identify.fit_data import FitData
 from hilctl.identify.searched.plays import numbered, spacing_limit
 from hilctl.identify.searched.search import SearchSpace

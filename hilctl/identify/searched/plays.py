@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from scipy.linalg import qr
 
-from hilctl.base.arrays import F64
+from hilctl.base.types import F64
 from hilctl.identify.fit_data import FitData
 from hilctl.identify.linear import bounded_and_free
 from hilctl.identify.searched.search import SearchSpace

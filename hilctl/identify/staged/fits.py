@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from hilctl.base.arrays import F64
+from hilctl.base.types import F64
 from hilctl.identify.job import FitJob, FoundModel
 from hilctl.identify.judge import weight_roots
 from hilctl.identify.linear import numbered, smooth_densities

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from pydantic import ConfigDict
 
-from hilctl.base.arrays import F64
 from hilctl.base.device import DeviceInfo, DeviceOptions
 from hilctl.base.errors import ConfigError, DataError
 from hilctl.base.segments import Segment
+from hilctl.base.types import F64
 from hilctl.base.yaml import Document
 from hilctl.experiment import check as module
 from hilctl.experiment.check import Checked, check, command_problems, pace_warnings

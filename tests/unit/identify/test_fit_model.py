@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from hilctl.base.errors import DataError
-from hilctl.base.units import CommandUnit
+from hilctl.base.types import CommandUnit
 from hilctl.identify.data.records import History, Records, SteadyLoop
 from hilctl.identify.fit_model import FittedModel, fit_model
 from hilctl.identify.judge import judge

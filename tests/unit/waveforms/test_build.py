@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hilctl.base import arrays
-from hilctl.base.arrays import chunks
+from hilctl.base import types
 from hilctl.base.errors import InputError
 from hilctl.base.segments import Segment
+from hilctl.base.types import chunks
 from hilctl.waveforms import build as module
 from hilctl.waveforms import shapes
 from hilctl.waveforms.build import Reference, Repeat, build, telling
@@ -311,7 +311,7 @@ WAVES: list[dict[str, Any]] = [
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let everything be long, and little be processed together."""
     monkeypatch.setattr(shapes, "LONG", 1000)
-    for each in (arrays, module, shapes):
+    for each in (types, module, shapes):
         monkeypatch.setattr(each, "CHUNK", 97)
 
 
@@ -366,7 +366,7 @@ def test_what_does_not_repeat_is_told_by_all_of_it(made: Made, small: None) -> N
 
 def test_telling_parts() -> None:
     """Nothing twice, nothing left out but the middle of what repeats."""
-    n, chunk = 10**9, arrays.CHUNK
+    n, chunk = 10**9, types.CHUNK
     (all_of_it,) = telling(n, ())
     assert (all_of_it.start, all_of_it.stop) == (0, n)
     two = (Repeat(100, 4 * 10**8, 500.0), Repeat(5 * 10**8, n, 1e7 / 3.0))

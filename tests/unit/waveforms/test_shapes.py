@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 
-from hilctl.base.arrays import F64
+from hilctl.base.types import F64
 from hilctl.waveforms import shapes, spec
 from hilctl.waveforms.build import Reference
 from hilctl.waveforms.shapes import common_period_s, sample_count

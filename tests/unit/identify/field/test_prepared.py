@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from hilctl.base.arrays import F64
+from hilctl.base.types import F64
 from hilctl.identify.data.records import History
 from hilctl.identify.field.prepared import LONGEST, OFF, POINTS, Latest, Prepared, Run, smoothed
 

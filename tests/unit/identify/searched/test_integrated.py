@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hilctl.base.arrays import F64
+from hilctl.base.types import F64
 from hilctl.identify.data.records import SteadyLoop
 from hilctl.identify.fit_data import FitData
 from hilctl.identify.searched.integrated import ExponentialProblem

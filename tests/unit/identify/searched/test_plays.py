@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.optimize import nnls
 
-from hilctl.base.arrays import F64
+from hilctl.base.types import F64
 from hilctl.identify.data.records import SteadyLoop
 from hilctl.identify.fit_data import FitData
 from hilctl.identify.fit_model import fit_model
