@@ -69,14 +69,15 @@ class ControlServer:
 
     def _serve(self) -> None:
         while not self._closing.is_set():
-            if not self._path.exists():
-                self._listen_again()
+            self._restore_socket()
             self._server.handle_request()
 
-    def _listen_again(self) -> None:
-        """Listen at the same path after the socket or its folder was removed."""
+    def _restore_socket(self) -> None:
+        """Listen again at the same path if the socket or its folder was removed."""
         folder = self._path.parent
         with suppress(OSError, RunError):  # retried at the next poll
+            if self._path.exists():
+                return
             private_folder(private_folder(folder.parent) / folder.name)
             server = _Server(self._path, self._answer, self._request_s)
             self._server.server_close()
@@ -111,7 +112,11 @@ class _Server(socketserver.ThreadingUnixStreamServer):
 
     def process_request(self, request: Any, client_address: Any) -> None:
         self._free.acquire()  # other clients wait in the queue of the socket
-        super().process_request(request, client_address)
+        try:
+            super().process_request(request, client_address)
+        except RuntimeError:  # the thread cannot be started
+            self._free.release()
+            raise
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:
         try:

@@ -75,10 +75,10 @@ def test_it_listens_again_after_its_folder_was_removed(tmp_path):
         shutil.rmtree(path.parent.parent)
         path.parent.parent.mkdir()
         path.parent.parent.chmod(0o777)
-        server._listen_again()
+        server._restore_socket()
         assert not path.exists()
         path.parent.parent.chmod(0o700)
-        server._listen_again()
+        server._restore_socket()
         server.start()
         assert json.loads(exchange(path.parent, b"hello"))["heard"] == "hello"
 
@@ -147,6 +147,21 @@ def test_a_client_that_has_left_is_no_error(server, tmp_path):
 
 def test_an_error_of_one_request_ends_no_other(server, tmp_path, caplog):
     assert exchange(tmp_path, b"break\n") == b""
+    assert "request failed" in caplog.text
+    assert json.loads(exchange(tmp_path, b"hello\n"))["ok"]
+
+
+def test_clients_without_a_thread_cost_no_place(server, tmp_path, monkeypatch, caplog):
+    """The next clients are served as soon as threads can be started again."""
+
+    def start(self):
+        raise RuntimeError("can't start new thread")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(threading.Thread, "start", start)
+        for _ in range(70):
+            with connect(tmp_path) as client:
+                assert answer_of(client) == b""
     assert "request failed" in caplog.text
     assert json.loads(exchange(tmp_path, b"hello\n"))["ok"]
 
