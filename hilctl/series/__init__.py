@@ -3,10 +3,9 @@
 Nothing is run here. The runs are those of a campaign, by its table and recordings, or recordings
 that somebody names.
 
-run_figures.py   what a recording says of its run, as one row of a table
+run_figures.py   what a recording says of its run, as one row of a table; drift of reference runs
 minor_loops.py   pure: the minor loops of an average cycle
 ringing.py       pure: natural frequency and damping of a step's ringing
-drift.py         what reference runs say of drift
 digest.py        what one run gives to figures of many: loop, error and response, some kilobytes
 columns.py       names of a campaign's table; written and read
 collect.py       runs of a folder or of files, each read once
