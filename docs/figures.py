@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 
 from hilctl import api
 from hilctl.analysis.canvas import COMMAND, DISPLACEMENT, ERROR, MARK, QUIET, REFERENCE, STYLE
-from hilctl.base.arrays import F64
+from hilctl.base.types import F64
 from hilctl.kernels.hysteresis import stop_step
 from hilctl.models.base import HysteresisModel
 from hilctl.models.bouc_wen import BoucWenModel

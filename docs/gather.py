@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from hilctl import api
-from hilctl.analysis.definitions import DEFINITIONS
+from hilctl.analysis.html import DEFINITIONS
 from hilctl.cli.commands import COMMANDS, load
 
 ROOT = Path(__file__).parents[1]

@@ -3,8 +3,8 @@
 import numpy as np
 
 from hilctl.models.base import Provenance
+from hilctl.models.integrated import even_thresholds, exponential_weights
 from hilctl.models.plays import PpiModel, RdpiModel
-from hilctl.models.published import even_thresholds, exponential_weights
 
 _DISSERTATION = (
     "Modeling and Compensation of Rate-Dependent Asymmetric Hysteresis Nonlinearities of "

@@ -10,7 +10,7 @@ from hilctl.identify.settings import FitSettings
 from hilctl.identify.staged.convex import convex_start
 from hilctl.identify.staged.fit_data import StagedFitData
 from hilctl.identify.staged.layered import Layers, Point
-from hilctl.models.published import exponential_integrated
+from hilctl.models.integrated import exponential_integrated
 from hilctl.models.staged import StagedModel
 
 GRID = [(a, f) for a in (3.0, 6.0) for f in (2.0, 50.0, 150.0, 250.0, 400.0)]

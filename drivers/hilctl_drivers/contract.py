@@ -20,9 +20,9 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 
-from hilctl.base.arrays import F64
 from hilctl.base.device import Device, WatchdogDevice
 from hilctl.base.errors import DeviceError
+from hilctl.base.types import F64
 
 RATE_HZ = 10_000.0
 SAMPLES = 20

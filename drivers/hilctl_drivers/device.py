@@ -10,9 +10,9 @@ from typing import ClassVar
 
 import numpy as np
 
-from hilctl.base.arrays import F64
 from hilctl.base.device import DeviceInfo, DeviceOptions
 from hilctl.base.errors import DeviceError, UnconfirmedError
+from hilctl.base.types import F64
 from hilctl_drivers.wire.timing import RateLimit
 
 _SHORT = 64

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 
 from hilctl.base.errors import InputError
 from hilctl.base.files import TextFiles
-from hilctl.base.units import CommandUnit
+from hilctl.base.types import CommandUnit
 from hilctl_drivers.profile import load_profile
 from hilctl_drivers.profile_parts import BaseProfile, Range, Watchdog
 

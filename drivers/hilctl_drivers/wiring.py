@@ -13,7 +13,7 @@ from pydantic import Field, model_validator
 from hilctl.base.device import DeviceOptions
 from hilctl.base.errors import InputError
 from hilctl.base.strict import Strict
-from hilctl.base.units import CommandUnit
+from hilctl.base.types import CommandUnit
 from hilctl_drivers.profile import ProfileName
 from hilctl_drivers.profile_parts import Range, Watchdog
 

@@ -9,9 +9,9 @@ report.py   from a recording, whole or in pieces, to a report; segment_figures.p
 table.py    a report for people, as rows of text
 canvas.py   what all plots share: style, colours, signals over time
 sheet.py    a figure before its size is known; vector.py  figures as files, and as SVG of a page
-plots.py    plots over time and frequency: history, error, spectrum.py, lateness
+plots.py    plots over time and frequency: history, error and its spectrum, lateness
 loops.py    the hysteresis loop, and before and after
-html.py     parts of self-contained pages; definitions.py  what their figures mean
+html.py     parts of self-contained pages, and definitions of their figures
 run_page.py the page of a run; provenance.py  when, by whom and with what it was made
 replay.py   the same commands again; predicted.py  the error of another model
 export.py   samples as a table; export_files.py  CSV, Parquet, NPZ, MAT; export_all.py  all

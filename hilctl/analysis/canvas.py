@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from hilctl.base.arrays import F64, I64
+from hilctl.base.types import F64, I64
 from hilctl.recording.data import Recording
 
 REFERENCE = "#000000"

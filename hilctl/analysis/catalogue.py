@@ -21,7 +21,7 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 from hilctl.base.errors import DataError, InputError
-from hilctl.base.printable import printable
+from hilctl.base.formatting import printable
 from hilctl.recording.facts import END_FIGURES, LABELS_FACT
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from hilctl.base.units import CommandUnit
+from hilctl.base.types import CommandUnit
 from hilctl.machine.usage import ProcessUsage
 from hilctl.recording.facts import LabelValue
 

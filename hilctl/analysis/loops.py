@@ -11,9 +11,8 @@ from hilctl.analysis.canvas import DISPLACEMENT, MARK, REFERENCE, WITH, WITHOUT
 from hilctl.analysis.sheet import Panel, Sheet
 from hilctl.analysis.steady import SteadyPart, steady_part
 from hilctl.base import metrics
-from hilctl.base.arrays import F64
-from hilctl.base.printable import short_name
-from hilctl.base.quantity import quantity
+from hilctl.base.formatting import quantity, short_name
+from hilctl.base.types import F64
 from hilctl.recording.data import Recording
 
 _LONGEST_PATH = 5_000

@@ -14,11 +14,11 @@ import numpy as np
 from hilctl.analysis.figures import RunReport
 from hilctl.analysis.report import RunGathering, Windows
 from hilctl.analysis.steady import Overview, SteadyPart, trusted
-from hilctl.base.arrays import F64, I64
 from hilctl.base.errors import DataError
 from hilctl.base.events import Event
 from hilctl.base.metrics import Fold
 from hilctl.base.samples import Samples
+from hilctl.base.types import F64, I64
 from hilctl.recording.data import Recording, Ticks
 
 MOST_SAMPLES = 2**22

@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from hilctl.base.arrays import F64
 from hilctl.base.samples import NO_WAVEFORM, Flag, Samples
+from hilctl.base.types import F64
 from hilctl.models.base import HysteresisModel
 
 

@@ -5,7 +5,7 @@ from dataclasses import astuple, fields
 from typing import Any, Literal
 
 from hilctl.base.errors import DataError
-from hilctl.base.quantity import quantity
+from hilctl.base.formatting import quantity
 from hilctl.machine.usage import ProcessUsage
 from hilctl.recording.data import Recording
 from hilctl.recording.facts import USAGE_FACT

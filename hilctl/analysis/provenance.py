@@ -5,8 +5,7 @@ from collections.abc import Iterator
 from datetime import datetime
 
 from hilctl.base.errors import ConfigError
-from hilctl.base.printable import printable
-from hilctl.base.quantity import quantity, significant
+from hilctl.base.formatting import printable, quantity, significant
 from hilctl.models.base import HysteresisModel
 from hilctl.models.files import parse_model
 from hilctl.recording.data import Recording

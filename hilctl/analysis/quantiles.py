@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from hilctl.base.arrays import F64, I64
+from hilctl.base.types import F64, I64
 
 MOST_EXACT = 2**21
 """Most values that are kept as they are; percentiles of more are right to 6e-5 of their size."""

@@ -11,10 +11,10 @@ import numpy as np
 import numpy.typing as npt
 
 from hilctl.analysis.predicted import ErrorPrediction, PredictedError
-from hilctl.base.arrays import F64, U32
 from hilctl.base.errors import DataError, ModelError
 from hilctl.base.events import INVERSE, Event
 from hilctl.base.samples import NO_WAVEFORM, Flag, Samples
+from hilctl.base.types import F64, U32
 from hilctl.base.yaml import Document
 from hilctl.experiment.file import Experiment
 from hilctl.loop.compensator import Compensator

@@ -11,12 +11,12 @@ from hilctl.analysis.figures import RunReport, SegmentReport
 from hilctl.analysis.processes import processes_of
 from hilctl.analysis.segment_figures import SegmentGathering
 from hilctl.analysis.steady import judged, waveform_end
-from hilctl.base.arrays import F64
 from hilctl.base.errors import DataError
 from hilctl.base.events import ADAPTED, CHANGES, MARK, Event
 from hilctl.base.metrics import Fold
 from hilctl.base.samples import LAST_SAMPLE, NO_WAVEFORM, Flag, Samples
 from hilctl.base.segments import Segment
+from hilctl.base.types import F64
 from hilctl.recording.data import Recording
 
 _LIMITED = Flag.RANGE_LIMITED | Flag.SLEW_LIMITED | Flag.INVALID

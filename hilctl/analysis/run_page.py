@@ -6,13 +6,13 @@ from pathlib import Path
 import numpy as np
 
 from hilctl.analysis import html, loops, plots, table
-from hilctl.analysis.definitions import definitions_of
 from hilctl.analysis.figures import RunReport
+from hilctl.analysis.html import definitions_of
 from hilctl.analysis.provenance import FAULT, provenance_rows
 from hilctl.analysis.report import worst_segment
 from hilctl.analysis.sheet import Sheet
 from hilctl.base.events import Event
-from hilctl.base.quantity import quantity
+from hilctl.base.formatting import quantity
 from hilctl.recording.data import Recording
 
 _MOST_EVENTS = 200

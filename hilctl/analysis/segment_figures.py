@@ -8,9 +8,9 @@ from hilctl.analysis.figures import SegmentReport
 from hilctl.analysis.quantiles import Quantiles
 from hilctl.analysis.steady import trusted
 from hilctl.base import metrics
-from hilctl.base.arrays import F64, I64
 from hilctl.base.samples import Samples
 from hilctl.base.segments import Segment
+from hilctl.base.types import F64, I64
 from hilctl.recording.data import Recording
 
 

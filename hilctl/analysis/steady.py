@@ -5,11 +5,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from hilctl.base.arrays import F64
 from hilctl.base.events import CHANGES, Event
 from hilctl.base.metrics import Fold, fold
 from hilctl.base.samples import NO_WAVEFORM, Flag, Samples
 from hilctl.base.segments import Segment
+from hilctl.base.types import F64
 from hilctl.recording.data import Recording
 
 

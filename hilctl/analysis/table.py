@@ -3,8 +3,7 @@
 from hilctl.analysis.figures import RunReport, SegmentReport
 from hilctl.analysis.processes import usage_text
 from hilctl.base.events import adapted_text
-from hilctl.base.printable import printable
-from hilctl.base.quantity import MISSING, quantity
+from hilctl.base.formatting import MISSING, printable, quantity
 
 SIMULATED = "simulated: no hardware was driven"
 

@@ -3,8 +3,8 @@
 import numpy as np
 
 from hilctl.analysis.quantiles import MOST_EXACT, Quantiles
-from hilctl.base.arrays import I64
 from hilctl.base.errors import DataError
+from hilctl.base.types import I64
 from hilctl.loop.pacer import USUAL_MISSED_SHARE, deadline_misses
 from hilctl.recording.data import Recording, Ticks
 

@@ -14,7 +14,7 @@ from hilctl.run.protocol import InverseState
 from hilctl.run.run_folder import RunFolder
 
 if TYPE_CHECKING:
-    from hilctl.desk.subscription import RunFrame
+    from hilctl.desk.frames import RunFrame
 
 
 def connect(run: str | None = None) -> "RunConnection":
@@ -107,7 +107,7 @@ class RunConnection:
             if not least <= value <= 1e5:
                 raise InputError(f"{name}: must be from {least:g} to 100000 s: got {value:g}")
         from hilctl.desk.feed import RunFeed
-        from hilctl.desk.subscription import frames_of
+        from hilctl.desk.frames import frames_of
 
         return frames_of(RunFeed(self._folder), every_s, window_s, time.monotonic, time.sleep)
 

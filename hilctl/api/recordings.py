@@ -289,7 +289,7 @@ def figures(
         DataError: A recording that was named can't be read.
     """
     from hilctl.analysis.vector import formats_of
-    from hilctl.series.files import draw_sheets, write_sheets
+    from hilctl.series.sheets import draw_sheets, write_sheets
 
     chosen = formats_of(formats)
     sheets = _sheets(paths_of(runs), model, on_progress)
@@ -309,7 +309,7 @@ def figures(
 def _sheets(
     runs: list[Path], model: PathLike | None, on_progress: Callable[[float, str], None]
 ) -> "list[Sheet]":
-    from hilctl.series.files import applying_sheets
+    from hilctl.series.sheets import applying_sheets
 
     if len(runs) > 1 or runs[0].is_dir() or model is not None:
         return applying_sheets(_series(runs, model, on_progress))

@@ -9,7 +9,7 @@ from hilctl.api.given import PathLike, Settings, path_or_none, texts_of
 
 if TYPE_CHECKING:
     from hilctl.base.device import DeviceInfo
-    from hilctl.base.units import CommandUnit
+    from hilctl.base.types import CommandUnit
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,18 +1,17 @@
 """What all rooms share; it knows none of them.
 
-arrays.py    array types, and long arrays piece by piece
-device.py    the contract of a device and of a clock; units.py  of its commands
+types.py     array types, the unit of commands, and long arrays in chunks
+device.py    the contract of a device and of a clock
 errors.py    every exception that is raised on purpose
 strict.py    base of every pydantic model; plain.py  stands in for it where nothing is checked
 files.py     texts, each read once; files written whole or not at all
-private.py   folders that belong to one user alone
+private.py   folders that belong to one user alone, and locks on files
 samples.py   a sample's columns and flags, and blocks of samples
 events.py    what a run records beside its samples
 segments.py  which samples of a run are judged
-exponential.py of a matrix, without SciPy
 metrics.py   pure: folding onto one cycle, peak hysteresis, loop area, errors, sensor noise
 remedy.py    what the system says of files and ports, and what to do about it
-printable.py texts from files as people may be shown them
+formatting.py  numbers with units, printable texts, and JSON
 text_table.py  columns of CSV and its relatives, mistakes with their line
 yaml/        plain YAML in, with the line of every value and all problems at once
 

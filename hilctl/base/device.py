@@ -8,10 +8,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
-from hilctl.base.arrays import F64
 from hilctl.base.errors import InputError
 from hilctl.base.strict import Strict
-from hilctl.base.units import CommandUnit
+from hilctl.base.types import F64, CommandUnit
 
 
 class DeviceOptions(Strict):

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hilctl.base.arrays import F64, I64
+from hilctl.base.types import F64, I64
 
 MAX_BINS = 1000
 """Most phase bins of an average cycle: at 1000 a sine's peak loses 2e-6 of its amplitude."""

@@ -11,8 +11,7 @@ from typing import Annotated, Literal, Self, TypeAlias, get_type_hints
 import numpy as np
 import numpy.typing as npt
 
-from hilctl.base.arrays import F64, I64, U32
-from hilctl.base.units import CommandUnit
+from hilctl.base.types import F64, I64, U32, CommandUnit
 
 LAST_SAMPLE = 2**40
 """No index reaches it: a hundred million samples, and a safe ramp of an hour at 1 MHz."""

@@ -20,9 +20,9 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from hilctl.base.arrays import F64
 from hilctl.base.errors import DataError
 from hilctl.base.files import read_text
+from hilctl.base.types import F64
 
 Column: TypeAlias = str | int
 """A column by its name, or by its number from 1."""

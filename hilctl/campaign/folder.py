@@ -8,7 +8,7 @@ from pathlib import Path
 from mcap.writer import MCAP0_MAGIC
 
 from hilctl.base.errors import ConfigError, DataError, InputError
-from hilctl.base.locks import HAS_LOCKS, take_lock
+from hilctl.base.private import HAS_LOCKS, take_lock
 from hilctl.base.yaml import load_document
 from hilctl.campaign.steps import CampaignSteps, base_problem, settings_of
 from hilctl.experiment.parts import RecordingConfig

@@ -29,7 +29,7 @@ from hilctl.run.step import OnPart, RunKey, StepStoppedError, paced
 from hilctl.series.collect import series_of
 from hilctl.series.columns import COMPLETED
 from hilctl.series.digest import digest_of
-from hilctl.series.drift import SeriesDrift, drift_of
+from hilctl.series.run_figures import SeriesDrift, drift_of
 
 HARMLESS = frozenset({"late", "dropped", "invalid_command"})
 """Codes of events that end a run, and say nothing of device or rig: the next step may do better."""

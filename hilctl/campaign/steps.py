@@ -13,8 +13,8 @@ from hilctl.base.files import TextFiles
 from hilctl.base.yaml import Document, Loc, dotted, load_document
 from hilctl.campaign.file import CampaignFile
 from hilctl.campaign.vary import MOST_STEPS, Point, groups_of, points
+from hilctl.experiment.device import device_class, known_devices
 from hilctl.experiment.load import LoadedExperiment, named_from, resolve
-from hilctl.experiment.registry import device_class, known_devices
 
 _SEEDS = 1_000_000
 

@@ -6,10 +6,8 @@ steps.py       the steps in order: what each is for, how long it takes, what is 
 noise.py       pure: noise, drift and the first reaction
 response.py    pure: small-signal response; gain, delay, lag and resonance that explain it
 loops.py       pure: loops, reversal curves, what repeats, and how far amplitudes may grow
-gaps.py        what a run has skipped, filled in
 problem.py     what ends a campaign, each with what to do about it
 modelling.py   the model, and how far it is from a reference that it has not seen
-settings.py    what a step sets over the experiment file
 results.py     all that was found, and the verdict
 session.py     the steps, one run each; those that stand in the folder already are not run again
 plots.py       figures; page.py  the page

@@ -3,9 +3,8 @@
 import math
 from dataclasses import dataclass
 
-from hilctl.base.arrays import F64
 from hilctl.base.errors import InputError
-from hilctl.base.units import CommandUnit
+from hilctl.base.types import F64, CommandUnit
 from hilctl.experiment.forecast import CommandFigures
 from hilctl.experiment.load import LoadedExperiment
 

@@ -8,9 +8,9 @@ import numpy as np
 
 from hilctl.analysis.steady import steady_part
 from hilctl.base import metrics
-from hilctl.base.arrays import F64
 from hilctl.base.errors import DataError
 from hilctl.base.segments import Segment
+from hilctl.base.types import F64
 from hilctl.characterise.problem import RigProblemError
 from hilctl.recording.data import Recording
 

@@ -8,9 +8,9 @@ import numpy as np
 import numpy.typing as npt
 
 from hilctl.base import metrics
-from hilctl.base.arrays import F64
 from hilctl.base.segments import Segment
-from hilctl.characterise.gaps import without_gaps
+from hilctl.base.types import F64
+from hilctl.characterise.response import without_gaps
 from hilctl.characterise.results import UnseenReference
 from hilctl.identify.command import Identification, identify_records, settings_from
 from hilctl.identify.data.records import History

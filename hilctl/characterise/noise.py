@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 
 from hilctl.analysis.steady import steady_samples
-from hilctl.base.arrays import F64, I64
+from hilctl.base.types import F64, I64
 from hilctl.characterise.problem import RigProblemError
 from hilctl.learning.cycle import coefficients
 from hilctl.recording.data import Recording

@@ -5,8 +5,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from hilctl.analysis.html import document, grid, wide_figure, write_page
-from hilctl.base.printable import printable
-from hilctl.base.quantity import quantity, significant
+from hilctl.base.formatting import printable, quantity, significant
 from hilctl.characterise import plots
 from hilctl.characterise.results import Characterisation, Measured, UnseenReference
 from hilctl.characterise.waveforms import CREEP_S

@@ -19,7 +19,7 @@ from hilctl.analysis.canvas import (
     legend,
     min_max,
 )
-from hilctl.base.arrays import F64
+from hilctl.base.types import F64
 from hilctl.characterise.loops import LoopFigures, ReversalCurves
 from hilctl.characterise.response import SmallSignal
 from hilctl.characterise.results import UnseenReference

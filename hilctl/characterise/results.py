@@ -7,7 +7,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from hilctl.base.arrays import F64
+from hilctl.base.types import F64
 from hilctl.characterise.loops import LoopFigures, Repeatability, ReversalCurves
 from hilctl.characterise.noise import RestNoise, SineReaction
 from hilctl.characterise.response import SmallSignal

@@ -7,31 +7,81 @@ that step done: a campaign that was killed goes on where it was, and loses one s
 import json
 import shutil
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TypeAlias
 
-from hilctl.base.arrays import F64
 from hilctl.base.errors import DataError, InputError, RunError
 from hilctl.base.files import check_writable, write_text
+from hilctl.base.types import F64, CommandUnit
+from hilctl.base.yaml import Document, load_document
 from hilctl.characterise.limits import CampaignLimits, limits_of
 from hilctl.characterise.modelling import identified, judged
 from hilctl.characterise.problem import RigProblemError
 from hilctl.characterise.results import Characterisation, Measured, StepRow
-from hilctl.characterise.settings import unit_of, waveform_setting, without_reference
 from hilctl.characterise.steps import STEPS, CampaignStep
 from hilctl.characterise.waveforms import Keys, at_rest, within
 from hilctl.experiment.heat import CoolingCoil, RunHeat
 from hilctl.experiment.history import heat_before
 from hilctl.experiment.load import load_experiment
+from hilctl.loop.interlocks import InterlockSettings, Needs
 from hilctl.models.files import dump_model
 from hilctl.recording.data import Recording
 from hilctl.recording.reader import read
 from hilctl.run.result import RunResult
 from hilctl.run.start import checked_experiment
 from hilctl.run.step import OnPart, RunKey, StepStoppedError, paced, unpaced
+
+
+def waveform_setting(keys: Keys) -> str:
+    """Return the ``key=value`` text that has an experiment run a waveform."""
+    return f"waveform={json.dumps(keys)}"
+
+
+def unit_of(experiment: Path, settings: Sequence[str]) -> CommandUnit:
+    """Return the unit of the commands that an experiment limits."""
+    return "V" if _document(experiment, settings).holds(("limits", "drive_v")) else "A"
+
+
+def without_reference(experiment: Path, settings: Sequence[str]) -> list[str]:
+    """Return settings that take out what needs a compensator: a step has none.
+
+    Args:
+        experiment: Experiment file.
+        settings: ``key=value`` texts over it.
+
+    Raises:
+        InputError: The file can't be read.
+        ConfigError: It is no YAML, or a text is none of these.
+    """
+    document = _document(experiment, settings)
+    found = ["compensator=none"]
+    found += [f"{key}=null" for key in ("feedback", "adaptation") if document.holds((key,))]
+    return found + [
+        f"limits.{key}=null" for key in _tracking_keys() if document.holds(("limits", key))
+    ]
+
+
+def _document(experiment: Path, settings: Sequence[str]) -> Document:
+    document = load_document(experiment)
+    for setting in settings:
+        document.set(setting)
+    return document
+
+
+def _tracking_keys() -> Iterator[str]:
+    """Give the interlocks that need a reference, and those that need one of them."""
+    known = {
+        key: [each for each in field.metadata if isinstance(each, Needs)]
+        for key, field in InterlockSettings.model_fields.items()
+    }
+    tracking = {key for key, needs in known.items() if any(each.reference_um for each in needs)}
+    for key, needs in known.items():
+        if key in tracking or any(each.key in tracking for each in needs):
+            yield key
+
 
 StepRunner: TypeAlias = Callable[[Path, Sequence[str], Path, OnPart], RunResult]
 """Runs an experiment file with settings into a recording, over one that stands there."""

@@ -10,7 +10,7 @@ from typing import Any, TypeAlias
 
 from pydantic import TypeAdapter
 
-from hilctl.base.arrays import F64
+from hilctl.base.types import F64
 from hilctl.characterise.limits import CampaignLimits, round_hz
 from hilctl.waveforms.build import Reference, build
 from hilctl.waveforms.spec import AnyWaveform

@@ -10,8 +10,7 @@ from rich.console import Console, ConsoleOptions, RenderableType
 from rich.segment import Segment
 from rich.text import Text
 
-from hilctl.base.printable import printable
-from hilctl.base.quantity import quantity
+from hilctl.base.formatting import printable, quantity
 from hilctl.cli.streams import PlainStream
 from hilctl.cli.volume import Volume
 

@@ -10,8 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from hilctl.analysis.catalogue import Entry, keys_of, read_catalogue, select
-from hilctl.base.finite_json import finite_json
-from hilctl.base.printable import printable, short_name
+from hilctl.base.formatting import finite_json, printable, short_name
 from hilctl.cli.options import AsJson
 from hilctl.cli.output import finish_orphans
 from hilctl.recording.facts import LABELS_FACT, RECORDINGS

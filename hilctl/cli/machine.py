@@ -54,7 +54,7 @@ def schema(
     as_json: AsJson = False,
 ) -> None:
     """Print the JSON schema of experiment files, for editors."""
-    from hilctl.experiment.schema import schema_text
+    from hilctl.experiment.inventory import schema_text
 
     del as_json  # it is JSON either way
     if output is None:

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from hilctl.base.finite_json import finite_json
+from hilctl.base.formatting import finite_json
 
 
 def print_json(value: dict[str, Any]) -> None:

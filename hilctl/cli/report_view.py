@@ -8,7 +8,7 @@ from rich.text import Text
 
 from hilctl.analysis.figures import RunReport
 from hilctl.analysis.table import quality_rows, run_rows, segment_table
-from hilctl.base.printable import printable
+from hilctl.base.formatting import printable
 
 _MOST_MINUTES = 20
 _COUNTS = {"minute", "ticks"}

@@ -13,7 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from hilctl.base.events import adapted_text
-from hilctl.base.quantity import unit_text
+from hilctl.base.formatting import unit_text
 from hilctl.cli.console import console
 
 if TYPE_CHECKING:

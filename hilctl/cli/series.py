@@ -66,7 +66,7 @@ def report_series(
     from hilctl.cli.console import print_rich
     from hilctl.cli.progress import shown_progress
     from hilctl.cli.series_view import render_series
-    from hilctl.series.result import series_mapping
+    from hilctl.series.page import series_mapping
 
     with shown_progress("read", quiet=as_json) as on_progress:
         series = api.report_runs(

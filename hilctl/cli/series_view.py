@@ -4,7 +4,7 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
-from hilctl.base.printable import printable
+from hilctl.base.formatting import printable
 from hilctl.series.collect import RunSeries
 from hilctl.series.headline import headline
 from hilctl.series.page import MOST_ROWS, run_table

@@ -60,8 +60,8 @@ def init(
 
 
 def _chosen_device(*, asks: bool) -> str:
+    from hilctl.experiment.device import known_devices
     from hilctl.experiment.inventory import shipped_profiles
-    from hilctl.experiment.registry import known_devices
 
     names = [name for name in known_devices() if name.startswith("simulated_")]
     names += shipped_profiles()

@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from typing import TextIO
 
-from hilctl.base.printable import printable
+from hilctl.base.formatting import printable
 
 _READER_IS_GONE = {errno.EPIPE, errno.EIO}
 """A pipe closed early, a terminal hung up: whoever read has chosen to read no more."""

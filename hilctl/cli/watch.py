@@ -22,16 +22,15 @@ from rich.text import Text
 
 from hilctl.base.errors import HilctlError, RunError
 from hilctl.base.events import Event
-from hilctl.base.printable import printable
+from hilctl.base.formatting import printable
 from hilctl.cli.console import console
 from hilctl.cli.streams import plain_streams
 from hilctl.desk.feed import RunFeed
 from hilctl.desk.scope import WINDOWS_S
 from hilctl.desk.signals import ROW
-from hilctl.run.client import find_run, mark_run, set_run
-from hilctl.run.protocol import MAX_MARK
+from hilctl.run.client import find_run, mark_run, request_stop, set_run
+from hilctl.run.protocol import JOB_CONTROL, MAX_MARK
 from hilctl.run.run_folder import RunFolder, runs
-from hilctl.run.stopping import JOB_CONTROL, request_stop
 
 _FRAME_S, _SEARCH_S, _END_S, _OVER_S = 0.15, 0.05, 2.0, 0.5
 _LINE_FRAMES, _EVENTS, _MIN_WIDTH, _MIN_HEIGHT = 7, 3, 40, 14

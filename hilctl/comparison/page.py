@@ -14,7 +14,7 @@ from matplotlib.figure import Figure, SubFigure
 
 from hilctl.analysis.canvas import DISPLACEMENT, QUIET, REFERENCE, STYLE
 from hilctl.analysis.html import document, grid, wide_figure, write_page
-from hilctl.base.arrays import F64
+from hilctl.base.types import F64
 from hilctl.comparison.compare import ComparedModel, Comparison
 from hilctl.comparison.summary import headings, notes, table_rows, titles
 from hilctl.identify.data.records import SteadyLoop

@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 
 from hilctl.base import metrics
-from hilctl.base.arrays import F64, U32
 from hilctl.base.errors import DeviceError, InputError
 from hilctl.base.samples import Flag
+from hilctl.base.types import F64, U32
 from hilctl.experiment.initial_state import begin
 from hilctl.experiment.load import LoadedExperiment
 from hilctl.identify.data.records import SteadyLoop

@@ -10,18 +10,88 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from hilctl.base.errors import RunError
 from hilctl.base.events import Event
+from hilctl.base.samples import Batch, Head
+from hilctl.base.types import F64, I64
 from hilctl.desk.figures import FigureValues, RunningFigures
 from hilctl.desk.headroom import Gauge, Headroom
-from hilctl.desk.lateness import EDGES_US, LatenessCounts
 from hilctl.desk.scope import Scope
-from hilctl.desk.signals import Traces, traces_of
-from hilctl.desk.spectrum import ErrorSpectrum
+from hilctl.desk.signals import ROW, Traces, traces_of
 from hilctl.run.description import RunDescription
 from hilctl.run.ring import SampleRing
 from hilctl.run.run_folder import RunFolder
 from hilctl.run.shared_page import Field, Phase
+
+_SAMPLES = 16384
+_POINTS = 240
+
+
+class ErrorSpectrum:
+    """Amplitudes of what the newest samples of the error are made of.
+
+    Args:
+        sample_rate_hz: Samples a second.
+    """
+
+    def __init__(self, sample_rate_hz: float) -> None:
+        self._rate_hz = sample_rate_hz
+        self._newest = np.empty(0)
+
+    def add(self, traces: Traces) -> None:
+        """Take the next samples; what has no error, or comes after a gap, begins anew."""
+        error_um = traces.values[ROW["error"]]
+        broken = ~np.isfinite(error_um)
+        if broken.any():
+            last = int(np.flatnonzero(broken)[-1])
+            self._newest, error_um = np.empty(0), error_um[last + 1 :]
+        self._newest = np.concatenate((self._newest, error_um))[-_SAMPLES:]
+
+    def points(self) -> tuple[F64, F64]:
+        """Return frequencies in Hz and amplitudes in um, each the largest of its neighbours.
+
+        Both float64[k]; empty before there are 256 samples. A line of a sine of 1 um is 1 um high.
+        """
+        size = 1 << (self._newest.size.bit_length() - 1) if self._newest.size else 0
+        if size < 256:
+            return np.empty(0), np.empty(0)
+        window = np.hanning(size)
+        error_um = self._newest[-size:]
+        lines_um = np.abs(np.fft.rfft((error_um - error_um.mean()) * window))
+        lines_um *= 2.0 / window.sum()
+        # By the largest: a line must not vanish among its neighbours.
+        edges = np.unique(np.geomspace(1, lines_um.size, _POINTS).astype(np.int64))[:-1]
+        largest_um: F64 = np.maximum.reduceat(lines_um, edges)
+        return edges.astype(np.float64) * np.float64(self._rate_hz / size), largest_um
+
+
+EDGES_US: F64 = np.concatenate(([0.0], np.geomspace(1.0, 1e6, 31)))
+"""Edges of the histogram's bins; what is later is in the last one."""
+_TICKS = 20_000
+
+
+class LatenessCounts:
+    """Histogram of the whole run, as far as it was seen, and percentiles of its newest ticks."""
+
+    def __init__(self) -> None:
+        self.counts: I64 = np.zeros(EDGES_US.size - 1, dtype=np.int64)
+        self._newest_us: F64 = np.empty(0)
+
+    def add(self, batch: Batch) -> None:
+        """Take the next blocks."""
+        late_us = np.maximum(batch.heads[:, Head.LATE_NS] * 1e-3, 0.0)
+        self.counts += np.histogram(np.minimum(late_us, EDGES_US[-1]), EDGES_US)[0]
+        self._newest_us = np.concatenate((self._newest_us, late_us))[-_TICKS:]
+
+    def percentiles_us(self) -> dict[str, float]:
+        """Return ``p50``, ``p99`` and ``max`` of the newest ticks; nothing before the first."""
+        if not self._newest_us.size:
+            return {}
+        p50, p99, most = np.percentile(self._newest_us, (50.0, 99.0, 100.0))
+        return {"p50": float(p50), "p99": float(p99), "max": float(most)}
+
 
 _EVENTS = 60
 _LOOK_S = 0.5  # so often the run's locks and the disk are looked at

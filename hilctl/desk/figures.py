@@ -8,7 +8,6 @@ from typing import TypeAlias
 
 import numpy as np
 
-from hilctl.base.arrays import F64, I64
 from hilctl.base.metrics import (
     Folding,
     noise_floor_percent,
@@ -21,6 +20,7 @@ from hilctl.base.metrics import (
 )
 from hilctl.base.samples import NO_WAVEFORM, Flag
 from hilctl.base.segments import Segment
+from hilctl.base.types import F64, I64
 from hilctl.desk.signals import ROW, Traces
 
 FigureValues: TypeAlias = dict[str, float | None]

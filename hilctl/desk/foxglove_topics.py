@@ -13,8 +13,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from hilctl.base.arrays import F64
 from hilctl.base.samples import COLUMNS
+from hilctl.base.types import F64
 from hilctl.desk.feed import RunFeed
 from hilctl.desk.signals import ROW
 from hilctl.recording.messages import Encoded, MessageMaker, RecordingLayout

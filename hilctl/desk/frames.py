@@ -8,10 +8,15 @@ float32 little endian  t_s[n], low[signals, n], high[signals, n], input[loop], o
 
 import json
 import struct
-from typing import Literal, TypeAlias
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
+from hilctl.base.events import Event
+from hilctl.base.types import F64
+from hilctl.desk.feed import RunFeed
 from hilctl.desk.scope import WINDOWS_S, Scope
 from hilctl.desk.signals import SIGNALS
 
@@ -49,3 +54,55 @@ def frame_of(scope: Scope, mode: ScopeMode, window_s: float) -> bytes:
     parts = (window.t_s, window.buckets.low, window.buckets.high, loops)
     values = np.concatenate([np.ravel(part) for part in parts]).astype("<f4")
     return struct.pack("<I", len(header)) + header + values.tobytes()
+
+
+@dataclass(frozen=True, slots=True)
+class RunFrame:
+    """A run at one time.
+
+    Attributes:
+        status: Where it stands: figures, limits, lateness; see :meth:`RunFeed.status`.
+        events: Those since the frame before.
+        t_s: float64[n], beginning of each bucket of samples, up to 0 for the newest.
+        low: Lowest value in each bucket by signal, float64[n]; NaN where there is none.
+        high: Highest value, likewise: no spike is lost.
+    """
+
+    status: dict[str, Any]
+    events: list[Event]
+    t_s: F64
+    low: dict[str, F64]
+    high: dict[str, F64]
+
+
+def frames_of(
+    feed: RunFeed,
+    every_s: float,
+    window_s: float,
+    clock: Callable[[], float],
+    sleep: Callable[[float], None],
+) -> Iterator[RunFrame]:
+    """Give frames of a run until it is over, the last of them after its end.
+
+    Args:
+        feed: The run.
+        every_s: Time from one frame to the next; one that is taken late does not hurry the next.
+        window_s: Time that each shows; the nearest that is kept.
+        clock: Monotonic time in s.
+        sleep: Lets that many s pass.
+    """
+    window_s, seen = nearest_window_s(window_s), 0
+    while True:
+        began_s = clock()
+        feed.poll(began_s)
+        ended = feed.ended
+        events, seen = feed.events_since(seen)
+        window = feed.scope.rolling(window_s)
+        low, high = (
+            {signal.name: values[row] for row, signal in enumerate(SIGNALS)}
+            for values in (window.buckets.low, window.buckets.high)
+        )
+        yield RunFrame(feed.status(), events, window.t_s, low, high)
+        if ended:
+            return
+        sleep(max(0.0, began_s + every_s - clock()))

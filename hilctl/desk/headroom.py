@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 
-from hilctl.base.arrays import F64, I64
+from hilctl.base.types import F64, I64
 from hilctl.desk.signals import ROW, Traces
 from hilctl.run.description import LimitBounds, RunDescription
 

@@ -11,26 +11,72 @@ import socket
 import time
 from collections.abc import Callable, Sequence
 from contextlib import AsyncExitStack, ExitStack, suppress
+from functools import cache
 from http import HTTPStatus
+from importlib.resources import files
 from typing import Any
 
 from websockets.asyncio.server import ServerConnection, serve
+from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 from websockets.typing import Subprotocol
 
 from hilctl.base.errors import HilctlError, InputError, RunError
-from hilctl.base.finite_json import finite_json
+from hilctl.base.formatting import finite_json
 from hilctl.base.remedy import ADDRESS_REMEDIES, reason
 from hilctl.desk.admission import PROTOCOL, Admission, PendingConnections, bounded
 from hilctl.desk.feed import RunFeed
 from hilctl.desk.feeds import RunFeeds
 from hilctl.desk.frames import frame_of, nearest_window_s
 from hilctl.desk.signals import SIGNALS
-from hilctl.desk.static import file_response, plain_response
 from hilctl.desk.viewer import MAX_MESSAGE_BYTES, PageMessage, Viewer, answer_text
-from hilctl.run.control_socket import ask
+from hilctl.run.client import ask, request_stop
 from hilctl.run.run_folder import RunFolder
-from hilctl.run.stopping import request_stop
+
+FILES = {
+    "/": ("index.html", "text/html; charset=utf-8"),
+    "/live.js": ("live.js", "text/javascript; charset=utf-8"),
+    "/icon.svg": ("icon.svg", "image/svg+xml"),
+    "/live.css": ("live.css", "text/css; charset=utf-8"),
+    "/uplot.js": ("uplot/uPlot.iife.min.js", "text/javascript; charset=utf-8"),
+    "/uplot.css": ("uplot/uPlot.min.css", "text/css; charset=utf-8"),
+}
+"""Path of each, its file and its type."""
+_HEADERS = {
+    "Content-Security-Policy": "default-src 'self'; base-uri 'none'; form-action 'none'; "
+    "frame-ancestors 'none'",
+    "X-Content-Type-Options": "nosniff",
+    "X-Frame-Options": "DENY",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Cache-Control": "no-store",
+    "Connection": "close",
+}
+
+
+@cache
+def _content(name: str) -> bytes:
+    return files("hilctl.desk").joinpath("page", name).read_bytes()
+
+
+def file_response(path: str) -> Response:
+    """Return the file at a path; 404 where there is none."""
+    if path not in FILES:
+        return plain_response(HTTPStatus.NOT_FOUND, "no such file")
+    name, kind = FILES[path]
+    return _response(HTTPStatus.OK, kind, _content(name))
+
+
+def plain_response(status: HTTPStatus, text: str) -> Response:
+    """Return a line of text."""
+    return _response(status, "text/plain; charset=utf-8", f"{text}\n".encode())
+
+
+def _response(status: HTTPStatus, kind: str, body: bytes) -> Response:
+    more = {"Content-Type": kind, "Content-Length": str(len(body))}
+    return Response(status.value, status.phrase, Headers({**_HEADERS, **more}), body)
+
 
 _log = logging.getLogger(__name__)
 

@@ -5,8 +5,8 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
-from hilctl.base.arrays import F64, I64, U32
 from hilctl.base.samples import Batch
+from hilctl.base.types import F64, I64, U32
 
 SignalUnit: TypeAlias = Literal["um", "command"]
 

@@ -13,7 +13,7 @@ from pydantic import Field, ValidationError
 from websockets.asyncio.server import ServerConnection
 from websockets.exceptions import ConnectionClosed
 
-from hilctl.base.finite_json import finite_json
+from hilctl.base.formatting import finite_json
 from hilctl.base.strict import Strict
 from hilctl.desk.frames import ScopeMode
 

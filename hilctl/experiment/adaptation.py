@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hilctl.base.arrays import F64
 from hilctl.base.errors import Problem
 from hilctl.base.segments import Segment
+from hilctl.base.types import F64
 from hilctl.experiment.feedback import LOOP_DELAY, delays
 from hilctl.experiment.file import Experiment
 from hilctl.loop.adaptation import Adaptation, AdaptationBounds, DisplacementOperator

@@ -11,8 +11,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hilctl.base.arrays import F64
+from hilctl.base.device import DeviceInfo
 from hilctl.base.errors import ConfigError, DataError, InputError, ModelError, Problem
+from hilctl.base.types import F64
 from hilctl.experiment.adaptation import (
     adaptation_problems,
     adaptation_warnings,
@@ -22,6 +23,7 @@ from hilctl.experiment.adaptation import (
 )
 from hilctl.experiment.condition import condition_problems, conditioning_of, measures_offset
 from hilctl.experiment.feedback import feedback_problems
+from hilctl.experiment.file import Experiment
 from hilctl.experiment.forecast import Forecast, forecast_of
 from hilctl.experiment.heat import CoolingCoil
 from hilctl.experiment.history import heat_before, left_by_last_run
@@ -35,11 +37,31 @@ from hilctl.experiment.initial_state import (
 from hilctl.experiment.interlocks import interlock_problems
 from hilctl.experiment.load import LoadedExperiment
 from hilctl.experiment.model_range import RangeFindings, range_findings
-from hilctl.experiment.pace import pace_warnings
 from hilctl.loop.adaptation import DisplacementOperator
 from hilctl.loop.compensator import Compensator
 from hilctl.loop.conditioning import Conditioning
 from hilctl.waveforms.build import Reference, build
+
+SHORTEST_TICK_S = 1e-4
+"""Shortest tick that timers keep on most machines: an idle CPU takes from a few us to a tenth of a
+millisecond to wake."""
+
+
+def pace_warnings(config: Experiment, info: DeviceInfo) -> tuple[str, ...]:
+    """Return a warning if many ticks will be late.
+
+    Args:
+        config: The experiment.
+        info: What its device says of itself: one that plays blocks from a FIFO keeps the pace.
+    """
+    if info.latency_blocks or config.tick_s >= SHORTEST_TICK_S:
+        return ()
+    remedy = "Use a larger block." if info.buffered else "Use a lower rate."
+    return (
+        f"sample_rate_hz: {1.0 / config.tick_s:g} ticks per second: on most machines timers wake "
+        f"the loop too late for some of them. {remedy}",
+    )
+
 
 _log = logging.getLogger(__name__)
 

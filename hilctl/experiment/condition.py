@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hilctl.base.arrays import F64
 from hilctl.base.errors import Problem
+from hilctl.base.types import F64
 from hilctl.experiment.file import Experiment
 from hilctl.experiment.parts import REST_S
 from hilctl.experiment.run_parts import RunParts

@@ -13,11 +13,11 @@ from typing import Annotated, Any
 import numpy as np
 import numpy.typing as npt
 
-from hilctl.base.arrays import C128, CHUNK, F64, I64
 from hilctl.base.errors import InputError
 from hilctl.base.files import TextFiles, write_text
 from hilctl.base.segments import Segment
 from hilctl.base.strict import Field, Strict, model_validator
+from hilctl.base.types import C128, CHUNK, F64, I64
 from hilctl.base.yaml import dump, load_document
 from hilctl.models.base import HysteresisModel
 from hilctl.models.files import dump_model

@@ -14,8 +14,7 @@ from hilctl.base.errors import Problem
 from hilctl.experiment.file import Experiment
 from hilctl.experiment.parts import IntegralFeedbackConfig, PiFeedbackConfig
 from hilctl.loop.compensator import Compensator
-from hilctl.loop.feedback import Controller, Feedback, Gains
-from hilctl.loop.integral import IntegralFeedback
+from hilctl.loop.feedback import Controller, Feedback, Gains, IntegralFeedback
 
 if TYPE_CHECKING:  # the loop's process has no use for what it imports
     from hilctl.experiment.load import LoadedExperiment

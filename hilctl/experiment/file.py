@@ -4,11 +4,11 @@ from typing import Annotated, Any, Literal, TypeVar
 
 from hilctl.base.strict import BeforeValidator, Field, Strict
 from hilctl.experiment.labels import Labels
-from hilctl.experiment.limits import Limits
 from hilctl.experiment.parts import (
     AdaptationConfig,
     Condition,
     FeedbackConfig,
+    Limits,
     Name,
     RecordingConfig,
     Timing,

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from hilctl.base.arrays import F64
+from hilctl.base.types import F64
 from hilctl.experiment.file import Experiment
 from hilctl.experiment.heat import CoilHeat, RunHeat
 from hilctl.experiment.initial_state import Begun

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hilctl.base.arrays import F64
 from hilctl.base.samples import Flag, Samples
+from hilctl.base.types import F64
 from hilctl.experiment.file import Experiment
-from hilctl.experiment.limits import Limits
+from hilctl.experiment.parts import Limits
 from hilctl.kernels.interlock import heat_block
 from hilctl.loop.interlocks import warming
 

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hilctl.base.arrays import F64
 from hilctl.base.errors import DataError
 from hilctl.base.samples import Flag
+from hilctl.base.types import F64
 from hilctl.loop.compensator import Compensator
 from hilctl.models.base import HysteresisModel
 

@@ -1,14 +1,17 @@
-"""Which devices there are: by name, by profile, by serial port."""
+"""List devices by name, profile and serial port; make the JSON schema of experiment files."""
 
+import json
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import Any, cast
 
+from hilctl.base.device import DeviceOptions
 from hilctl.base.errors import InputError
 from hilctl.base.yaml import did_you_mean, load_document
-from hilctl.experiment.registry import device_class, known_devices
+from hilctl.experiment.device import device_class, known_devices
+from hilctl.experiment.file import Experiment
 
 SHIPPED_PROFILES = "hilctl_drivers.profile:shipped_profiles"
 
@@ -134,3 +137,25 @@ def _serial_ports() -> tuple[SerialPort, ...]:
         SerialPort(by_id.get(port.device, port.device), port.description)
         for port in sorted(comports())
     )
+
+
+def experiment_schema() -> dict[str, Any]:
+    """Return the JSON schema of experiment files, with the options of all known devices."""
+    schema = Experiment.model_json_schema()
+    definitions = schema["$defs"]
+    choices = []
+    for kind in known_devices():
+        options: type[DeviceOptions] = device_class(kind).Options
+        part = options.model_json_schema()
+        definitions.update(part.pop("$defs", {}))
+        part["properties"] = {"kind": {"const": kind}, **part.get("properties", {})}
+        part["required"] = ["kind", *part.get("required", [])]
+        definitions[f"device_{kind}"] = part
+        choices.append({"$ref": f"#/$defs/device_{kind}"})
+    schema["properties"]["device"] = {"oneOf": choices, "description": "kind and its options"}
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}
+
+
+def schema_text() -> str:
+    """Return the JSON schema as the text of ``configs/schema.json``."""
+    return json.dumps(experiment_schema(), indent=1, sort_keys=True) + "\n"

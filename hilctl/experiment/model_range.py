@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hilctl.base.arrays import F64, chunks
 from hilctl.base.segments import Segment
+from hilctl.base.types import F64, chunks
 from hilctl.models.base import IdentifiedRange
 from hilctl.waveforms.build import Reference
 from hilctl.waveforms.shapes import LONG, telling_samples

@@ -1,4 +1,4 @@
-"""Common types of the experiment file, and its parts about the machine: time, recording, CPU."""
+"""Common types of the experiment file, and its sections: limits, timing, recording, real time."""
 
 import re
 from typing import Annotated, Any, Literal, Self, TypeAlias
@@ -11,6 +11,8 @@ from hilctl.base.strict import (
     WithJsonSchema,
     model_validator,
 )
+from hilctl.base.types import CommandUnit
+from hilctl.loop.interlocks import InterlockSettings
 from hilctl.loop.pacer import USUAL_MISSED_SHARE
 from hilctl.recording.facts import RECORDINGS
 
@@ -182,7 +184,7 @@ class PiFeedbackConfig(_AnyFeedback):
 
 
 class IntegralFeedbackConfig(_AnyFeedback):
-    """An integrator of the mean error of each block, for every device: see loop/integral.py.
+    """An integrator of the mean error of each block, for every device: see loop/feedback.py.
 
     Attributes:
         bandwidth_hz: Frequency below which offset, creep and drift are taken out; a disturbance
@@ -223,3 +225,52 @@ FeedbackConfig: TypeAlias = Annotated[
     Annotated[PiFeedbackConfig | IntegralFeedbackConfig, Field(discriminator="kind")],
     BeforeValidator(_pi_where_not_said),
 ]
+
+
+class Limits(InterlockSettings):
+    """What the limiter and the interlocks hold the run to; the limiter is last before the device.
+
+    Attributes:
+        peak_current_a: Largest magnitude of the coil current, for devices driven in A.
+        slew_a_per_s: Fastest change of the coil current.
+        drive_v: Lowest and highest drive voltage, for devices driven in V.
+        slew_v_per_s: Fastest change of the drive voltage.
+        stroke_um: Displacements that the sensor may show; outside, the run ends by its safe ramp.
+    """
+
+    peak_current_a: Annotated[float, Field(gt=0.0)] | None = None
+    slew_a_per_s: Annotated[float, Field(gt=0.0)] | None = None
+    drive_v: Interval | None = None
+    slew_v_per_s: Annotated[float, Field(gt=0.0)] | None = None
+    stroke_um: Interval
+
+    @model_validator(mode="after")
+    def _one_unit(self) -> Self:
+        current = (self.peak_current_a, self.slew_a_per_s)
+        voltage = (self.drive_v, self.slew_v_per_s)
+        complete = None not in current or None not in voltage
+        mixed = any(v is not None for v in current) and any(v is not None for v in voltage)
+        if mixed or not complete:
+            raise ValueError(
+                "must have either peak_current_a and slew_a_per_s (a device driven in A) or "
+                "drive_v and slew_v_per_s (a device driven in V)"
+            )
+        return self
+
+    @property
+    def unit(self) -> CommandUnit:
+        """Unit of the commands that are limited."""
+        return "V" if self.drive_v is not None else "A"
+
+    @property
+    def command_range(self) -> tuple[float, float]:
+        """Lowest and highest command, in :attr:`unit`."""
+        if self.drive_v is not None:
+            return self.drive_v
+        peak = self.peak_current_a or 0.0
+        return -peak, peak
+
+    @property
+    def slew_per_s(self) -> float:
+        """Fastest change of the command, in :attr:`unit` a second."""
+        return self.slew_v_per_s or self.slew_a_per_s or 0.0

@@ -15,13 +15,12 @@ from typing import Any
 from hilctl.base.device import DeviceInfo
 from hilctl.base.errors import ConfigError, InputError, Problem
 from hilctl.base.files import TextFiles
-from hilctl.base.units import CommandUnit
+from hilctl.base.types import CommandUnit
 from hilctl.base.yaml import Document, commented, did_you_mean, dump
 from hilctl.experiment.check import check
-from hilctl.experiment.device import made_device
+from hilctl.experiment.device import known_devices, made_device
 from hilctl.experiment.inventory import describe, shipped_profiles
 from hilctl.experiment.load import resolve
-from hilctl.experiment.registry import known_devices
 
 STARTING_SECTION = "hilctl_drivers.starter:starting_section"
 _SCHEMA_LINE = "# yaml-language-server: $schema=schema.json"

@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from hilctl.base.arrays import F64
+from hilctl.base.types import F64
 from hilctl.experiment.load import LoadedExperiment
 from hilctl.loop.host import StraightLine
 

@@ -11,9 +11,9 @@ from typing import Protocol
 
 import numpy as np
 
-from hilctl.base.arrays import CHUNK, F64
+from hilctl.base.types import CHUNK, F64
 from hilctl.loop.compensator import Compensator
-from hilctl.waveforms.parts import Repeat
+from hilctl.waveforms.build import Repeat
 from hilctl.waveforms.shapes import LONG
 
 _MOST_PERIODS = 1024

@@ -1,22 +1,20 @@
 """Measured data in, model parameters out.
 
-command.py     identify from files; summary.py and page.py show what was found
+command.py     identify from files, with further modes; summary.py and page.py show what was found
 settings.py    every choice of a fit, once; the published ones
 catalogue.py   every kind of model: its name, how it is identified, what data that takes
 fit_model.py   fit a model of any kind, with its provenance
 job.py         what a fit takes, and what it returns
-judge.py       how far a model is from data
+judge.py       how far a model is from data; weights of loops by hysteresis
 held_out.py    the same on data that its fit did not see
 verdict.py     what a model is worth, or why it is none
 found_range.py the motions that it was identified on
 creep.py       creep, from rests; modes.py: further modes of the structure, from what a model leaves
-with_modes.py  a model with the modes that data held out are the better for
 candidates.py  the kind of model that does best on data held out
 model_size.py  number of plays by loops held out; lag of a table
 workers.py     independent fits over threads, processes or a Dask cluster
 fit_data.py    all data ready for the kernels
 linear.py      weights by bounded linear least squares; densities held smooth
-geometry.py    weights of loops by hysteresis
 
 data           loops and histories, from recordings and tables
 searched       thresholds searched from several starts

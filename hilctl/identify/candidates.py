@@ -6,7 +6,7 @@ from itertools import zip_longest
 from typing import Any
 
 from hilctl.base.errors import DataError
-from hilctl.base.units import CommandUnit
+from hilctl.base.types import CommandUnit
 from hilctl.identify.data.records import History, Record
 from hilctl.identify.held_out import HeldOut, held_out_error
 from hilctl.identify.job import OnProgress, ignore_progress

@@ -1,32 +1,88 @@
 """Identify from files: settings from texts, records in, the model written and judged."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, TypeVar
 
 from hilctl.base.errors import InputError
 from hilctl.base.files import check_writable, write_text
-from hilctl.base.units import CommandUnit
+from hilctl.base.types import CommandUnit
 from hilctl.base.yaml import Document
 from hilctl.identify.candidates import CandidateError, Choice, choose_kind
 from hilctl.identify.catalogue import entry
 from hilctl.identify.data.files import load_records
-from hilctl.identify.data.records import Record
+from hilctl.identify.data.records import History, Record
 from hilctl.identify.fit_model import FittedModel, error_table, fit_model
 from hilctl.identify.held_out import HeldOut, held_out_error
 from hilctl.identify.job import OnProgress, ignore_progress
 from hilctl.identify.judge import Judgement, judge
 from hilctl.identify.model_size import OrderError, choose_lag, choose_order
+from hilctl.identify.modes import WORTH, further_modes
 from hilctl.identify.settings import FitSettings, IdentifySettings
 from hilctl.identify.verdict import Verdict, verdict_of
-from hilctl.identify.with_modes import with_modes
 from hilctl.identify.workers import Map, one_by_one, workers
 from hilctl.models.base import HysteresisModel
 from hilctl.models.files import dump_model
-from hilctl.models.structure import Mode
+from hilctl.models.structure import Mode, Structure
+
+TURNS = 4  # each finds a model anew
+
+
+class Judged(Protocol):
+    """A model, and how it does on data that its fit did not see."""
+
+    @property
+    def fit(self) -> FittedModel:
+        """The model."""
+
+    @property
+    def held_out(self) -> HeldOut | None:
+        """How it does on such data; None where there were none."""
+
+    @property
+    def settings(self) -> FitSettings:
+        """How it was fitted."""
+
+
+_Judged = TypeVar("_Judged", bound=Judged)
+
+
+def with_modes(records: Sequence[Record], identify: Callable[[Sequence[Mode]], _Judged]) -> _Judged:
+    """Return a model with the further modes that its records show.
+
+    A mode that was left out bends all the rest, so the model is found anew without it each time,
+    and what it leaves shows the modes the better.
+
+    Args:
+        records: What it is fitted to.
+        identify: Finds a model of them, given modes that are known.
+    """
+    best = identify(())
+    histories = [record for record in records if isinstance(record, History)]
+    if not best.settings.looks_for("modes") or len(histories) < len(records):
+        return best
+    for _ in range(TURNS):
+        model = best.fit.model
+        structure, known = getattr(model, "structure", None), getattr(model, "modes", ())
+        first_hz = structure.natural_hz if isinstance(structure, Structure) else None
+        better = further_modes(histories, best.fit.modelled_um, known, first_hz)
+        if better is None:
+            break
+        tried = identify(better)
+        if not _rms_percent(tried) < WORTH * _rms_percent(best):
+            break
+        best = tried
+    return best
+
+
+def _rms_percent(judged: Judged) -> float:
+    """Return the error on data held out; on all data where none were."""
+    if judged.held_out is None:
+        return judged.fit.rms_percent
+    return judged.held_out.judgement.rms_percent
 
 
 @dataclass(frozen=True, slots=True)

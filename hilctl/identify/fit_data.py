@@ -7,9 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from hilctl.base.arrays import F64
 from hilctl.base.errors import DataError
-from hilctl.base.units import CommandUnit
+from hilctl.base.types import F64, CommandUnit
 from hilctl.identify.data.records import History, Records, SteadyLoop
 from hilctl.identify.data.thin import thinned
 from hilctl.identify.staged.sensitivity import (

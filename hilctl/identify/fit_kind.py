@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-from hilctl.base.units import CommandUnit
+from hilctl.base.types import CommandUnit
 from hilctl.identify.catalogue import CATALOGUE
 from hilctl.identify.creep import creep_of, without_creep
 from hilctl.identify.data.records import Records

@@ -8,7 +8,7 @@ import numpy as np
 import scipy
 
 import hilctl
-from hilctl.base.units import CommandUnit
+from hilctl.base.types import CommandUnit
 from hilctl.identify.catalogue import CATALOGUE
 from hilctl.identify.data.records import Record, Records, SteadyLoop
 from hilctl.identify.fit_data import FitData

@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.fft import rfft, rfftfreq
 
-from hilctl.base.arrays import F64
+from hilctl.base.types import F64
 from hilctl.experiment.model_range import ALL, spectrum
 from hilctl.identify.data.records import History, Record, SteadyLoop
 from hilctl.identify.data.thin import turning_points

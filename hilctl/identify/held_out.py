@@ -6,9 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from hilctl.base.arrays import F64
 from hilctl.base.errors import DataError
-from hilctl.base.units import CommandUnit
+from hilctl.base.types import F64, CommandUnit
 from hilctl.identify.data.records import History, Record, SteadyLoop
 from hilctl.identify.fit_data import FitData
 from hilctl.identify.fit_kind import fit_kind

@@ -7,7 +7,7 @@ import numpy.typing as npt
 from scipy.linalg import qr
 from scipy.optimize import nnls
 
-from hilctl.base.arrays import F64, I64
+from hilctl.base.types import F64, I64
 
 Mask: TypeAlias = npt.NDArray[np.bool_]
 

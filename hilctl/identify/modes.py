@@ -14,8 +14,8 @@ from itertools import pairwise
 import numpy as np
 from scipy.optimize import least_squares
 
-from hilctl.base.arrays import C128, F64
 from hilctl.base.errors import ModelError
+from hilctl.base.types import C128, F64
 from hilctl.identify.data.records import History, Record
 from hilctl.models.structure import Mode
 

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from hilctl.analysis.canvas import DISPLACEMENT, ERROR, REFERENCE, STYLE
 from hilctl.analysis.html import document, grid, wide_figure, write_page
-from hilctl.base.arrays import F64
+from hilctl.base.types import F64
 from hilctl.identify.command import Identification
 from hilctl.identify.data.records import Record, SteadyLoop
 from hilctl.identify.judge import Judgement

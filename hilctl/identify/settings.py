@@ -11,7 +11,7 @@ from pydantic import Field, ValidationInfo, field_validator, model_validator
 from pydantic.fields import FieldInfo
 
 from hilctl.base.strict import Strict
-from hilctl.base.units import CommandUnit
+from hilctl.base.types import CommandUnit
 
 FitKind: TypeAlias = Literal[
     "integrated", "staged", "rdpi", "asymmetric", "ppi", "spi", "generalised", "preisach", "kp",

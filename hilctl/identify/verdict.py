@@ -6,7 +6,7 @@ from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
-from hilctl.base.arrays import F64
+from hilctl.base.types import F64
 from hilctl.identify.data.records import Record, SteadyLoop
 from hilctl.identify.fit_model import FittedModel
 from hilctl.identify.held_out import HeldOut

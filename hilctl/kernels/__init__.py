@@ -10,8 +10,7 @@ does not notice a callee that changed in another file. Units live one level abov
     envelope.py  play operators between envelopes
     field.py     plays and drags of an effective field, its losses, and their inverse
     residual.py  plays, drags and rate of a modelled displacement, and what undoes them
-    dynamics.py  field lag, structure and delay, and their inverses
-    modes.py     further modes of the structure, and their inverse
+    dynamics.py  field lag, structure, delay, creep and modes, and their inverses
     atomics.py   numbers in shared memory that say of other data that they are there
     limit.py     peak and slew limits of a command
     interlock.py what ends a run, looked at in every sample

@@ -13,7 +13,7 @@ part of its regressor that those before it have not. So a step or a bound of one
 
 import math
 
-from hilctl.base.arrays import F64, I64, U32
+from hilctl.base.types import F64, I64, U32
 from hilctl.kernels.jit import kernel
 
 OFFSET, GAIN, WEIGHTS = range(3)  # places of the parameters; the weights go on from there

@@ -18,7 +18,7 @@ from typing import Any, TypeAlias, cast
 from numba import config, types
 from numba.extending import intrinsic
 
-from hilctl.base.arrays import I64
+from hilctl.base.types import I64
 from hilctl.kernels.jit import kernel
 
 _Typed: TypeAlias = tuple[Any, Callable[..., Any]]

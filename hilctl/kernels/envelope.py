@@ -15,7 +15,7 @@ Nonlinearities of Magnetostrictive Actuators", Concordia; equation numbers are t
 
 import math
 
-from hilctl.base.arrays import F64
+from hilctl.base.types import F64
 from hilctl.kernels.jit import kernel
 
 _SATURATED = 1.0 - 1e-12

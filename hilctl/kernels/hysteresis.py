@@ -15,7 +15,7 @@ Magnetostrictive Actuators", Concordia; equation numbers are that dissertation's
 
 import numpy as np
 
-from hilctl.base.arrays import F64
+from hilctl.base.types import F64
 from hilctl.kernels.jit import STAGE, kernel
 
 

@@ -20,7 +20,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from hilctl.base.arrays import F64
+from hilctl.base.types import F64
 from hilctl.kernels.jit import STAGE, kernel
 
 Arrays: TypeAlias = tuple[F64, F64, F64]

@@ -7,8 +7,8 @@ samples; one that is infinite switches its interlock off.
 
 from enum import IntFlag
 
-from hilctl.base.arrays import F64, U32
 from hilctl.base.samples import Flag
+from hilctl.base.types import F64, U32
 from hilctl.kernels.jit import kernel
 
 

@@ -1,6 +1,6 @@
 """Limits of a command: range first, slew second, both in one pass, and the way down."""
 
-from hilctl.base.arrays import F64, U32
+from hilctl.base.types import F64, U32
 from hilctl.kernels.jit import kernel
 
 

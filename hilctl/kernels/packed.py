@@ -7,7 +7,7 @@ every way to write one.
 Sources: MCAP specification, records; Protocol Buffers, encoding.
 """
 
-from hilctl.base.arrays import I64, U8, U32
+from hilctl.base.types import I64, U8, U32
 from hilctl.kernels.jit import kernel
 
 TIME, START, BODY, END, CHANNEL = range(5)

@@ -26,7 +26,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from hilctl.base.arrays import F64, I64
+from hilctl.base.types import F64, I64
 from hilctl.kernels.jit import kernel
 
 Tables: TypeAlias = tuple[F64, F64, F64, F64, F64]

@@ -8,9 +8,9 @@ import numpy as np
 
 from hilctl.analysis.steady import SteadyPart, steady_part
 from hilctl.base import metrics
-from hilctl.base.arrays import C128, F64, I64
 from hilctl.base.errors import DataError
 from hilctl.base.segments import Segment
+from hilctl.base.types import C128, F64, I64
 from hilctl.recording.data import Recording
 
 MAX_HARMONICS = 2000

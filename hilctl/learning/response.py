@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import least_squares
 
-from hilctl.base.arrays import C128, F64
+from hilctl.base.types import C128, F64
 
 _COUPLING = 0.15
 """Part of a harmonic's change that hysteresis scatters over its neighbours."""

@@ -8,25 +8,78 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TypeAlias
 
+import numpy as np
+
 from hilctl import __version__
-from hilctl.base.arrays import C128
-from hilctl.base.errors import ConfigError, HilctlError, InputError, RunError
+from hilctl.base.errors import ConfigError, HilctlError, InputError, Problem, RunError
 from hilctl.base.segments import Segment
+from hilctl.base.types import C128
+from hilctl.experiment.check import Checked
 from hilctl.experiment.correction import (
     Correction,
     LearnedCycle,
+    fits,
     model_sha256,
     signature,
     write_correction,
 )
-from hilctl.learning.cycle import cycle_error
-from hilctl.learning.repeating import beginning, repeating
+from hilctl.learning.cycle import cycle_error, harmonic_count
 from hilctl.learning.results import Learned, Row, row_of
-from hilctl.learning.update import learn, refused
+from hilctl.learning.update import Learning, begin, learn, refused
 from hilctl.recording.reader import read
 from hilctl.run.result import RunResult
 from hilctl.run.start import checked_experiment
 from hilctl.run.step import StepStoppedError, paced
+
+HIGHEST_PART = 0.125
+"""Highest frequency that a correction reaches, as a part of the sample rate."""
+
+_FEWEST_CYCLES = 2
+
+
+def repeating(checked: Checked) -> list[Segment]:
+    """Return the segments to learn, the first of those that are alike.
+
+    Raises:
+        ConfigError: There is none, or one is too short; or no compensator stands there.
+    """
+    loaded = checked.loaded
+
+    def refuse(key: str, rule: str, hint: str) -> ConfigError:
+        return ConfigError([Problem(loaded.document.where((key,)), key, rule, hint=hint)])
+
+    if loaded.model is None:
+        raise refuse("compensator", "is needed to learn: its input is corrected", "set a model")
+    found: list[Segment] = []
+    known: list[LearnedCycle] = []
+    for segment in checked.reference.segments:
+        wanted = signature(checked.reference.values, segment)
+        if wanted is None or segment.steady_cycles()[2] < _FEWEST_CYCLES:
+            continue
+        if any(fits(cycle, checked.reference.values, segment) for cycle in known):
+            continue
+        found.append(segment)
+        nothing = np.zeros(1, dtype=np.complex128)
+        known.append(LearnedCycle.from_coefficients(segment.label, segment.period, wanted, nothing))
+    if not found:
+        rule = f"must repeat for at least {_FEWEST_CYCLES} whole cycles after its soft start"
+        raise refuse("waveform", rule, "16 or more average the noise well")
+    return found
+
+
+def beginning(checked: Checked, segment: Segment) -> Learning:
+    """Return where learning begins: with nothing, or with the correction the experiment has."""
+    rate_hz = checked.reference.sample_rate_hz
+    highest_hz = HIGHEST_PART * rate_hz
+    count = harmonic_count(segment.period, rate_hz / segment.period, highest_hz)
+    first: C128 = np.zeros(count + 1, dtype=np.complex128)
+    known = checked.loaded.correction
+    for cycle in known.cycles if known else ():
+        if fits(cycle, checked.reference.values, segment):
+            size = min(first.size, cycle.coefficients.size)
+            first[:size] = cycle.coefficients[:size]
+    return begin(rate_hz, first, highest_hz)
+
 
 Runner: TypeAlias = Callable[[Path, Sequence[str], Path], RunResult]
 """Runs an experiment file with settings into a recording."""

@@ -11,7 +11,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from hilctl.base.arrays import C128, F64
+from hilctl.base.types import C128, F64
 from hilctl.learning.cycle import CycleError
 from hilctl.learning.response import Change, Response, fit
 

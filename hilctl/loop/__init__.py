@@ -9,7 +9,7 @@ block.py        one block of samples, in its slot from birth to answer
 pacer.py        absolute deadlines and the policy for late ticks
 tuning.py       gain and offset of a running reference, and the inverse faded out and in
 compensator.py  the inverse of a model, in the loop's terms
-feedback.py     a controller around the compensator, sample by sample; integral.py, by blocks
+feedback.py     a controller around the compensator, per sample or per block
 adaptation.py   offset, gain and weights of the model, adapted by the tracking error
 limiter.py      range and slew of every command: last before the device
 interlocks.py   what ends a run, checked in every answer

@@ -20,9 +20,9 @@ from typing import Any, Self
 
 import numpy as np
 
-from hilctl.base.arrays import F64, chunks
 from hilctl.base.errors import InputError
 from hilctl.base.events import ADAPTED, Event, adapted_text
+from hilctl.base.types import F64, chunks
 from hilctl.kernels import adaptation as kernel
 from hilctl.kernels.jit import ensure_compiled
 from hilctl.loop.block import Block

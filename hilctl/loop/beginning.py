@@ -7,8 +7,8 @@ then the waveform, whose input is without the offset that was measured at rest.
 import math
 from typing import TypeAlias
 
-from hilctl.base.arrays import F64
 from hilctl.base.events import Event
+from hilctl.base.types import F64
 from hilctl.loop.conditioning import Conditioning, RestingOffset
 
 Finding: TypeAlias = tuple[str, dict[str, float], bool]

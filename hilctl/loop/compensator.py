@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from hilctl.base.arrays import F64
 from hilctl.base.errors import ModelError
+from hilctl.base.types import F64
 from hilctl.models.base import HysteresisModel, Operator
 
 

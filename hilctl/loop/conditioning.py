@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hilctl.base.arrays import F64
+from hilctl.base.types import F64
 
 
 @dataclass(frozen=True, slots=True)

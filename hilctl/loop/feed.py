@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from hilctl.base.arrays import F64
+from hilctl.base.types import F64
 from hilctl.loop.beginning import Beginning
 from hilctl.loop.block import Block
 from hilctl.loop.plan import Plan

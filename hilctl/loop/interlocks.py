@@ -10,11 +10,10 @@ from typing import Annotated, Literal, TypeAlias
 
 import numpy as np
 
-from hilctl.base.arrays import F64, U32
 from hilctl.base.errors import InputError
 from hilctl.base.samples import Flag, Head
 from hilctl.base.strict import Field, Strict
-from hilctl.base.units import CommandUnit
+from hilctl.base.types import F64, U32, CommandUnit
 from hilctl.kernels import interlock as kernels
 from hilctl.kernels.interlock import InterlockFlag
 from hilctl.kernels.jit import ensure_compiled

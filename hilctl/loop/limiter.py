@@ -6,9 +6,9 @@ Pure: (wanted, previous, limits, time step) to (command, flags). The loop and th
 import math
 from dataclasses import dataclass
 
-from hilctl.base.arrays import F64, U32
 from hilctl.base.errors import InputError
 from hilctl.base.samples import Flag
+from hilctl.base.types import F64, U32
 from hilctl.kernels.jit import ensure_compiled
 from hilctl.kernels.limit import limit_block
 

@@ -17,11 +17,11 @@ from enum import Enum
 
 import numpy as np
 
-from hilctl.base.arrays import F64, U32
 from hilctl.base.device import Device, WatchdogDevice
 from hilctl.base.errors import DeviceError
 from hilctl.base.events import OFFSET, Event
 from hilctl.base.samples import Flag, Head
+from hilctl.base.types import F64, U32
 from hilctl.loop.beginning import Beginning
 from hilctl.loop.block import Block
 from hilctl.loop.feed import feed, pass_over

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Literal, TypeAlias
 
-from hilctl.base.arrays import F64
+from hilctl.base.types import F64
 from hilctl.loop.adaptation import Adaptation
 from hilctl.loop.compensator import Compensator
 from hilctl.loop.conditioning import Conditioning

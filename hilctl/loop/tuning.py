@@ -12,9 +12,9 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 
-from hilctl.base.arrays import F64, U32
 from hilctl.base.events import INVERSE, TUNED, Event
 from hilctl.base.samples import Flag
+from hilctl.base.types import F64, U32
 from hilctl.loop.host import StraightLine, Tuning
 
 T = TypeVar("T", float, F64)

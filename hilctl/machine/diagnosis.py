@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from hilctl.base.arrays import I64
+from hilctl.base.types import I64
 from hilctl.machine import findings, hardware
 from hilctl.machine.files import Finding, Machine
 from hilctl.machine.latency import Latency, measure

@@ -18,9 +18,9 @@ from typing import Any
 
 import numpy as np
 
-from hilctl.base.arrays import I64
 from hilctl.base.device import Clock
 from hilctl.base.errors import InputError, RunError
+from hilctl.base.types import I64
 from hilctl.loop.pacer import LatePolicy, LateRules, Pacer, SystemClock
 from hilctl.machine.realtime import SetUpStep, prepare
 from hilctl.machine.settings import Realtime

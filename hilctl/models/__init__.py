@@ -2,10 +2,10 @@
 
 base.py        what every model has; the streaming operator
 plays.py       sums of plays and their inverse: the Prandtl-Ishlinskii model (PPI), and the
-               rate-dependent one (RDPI)
-spi.py         a PPI compensated by stop operators (SPI)
+               rate-dependent one (RDPI); a PPI compensated by stop operators (SPI)
 deadband.py    memoryless function of deadband operators and its inverse
-integrated.py  the integrated model: RDPI, then deadbands, and its inverse
+integrated.py  the integrated model: RDPI, then deadbands, and its inverse; its published
+               parametrisations
 butterfly.py   plays, then an even function: rods without bias, inverted on one side
 staged.py      field lag, hysteresis, structure, delay, creep, and their inverse; chain.py joins
                them, and undoes the structure
@@ -17,6 +17,5 @@ numeric_inverse.py  models whose inverse is found root by root: preisach.py, kp.
 field.py       plays and drags of an effective field, a curve, losses; for staged.py
 generalised_duhem.py  slopes by place and direction, all over a band, with losses; for staged.py
 refined.py     a model and what runs have shown beyond it, with the inverse of both
-published.py   parametrisations and parameter sets from the literature
 files.py       model files, in and out
 """

@@ -6,10 +6,9 @@ from typing import Annotated, Any, Self, TypeAlias
 
 import numpy as np
 
-from hilctl.base.arrays import F64
 from hilctl.base.errors import ModelError
 from hilctl.base.strict import Field, Strict, field_validator, model_validator
-from hilctl.base.units import CommandUnit
+from hilctl.base.types import F64, CommandUnit
 from hilctl.kernels.hysteresis import rest_memory
 
 BlockKernel: TypeAlias = Callable[[F64, F64, F64], None]

@@ -9,9 +9,9 @@ from typing import Literal, Self
 
 import numpy as np
 
-from hilctl.base.arrays import F64
 from hilctl.base.errors import ModelError
 from hilctl.base.strict import Field, model_validator
+from hilctl.base.types import F64
 from hilctl.kernels.hysteresis import deadband_block, play_sum
 from hilctl.models.base import Operator, refuse
 from hilctl.models.deadband import DeadbandFunction

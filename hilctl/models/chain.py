@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from hilctl.base.arrays import F64
+from hilctl.base.types import F64
 from hilctl.kernels.dynamics import between_stage, delay_block
 from hilctl.models.base import Operator
 

@@ -4,9 +4,9 @@ from typing import Annotated, Self
 
 import numpy as np
 
-from hilctl.base.arrays import F64
 from hilctl.base.strict import Field, Strict, model_validator
-from hilctl.kernels.creep import creep_stage, uncreep_stage
+from hilctl.base.types import F64
+from hilctl.kernels.dynamics import creep_stage, uncreep_stage
 from hilctl.models.base import Operator, StageKernel, refuse, threshold_problems
 
 TimeConstant = Annotated[float, Field(ge=1e-3, le=1e6)]

@@ -5,9 +5,9 @@ from typing import Self
 
 import numpy as np
 
-from hilctl.base.arrays import F64
 from hilctl.base.errors import ModelError
 from hilctl.base.strict import Strict, ValidationError, model_validator
+from hilctl.base.types import F64
 from hilctl.kernels.hysteresis import deadband_block
 from hilctl.models.base import Thresholds, Weights, length_problems, refuse, threshold_problems
 

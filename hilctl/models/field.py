@@ -6,8 +6,8 @@ from typing import Annotated, Literal, Self
 
 import numpy as np
 
-from hilctl.base.arrays import F64
 from hilctl.base.strict import Field, Strict, model_validator
+from hilctl.base.types import F64
 from hilctl.kernels.field import Bank, Losses, field_forward, field_inverse
 from hilctl.models.base import HysteresisModel, Operator, Thresholds, Weights, refuse
 from hilctl.models.preisach import cell_problems, table_problems

@@ -5,8 +5,8 @@ from typing import Literal, Self
 
 import numpy as np
 
-from hilctl.base.arrays import F64
 from hilctl.base.strict import Strict, model_validator
+from hilctl.base.types import F64
 from hilctl.kernels.envelope import envelope_forward, envelope_inverse
 from hilctl.models.base import (
     Operator,

@@ -5,8 +5,8 @@ from typing import Literal, Self, TypeAlias
 
 import numpy as np
 
-from hilctl.base.arrays import F64
 from hilctl.base.strict import model_validator
+from hilctl.base.types import F64
 from hilctl.kernels.generalised_duhem import Band, Losses, duhem_forward, duhem_inverse
 from hilctl.models.base import HysteresisModel, Operator, Weights, refuse
 from hilctl.models.field import FieldLosses

@@ -6,8 +6,8 @@ from typing import Self
 
 import numpy as np
 
-from hilctl.base.arrays import F64
 from hilctl.base.strict import model_validator
+from hilctl.base.types import F64
 from hilctl.kernels.implicit import implicit_forward, implicit_inverse_stage
 from hilctl.models.base import HysteresisModel, Operator
 

@@ -7,8 +7,8 @@ from typing import Annotated, Any, Literal, Self, TypeAlias
 
 import numpy as np
 
-from hilctl.base.arrays import F64
 from hilctl.base.strict import Field, Strict, model_validator
+from hilctl.base.types import F64
 from hilctl.kernels.residual import Tables, residual_forward, residual_inverse
 from hilctl.models.base import (
     HysteresisModel,
@@ -26,9 +26,8 @@ from hilctl.models.duhem import DuhemModel
 from hilctl.models.generalised import GeneralisedModel
 from hilctl.models.integrated import IntegratedModel
 from hilctl.models.kp import KrasnoselskiiPokrovskiiModel
-from hilctl.models.plays import PpiModel, RdpiModel
+from hilctl.models.plays import PpiModel, RdpiModel, SpiModel
 from hilctl.models.preisach import PreisachModel
-from hilctl.models.spi import SpiModel
 from hilctl.models.staged import StagedModel
 from hilctl.models.structure import Structure
 

@@ -19,8 +19,8 @@ from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 
-from hilctl.base.arrays import F64
 from hilctl.base.strict import Field, Strict, model_validator
+from hilctl.base.types import F64
 from hilctl.kernels.dynamics import lag_block, lead_stage, weigh_block
 from hilctl.models.base import HysteresisModel, Operator, Provenance, refuse
 from hilctl.models.chain import Chain, between, delayed, smoothing_weights

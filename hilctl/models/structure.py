@@ -4,12 +4,10 @@ import math
 
 import numpy as np
 
-from hilctl.base.arrays import C128, F64
 from hilctl.base.errors import ModelError
-from hilctl.base.exponential import exponential
 from hilctl.base.strict import Field, Strict
-from hilctl.kernels.dynamics import structure_block
-from hilctl.kernels.modes import mode_stage, unmode_stage
+from hilctl.base.types import C128, F64
+from hilctl.kernels.dynamics import exponential, mode_stage, structure_block, unmode_stage
 from hilctl.models.base import Operator
 
 _SLOWEST = 1e12  # samples in a radian of the structure: beyond it, it does not move
@@ -111,7 +109,7 @@ class Mode(Strict):
         return np.asarray(zeros / (1.0 + 2.0 * self.damping_ratio * down + down**2))
 
     def _parameters(self, sample_rate_hz: float) -> F64:
-        """Return float64[12], see :func:`~hilctl.kernels.modes.mode_stage`."""
+        """Return float64[12], see :func:`~hilctl.kernels.dynamics.mode_stage`."""
         own = Structure(natural_hz=self.natural_hz, damping_ratio=self.damping_ratio)
         motion = own.motion(sample_rate_hz)
         ratio = self.natural_hz / self.antiresonance_hz

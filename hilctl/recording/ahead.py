@@ -13,7 +13,7 @@ import zstandard
 from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC as MAGIC
 
-from hilctl.base.arrays import U8
+from hilctl.base.types import U8
 from hilctl.recording.allowance import LARGEST_CHUNK_BYTES
 from hilctl.recording.chunks import Messages, kernels
 from hilctl.recording.records import CHUNK_HEAD, FRAME, LARGEST_BYTES, LENGTH

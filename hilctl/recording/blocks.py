@@ -7,8 +7,8 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from hilctl.base.arrays import F64, I64, U8, U32
 from hilctl.base.samples import LAST_SAMPLE, LONGEST_NS
+from hilctl.base.types import F64, I64, U8, U32
 from hilctl.recording import wire
 from hilctl.recording.checks import has_all
 from hilctl.recording.chunks import Messages, kernels

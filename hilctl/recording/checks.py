@@ -17,7 +17,7 @@ from mcap.records import Channel, McapRecord, Message, Schema
 
 from hilctl.base.events import CHANGES, INVERSE
 from hilctl.base.samples import COLUMNS, LAST_SAMPLE, LONGEST_NS, RECORDED_FIELDS, Batch, Head
-from hilctl.base.units import CommandUnit
+from hilctl.base.types import CommandUnit
 from hilctl.recording import schema, wire
 from hilctl.recording.data import TICK_COLUMNS, Ticks
 from hilctl.recording.facts import LABELS_FACT, LabelValue

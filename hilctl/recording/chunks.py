@@ -20,7 +20,7 @@ import zstandard
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, McapRecord, Message
 
-from hilctl.base.arrays import I64, U8
+from hilctl.base.types import I64, U8
 from hilctl.recording.allowance import LARGEST_CHUNK_BYTES, MOST_IN_CHUNK, Allowance
 from hilctl.recording.records import FRAME, LENGTH, parse
 

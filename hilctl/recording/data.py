@@ -4,11 +4,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 
-from hilctl.base.arrays import F64, I64
 from hilctl.base.events import Event
 from hilctl.base.samples import Samples
 from hilctl.base.segments import Segment
-from hilctl.base.units import CommandUnit
+from hilctl.base.types import F64, I64, CommandUnit
 from hilctl.recording.facts import LabelValue
 
 

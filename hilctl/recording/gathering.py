@@ -7,11 +7,10 @@ from typing import Any
 import numpy as np
 from mcap.records import Attachment, Channel, McapRecord, Message, Metadata
 
-from hilctl.base.arrays import F64, I64, U32
 from hilctl.base.errors import DataError
 from hilctl.base.events import Event
 from hilctl.base.samples import COLUMNS, LAST_SAMPLE, Samples
-from hilctl.base.units import CommandUnit
+from hilctl.base.types import F64, I64, U32, CommandUnit
 from hilctl.recording.blocks import Blocks, Bounds, TickTable
 from hilctl.recording.checks import (
     RATES_HZ,

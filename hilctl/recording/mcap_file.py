@@ -32,7 +32,7 @@ from mcap.records import (
 )
 from mcap.writer import MCAP0_MAGIC
 
-from hilctl.base.arrays import I64
+from hilctl.base.types import I64
 from hilctl.recording.records import FRAME
 from hilctl.recording.rows import MessageRows
 

@@ -6,11 +6,10 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
-from hilctl.base.arrays import F64, I64, U32
 from hilctl.base.errors import DataError, InputError
 from hilctl.base.events import Event
 from hilctl.base.samples import COLUMNS, Batch, Head, RecordedField, SampleColumn, Samples
-from hilctl.base.units import CommandUnit
+from hilctl.base.types import F64, I64, U32, CommandUnit
 from hilctl.recording import schema
 from hilctl.recording.checks import MAX_UNIX_NS, RATES_HZ
 from hilctl.recording.data import TICK_COLUMNS

@@ -15,7 +15,7 @@ import numpy as np
 
 from hilctl.base.errors import DataError, InputError
 from hilctl.base.events import Event
-from hilctl.base.locks import HAS_LOCKS
+from hilctl.base.private import HAS_LOCKS
 from hilctl.base.samples import LAST_SAMPLE, Batch, Head
 from hilctl.recording.checks import MAX_UNIX_NS, SoundMessages, sound_blocks
 from hilctl.recording.locks import lock

@@ -8,7 +8,7 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from hilctl.base.arrays import F64, I64, U32
+from hilctl.base.types import F64, I64, U32
 
 Cells: TypeAlias = npt.NDArray[np.uint8]
 Kept: TypeAlias = npt.NDArray[np.bool_]

@@ -13,8 +13,8 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from hilctl.base.arrays import F64, I64, U32
 from hilctl.base.samples import RECORDED_FIELDS
+from hilctl.base.types import F64, I64, U32
 from hilctl.recording.data import TICK_COLUMNS, Ticks
 
 U64: TypeAlias = npt.NDArray[np.uint64]

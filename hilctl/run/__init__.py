@@ -20,9 +20,9 @@ recorder.py        into the recording; metadata.py what it says of the run, end_
 ring_recorder.py   from the ring into it, in a thread of its own; progress.py  for who looks on
 run_folder.py      runs that are going on, and who holds a device
 description.py     what a run says of itself to those who look on
-requests.py        requests to a run, over control_socket.py; stopping.py a signal to stop;
-                   client.py sends them, protocol.py has their words; detached.py starts runs in
-                   the background
+requests.py        answers requests to a run, over control_socket.py, one thread per client;
+                   client.py sends them and stops runs, protocol.py defines them;
+                   detached.py starts runs in the background
 changes.py         gain, offset and inverse on their way to the loop
 systemd.py         readiness and watchdog of a service
 probe.py           whether a device answers, and whether that can be true

@@ -3,8 +3,8 @@
 import math
 from dataclasses import replace
 
-from hilctl.base.arrays import F64
 from hilctl.base.device import DeviceInfo
+from hilctl.base.types import F64
 from hilctl.experiment.adaptation import make_adaptation
 from hilctl.experiment.feedback import make_feedback
 from hilctl.experiment.file import Experiment

@@ -1,14 +1,15 @@
-"""Changes of gain, offset and inverse on their way to the loop, one after another.
+"""Pass changes of gain, offset and inverse to the loop, one after another.
 
-Each is checked by a bound on its amplitude when the loop has taken the one before: so the second
-follows the first, and none is overwritten. Nothing here waits.
+Each is checked by a bound on its amplitude when the loop has taken the one before. So the second
+follows the first, and none is overwritten.
 """
 
 import math
-from collections import deque
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from typing import Any, Literal
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -16,69 +17,46 @@ from hilctl.base.errors import InputError
 from hilctl.experiment.check import Checked, command_problems, reference_problems
 from hilctl.experiment.straight import fade_refusal
 from hilctl.loop.compensator import Compensator
+from hilctl.run.protocol import InverseState
 from hilctl.run.shared_page import Field, SharedPage
 
 _SHARES: dict[str | None, float] = {"in": 1.0, "out": 0.0}
 _MOST_WAITING = 16
+_WAIT_S = 20.0
+"""Longest wait for the change before; a client waits longer for its answer."""
+_POLL_S = 0.005
 _LEAD_S = 0.05
 """Time from the answer to the first sample of a change."""
 _CYCLE = 2000
 """Samples per cycle of the sine from which the command range is computed."""
 
 
-@dataclass(slots=True)
-class RequestedChange:
-    """A change whose request waits for its answer.
-
-    Attributes:
-        gain: Factor of the reference; unchanged if None.
-        offset: Added to the reference; unchanged if None.
-        over_s: Time that the change takes.
-        inverse: Whether the inverse is to be ``in`` or ``out``; unchanged if None.
-    """
-
-    gain: float | None
-    offset: float | None
-    over_s: float
-    inverse: Literal["in", "out"] | None = None
-    _answer: Mapping[str, Any] | None = None
-    _refusal: str = ""
-
-    def answer(self) -> Mapping[str, Any] | None:
-        """Return the answer; None while there is none.
-
-        Raises:
-            InputError: It is refused; nothing has changed.
-        """
-        if self._refusal:
-            raise InputError(f"set: {self._refusal}")
-        return self._answer
-
-    def accept(self, answer: Mapping[str, Any]) -> None:
-        """Let it have been done."""
-        self._answer = answer
-
-    def refuse(self, why: str) -> None:
-        """Let it have been refused."""
-        self._refusal = why
-
-
 class Changes:
-    """The changes of one run.
+    """The changes of one run; they may be requested from several threads.
 
     Args:
         checked: The experiment.
         page: Shared with the loop.
+        clock: Monotonic time in s.
+        sleep: Waits for that many s.
 
     Attributes:
         gain: Factor of the reference that the last change has led to, or leads to.
         offset: What is added to it, likewise.
     """
 
-    def __init__(self, checked: Checked, page: SharedPage) -> None:
+    def __init__(
+        self,
+        checked: Checked,
+        page: SharedPage,
+        clock: Callable[[], float] = time.monotonic,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
         self.gain, self.offset, self._inverse_share = 1.0, 0.0, 1.0
         self._checked, self._page = checked, page
-        self._waiting: deque[RequestedChange] = deque()
+        self._clock, self._sleep = clock, sleep
+        self._lock = threading.Lock()
+        self._places = threading.BoundedSemaphore(_MOST_WAITING)
 
     @property
     def inverse(self) -> str | None:
@@ -87,35 +65,47 @@ class Changes:
             return None
         return "in" if self._inverse_share else "out"
 
-    def add(self, change: RequestedChange) -> None:
-        """Let a change wait for its turn.
+    def make(
+        self,
+        gain: float | None,
+        offset: float | None,
+        over_s: float,
+        inverse: InverseState | None = None,
+    ) -> dict[str, Any]:
+        """Make a change as soon as the loop has taken the one before; return the answer.
+
+        Args:
+            gain: Factor of the reference; unchanged if None.
+            offset: Added to the reference; unchanged if None.
+            over_s: Time that the change takes.
+            inverse: Whether the inverse is to be ``in`` or ``out``; unchanged if None.
 
         Raises:
-            InputError: It can't have one.
+            InputError: It is refused; nothing has changed.
         """
-        if change.gain is None and change.offset is None and change.inverse is None:
+        if gain is None and offset is None and inverse is None:
             raise InputError("set: gain, offset or inverse is required")
-        if change.inverse is not None:
+        if inverse is not None:
             checked = self._checked
-            if why := fade_refusal(checked.loaded, checked.forecast.line, change.inverse):
+            if why := fade_refusal(checked.loaded, checked.forecast.line, inverse):
                 raise InputError(f"set: inverse: {why}")
-        if why := self._too_late():
-            raise InputError(f"set: {why}")
-        if len(self._waiting) >= _MOST_WAITING:
+        if not self._places.acquire(blocking=False):
             raise InputError(f"set: {_MOST_WAITING} changes are waiting already: try again")
-        self._waiting.append(change)
-
-    def attend(self) -> None:
-        """Go on with what can go on; to be called often."""
-        if why := self._too_late():
-            for change in self._waiting:
-                change.refuse(why)
-            self._waiting.clear()
-            return
-        page = self._page
-        # Only after the loop has taken it may the change before be overwritten.
-        if self._waiting and page.get(Field.TUNE_WANTED) == page.observe(Field.TUNE_TAKEN):
-            self._make(self._waiting.popleft())
+        try:
+            until = self._clock() + _WAIT_S
+            while True:
+                with self._lock:
+                    if why := self._too_late():
+                        raise InputError(f"set: {why}")
+                    # The loop must have taken the change before, which is overwritten.
+                    page = self._page
+                    if page.get(Field.TUNE_WANTED) == page.observe(Field.TUNE_TAKEN):
+                        return self._make(gain, offset, over_s, inverse)
+                if self._clock() >= until:
+                    raise InputError("set: the loop has not taken the change before: try again")
+                self._sleep(_POLL_S)
+        finally:
+            self._places.release()
 
     def _too_late(self) -> str:
         """Return why no change can be made any more, or an empty text."""
@@ -125,42 +115,48 @@ class Changes:
             return "the waveform is over; the run is on its way to the safe value"
         return ""
 
-    def _make(self, change: RequestedChange) -> None:
-        """Put a change on the page for the loop, or refuse it."""
-        gain = self.gain if change.gain is None else change.gain
-        offset = self.offset if change.offset is None else change.offset
-        share = _SHARES.get(change.inverse, self._inverse_share)
+    def _make(
+        self,
+        gain: float | None,
+        offset: float | None,
+        over_s: float,
+        inverse: InverseState | None,
+    ) -> dict[str, Any]:
+        """Put a change on the page for the loop; return the answer.
+
+        Raises:
+            InputError: It is refused; nothing has changed.
+        """
+        gain = self.gain if gain is None else gain
+        offset = self.offset if offset is None else offset
+        share = _SHARES.get(inverse, self._inverse_share)
         bypassed = min(share, self._inverse_share) < 1.0
         if why := bound_refusal(self._checked, gain, offset, bypassed=bypassed):
-            change.refuse(why)
-            return
+            raise InputError(f"set: {why}")
         page, config = self._page, self._checked.loaded.config
         lead = max(1, round(_LEAD_S * config.sample_rate_hz))
         blocks = math.ceil((page.get(Field.NEXT_SAMPLE) + lead) / config.block) + 1
         begins_at = blocks * config.block
         if begins_at >= self._checked.forecast.samples:
-            change.refuse("the waveform is over before the change could begin")
-            return
+            raise InputError("set: the waveform is over before the change could begin")
         page.put_float(Field.TUNE_GAIN, gain)
         page.put_float(Field.TUNE_OFFSET, offset)
         page.put_float(Field.TUNE_INVERSE_SHARE, share)
         if line := self._checked.forecast.line:
             page.put_float(Field.TUNE_LINE_SLOPE, line.slope)
             page.put_float(Field.TUNE_LINE_AT_ZERO, line.at_zero)
-        page.put(Field.TUNE_SAMPLES, max(1, round(change.over_s * config.sample_rate_hz)))
+        page.put(Field.TUNE_SAMPLES, max(1, round(over_s * config.sample_rate_hz)))
         page.put(Field.TUNE_BEGINS_AT, begins_at)
         # Last: the loop reads the numbers above as soon as it sees a new count.
         page.publish(Field.TUNE_WANTED, page.get(Field.TUNE_WANTED) + 1)
         self.gain, self.offset, self._inverse_share = gain, offset, share
-        change.accept(
-            {
-                "gain": gain,
-                "offset": offset,
-                "inverse": self.inverse,
-                "over_s": change.over_s,
-                "begins_at_sample": begins_at,
-            }
-        )
+        return {
+            "gain": gain,
+            "offset": offset,
+            "inverse": self.inverse,
+            "over_s": over_s,
+            "begins_at_sample": begins_at,
+        }
 
 
 def bound_refusal(checked: Checked, gain: float, offset: float, *, bypassed: bool) -> str:

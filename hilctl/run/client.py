@@ -1,20 +1,98 @@
-"""Runs in the background, from outside: find one, ask it, change, mark and stop it.
+"""Find, query, change, mark and stop runs from outside.
 
 It imports nothing heavy: a stop must not wait for a compiler.
 """
 
+import json
+import os
+import signal
+import socket
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 from hilctl.base.errors import InputError, RunError
-from hilctl.run.control_socket import ask
-from hilctl.run.protocol import InverseState, request
+from hilctl.run.protocol import (
+    STOP_SIGNAL,
+    VERSION,
+    VERSION_KEY,
+    InverseState,
+    is_same_user,
+    request,
+    short_path,
+)
 from hilctl.run.run_folder import RunFolder, facts_of, runs
-from hilctl.run.stopping import request_stop
 
 _POLL_S = 0.02
 _SET_S = 30.0
+_LEAST_S = 0.01
+_ANSWER_BYTES = 65536
+
+
+def ask(
+    path: Path,
+    question: Mapping[str, Any],
+    timeout_s: float = 5.0,
+    clock: Callable[[], float] = time.monotonic,
+    sleep: Callable[[float], None] = time.sleep,
+) -> dict[str, Any]:
+    """Send a request to a run, again if it was dropped before its answer.
+
+    Args:
+        path: Socket of the run.
+        question: The request; sent twice it must have the effect of one.
+        timeout_s: Longest wait.
+        clock: Monotonic time in s.
+        sleep: Waits for that many s.
+
+    Returns:
+        The answer.
+
+    Raises:
+        InputError: The run refuses; the text says why.
+        RunError: The run is gone, does not answer, or has another version of the protocol.
+    """
+    until = clock() + timeout_s
+    raw = json.dumps(question).encode() + b"\n"
+    try:
+        while not (said := _asked_once(path, raw, max(_LEAST_S, until - clock()))):
+            if clock() >= until:
+                raise TimeoutError("timed out among other clients")
+            sleep(_LEAST_S)
+        answer = json.loads(said)
+    except (OSError, ValueError) as error:
+        raise RunError(f"the run at {path.parent.name} does not answer: {error}") from None
+    version = answer.pop(VERSION_KEY, None) if isinstance(answer, dict) else None
+    if version != VERSION:
+        raise RunError(
+            f"the run at {path.parent.name} speaks protocol {version}, this hilctl {VERSION}: use "
+            "the hilctl that it was started with"
+        )
+    values: dict[str, Any] = answer
+    if not values.pop("ok", False):
+        raise InputError(str(values.get("error", "refused")))
+    return values
+
+
+def _asked_once(path: Path, raw: bytes, timeout_s: float) -> bytes:
+    """Return the answer of a run; nothing if it has dropped the client or its queue is full."""
+    said = bytearray()
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
+        connection.settimeout(timeout_s)
+        with short_path(path) as short:
+            try:
+                connection.connect(short)
+            except BlockingIOError:
+                return b""
+        if not is_same_user(connection):
+            raise PermissionError("another user's process listens there")
+        with suppress(ConnectionResetError, BrokenPipeError):
+            connection.sendall(raw)
+            while not said.endswith(b"\n") and (data := connection.recv(_ANSWER_BYTES)):
+                said += data
+    return bytes(said)
 
 
 def going_on() -> list[RunFolder]:
@@ -70,6 +148,39 @@ def _guardian_status(run: RunFolder) -> dict[str, Any]:
         return {}
     known = {"output_state": result.output, "error": describe(result.output, result.error)}
     return {"state": "setting the safe value", **known}
+
+
+def request_stop(run: RunFolder) -> bool:
+    """Stop a run by its safe ramp; return whether a process received the request.
+
+    A guardian that is still active after the end of a run is ended immediately.
+
+    Raises:
+        RunError: The kernel refuses.
+    """
+    try:
+        process = os.pidfd_open(run.card.supervisor)
+        try:
+            # After the process was opened: while its lock is held the number can't be another's.
+            if run.supervised:
+                signal.pidfd_send_signal(process, STOP_SIGNAL)
+                return True
+        finally:
+            os.close(process)
+    except ProcessLookupError:
+        pass
+    except OSError as error:
+        raise RunError(f"{run.card.name}: can't be stopped: {error.strerror}") from None
+    return _end_guardian(run)
+
+
+def _end_guardian(run: RunFolder) -> bool:
+    if not run.alive:
+        return False
+    # Imported here: a stop must not wait for numpy.
+    from hilctl.run.guardian_process import signal_guardian
+
+    return signal_guardian(run, signal.SIGTERM)
 
 
 def stop_runs(

@@ -1,75 +1,53 @@
-"""The control socket of a run: one question a connection, one answer, both one line of JSON.
+"""Serve the control socket of a run.
 
-It is served between two looks at the ring, without waiting for anybody: a client that is slow,
-silent or too long is cut off, and where there are too many, the one that has been silent longest.
-What takes time to answer is answered later, while others are served.
+A connection carries one request and one answer, each one line of JSON. Each client has a thread of
+its own, so an answer may take its time. Clients that send nothing are dropped after half a second.
 """
 
 import json
-import math
+import logging
 import os
-import selectors
-import socket
-import struct
+import socketserver
+import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Protocol, Self
+from typing import Any, Self
 
 from hilctl.base.errors import InputError, RunError
 from hilctl.base.private import private_folder
-from hilctl.run.protocol import MAX_BYTES, VERSION, VERSION_KEY
+from hilctl.run.protocol import MAX_BYTES, VERSION, VERSION_KEY, is_same_user, short_path
+
+_log = logging.getLogger(__name__)
 
 _MAX_CLIENTS = 64
 _BACKLOG = 256
-_SILENT_S = 0.5
-_LATER_S = 0.005
-_ANSWER_BYTES = 65536
-_LEAST_S = 0.01
+_REQUEST_S = 0.5
+_POLL_S = 0.05
 
-
-class LaterAnswer(Protocol):
-    """An answer that takes its time."""
-
-    def answer(self) -> Mapping[str, Any] | None:
-        """Return it; None where it is not there yet. An InputError becomes an answer in words."""
-        ...
-
-
-Answer = Callable[[bytes], Mapping[str, Any] | LaterAnswer]
-"""Question in, answer out; an InputError becomes an answer in words."""
-
-
-@dataclass(slots=True)
-class _Client:
-    connection: socket.socket
-    until: float
-    question: bytearray = field(default_factory=bytearray)
-    later: LaterAnswer | None = None
+Answer = Callable[[bytes], Mapping[str, Any]]
+"""Answer a request; an InputError becomes a refusal. It is called from several threads."""
 
 
 class ControlServer:
-    """Listens at a socket that only its owner may use.
+    """Serve a socket that only its owner may use.
 
     Args:
-        path: Where; its folder must be private.
-        answer: What to say.
-        clock: Monotonic time in s.
+        path: Path of the socket; its folder must be private.
+        answer: Answers requests.
+        request_s: Time in which a request must be complete.
+
+    Raises:
+        RunError: The socket cannot be made.
     """
 
-    def __init__(
-        self, path: Path, answer: Answer, clock: Callable[[], float] = time.monotonic
-    ) -> None:
-        self._answer = answer
-        self._clock = clock
-        self._clients: dict[int, _Client] = {}
-        self._path = path
-        self._selector = selectors.DefaultSelector()
-        self._listener = _listening(path)
-        self._selector.register(self._listener, selectors.EVENT_READ)
+    def __init__(self, path: Path, answer: Answer, request_s: float = _REQUEST_S) -> None:
+        self._path, self._answer, self._request_s = path, answer, request_s
+        self._server = _Server(path, answer, request_s)
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._serve, name="control", daemon=True)
 
     def __enter__(self) -> Self:
         return self
@@ -80,220 +58,108 @@ class ControlServer:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        for client in list(self._clients.values()):
-            self._drop(client)
-        self._selector.close()
-        self._listener.close()
+        self._closing.set()
+        if self._thread.ident is not None:
+            self._thread.join()
+        self._server.server_close()
 
-    def serve(self, timeout_s: float) -> None:
-        """Wait for something to do, at most that long, and do it."""
-        if not self._path.exists():
-            self._listen_again()
-        until = self._clock() + timeout_s
-        while True:
-            later = [each for each in self._clients.values() if each.later is not None]
-            left_s = max(0.0, until - self._clock())
-            for key, _ in self._selector.select(min(left_s, _LATER_S) if later else left_s):
-                if key.fileobj is self._listener:
-                    self._accept()
-                # One that was read may have made room for another of the same descriptor.
-                elif (client := self._clients.get(key.fd)) is not None:
-                    self._read(client)
-            for client in later:
-                self._answer_later(client)
-            now = self._clock()
-            for client in [each for each in self._clients.values() if now > each.until]:
-                self._drop(client)
-            if now >= until:
-                return
+    def start(self) -> None:
+        """Start to answer; earlier requests have waited."""
+        self._thread.start()
 
-    def _listen_again(self) -> None:
-        """Listen at the same place after somebody has removed the socket or its folder."""
+    def _serve(self) -> None:
+        while not self._closing.is_set():
+            self._restore_socket()
+            self._server.handle_request()
+
+    def _restore_socket(self) -> None:
+        """Listen again at the same path if the socket or its folder was removed."""
         folder = self._path.parent
-        with suppress(OSError, RunError):  # if not now, perhaps the next time
+        with suppress(OSError, RunError):  # retried at the next poll
+            if self._path.exists():
+                return
             private_folder(private_folder(folder.parent) / folder.name)
-            listener = _listening(self._path)
-            self._selector.unregister(self._listener)
-            self._listener.close()
-            self._listener = listener
-            self._selector.register(listener, selectors.EVENT_READ)
+            server = _Server(self._path, self._answer, self._request_s)
+            self._server.server_close()
+            self._server = server
 
-    def _accept(self) -> None:
+
+class _Server(socketserver.ThreadingUnixStreamServer):
+    daemon_threads = True
+    request_queue_size = _BACKLOG
+    timeout = _POLL_S
+
+    def __init__(self, path: Path, answer: Answer, request_s: float) -> None:
+        self.answer, self.request_s = answer, request_s
+        self._path = path
+        self._free = threading.BoundedSemaphore(_MAX_CLIENTS)
         try:
-            # All of them, up to what there is room for: a crowd must not fill the queue.
-            for _ in range(_MAX_CLIENTS):
-                self._welcome(self._listener.accept()[0])
-        except BlockingIOError:
-            return
-        except OSError:  # there are no descriptors left: some come back
-            self._drop_longest_silent()
+            super().__init__(str(path), _Handler)
+        except OSError as error:
+            raise RunError(f"{path}: can't listen: {error.strerror or error}") from None
 
-    def _welcome(self, connection: socket.socket) -> None:
-        if not _is_ours(connection):
-            connection.close()
-            return
-        if len(self._clients) >= _MAX_CLIENTS:
-            self._drop_longest_silent()
-        connection.setblocking(False)
-        client = _Client(connection, self._clock() + _SILENT_S)
-        self._clients[connection.fileno()] = client
-        self._selector.register(connection, selectors.EVENT_READ)
-        # At once: what has been asked already can't be pushed out by those who come next.
-        self._read(client)
-
-    def _read(self, client: _Client) -> None:
+    def server_bind(self) -> None:
+        # Not chmod after bind: for that moment others could connect.
+        before = os.umask(0o177)
         try:
-            data = client.connection.recv(MAX_BYTES)
-        except BlockingIOError:
-            return
-        except OSError:
-            self._drop(client)
-            return
-        client.question += data
-        line, end, _ = client.question.partition(b"\n")
-        if len(line) > MAX_BYTES:
-            self._reply(client, {"ok": False, "error": f"longer than {MAX_BYTES} bytes"})
-        elif end or (line and not data):
-            self._question(client, bytes(line))
-        elif not data:
-            self._drop(client)
+            with short_path(self._path) as short:
+                self.socket.bind(short)
+        finally:
+            os.umask(before)
 
-    def _question(self, client: _Client, line: bytes) -> None:
+    def verify_request(self, request: Any, client_address: Any) -> bool:
+        return is_same_user(request)
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        self._free.acquire()  # other clients wait in the queue of the socket
         try:
-            answer = self._answer(line)
-        except InputError as error:
-            self._reply(client, {"ok": False, "error": str(error)})
-            return
-        if isinstance(answer, Mapping):
-            self._reply(client, {"ok": True, **answer})
-            return
-        # It has nothing more to say: that it has closed its side must not keep this one busy.
-        self._selector.unregister(client.connection)
-        client.later, client.until = answer, math.inf
+            super().process_request(request, client_address)
+        except RuntimeError:  # the thread cannot be started
+            self._free.release()
+            raise
 
-    def _answer_later(self, client: _Client) -> None:
-        assert client.later is not None
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
         try:
-            answer = client.later.answer()
-        except InputError as error:
-            self._reply(client, {"ok": False, "error": str(error)})
-            return
-        if answer is not None:
-            self._reply(client, {"ok": True, **answer})
+            super().process_request_thread(request, client_address)
+        finally:
+            self._free.release()
 
-    def _reply(self, client: _Client, answer: Mapping[str, Any]) -> None:
-        said = json.dumps({VERSION_KEY: VERSION, **answer})
-        with suppress(OSError):  # it did not wait, or can't take it: its loss
-            client.connection.send(said.encode() + b"\n")
-        self._drop(client)
-
-    def _drop_longest_silent(self) -> None:
-        silent = (each for each in self._clients.values() if each.later is None)
-        if (longest := next(silent, None)) is not None:
-            self._drop(longest)
-
-    def _drop(self, client: _Client) -> None:
-        del self._clients[client.connection.fileno()]
-        if client.later is None:
-            self._selector.unregister(client.connection)
-        client.connection.close()
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        _log.exception("a control request failed")
 
 
-def _listening(path: Path) -> socket.socket:
-    """Return a socket that listens at a path that only its owner may use.
+class _Handler(socketserver.BaseRequestHandler):
+    server: _Server
 
-    Raises:
-        RunError: It can't.
-    """
-    listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-    # Not chmod after bind: for that moment others could connect.
-    before = os.umask(0o177)
-    try:
-        with _short(path) as short:
-            listener.bind(short)
-    except OSError as error:
-        listener.close()
-        raise RunError(f"{path}: can't listen: {error.strerror or error}") from None
-    finally:
-        os.umask(before)
-    listener.listen(_BACKLOG)
-    listener.setblocking(False)
-    return listener
+    def handle(self) -> None:
+        with suppress(OSError):  # a client that is slow or has left gets no answer
+            if (line := self._read_line()) is not None:
+                self.request.settimeout(self.server.request_s)
+                self.request.sendall(self._answer(line))
 
+    def _read_line(self) -> bytes | None:
+        """Return the request; None if the client has sent nothing.
 
-@contextmanager
-def _short(path: Path) -> Iterator[str]:
-    """Give a short name of a socket: the kernel takes no more than 107 bytes.
+        Raises:
+            TimeoutError: It is not complete in time.
+        """
+        deadline = time.monotonic() + self.server.request_s
+        read = bytearray()
+        while b"\n" not in read and len(read) <= MAX_BYTES:
+            left_s = deadline - time.monotonic()
+            if left_s <= 0.0:
+                raise TimeoutError
+            self.request.settimeout(left_s)
+            if not (data := self.request.recv(MAX_BYTES)):
+                break
+            read += data
+        return bytes(read).partition(b"\n")[0] if read else None
 
-    Raises:
-        OSError: Its folder can't be opened.
-    """
-    folder = os.open(path.parent, os.O_PATH | os.O_DIRECTORY)
-    try:
-        yield f"/proc/self/fd/{folder}/{path.name}"
-    finally:
-        os.close(folder)
-
-
-def _is_ours(connection: socket.socket) -> bool:
-    raw = connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i"))
-    user = struct.unpack("3i", raw)[1]
-    return user in {0, os.getuid()}
-
-
-def ask(
-    path: Path,
-    question: Mapping[str, Any],
-    timeout_s: float = 5.0,
-    clock: Callable[[], float] = time.monotonic,
-) -> dict[str, Any]:
-    """Ask a run something, again where a crowd has pushed the question out.
-
-    Args:
-        path: Its socket.
-        question: What to ask; asked twice it must be the same as once.
-        timeout_s: Longest wait.
-        clock: Monotonic time in s.
-
-    Returns:
-        The answer.
-
-    Raises:
-        InputError: The run refuses; the text says why.
-        RunError: There is nobody, or no answer, or one of another version.
-    """
-    until = clock() + timeout_s
-    raw = json.dumps(question).encode() + b"\n"
-    try:
-        while not (said := _asked_once(path, raw, max(_LEAST_S, until - clock()))):
-            if clock() >= until:
-                raise TimeoutError("timed out among a crowd")
-        answer = json.loads(said)
-    except (OSError, ValueError) as error:
-        raise RunError(f"the run at {path.parent.name} does not answer: {error}") from None
-    spoken = answer.pop(VERSION_KEY, None) if isinstance(answer, dict) else None
-    if spoken != VERSION:
-        raise RunError(
-            f"the run at {path.parent.name} speaks protocol {spoken}, this hilctl {VERSION}: use "
-            "the hilctl that it was started with"
-        )
-    said_so: dict[str, Any] = answer
-    if not said_so.pop("ok", False):
-        raise InputError(str(said_so.get("error", "refused")))
-    return said_so
-
-
-def _asked_once(path: Path, raw: bytes, timeout_s: float) -> bytes:
-    """Return what a run says to a question; nothing where it has cut the connection."""
-    said = bytearray()
-    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
-        connection.settimeout(timeout_s)
-        with _short(path) as short:
-            connection.connect(short)
-        if not _is_ours(connection):
-            raise PermissionError("another user's process listens there")
-        with suppress(ConnectionResetError, BrokenPipeError):
-            connection.sendall(raw)
-            while not said.endswith(b"\n") and (data := connection.recv(_ANSWER_BYTES)):
-                said += data
-    return bytes(said)
+    def _answer(self, line: bytes) -> bytes:
+        answer: dict[str, Any] = {"ok": False, "error": f"longer than {MAX_BYTES} bytes"}
+        if len(line) <= MAX_BYTES:
+            try:
+                answer = {"ok": True, **self.server.answer(line)}
+            except InputError as error:
+                answer = {"ok": False, "error": str(error)}
+        return json.dumps({VERSION_KEY: VERSION, **answer}).encode() + b"\n"

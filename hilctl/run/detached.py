@@ -10,7 +10,7 @@ from pathlib import Path
 
 from hilctl.base.errors import HilctlError, InputError, RunError
 from hilctl.run.architecture import require_linux
-from hilctl.run.control_socket import ask
+from hilctl.run.client import ask
 from hilctl.run.protocol import request
 from hilctl.run.run_folder import RunFolder, runs
 from hilctl.run.start import checked_experiment, output_of

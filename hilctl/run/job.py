@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
-from hilctl.base.arrays import F64
 from hilctl.base.device import Device
 from hilctl.base.errors import RunError
+from hilctl.base.types import F64
 from hilctl.experiment.file import Experiment
 from hilctl.loop.adaptation import DisplacementOperator
 from hilctl.models.base import HysteresisModel

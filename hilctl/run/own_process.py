@@ -19,8 +19,8 @@ from types import FrameType
 from typing import Any, BinaryIO
 
 from hilctl.base.errors import HilctlError, RunError
+from hilctl.run.protocol import HANG_UP
 from hilctl.run.result import Progress, RunResult
-from hilctl.run.stopping import HANG_UP
 
 _log = logging.getLogger(__name__)
 

@@ -10,7 +10,7 @@ from hilctl.base.errors import InputError
 from hilctl.base.events import MARK, Event
 from hilctl.base.strict import Strict
 from hilctl.experiment.check import Checked
-from hilctl.run.changes import Changes, RequestedChange
+from hilctl.run.changes import Changes
 from hilctl.run.protocol import MAX_MARK
 from hilctl.run.ring_recorder import RingRecorder
 from hilctl.run.run_folder import RunFolder, facts_of
@@ -87,11 +87,11 @@ class Requests:
         self._page = page
         self._recording, self._recorder = recording, recording.recorder
         self._changes = Changes(checked, page)
-        self.attend = self._changes.attend
-        """Goes on with changes that are under way; to be called often."""
 
-    def answer(self, line: bytes) -> Mapping[str, Any] | RequestedChange:
-        """Return the answer to one line of JSON, or what will have it.
+    def answer(self, line: bytes) -> Mapping[str, Any]:
+        """Return the answer to one line of JSON; a change waits for the one before.
+
+        Several threads may call it.
 
         Raises:
             InputError: It is no request, or can't be followed; nothing has changed.
@@ -106,9 +106,7 @@ class Requests:
             return self._status()
         if isinstance(request, MarkRequest):
             return self._mark(request.text)
-        change = RequestedChange(request.gain, request.offset, request.over_s, request.inverse)
-        self._changes.add(change)
-        return change
+        return self._changes.make(request.gain, request.offset, request.over_s, request.inverse)
 
     def _mark(self, text: str) -> dict[str, Any]:
         if not self._recording.takes_marks:

@@ -25,8 +25,8 @@ from typing import Any, Self
 import numpy as np
 import numpy.typing as npt
 
-from hilctl.base.arrays import I64
 from hilctl.base.samples import ANSWERS, COLUMNS, LAST_SAMPLE, LONGEST_NS, Batch, Flag, Head
+from hilctl.base.types import I64
 from hilctl.loop.block import COMMAND, Block
 from hilctl.run.run_folder import RunFolder
 from hilctl.run.shared_page import SIZE as _PAGE_SIZE

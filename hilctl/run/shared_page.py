@@ -20,8 +20,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hilctl.base.arrays import F64, I64
 from hilctl.base.events import Event
+from hilctl.base.types import F64, I64
 from hilctl.loop.safe_output import OutputState
 
 if TYPE_CHECKING:

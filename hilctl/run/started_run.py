@@ -13,12 +13,12 @@ from hilctl.experiment.check import Checked
 from hilctl.loop.plan import Outcome
 from hilctl.loop.safe_output import describe
 from hilctl.run.child import LoopChild
+from hilctl.run.protocol import HANG_UP, STOP_SIGNAL
 from hilctl.run.result import Progress
 from hilctl.run.ring import SampleRing
 from hilctl.run.ring_recorder import RingRecorder
 from hilctl.run.safety import Safety
 from hilctl.run.shared_page import Field, Stop
-from hilctl.run.stopping import HANG_UP, STOP_SIGNAL
 
 STOPS = {
     signal.SIGINT: Stop.CTRL_C,

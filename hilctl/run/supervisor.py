@@ -23,6 +23,7 @@ from hilctl.run.child import LoopChild
 from hilctl.run.control_socket import ControlServer
 from hilctl.run.guardian_process import GuardianRelief
 from hilctl.run.progress import ProgressThread
+from hilctl.run.protocol import JOB_CONTROL, STOP_SIGNAL
 from hilctl.run.recorder import Recorder
 from hilctl.run.requests import Requests
 from hilctl.run.result import Progress, RunResult
@@ -32,7 +33,6 @@ from hilctl.run.run_folder import RunFolder, held_devices, run_folder
 from hilctl.run.safety import Safety, guardian_starter
 from hilctl.run.shared_page import Field, PageText, SharedPage
 from hilctl.run.started_run import STOPS, StartedRun
-from hilctl.run.stopping import JOB_CONTROL, STOP_SIGNAL
 from hilctl.run.systemd import Notifier
 
 _log = logging.getLogger(__name__)
@@ -118,7 +118,7 @@ class Supervisor:
                 raise
             relief.discard()
             _go(ring.page, start_ns)
-            self._attend(started, server, requests)
+            self._attend(started, server)
             ring.page.put(Field.RECORDED, int(not recorder.error))
             stops = self._stops
             guarded = safety.close(lambda: self._stops > stops)
@@ -195,17 +195,17 @@ class Supervisor:
             "nothing has moved"
         )
 
-    def _attend(self, started: StartedRun, server: ControlServer, requests: Requests) -> None:
+    def _attend(self, started: StartedRun, server: ControlServer) -> None:
         """See to a run until its recording is closed, whatever goes wrong meanwhile."""
         shown: ProgressThread | None = None
         try:
             shown = ProgressThread(started.progress, self._on_progress, started.progress_failed)
             shown.start()
+            server.start()
             self._notifier.say("READY=1", f"STATUS=recording to {self._output}")
             while started.attend(self._stop_signal):
                 self._notifier.alive()
-                requests.attend()
-                server.serve(_POLL_S)
+                time.sleep(_POLL_S)
             self._notifier.say("STOPPING=1")
         except Exception as error:  # noqa: BLE001  it must not cost coil, ring or recording
             started.break_off(error)

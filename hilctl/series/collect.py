@@ -12,8 +12,7 @@ from hilctl.recording.reader import read
 from hilctl.series.columns import COMPLETED, PLANNED, SeriesEntry, find_table, read_entries
 from hilctl.series.digest import RunDigest, digest_of
 from hilctl.series.dimension import Dimension, dimensions, keys_of, short_value, value_at
-from hilctl.series.drift import SeriesDrift, drift_of
-from hilctl.series.run_figures import RunFigures
+from hilctl.series.run_figures import RunFigures, SeriesDrift, drift_of
 
 OnRead = Callable[[float, str], None]
 """Called with what is done, from 0 to 1, and what is being read."""

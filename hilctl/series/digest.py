@@ -11,9 +11,9 @@ from hilctl.analysis.canvas import min_max
 from hilctl.analysis.report import judge as judge_segment
 from hilctl.analysis.report import worst_segment
 from hilctl.analysis.steady import steady_part
-from hilctl.base.arrays import F64
 from hilctl.base.errors import ConfigError, DataError, InputError, ModelError
 from hilctl.base.segments import Segment
+from hilctl.base.types import F64
 from hilctl.base.yaml import Document
 from hilctl.characterise.response import SmallSignal
 from hilctl.models.base import HysteresisModel

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import PurePath
 from typing import Any
 
-from hilctl.base.quantity import significant, unit_text
+from hilctl.base.formatting import significant, unit_text
 
 _IGNORED = ("name", "description", "labels", "recording", "device.seed", "condition")
 _NAMES = {

@@ -3,7 +3,7 @@
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 
-from hilctl.base.quantity import quantity, significant
+from hilctl.base.formatting import quantity, significant
 from hilctl.series.collect import RunSeries, SeriesRun
 from hilctl.series.dimension import Dimension
 from hilctl.series.trend import (

@@ -8,8 +8,8 @@ from matplotlib.axes import Axes
 
 from hilctl.analysis.canvas import DISPLACEMENT, MARK, QUIET, REFERENCE
 from hilctl.analysis.sheet import Panel, Sheet
-from hilctl.base.arrays import F64
-from hilctl.base.quantity import quantity
+from hilctl.base.formatting import quantity
+from hilctl.base.types import F64
 from hilctl.series.collect import RunSeries, SeriesRun
 from hilctl.series.digest import RunDigest
 from hilctl.series.dimension import WITHOUT_COMPENSATOR, Dimension

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hilctl.base import metrics
-from hilctl.base.arrays import F64
+from hilctl.base.types import F64
 
 _LEAST = 0.01  # of the input's span: smaller turns are noise of a measured input
 _GRID = 200

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import least_squares
 
-from hilctl.base.arrays import F64
+from hilctl.base.types import F64
 
 _CYCLES = 8.0  # of the ringing that are looked at
 _FEWEST = 40  # samples

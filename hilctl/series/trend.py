@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from hilctl.base.arrays import F64
+from hilctl.base.types import F64
 from hilctl.series.collect import RunSeries, SeriesRun
 from hilctl.series.dimension import Dimension
 
@@ -22,7 +22,7 @@ class RunFigure:
     Attributes:
         name: Its column in the table.
         text: What it is, for people.
-        unit: Its unit; ``%`` or as in :func:`hilctl.base.quantity.quantity`.
+        unit: Its unit; ``%`` or as in :func:`hilctl.base.formatting.quantity`.
         short: Heading where there is no room for more.
         value: Takes it from a run; None where it has none.
     """

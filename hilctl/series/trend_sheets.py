@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 
 from hilctl.analysis.canvas import COMMAND, DISPLACEMENT, ERROR, MARK, QUIET
 from hilctl.analysis.sheet import Panel, Sheet
-from hilctl.base.quantity import unit_text
+from hilctl.base.formatting import unit_text
 from hilctl.series.collect import RunSeries, SeriesRun
 from hilctl.series.dimension import Dimension
 from hilctl.series.look import looks, spread

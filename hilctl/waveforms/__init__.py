@@ -2,7 +2,6 @@
 
 spec.py     pydantic models of each kind
 shapes.py   pure: one kind and a sample rate -> label, spectrum, samples
-parts.py    soft starts and ends, and what repeats
 table.py    waveforms read from CSV, NPY and MCAP files
-build.py    a whole reference: shape, soft start and end, sequences, segments to judge
+build.py    a whole reference: shapes, soft starts and ends, sequences, segments, repetitions
 """

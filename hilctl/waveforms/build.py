@@ -1,17 +1,32 @@
 """A whole reference: shapes, soft starts and ends, sequences, and what of it is judged."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from hilctl.base.arrays import CHUNK, F64, chunks
 from hilctl.base.errors import InputError
 from hilctl.base.segments import Segment
+from hilctl.base.types import CHUNK, F64, chunks
 from hilctl.waveforms import shapes, spec
-from hilctl.waveforms.parts import Repeat, soften, telling
 from hilctl.waveforms.table import read_samples
+
+
+@dataclass(frozen=True, slots=True)
+class Repeat:
+    """What repeats within a reference, to the last bit or to a sample's part.
+
+    Attributes:
+        start: Its first sample.
+        stop: After its last one.
+        period: Samples in a period, not necessarily whole.
+    """
+
+    start: int
+    stop: int
+    period: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,22 +138,14 @@ def _part(w: spec.SinglePart, name: str, unit: str, sample_rate_hz: float, folde
                 f"{name}: every frequency must be below half the sample rate, "
                 f"{sample_rate_hz / 2.0:.10g} Hz: {highest_hz:.10g} Hz"
             )
-        values, period = _computed(shapes.sampled(w, sample_rate_hz)), period_s * sample_rate_hz
+        values, period = shapes.sampled(w, sample_rate_hz), period_s * sample_rate_hz
     n = values.size
     soft_start, soft_end = _soft_samples(w, name, n, sample_rate_hz)
     period = period if math.isfinite(period) else 0.0
     segment = Segment(label, 0, n, soft_start, n - soft_end, period)
-    soften(values, w.rest, soft_start, soft_end)
+    _soften(values, w.rest, soft_start, soft_end)
     # What a file says of its period is its author's word.
     return _Part(values, segment, period > 0.0 and w.kind != "file")
-
-
-def _computed(values: shapes.Values) -> F64:
-    """Return an array of values that are computed part by part: float64[n]."""
-    whole = np.empty(values.size)
-    for start in range(0, whole.size, CHUNK):
-        whole[start : start + CHUNK] = values[start : start + CHUNK]
-    return whole
 
 
 def _soft_samples(w: spec.SinglePart, name: str, n: int, sample_rate_hz: float) -> tuple[int, int]:
@@ -151,3 +158,39 @@ def _soft_samples(w: spec.SinglePart, name: str, n: int, sample_rate_hz: float) 
         )
     # whole samples, and one that rounding kept from being whole: never more than n together
     return int(w.soft_start_s * sample_rate_hz + 1e-6), int(w.soft_end_s * sample_rate_hz + 1e-6)
+
+
+def _soften(values: F64, rest: float, start: int, end: int) -> None:
+    """Bend the first and the last values to rest, in place.
+
+    Args:
+        values: float64[n].
+        rest: The value that they begin at and end at.
+        start: How many are bent at the start.
+        end: How many at the end; none of them twice.
+    """
+    first, last = values[:start], values[values.size - end :]
+    first[:] = rest + _raised_cosine(start) * (first - rest)
+    last[:] = rest + _raised_cosine(end)[::-1] * (last - rest)
+
+
+def _raised_cosine(n: int) -> F64:
+    """Return a raised cosine that grows from 0 to 1: float64[n]."""
+    values: F64 = 0.5 - 0.5 * np.cos(np.pi * np.arange(n) / max(n, 1))
+    return values
+
+
+def telling(size: int, repeats: Sequence[Repeat]) -> tuple[slice, ...]:
+    """Return the parts of a reference that show all there is to see in it.
+
+    Args:
+        size: How many samples it has.
+        repeats: What repeats in it, in order.
+    """
+    parts, at = [], 0
+    for each in repeats:
+        shown, ends_at = each.start + shapes.telling_samples(each.period), each.stop - CHUNK
+        if shown < ends_at:
+            parts.append(slice(at, shown))
+            at = ends_at
+    return (*parts, slice(at, size))

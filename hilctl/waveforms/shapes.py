@@ -3,12 +3,11 @@
 import math
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import Protocol
 
 import numpy as np
 
-from hilctl.base.arrays import CHUNK, F64, I64
 from hilctl.base.errors import InputError
+from hilctl.base.types import CHUNK, F64, I64
 from hilctl.waveforms import spec
 
 MAX_SAMPLES = 100_000_000
@@ -77,52 +76,29 @@ def outline(w: spec.Shape, unit: str) -> tuple[str, float, float]:
             return w.kind, 0.0, 0.0
 
 
-class Values(Protocol):
-    """Values that are computed part by part: the same bits, however divided; an array is one."""
-
-    @property
-    def size(self) -> int:
-        """How many there are."""
-        ...
-
-    def __getitem__(self, part: slice, /) -> F64:
-        """Return those of a part, float64[stop - start]; not to be written to."""
-        ...
-
-
-def sampled(w: spec.Shape, sample_rate_hz: float) -> Values:
+def sampled(w: spec.Shape, sample_rate_hz: float) -> F64:
     """Return every sample of a waveform, offset included and not yet softened: float64[n].
 
     Raises:
         InputError: They are too many.
     """
     size = sample_count(_duration_s(w), sample_rate_hz)
-    match w:
-        case spec.RandomSines():
-            return w.offset + _random(w, size)
-        case spec.Multisine():
-            scale = _multisine_scale(w, sample_rate_hz, size)
-            return _Shaped(w, sample_rate_hz, size, _period(w, sample_rate_hz), scale)
-        case _:
-            return _Shaped(w, sample_rate_hz, size, _period(w, sample_rate_hz))
+    if isinstance(w, spec.RandomSines):
+        return w.offset + _random(w, size)
+    values = _computed(w, sample_rate_hz, size)
+    if isinstance(w, spec.Multisine):
+        values *= _multisine_scale(w, sample_rate_hz, values)
+    values += w.offset
+    return values
 
 
-@dataclass(frozen=True, slots=True)
-class _Shaped:
-    """A waveform's samples, worked out where they are asked for; of what repeats, one period."""
-
-    shape: spec.ShapeOfTime
-    sample_rate_hz: float
-    size: int
-    period: int
-    scale: float = 1.0
-
-    def __getitem__(self, part: slice, /) -> F64:
-        start, stop, _ = part.indices(self.size)
-        count = max(stop - start, 0)
-        worked_out = min(count, self.period or count)
-        at = _Instants(np.arange(start, start + worked_out), self.sample_rate_hz)
-        return np.resize(self.shape.offset + _shape(self.shape, at, self.scale), count)
+def _computed(w: spec.ShapeOfTime, sample_rate_hz: float, size: int) -> F64:
+    """Return a waveform's samples without its offset, from one period if it repeats: float64[n]."""
+    once = np.empty(min(size, _period(w, sample_rate_hz) or size))
+    for start in range(0, once.size, CHUNK):
+        stop = min(start + CHUNK, once.size)
+        once[start:stop] = _shape(w, _Instants(np.arange(start, stop), sample_rate_hz))
+    return once if once.size == size else np.resize(once, size)
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,7 +158,7 @@ def _duration_s(w: spec.Shape) -> float:
             return w.duration_s
 
 
-def _shape(w: spec.ShapeOfTime, at: _Instants, scale: float) -> F64:
+def _shape(w: spec.ShapeOfTime, at: _Instants) -> F64:
     match w:
         case spec.Sine():
             return w.amplitude * _sine(w.frequency_hz, math.radians(w.phase_deg), at)
@@ -202,7 +178,7 @@ def _shape(w: spec.ShapeOfTime, at: _Instants, scale: float) -> F64:
         case spec.Chirp():
             return _chirp(w, at.t)
         case spec.Multisine():
-            return scale * _multisine(w, at)
+            return _multisine(w, at)
         case spec.Step() | spec.Hold() | spec.LevelPath():
             return _levelled(w, at.t)
 
@@ -256,16 +232,13 @@ def _multisine(w: spec.Multisine, at: _Instants) -> F64:
     return total
 
 
-def _multisine_scale(w: spec.Multisine, sample_rate_hz: float, size: int) -> float:
-    """Return what gives a multisine its amplitude, by its peak over the samples that tell it."""
-    told = size
-    if size > LONG:
+def _multisine_scale(w: spec.Multisine, sample_rate_hz: float, values: F64) -> float:
+    """Return the factor that gives a multisine its amplitude, from the peak of its samples."""
+    told = values.size
+    if told > LONG:
         period = outline(w, "")[2] * sample_rate_hz
-        told = min(size, telling_samples(period) if math.isfinite(period) else size)
-    without = w.model_copy(update={"offset": 0.0})
-    plain = _Shaped(without, sample_rate_hz, told, _period(w, sample_rate_hz))
-    parts = (plain[start : start + CHUNK] for start in range(0, told, CHUNK))
-    peak = max(float(np.max(np.abs(part))) for part in parts)
+        told = min(told, telling_samples(period) if math.isfinite(period) else told)
+    peak = float(np.max(np.abs(values[:told])))
     return 1.0 if peak == 0.0 else w.amplitude / peak
 
 

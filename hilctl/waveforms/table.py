@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from hilctl.base.arrays import F64
 from hilctl.base.errors import InputError
 from hilctl.base.remedy import no_such_file, reason
 from hilctl.base.segments import SHORTEST_PERIOD
 from hilctl.base.text_table import MAX_COLUMNS, TextTable, check_rows, column_index
+from hilctl.base.types import F64
 from hilctl.waveforms.shapes import check_length
 from hilctl.waveforms.spec import FileWaveform
 

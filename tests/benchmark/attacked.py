@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 import yaml
 
-from hilctl.base.arrays import F64, I64
 from hilctl.base.samples import Flag
+from hilctl.base.types import F64, I64
 from hilctl.recording.data import Samples
 from hilctl.run.ring import SampleRing
 from hilctl.run.shared_page import SharedPage

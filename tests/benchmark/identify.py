@@ -22,8 +22,7 @@ from hilctl.identify.fit_model import fit_model
 from hilctl.identify.judge import Judgement, judge
 from hilctl.identify.settings import FitSettings
 from hilctl.kernels.hysteresis import deadband_block
-from hilctl.models.integrated import IntegratedModel
-from hilctl.models.published import exponential_integrated
+from hilctl.models.integrated import IntegratedModel, exponential_integrated
 from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
 
 RATE_HZ = 50_000.0

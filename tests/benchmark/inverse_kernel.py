@@ -35,7 +35,7 @@ def reference_um() -> np.ndarray:
 
 def inverse_parameters() -> tuple[Any, ...]:
     """Return what the kernel takes between input and memory: 12 plays, 17 deadbands."""
-    from hilctl.models.published import exponential_integrated
+    from hilctl.models.integrated import exponential_integrated
 
     model = exponential_integrated(
         alpha=0.3, gamma_s=2e-4, a_0=1.0, alpha_0=0.2, beta_0=0.3, g_0=6.0,

@@ -20,9 +20,9 @@ from pathlib import Path
 
 import numpy as np
 
-from hilctl.base.arrays import F64, U32
 from hilctl.base.samples import COLUMNS, Batch, Head
 from hilctl.base.segments import Segment
+from hilctl.base.types import F64, U32
 from hilctl.experiment.check import Checked
 from hilctl.loop.compensator import Compensator
 from hilctl.loop.limiter import Limiter

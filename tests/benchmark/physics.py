@@ -22,7 +22,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 
-from hilctl.base.arrays import F64
+from hilctl.base.types import F64
 from hilctl.experiment.condition import conditioning_of
 from hilctl.experiment.initial_state import InitialState, begin, left_by
 from hilctl.experiment.load import LoadedExperiment, load_experiment

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from hilctl.base.arrays import F64
+from hilctl.base.types import F64
 from hilctl.waveforms import spec
 from hilctl.waveforms.shapes import sampled
 
@@ -119,14 +119,14 @@ def _complex(low_hz: float) -> F64:
         for amplitude, frequency_hz in ((1.0, low_hz), (5.0, 2.0 * low_hz))
     )
     shape = spec.ComplexHarmonic(kind="complex_harmonic", components=parts, duration_s=0.16)
-    wave = sampled(shape, RATE_HZ)[:]
+    wave = sampled(shape, RATE_HZ)
     return wave / float(np.max(np.abs(wave)))
 
 
 def _triangle(stroke: Stroke) -> Row:
     """Return 100 Hz, judged away from its corners, which no structure with a mass follows."""
     shape = spec.Triangle(kind="triangle", amplitude=1.0, frequency_hz=100.0, duration_s=0.13)
-    row = stroke.row("triangle 100 Hz", (_SMALL_GOAL, None), sampled(shape, RATE_HZ)[:])
+    row = stroke.row("triangle 100 Hz", (_SMALL_GOAL, None), sampled(shape, RATE_HZ))
     turns = np.mod(100.0 * np.arange(row.judged.size) / RATE_HZ - 0.25, 0.5)
     row.judged[np.minimum(turns, 0.5 - turns) < 100.0 * _CORNER_S] = False
     return row
@@ -136,9 +136,9 @@ def _multisine() -> F64:
     shape = spec.Multisine(
         kind="multisine", amplitude=1.0, first_hz=5.0, last_hz=200.0, step_hz=5.0, duration_s=0.6
     )
-    return sampled(shape, RATE_HZ)[:]
+    return sampled(shape, RATE_HZ)
 
 
 def _chirp() -> F64:
     shape = spec.Chirp(kind="chirp", amplitude=1.0, start_hz=5.0, stop_hz=250.0, duration_s=0.8)
-    return sampled(shape, RATE_HZ)[:]
+    return sampled(shape, RATE_HZ)

@@ -38,8 +38,8 @@ from hilctl_drivers.text.lines import (
     parse_number,
 )
 from hilctl_drivers.wire.crc import CRCS
-from hilctl_drivers.wire.errors import Corrupt, FrameError
 from hilctl_drivers.wire.framing import binary_framing
+from hilctl_drivers.wire.links import Corrupt, FrameError
 
 BINARY = [(kind, crc) for kind in ("cobs", "length") for crc in CRCS if crc != "none"]
 NUMPY = {

@@ -12,8 +12,7 @@ from hilctl.kernels.hysteresis import play_sum_shared, rest_memory
 from hilctl.models.deadband import DeadbandFunction
 from hilctl.models.files import dump_model, parse_model
 from hilctl.models.integrated import IntegratedModel
-from hilctl.models.plays import PpiModel, RdpiModel
-from hilctl.models.spi import SpiModel
+from hilctl.models.plays import PpiModel, RdpiModel, SpiModel
 
 SAMPLE_RATE_HZ = 20_000.0
 LEVEL = st.floats(-100.0, 100.0)

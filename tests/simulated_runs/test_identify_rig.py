@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hilctl.base.arrays import F64
 from hilctl.base.metrics import fold, peak_hysteresis_percent
+from hilctl.base.types import F64
 from hilctl.identify.data.cycles import average_cycle
 from hilctl.identify.data.records import SteadyLoop
 from hilctl.identify.fit_model import FittedModel, fit_model

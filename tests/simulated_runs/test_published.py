@@ -13,7 +13,7 @@ import pytest
 from hilctl.analysis.replay import replay
 from hilctl.analysis.report import summarize
 from hilctl.models.files import dump_model
-from hilctl.models.spi import SpiModel
+from hilctl.models.plays import SpiModel
 from hilctl.recording.reader import read
 from hilctl.run.start import checked_experiment
 from hilctl.run.unpaced import run_unpaced

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 import scipy
 
-from hilctl.base.arrays import F64
+from hilctl.base.types import F64
 from hilctl.identify.catalogue import CATALOGUE, HISTORIES
 from hilctl.identify.data.cycles import average_cycle
 from hilctl.identify.data.records import History, SteadyLoop

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from hilctl.analysis import html
-from hilctl.base.arrays import F64, I64, U32
 from hilctl.base.events import Event
 from hilctl.base.samples import Flag, Samples
 from hilctl.base.segments import Segment
+from hilctl.base.types import F64, I64, U32
 from hilctl.recording.data import Recording, Ticks
 
 MakeRecording = Callable[..., Recording]

@@ -7,19 +7,17 @@ ROOT = UNIT.parents[1]
 PACKAGES = {Path(): ROOT / "hilctl", Path("drivers"): ROOT / "drivers" / "hilctl_drivers"}
 
 WITHOUT = {
-    "base/arrays": "names of array types; nothing runs",
+    "base/types": "names of types; waveforms/test_build.py reads arrays in chunks",
     "base/device": "the contract of devices: tests/contract/test_devices.py holds each to it",
-    "base/units": "a name of a type; nothing runs",
     "base/events": "one record of plain values; seen in run/test_shared_page.py",
     "cli/options": "types of options; cli/test_commands.py loads every command that has them",
     "drivers/contract": "the checks of tests/contract; test_bad_devices.py makes each of them fail",
     "drivers/emulator/wire": "a contract and a record; drivers/emulator/test_server.py uses both",
-    "drivers/labjack/safe_write": "two messages; labjack/test_device.py sees what becomes of them",
     "experiment/run_parts": "a contract; run/test_carried_out.py runs what keeps it",
     "loop/host": "a contract and a record; loop/test_loop.py runs the loop on a double of it",
     "loop/plan": "two records of plain values; loop/test_loop.py fills and reads all of them",
     "recording/facts": "names; analysis/test_catalogue.py reads all of them",
-    "run/protocol": "words and one function; run/test_requests.py holds both sides to it",
+    "run/protocol": "constants and small functions; run/test_requests.py and test_client.py use it",
     "recording/data": "records of plain values; recording/test_reader.py fills them",
 }
 """Modules without a file of their own, and where they are tested instead."""

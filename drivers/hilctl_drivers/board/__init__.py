@@ -3,7 +3,6 @@
 profile.py  what a profile says of one
 frames.py   its messages
 session.py  one conversation
-timing.py   how long a block takes
 wire.py     sample by sample, and through a FIFO
 """
 

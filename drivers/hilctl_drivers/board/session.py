@@ -7,13 +7,19 @@ from struct import Struct
 
 import numpy as np
 
-from hilctl.base.arrays import F64
 from hilctl.base.errors import DeviceError, InputError
+from hilctl.base.types import F64
 from hilctl_drivers.board import frames as board
 from hilctl_drivers.board.profile import FrameChannel, FrameProfile
-from hilctl_drivers.wire.errors import BadRequest, Incomplete, Mismatch, Refused, WatchdogTripped
 from hilctl_drivers.wire.framing import CobsFraming, Framing, binary_framing
-from hilctl_drivers.wire.links import Link
+from hilctl_drivers.wire.links import (
+    BadRequest,
+    Incomplete,
+    Link,
+    Mismatch,
+    Refused,
+    WatchdogTripped,
+)
 
 _CODES = {"int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4", "float32": "f4",
           "float64": "f8"}  # fmt: skip

@@ -9,8 +9,8 @@ setup.py           devices, rig and ports put together
 wired.py           what to emulate for an experiment
 server.py          one thread that answers, over connections.py
 wire.py            requests out of bytes, replies into bytes: modbus_wire.py, serial_wire.py
-modbus_device.py   a device of registers.py, with its watchdog.py
-labjack_stream.py  the streams of a LabJack; labjack_input.py  their readings
+modbus_device.py   a device of registers.py, with its watchdog
+labjack_stream.py  the streams of a LabJack
 text_device.py     a device that speaks lines of text
 board_device.py    a microcontroller board
 fifo.py            values put out by the device's own sample clock

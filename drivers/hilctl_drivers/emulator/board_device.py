@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from hilctl.base.arrays import F64
+from hilctl.base.types import F64
 from hilctl_drivers.board import frames as board
 from hilctl_drivers.board.frames import Status
 from hilctl_drivers.board.profile import FrameProfile, FrameStreaming

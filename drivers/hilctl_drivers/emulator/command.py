@@ -12,7 +12,7 @@ from typing import Annotated, Any, cast
 import typer
 
 from hilctl.base.errors import InputError
-from hilctl.base.finite_json import finite_json
+from hilctl.base.formatting import finite_json
 from hilctl_drivers.emulator.faults import parse_fault
 from hilctl_drivers.emulator.modbus_device import EmulatedModbus
 from hilctl_drivers.emulator.modbus_wire import LinkKind

@@ -7,7 +7,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from hilctl.base.arrays import F64
+from hilctl.base.types import F64
 from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
 
 _SETTLED_S = 0.1

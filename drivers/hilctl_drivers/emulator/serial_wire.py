@@ -8,8 +8,8 @@ from hilctl_drivers.board.profile import FrameProfile
 from hilctl_drivers.emulator.wire import EmulatedReply
 from hilctl_drivers.text.lines import LineFormat
 from hilctl_drivers.text.profile import AsciiProfile
-from hilctl_drivers.wire.errors import Corrupt
 from hilctl_drivers.wire.framing import Framing, binary_framing
+from hilctl_drivers.wire.links import Corrupt
 
 
 class LineFraming(Protocol):

@@ -2,9 +2,8 @@
 
 profile.py     what a profile says of streaming
 frames.py      Modbus function 76
-stream.py      registers and messages of a stream; timing.py  how long they take
-setup.py       an experiment's options, held against the profile
+stream.py      registers and messages of a stream
+setup.py       an experiment's options, held against the profile; time of a block
 session.py     one stream
-safe_write.py  one attempt to write the safe value
-device.py      the device
+device.py      the device, and its safe write
 """

@@ -12,21 +12,43 @@ from typing import ClassVar
 
 import numpy as np
 
-from hilctl.base.arrays import F64
 from hilctl.base.device import DeviceOptions
 from hilctl.base.errors import DeviceError
+from hilctl.base.types import F64
 from hilctl_drivers.device import DacDevice
-from hilctl_drivers.labjack.frames import ModbusFeedback
-from hilctl_drivers.labjack.safe_write import StreamSafeWrite
+from hilctl_drivers.labjack.frames import ModbusFeedback, ReadFrame, WriteFrame
 from hilctl_drivers.labjack.session import StreamSession
 from hilctl_drivers.labjack.setup import ModbusStreamOptions, StreamSetup
-from hilctl_drivers.labjack.stream import InputCalibration
+from hilctl_drivers.labjack.stream import ENABLE, InputCalibration, u32
 from hilctl_drivers.modbus.look import look
-from hilctl_drivers.modbus.safe_write import Connect
+from hilctl_drivers.modbus.safe_write import Connect, ModbusSafeWrite
 from hilctl_drivers.modbus.session import ModbusSession
 from hilctl_drivers.modbus.setup import ModbusPeer
 from hilctl_drivers.modbus.watchdog import ModbusGuard
+from hilctl_drivers.wire.links import Refused
 from hilctl_drivers.wire.timing import RateLimit
+
+
+class StreamSafeWrite(ModbusSafeWrite):
+    """Stops the stream and writes the output in one message; what is queued is dropped."""
+
+    def _put(self, session: ModbusSession, data: bytes) -> None:
+        feedback = ModbusFeedback(session.link, self._setup.writer.unit)
+        write = WriteFrame(self._setup.writer.address(self._setup.output), data)
+        # The stream first: it would write over the safe value with its next scan.
+        try:
+            feedback.call([WriteFrame(ENABLE, u32(0)), write])
+        except Refused:  # a stream that does not run can't be stopped
+            feedback.call([write])
+
+    def _check_held(self, session: ModbusSession, value: float) -> None:
+        output = self._setup.output
+        feedback = ModbusFeedback(session.link, self._setup.writer.unit)
+        target = ReadFrame(self._setup.writer.address(output), output.words)
+        running, held = feedback.call([ReadFrame(ENABLE, 2), target])
+        if running != u32(0):
+            raise DeviceError("the stream was stopped, but still runs")
+        self._check(output.format.decode(held), value)
 
 
 class ModbusStream(DacDevice):

@@ -11,8 +11,7 @@ from dataclasses import dataclass
 from typing import Final, TypeAlias
 
 from hilctl_drivers.modbus.pdu import EXCEPTIONS, FEEDBACK, PDU_MAX, TCP_HEAD, tcp_adu, tcp_pdu
-from hilctl_drivers.wire.errors import BadRequest, Mismatch, Refused
-from hilctl_drivers.wire.links import Link
+from hilctl_drivers.wire.links import BadRequest, Link, Mismatch, Refused
 
 FRAME_HEAD: Final = 4
 """Bytes of a frame before its data."""

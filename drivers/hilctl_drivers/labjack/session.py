@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import numpy.typing as npt
 
-from hilctl.base.arrays import F64
 from hilctl.base.errors import DeviceError
+from hilctl.base.types import F64
 from hilctl_drivers.labjack import stream
 from hilctl_drivers.labjack.frames import FeedbackFrame, ModbusFeedback, WriteFrame
 from hilctl_drivers.labjack.profile import LabJackStreaming

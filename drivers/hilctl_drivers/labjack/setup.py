@@ -1,14 +1,26 @@
 """What an experiment says of a device that streams over Modbus, held against its profile."""
 
+import math
 from dataclasses import dataclass, replace
 
 from hilctl.base.device import DeviceInfo
 from hilctl.base.errors import DeviceError, InputError
 from hilctl_drivers.labjack.profile import LabJackStreaming
-from hilctl_drivers.labjack.timing import stream_time
+from hilctl_drivers.labjack.stream import VALUES_MAX
+from hilctl_drivers.modbus.profile import ModbusProfile
 from hilctl_drivers.modbus.setup import ModbusOptions, ModbusSetup
-from hilctl_drivers.wire.timing import RateLimit
+from hilctl_drivers.wire.timing import RateLimit, WireTime
 from hilctl_drivers.wiring import FifoBlocks
+
+
+def stream_time(profile: ModbusProfile, block: int) -> WireTime:
+    """Return what a block costs: messages that bring its values, and one that waits for the clock.
+
+    Readings come back in the same messages, so that fetching the last of them is one more.
+    """
+    messages = math.ceil(block / VALUES_MAX) + 1
+    what = f"{block} samples in {messages} messages over TCP"
+    return WireTime(what, 0.0, 0.0, 0, 0.0, messages * profile.turnaround_s, block)
 
 
 class ModbusStreamOptions(ModbusOptions):

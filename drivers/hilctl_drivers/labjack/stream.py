@@ -17,12 +17,12 @@ from typing import Final, Literal
 import numpy as np
 import numpy.typing as npt
 
-from hilctl.base.arrays import F64
 from hilctl.base.errors import DeviceError
+from hilctl.base.types import F64
 from hilctl_drivers.labjack.frames import FRAME_HEAD, FeedbackFrame, ReadFrame, WriteFrame
 from hilctl_drivers.labjack.profile import BYTES_A_SAMPLE
 from hilctl_drivers.modbus.pdu import PDU_MAX
-from hilctl_drivers.wire.errors import Mismatch
+from hilctl_drivers.wire.links import Mismatch
 
 SCANRATE_HZ: Final = 4002
 NUM_ADDRESSES: Final = 4004

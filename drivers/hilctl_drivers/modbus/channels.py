@@ -7,7 +7,7 @@ from pydantic import Field, model_validator
 from hilctl.base.strict import Strict
 from hilctl_drivers.modbus.registers import RegisterFormat, RegisterType
 from hilctl_drivers.profile_parts import Range, WaitStep
-from hilctl_drivers.wire.errors import BadRequest
+from hilctl_drivers.wire.links import BadRequest
 
 Area: TypeAlias = Literal["coil", "discrete", "input", "holding"]
 AddressBase: TypeAlias = Literal[0, 1, "modicon"]

@@ -10,9 +10,9 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import ClassVar, TypeAlias
 
-from hilctl.base.arrays import F64
 from hilctl.base.device import DeviceOptions
 from hilctl.base.errors import DeviceError
+from hilctl.base.types import F64
 from hilctl_drivers.device import DacDevice
 from hilctl_drivers.modbus.look import look
 from hilctl_drivers.modbus.pdu import feedback_pdu, read_pdu, write_read_pdu
@@ -20,8 +20,7 @@ from hilctl_drivers.modbus.safe_write import Connect, ModbusSafeWrite
 from hilctl_drivers.modbus.session import ModbusSession
 from hilctl_drivers.modbus.setup import ModbusOptions, ModbusPeer, ModbusSetup
 from hilctl_drivers.modbus.watchdog import ModbusGuard
-from hilctl_drivers.wire.errors import Refused
-from hilctl_drivers.wire.links import NoAnswerError, naming
+from hilctl_drivers.wire.links import NoAnswerError, Refused, naming
 from hilctl_drivers.wire.serial_port import SerialLink
 
 Swap: TypeAlias = Callable[[bytes], bytes]

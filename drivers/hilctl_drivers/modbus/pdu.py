@@ -9,7 +9,7 @@ Modbus TCP]". Addresses are PDU addresses: counted from 0.
 import struct
 
 from hilctl_drivers.wire.crc import Bytes, crc16_modbus
-from hilctl_drivers.wire.errors import BadRequest, Corrupt, Incomplete, Mismatch, Refused
+from hilctl_drivers.wire.links import BadRequest, Corrupt, Incomplete, Mismatch, Refused
 
 READ_COILS, READ_DISCRETE, READ_HOLDING, READ_INPUT = 1, 2, 3, 4
 WRITE_COIL, WRITE_REGISTER, WRITE_REGISTERS, WRITE_READ = 5, 6, 16, 23

@@ -13,7 +13,7 @@ from operator import itemgetter
 from typing import Literal, TypeAlias
 
 from hilctl_drivers.wire.crc import Bytes
-from hilctl_drivers.wire.errors import BadRequest, Mismatch
+from hilctl_drivers.wire.links import BadRequest, Mismatch
 
 RegisterType: TypeAlias = Literal["int16", "uint16", "int32", "uint32", "float32", "float64"]
 

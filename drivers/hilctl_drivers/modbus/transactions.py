@@ -23,7 +23,7 @@ from hilctl_drivers.modbus.pdu import (
     tcp_pdu,
 )
 from hilctl_drivers.wire.crc import MODBUS_WORDS, Bytes, crc16_modbus
-from hilctl_drivers.wire.errors import BadRequest, Incomplete
+from hilctl_drivers.wire.links import BadRequest, Incomplete
 
 _TCP_SHORTEST = TCP_HEAD + 2
 _RTU_SHORTEST = 5

@@ -8,7 +8,7 @@ from hilctl_drivers.modbus.channels import ModbusStep, RegisterStep
 from hilctl_drivers.modbus.profile import ModbusWatchdog
 from hilctl_drivers.modbus.session import ModbusSession
 from hilctl_drivers.modbus.setup import ModbusSetup
-from hilctl_drivers.wire.errors import Refused
+from hilctl_drivers.wire.links import Refused
 from hilctl_drivers.wire.timing import check_feeds
 
 

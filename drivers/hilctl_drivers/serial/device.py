@@ -10,8 +10,8 @@ from typing import ClassVar, cast
 
 import numpy as np
 
-from hilctl.base.arrays import F64
 from hilctl.base.device import DeviceInfo, DeviceOptions
+from hilctl.base.types import F64
 from hilctl_drivers.device import DacDevice
 from hilctl_drivers.profile import named_class
 from hilctl_drivers.serial.setup import SerialOptions, SerialSetup

@@ -2,8 +2,8 @@
 
 from abc import ABC, abstractmethod
 
-from hilctl.base.arrays import F64
 from hilctl.base.errors import DeviceError, InputError
+from hilctl.base.types import F64
 from hilctl_drivers.profile_parts import Range
 from hilctl_drivers.serial.setup import SerialSetup
 from hilctl_drivers.wire.safe_exchange import SafeExchange

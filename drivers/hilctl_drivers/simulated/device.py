@@ -10,10 +10,10 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
-from hilctl.base.arrays import F64
 from hilctl.base.device import DeviceInfo, DeviceOptions
 from hilctl.base.errors import DeviceError
 from hilctl.base.strict import Field, Strict
+from hilctl.base.types import F64
 from hilctl_drivers.device import DacDevice
 from hilctl_drivers.simulated.plant import Plant
 

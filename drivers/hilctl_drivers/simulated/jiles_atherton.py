@@ -31,7 +31,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from hilctl.base.arrays import F64
+from hilctl.base.types import F64
 from hilctl.kernels.jit import kernel
 from hilctl_drivers.simulated.rods import (
     ROD_LENGTH_M,

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hilctl.base.arrays import F64
+from hilctl.base.types import F64
 from hilctl.kernels.jit import ensure_compiled, kernel
 from hilctl_drivers.simulated.rods import Coil, RodParameters, Rods
 

@@ -4,7 +4,7 @@ from abc import ABC, abstractmethod
 
 import numpy as np
 
-from hilctl.base.arrays import F64
+from hilctl.base.types import F64
 
 CHUNK = 4096  # samples a kernel call; bounds the scratch memory
 _DRAWN = 256

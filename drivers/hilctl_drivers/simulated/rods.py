@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
-from hilctl.base.arrays import F64
+from hilctl.base.types import F64
 
 ROD_LENGTH_M = 0.1206  # two rods of 60.3 mm, section 3.3.1 (chapter 2) of the dissertation
 ROD_RADIUS_M = 6.15e-3

@@ -12,8 +12,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from hilctl.base.arrays import F64
-from hilctl.base.exponential import exponential
+from hilctl.base.types import F64
+from hilctl.kernels.dynamics import exponential
 from hilctl.kernels.jit import ensure_compiled
 from hilctl_drivers.simulated.extras import Creep, SecondMode, Thermal, VoltageLimit
 from hilctl_drivers.simulated.pinned_cells import PinnedCellsParameters

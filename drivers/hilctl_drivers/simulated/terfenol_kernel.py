@@ -8,7 +8,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from hilctl.base.arrays import F64
+from hilctl.base.types import F64
 from hilctl.kernels.jit import kernel
 
 Amplification: TypeAlias = tuple[float, float, float, float, float, float]

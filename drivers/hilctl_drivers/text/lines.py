@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
 from hilctl_drivers.wire.crc import Bytes, dcon_checksum, gen_checksum
-from hilctl_drivers.wire.errors import BadRequest, Corrupt, Incomplete
+from hilctl_drivers.wire.links import BadRequest, Corrupt, Incomplete
 from hilctl_drivers.wire.splitters import DelimitedSplitter
 
 ChecksumKind: TypeAlias = Literal["none", "dcon", "gen"]

@@ -16,8 +16,14 @@ from hilctl_drivers.text.profile import (
     Reply,
     SendStep,
 )
-from hilctl_drivers.wire.errors import Corrupt, Mismatch, Refused, WatchdogTripped
-from hilctl_drivers.wire.links import Link, NoAnswerError
+from hilctl_drivers.wire.links import (
+    Corrupt,
+    Link,
+    Mismatch,
+    NoAnswerError,
+    Refused,
+    WatchdogTripped,
+)
 
 _ADDRESSED = re.compile(r"[!?]([0-9A-F]{2})")
 

@@ -3,8 +3,8 @@
 import re
 from string import Formatter
 
-from hilctl.base.arrays import F64
 from hilctl.base.errors import DeviceError, InputError, UnconfirmedError
+from hilctl.base.types import F64
 from hilctl_drivers.profile_parts import Range
 from hilctl_drivers.serial.setup import SerialSetup
 from hilctl_drivers.serial.wire import SerialWire, check_stands
@@ -12,8 +12,7 @@ from hilctl_drivers.text.lines import parse_number
 from hilctl_drivers.text.profile import AsciiInput, AsciiOutput, AsciiProfile
 from hilctl_drivers.text.session import AsciiSession
 from hilctl_drivers.text.timing import arm_s, exchange_time, feed_time, query_time
-from hilctl_drivers.wire.errors import WatchdogTripped
-from hilctl_drivers.wire.links import naming
+from hilctl_drivers.wire.links import WatchdogTripped, naming
 from hilctl_drivers.wire.timing import RateLimit, WireTime, check_feeds
 
 _NO_EVIDENCE = (

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import TypeAlias
 
-from hilctl_drivers.wire.errors import BadRequest
+from hilctl_drivers.wire.links import BadRequest
 
 Bytes: TypeAlias = bytes | bytearray | memoryview
 

@@ -11,7 +11,7 @@ from typing import Literal, Protocol, TypeAlias
 from cobs import cobs
 
 from hilctl_drivers.wire.crc import Bytes, Crc, named_crc
-from hilctl_drivers.wire.errors import BadRequest, Corrupt, Incomplete
+from hilctl_drivers.wire.links import BadRequest, Corrupt, Incomplete
 from hilctl_drivers.wire.splitters import DelimitedSplitter, PrefixedSplitter, Splitter
 
 FramingKind: TypeAlias = Literal["cobs", "length"]

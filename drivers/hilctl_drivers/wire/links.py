@@ -6,6 +6,21 @@ out who was asked for what: the device that owns the link adds it.
 
 This is what all links have in common; :mod:`hilctl_drivers.wire.tcp` and
 :mod:`hilctl_drivers.wire.serial_port` are the links.
+
+Errors of one message:
+
+DeviceError
+|-- NoAnswerError     nothing, or not all of a reply, in time
+|-- LostError         the connection is gone
+`-- FrameError        any of the below
+    |-- BadRequest    the request is not possible on this wire; nothing was sent
+    |-- Incomplete    a good beginning, but more bytes are needed
+    |-- Corrupt       a check or the structure is wrong
+    |-- Mismatch      well formed, but not the answer to the request
+    `-- Refused       the device understood and refused
+        `-- WatchdogTripped   its host watchdog has set the output to its safe value
+
+The texts describe the bytes; devices put their own name and the request in front.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -100,3 +115,47 @@ def cut(got: int, wanted: int, timeout_s: float) -> str:
     """
     what = f"only {got} bytes, {wanted} short," if got else "no answer"
     return f"{what} within {timeout_s:g} s"
+
+
+class FrameError(DeviceError):
+    """A message can't be built, or what came back is not a good answer to it."""
+
+
+class BadRequest(FrameError, ValueError):  # noqa: N818  conditions of a protocol, caught by name
+    """What is asked can't be put on this wire; nothing was sent.
+
+    Example scenarios: more registers than a frame holds, a value that the register's type or the
+    number's field can't hold. Also a ``ValueError``, so that a profile's validation can collect it.
+    """
+
+
+class Incomplete(FrameError):  # noqa: N818
+    """The bytes so far are the beginning of a message: read on until the deadline."""
+
+
+class Corrupt(FrameError):  # noqa: N818
+    """The bytes are not a message: a check or the structure is wrong."""
+
+
+class Mismatch(FrameError):  # noqa: N818
+    """A well-formed message, but not the answer to what was asked.
+
+    Example scenarios: another transaction, unit, function, address or length; a late answer to an
+    earlier request.
+    """
+
+
+class Refused(FrameError):  # noqa: N818
+    """The device understood the request and refused it.
+
+    Attributes:
+        code: Modbus exception code, SCPI error number or the device's own mark, such as ``E01``.
+    """
+
+    def __init__(self, text: str, code: int | str = "") -> None:
+        super().__init__(text)
+        self.code = code
+
+
+class WatchdogTripped(Refused):
+    """The host watchdog has tripped: the output is at its safe value, commands are ignored."""

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from typing import Generic, Protocol, TypeVar
 
 from hilctl_drivers.wire.crc import Bytes
-from hilctl_drivers.wire.errors import Corrupt
+from hilctl_drivers.wire.links import Corrupt
 
 Content = TypeVar("Content")
 

@@ -5,9 +5,9 @@ from collections.abc import Collection, Iterable
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from hilctl.base.arrays import F64
 from hilctl.base.errors import DataError
 from hilctl.base.segments import Segment
+from hilctl.base.types import F64
 from hilctl.identify.data.period import find_period
 from hilctl.identify.data.records import FEWEST_POINTS, History, SteadyLoop
 from hilctl.recording.data import Recording

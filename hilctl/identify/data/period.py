@@ -6,9 +6,9 @@ import numpy as np
 from scipy.fft import irfft, next_fast_len, rfft
 from scipy.optimize import minimize_scalar
 
-from hilctl.base.arrays import F64, I64
 from hilctl.base.errors import DataError
 from hilctl.base.metrics import MAD_TO_SIGMA
+from hilctl.base.types import F64, I64
 from hilctl.identify.data.records import FEWEST_POINTS
 
 LIKELY = 0.3  # least similarity worth a closer look; a decay lowers it

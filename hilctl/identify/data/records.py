@@ -7,8 +7,8 @@ from typing import TypeAlias
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from hilctl.base.arrays import F64
 from hilctl.base.errors import DataError
+from hilctl.base.types import F64
 
 FEWEST_POINTS = 16
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hilctl.base.arrays import F64, I64
+from hilctl.base.types import F64, I64
 from hilctl.identify.data.records import History, Record
 from hilctl.kernels.hysteresis import play_outputs, rest_memory
 

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from hilctl.base.arrays import F64, I64
+from hilctl.base.types import F64, I64
 from hilctl.kernels.jit import kernel
 
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hilctl.base.arrays import F64
+from hilctl.base.types import F64
 from hilctl.identify.staged.descend import bounded_solution
 
 STEPS, TRIALS = 5, 8  # most that are taken, and that are tried

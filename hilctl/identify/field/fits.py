@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 
-from hilctl.base.arrays import F64
 from hilctl.base.errors import DataError
+from hilctl.base.types import F64
 from hilctl.identify.data.records import History, SteadyLoop
 from hilctl.identify.field.prepared import Prepared
 from hilctl.identify.field.search import FieldEnd, FieldSearch, Size

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hilctl.base.arrays import F64, I64
+from hilctl.base.types import F64, I64
 from hilctl.identify.field.columns import swings
 
 LEAST_SWING = 0.1  # of the stroke: smaller swings count as this one

@@ -5,7 +5,7 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from hilctl.base.arrays import F64
+from hilctl.base.types import F64
 from hilctl.identify.field.prepared import Prepared, Run
 from hilctl.identify.field.weights import Curve
 from hilctl.kernels.field import field_left

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.linalg import cholesky, solve_triangular
 from scipy.optimize import nnls
 
-from hilctl.base.arrays import F64, I64
+from hilctl.base.types import F64, I64
 from hilctl.identify.field.columns import needed_points, play_columns, plays_given
 from hilctl.identify.field.descent import Place
 from hilctl.identify.linear import RIDGE

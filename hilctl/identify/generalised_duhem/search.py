@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
-from hilctl.base.arrays import F64, I64
+from hilctl.base.types import F64, I64
 from hilctl.identify.field.prepared import Prepared
 from hilctl.identify.field.rows import chosen
 from hilctl.identify.field.stages import Physical

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hilctl.base.arrays import F64, I64
+from hilctl.base.types import F64, I64
 from hilctl.identify.field.columns import turning_points
 from hilctl.identify.field.prepared import Latest, Prepared
 from hilctl.identify.field.rows import Motion

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import RegularGridInterpolator
 
-from hilctl.base.arrays import F64, I64
+from hilctl.base.types import F64, I64
 from hilctl.identify.generalised_duhem.signals import Path
 from hilctl.kernels.generalised_duhem import Band
 from hilctl.models.generalised_duhem import band_of

@@ -8,7 +8,7 @@ there.
 import numpy as np
 from scipy.optimize import nnls
 
-from hilctl.base.arrays import F64
+from hilctl.base.types import F64
 from hilctl.identify.job import FitJob, FoundModel
 from hilctl.identify.searched.search import converged, first_least
 from hilctl.identify.staged.layered import segments

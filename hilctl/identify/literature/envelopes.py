@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from hilctl.base.arrays import F64
+from hilctl.base.types import F64
 from hilctl.identify.job import FitJob, FoundModel
 from hilctl.identify.literature.operators import weigh
 from hilctl.identify.searched.search import converged, first_least

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from hilctl.base.arrays import F64, I64
+from hilctl.base.types import F64, I64
 from hilctl.identify.job import FitJob, FoundModel
 from hilctl.identify.linear import bounded_weights, numbered, smooth_densities
 from hilctl.models.kp import KrasnoselskiiPokrovskiiModel

@@ -1,6 +1,5 @@
 """Better models from recordings of their use.
 
-runs.py       recordings as commands and displacements from where the actuator stood
 remainder.py  what a model leaves of the displacement, as one linear problem
 strength.py   how firmly the old model is held to, by runs left out in turn
 command.py    from files to a better model, or to why there is none

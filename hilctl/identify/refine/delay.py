@@ -9,7 +9,7 @@ from typing import get_args
 
 import numpy as np
 
-from hilctl.base.arrays import F64
+from hilctl.base.types import F64
 from hilctl.identify.data.records import History
 from hilctl.kernels.residual import residual_columns
 from hilctl.models.base import HysteresisModel

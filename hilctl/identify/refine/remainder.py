@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hilctl.base.arrays import F64, I64
+from hilctl.base.types import F64, I64
 from hilctl.identify.data.records import History
 from hilctl.identify.refine.delay import delayed_model, fastest_um_per_s
 from hilctl.kernels.residual import residual_columns

@@ -5,9 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hilctl.base.arrays import F64
 from hilctl.base.errors import DataError
-from hilctl.base.units import CommandUnit
+from hilctl.base.types import F64, CommandUnit
 from hilctl.identify.data.records import History
 from hilctl.identify.fit_data import FitData
 from hilctl.identify.held_out import HeldOut, folds_of

@@ -1,6 +1,5 @@
 """Fits whose thresholds are searched from several starts.
 
-fits.py        from a job to a model
 search.py      least squares from several starts; refinement for the peak error
 plays.py       PPI, SPI and RDPI as a search problem
 integrated.py  the integrated model with exponential weights as a search problem

@@ -8,8 +8,8 @@ around it stands a search over the thresholds' spacing and their growth with the
 import numpy as np
 from scipy.optimize import lsq_linear, minimize
 
-from hilctl.base.arrays import F64
 from hilctl.base.errors import DataError
+from hilctl.base.types import F64
 from hilctl.identify.data.records import SteadyLoop
 from hilctl.identify.job import FitJob, FoundModel
 from hilctl.identify.searched.search import first_least

@@ -2,14 +2,13 @@
 
 import numpy as np
 
-from hilctl.base.arrays import F64
+from hilctl.base.types import F64
 from hilctl.identify.fit_data import FitData
 from hilctl.identify.searched.plays import numbered, spacing_limit
 from hilctl.identify.searched.search import SearchSpace
 from hilctl.identify.settings import FitSettings
 from hilctl.kernels.hysteresis import deadband_block
-from hilctl.models.integrated import IntegratedModel
-from hilctl.models.published import exponential_integrated, exponential_weights
+from hilctl.models.integrated import IntegratedModel, exponential_integrated, exponential_weights
 
 SEARCHED = (
     "alpha", "gamma", "a_0", "alpha_0", "beta_0", "alpha_1", "beta_1", "d_p", "alpha_2", "beta_2",

@@ -5,13 +5,12 @@ from typing import Any
 import numpy as np
 from scipy.linalg import qr
 
-from hilctl.base.arrays import F64
+from hilctl.base.types import F64
 from hilctl.identify.fit_data import FitData
 from hilctl.identify.linear import bounded_and_free
 from hilctl.identify.searched.search import SearchSpace
 from hilctl.identify.settings import FitSettings
-from hilctl.models.plays import PlayModel, PpiModel, RdpiModel
-from hilctl.models.spi import SpiModel
+from hilctl.models.plays import PlayModel, PpiModel, RdpiModel, SpiModel
 
 SMOOTHNESS = 1e-4  # weight of a density's slope, see _held
 RIDGE = 1e-4  # weight of the weights themselves

@@ -7,7 +7,7 @@ from typing import Protocol
 import numpy as np
 from scipy.optimize import least_squares
 
-from hilctl.base.arrays import F64
+from hilctl.base.types import F64
 from hilctl.identify.job import OnProgress, StartOutcome
 from hilctl.identify.linear import Mask
 from hilctl.models.plays import PlayModel

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from hilctl.base.arrays import F64
+from hilctl.base.types import F64
 from hilctl.identify.staged.layered import DYNAMIC, Layers
 from hilctl.identify.staged.search import StagedEnd
 from hilctl.identify.staged.sensitivity import GAMMA_S, GROWTH, LAG_S, SPACING

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hilctl.base.arrays import F64
+from hilctl.base.types import F64
 from hilctl.identify.linear import bounded_weights
 from hilctl.identify.staged.fit_data import Linear, StagedFitData
 from hilctl.identify.staged.layered import STEEPEST, Layers, Point, loop_delay_s, segments

@@ -6,7 +6,7 @@ from typing import TypeAlias
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
-from hilctl.base.arrays import F64
+from hilctl.base.types import F64
 
 ErrorAndSlopes: TypeAlias = Callable[[F64], tuple[F64, F64]]
 """From a point to scaled errors float64[N] and their derivatives float64[N, p]."""

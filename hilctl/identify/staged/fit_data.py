@@ -14,8 +14,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.fft import irfft, rfft
 
-from hilctl.base.arrays import F64
 from hilctl.base.errors import DataError
+from hilctl.base.types import F64
 from hilctl.identify.data.records import Record, Records, SteadyLoop
 from hilctl.identify.staged.sensitivity import PARAMETERS, lagged, plays_and_slopes
 from hilctl.models.base import Operator

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hilctl.base.arrays import F64
+from hilctl.base.types import F64
 from hilctl.identify.staged.fit_data import Linear, StagedFitData
 from hilctl.identify.staged.sensitivity import LAG_S, PARAMETERS
 

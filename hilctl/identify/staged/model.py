@@ -4,8 +4,7 @@ import math
 
 import numpy as np
 
-from hilctl.base.arrays import F64
-from hilctl.base.units import CommandUnit
+from hilctl.base.types import F64, CommandUnit
 from hilctl.identify.staged.fit_data import Linear, StagedFitData
 from hilctl.identify.staged.layered import Layers, Point, loop_delay_s
 from hilctl.models.deadband import DeadbandFunction

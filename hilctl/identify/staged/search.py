@@ -6,8 +6,8 @@ from itertools import product
 
 import numpy as np
 
-from hilctl.base.arrays import F64
 from hilctl.base.errors import DataError
+from hilctl.base.types import F64
 from hilctl.identify.job import OnProgress, StartOutcome
 from hilctl.identify.searched.search import first_least
 from hilctl.identify.staged.convex import WeightedStart, convex_start

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from hilctl.base.arrays import F64
+from hilctl.base.types import F64
 from hilctl.kernels.jit import kernel
 
 LAG_S, GROWTH, SPACING, GAMMA_S = range(4)

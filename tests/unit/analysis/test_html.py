@@ -3,6 +3,7 @@
 import pytest
 
 from hilctl.analysis import html
+from hilctl.analysis.html import DEFINITIONS, definitions_of
 from hilctl.analysis.sheet import Panel, Sheet
 
 NASTY = "<b onclick='x'>&\x1b"
@@ -35,3 +36,15 @@ def test_a_page_is_readable_in_the_dark_on_paper_and_on_a_phone():
     for needed in ("prefers-color-scheme: dark", "@media print", 'name="viewport"'):
         assert needed in page
     assert page.endswith("<p>x</p>\n</body></html>\n")
+
+
+def test_terms_are_found_in_the_order_of_the_list():
+    assert [term for term, _ in definitions_of("loop area", "average cycle")] == [
+        "average cycle",
+        "loop area",
+    ]
+
+
+def test_every_term_is_defined_once_in_a_sentence():
+    assert len({term for term, _ in DEFINITIONS}) == len(DEFINITIONS)
+    assert all(meaning.endswith(".") for _, meaning in DEFINITIONS)

@@ -11,11 +11,11 @@ import pytest
 from hilctl.analysis.figures import RunReport
 from hilctl.analysis.report import summarize, worst_segment
 from hilctl.analysis.table import run_rows
-from hilctl.base.arrays import F64
 from hilctl.base.errors import DataError
 from hilctl.base.events import ADAPTED, MARK, TUNED, Event
 from hilctl.base.samples import Flag
 from hilctl.base.segments import Segment
+from hilctl.base.types import F64
 from hilctl.recording import reader
 from hilctl.recording.data import Recording, Ticks
 from hilctl.recording.reader import Pieces, read

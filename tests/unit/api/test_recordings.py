@@ -77,7 +77,7 @@ def test_what_is_no_recording_is_refused(tmp_path):
 def test_figures_of_one_recording_are_those_of_its_page(file, tmp_path, monkeypatch):
     pages, seen = [], {}
     monkeypatch.setattr("hilctl.analysis.html.figures", lambda sheets: pages.extend(sheets) or "")
-    monkeypatch.setattr("hilctl.series.files.drawn", lambda sheet, width: Figure())
+    monkeypatch.setattr("hilctl.series.sheets.drawn", lambda sheet, width: Figure())
     page = tmp_path / "page.html"
     assert api.report_page(file, page) == api.summarize(file)
     figures = api.figures(file, tmp_path / "one", formats="svg", on_written=seen.__setitem__)

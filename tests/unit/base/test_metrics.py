@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hilctl.base import metrics
-from hilctl.base.arrays import F64
+from hilctl.base.types import F64
 from hilctl.models.plays import PpiModel
 
 PERIODS = [50_000.0, 200.0, 1000.0 / 3.0, 20.0, 1234.567]

@@ -4,7 +4,8 @@ import os
 
 import pytest
 
-from hilctl.base.private import memory_folder, private_folder, user_folders
+from hilctl.base import private as locks
+from hilctl.base.private import is_locked, memory_folder, private_folder, take_lock, user_folders
 
 
 def test_made_for_its_user_alone(tmp_path):
@@ -62,3 +63,42 @@ def test_each_user_has_places_of_their_own(monkeypatch):
     monkeypatch.setattr(os, "geteuid", lambda: 1234)
     assert user_folders()[0] == memory_folder() / "hilctl-1234"
     assert str(user_folders()[1]) == "/run/user/1234/hilctl"
+
+
+@pytest.fixture
+def two(tmp_path):
+    path = tmp_path / "file"
+    path.touch()
+    with path.open("rb") as one, path.open("rb") as other:
+        yield one, other
+
+
+def test_one_at_a_time(two):
+    one, other = two
+    assert not is_locked(other)
+    take_lock(one)
+    assert is_locked(other)
+    with pytest.raises(BlockingIOError):
+        take_lock(other.fileno(), shared=True)
+    one.close()
+    take_lock(other)
+
+
+def test_two_may_share(two):
+    one, other = two
+    take_lock(one, shared=True)
+    take_lock(other, shared=True)
+    assert not is_locked(two[0])
+
+
+def test_a_look_leaves_no_lock(two):
+    one, other = two
+    assert not is_locked(one)
+    take_lock(other)
+
+
+def test_without_locks_nobody_is_kept_out(two, monkeypatch):
+    monkeypatch.setattr(locks, "fcntl", None)
+    for each in two:
+        take_lock(each)
+        assert not is_locked(each)

@@ -7,7 +7,7 @@ import pytest
 from typer.testing import CliRunner
 
 from hilctl.cli.machine import devices_app, schema
-from hilctl.experiment.schema import schema_text
+from hilctl.experiment.inventory import schema_text
 from hilctl.run.probe import Probed
 
 DEMO = Path(__file__).parents[3] / "configs" / "demo.yaml"

@@ -9,8 +9,8 @@ from rich.console import Console
 
 from hilctl.analysis.figures import RunReport
 from hilctl.analysis.report import summarize
-from hilctl.base.arrays import F64
 from hilctl.base.segments import Segment
+from hilctl.base.types import F64
 from hilctl.cli.report_view import render
 
 LAG = 0.05

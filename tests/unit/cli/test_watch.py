@@ -19,8 +19,7 @@ from hilctl.base.events import Event
 from hilctl.cli import watch as module
 from hilctl.cli.console import print_rich
 from hilctl.cli.watch import View, print_lines
-from hilctl.desk.envelope import Buckets
-from hilctl.desk.scope import WINDOWS_S, Window
+from hilctl.desk.scope import WINDOWS_S, Buckets, Window
 from hilctl.desk.signals import SIGNALS
 
 

@@ -8,9 +8,9 @@ import pytest
 
 from hilctl.base.errors import RunError
 from hilctl.base.events import Event
-from hilctl.base.samples import Head
-from hilctl.desk.feed import RunFeed
-from hilctl.desk.signals import ROW
+from hilctl.base.samples import Batch, Head
+from hilctl.desk.feed import EDGES_US, ErrorSpectrum, LatenessCounts, RunFeed
+from hilctl.desk.signals import ROW, SIGNALS, Traces
 from hilctl.loop.plan import Outcome
 from hilctl.run.description import RunDescription
 from hilctl.run.ring import SampleRing
@@ -152,3 +152,41 @@ def test_events_since_those_that_were_seen(run):
     assert seen == 100
     assert [event.sample for event in feed.events_since(10)[0]] == list(range(40, 100))
     assert feed.events_since(100) == ([], 100)
+
+
+def test_every_tick_is_counted_once_whatever_its_lateness():
+    counts = LatenessCounts()
+    assert counts.percentiles_us() == {}
+    batch = Batch.empty(5, 1, 1)
+    batch.heads[:, Head.LATE_NS] = (-5, 0, 30_000, 30_000, 9_000_000_000)
+    counts.add(batch)
+    assert counts.counts.sum() == 5
+    assert counts.counts[-1] == 1
+    assert counts.counts[np.searchsorted(EDGES_US, 30.0) - 1] == 2
+    assert counts.percentiles_us()["p50"] == 30.0
+    assert counts.percentiles_us()["max"] == 9e6
+
+
+def error(error_um, start=0):
+    values = np.zeros((len(SIGNALS), error_um.size))
+    values[ROW["error"]] = error_um
+    index = np.arange(start, start + error_um.size)
+    return Traces(index, values, np.zeros(error_um.size, dtype=np.uint32))
+
+
+def test_a_line_is_as_high_as_its_sine_and_stands_at_its_frequency():
+    spectrum = ErrorSpectrum(50000.0)
+    t_s = np.arange(16384) / 50000.0
+    spectrum.add(error(5.0 + 0.3 * np.sin(2 * np.pi * 1000.0 * t_s)))
+    hz, um = spectrum.points()
+    assert um.max() == pytest.approx(0.3, rel=0.1)
+    assert hz[um.argmax()] == pytest.approx(1000.0, rel=0.05)
+
+
+def test_no_points_before_there_are_samples_and_a_gap_begins_anew():
+    spectrum = ErrorSpectrum(1000.0)
+    assert spectrum.points()[0].size == 0
+    spectrum.add(error(np.zeros(300)))
+    assert spectrum.points()[0].size > 0
+    spectrum.add(error(np.array([np.nan, 1.0])))
+    assert spectrum.points()[0].size == 0

@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import re
 import socket
 from contextlib import asynccontextmanager, contextmanager, suppress
 from pathlib import Path
@@ -13,7 +14,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from hilctl.base.errors import RunError
 from hilctl.desk import server as module
 from hilctl.desk.admission import MOST_PENDING
-from hilctl.desk.server import LiveServer
+from hilctl.desk.server import FILES, LiveServer, file_response
 from hilctl.run.description import RunDescription
 from hilctl.run.ring import SampleRing
 from hilctl.run.run_folder import run_folder
@@ -251,3 +252,31 @@ def test_a_port_that_is_taken_is_said():
         port = taken.getsockname()[1]
         with pytest.raises(RunError, match=f"port {port} of 127.0.0.1: Address already in use"):
             LiveServer(lambda runs: None, port)
+
+
+@pytest.mark.parametrize("path", FILES)
+def test_each_file_is_there_and_comes_with_its_headers(path):
+    response = file_response(path)
+    assert response.status_code == 200
+    assert len(response.body) == int(response.headers["Content-Length"]) > 100
+    assert response.headers["Content-Security-Policy"].startswith("default-src 'self';")
+    assert response.headers["X-Content-Type-Options"] == "nosniff"
+
+
+@pytest.mark.parametrize("path", ["/x", "/../live.js", "/page/live.js", "", "//", "/live.js/"])
+def test_nothing_else_is_served(path):
+    assert file_response(path).status_code == 404
+
+
+def test_the_page_names_no_address_outside_and_holds_no_script_of_its_own():
+    """So that it works with the cable out, and a strict policy lets all of it through."""
+    page = file_response("/").body.decode()
+    script = file_response("/live.js").body.decode()
+    assert not re.findall(r"""(?:https?:)?//[a-z0-9]""", page)
+    assert not re.findall(r"""["'`](?:https?:)?//""", script)
+    assert not re.findall(r"<script>|<style|style=|\son\w+=", page)
+    assert "innerHTML" not in script
+    asked = set(re.findall(r'(?:href|src)="([^"]+)"', page))
+    assert {f"/{name}" for name in asked} == FILES.keys() - {"/"}
+    ids = set(re.findall(r'id="([^"]+)"', page))
+    assert set(re.findall(r'\$\("([^"]+)"\)', script)) <= ids

@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 from pydantic import ConfigDict
 
-from hilctl.base.arrays import F64
 from hilctl.base.device import DeviceInfo, DeviceOptions
 from hilctl.base.errors import ConfigError, DataError
 from hilctl.base.segments import Segment
+from hilctl.base.types import F64
 from hilctl.base.yaml import Document
 from hilctl.experiment import check as module
-from hilctl.experiment.check import Checked, check, command_problems
+from hilctl.experiment.check import Checked, check, command_problems, pace_warnings
 from hilctl.experiment.correction import Correction, LearnedCycle, model_sha256, signature
 from hilctl.experiment.file import CompensatorConfig
 from hilctl.experiment.heat import RunHeat
 from hilctl.experiment.initial_state import InitialState
-from hilctl.experiment.load import LoadedExperiment, resolve
+from hilctl.experiment.load import LoadedExperiment, load_experiment, resolve
 from hilctl.models.base import HysteresisModel, IdentifiedRange, Operator, Provenance
 from hilctl.models.plays import RdpiModel
 from tests.published import piezo_ppi, terfenol_rdpi
@@ -704,3 +704,35 @@ def test_a_rest_before_the_waveform_does_not_make_the_last_run_forgotten(
         found = check(replace(made, config=config))
         assert found.conditioning() is not None
         assert found.begun.run_id == run_id
+
+
+DEMO = Path(__file__).parents[3] / "configs" / "demo.yaml"
+
+
+def warned(*settings, **info):
+    loaded = load_experiment(DEMO, settings)
+    return pace_warnings(loaded.config, replace(loaded.device.info, **info))
+
+
+@pytest.mark.parametrize(("block", "told"), [(4, True), (5, False)])
+def test_ticks_of_less_than_a_tenth_of_a_millisecond_are_told(block, told):
+    """The demo has 50 kHz."""
+    assert bool(warned(f"block={block}")) == told
+
+
+def test_the_text_says_what_to_do():
+    (text,) = warned("block=1")
+    assert text.startswith("sample_rate_hz: 50000 ticks per second: ")
+    assert "larger block" in text
+    (text,) = warned("block=1", buffered=False)
+    assert "lower rate" in text
+
+
+def test_a_device_that_keeps_the_pace_needs_no_timer():
+    assert warned("block=1", latency_blocks=2) == ()
+
+
+def test_a_check_tells():
+    settings = ["sample_rate_hz=20000", "block=1", "waveform.duration_s=1.0"]
+    checked = check(load_experiment(DEMO, settings))
+    assert any("ticks per second" in each for each in checked.warnings)

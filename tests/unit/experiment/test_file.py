@@ -10,7 +10,7 @@ import pytest
 from hilctl.base.device import DeviceOptions
 from hilctl.base.errors import ConfigError, InputError
 from hilctl.base.yaml import Document
-from hilctl.experiment import registry
+from hilctl.experiment import device as registry
 from hilctl.experiment.load import LoadedExperiment, load_experiment, resolve
 from hilctl.models.plays import PpiModel, RdpiModel
 from hilctl.waveforms.spec import Sine

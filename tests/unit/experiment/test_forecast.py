@@ -7,9 +7,9 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 
-from hilctl.base.arrays import F64
 from hilctl.base.device import DeviceInfo, DeviceOptions
 from hilctl.base.errors import ConfigError
+from hilctl.base.types import F64
 from hilctl.base.yaml import Document
 from hilctl.experiment.check import Checked, check
 from hilctl.experiment.load import LoadedExperiment, resolve

@@ -10,7 +10,7 @@ from hilctl.base.errors import DataError
 from hilctl.base.samples import COLUMNS, Batch, Flag, Head
 from hilctl.experiment.initial_state import InitialState, initial_state_after, left_by
 from hilctl.models.creep import Creep
-from hilctl.models.published import exponential_integrated
+from hilctl.models.integrated import exponential_integrated
 from hilctl.models.staged import FieldLag, StagedModel
 from hilctl.recording.messages import RecordingLayout
 from hilctl.recording.writer import RecordingWriter, RunFacts

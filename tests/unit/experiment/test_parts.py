@@ -3,7 +3,7 @@
 import pytest
 from pydantic import TypeAdapter, ValidationError
 
-from hilctl.experiment.parts import Interval, Name, PiFeedbackConfig, RecordingConfig
+from hilctl.experiment.parts import Interval, Limits, Name, PiFeedbackConfig, RecordingConfig
 
 NAME, INTERVAL = TypeAdapter(Name), TypeAdapter(Interval)
 
@@ -45,3 +45,23 @@ def test_one_way_of_feedback_is_enough(way):
 def test_no_way_of_feedback_and_both_are_refused(ways):
     with pytest.raises(ValidationError, match="must have either bandwidth_hz or ki_per_s"):
         PiFeedbackConfig(limit_um=1.0, **ways)
+
+
+STROKE = {"stroke_um": (-50.0, 50.0)}
+CURRENT = {"peak_current_a": 7.0, "slew_a_per_s": 1e4}
+VOLTAGE = {"drive_v": (-20.0, 120.0), "slew_v_per_s": 2e4}
+
+
+def test_a_peak_current_counts_both_ways_and_a_drive_as_it_is():
+    current, voltage = Limits(**STROKE, **CURRENT), Limits(**STROKE, **VOLTAGE)
+    assert (current.unit, current.command_range, current.slew_per_s) == ("A", (-7.0, 7.0), 1e4)
+    assert (voltage.unit, voltage.command_range, voltage.slew_per_s) == ("V", (-20.0, 120.0), 2e4)
+
+
+@pytest.mark.parametrize("given", [{}, {"peak_current_a": 7.0}, {"slew_v_per_s": 2e4},
+                                   {**CURRENT, "drive_v": (0.0, 1.0)},
+                                   {**CURRENT, **VOLTAGE}])  # fmt: skip
+def test_incomplete_and_mixed_limits_are_refused(given):
+    """Half a limiter is none."""
+    with pytest.raises(ValidationError, match="must have either peak_current_a and slew_a_per_s"):
+        Limits(**STROKE, **given)

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hilctl.base import arrays
-from hilctl.base.arrays import F64
+from hilctl.base import types
+from hilctl.base.types import F64
 from hilctl.experiment import check as check_module
 from hilctl.experiment import whole_run
 from hilctl.experiment.forecast import Forecast
@@ -16,8 +16,8 @@ from hilctl.experiment.whole_run import WholeRun, whole_cycle
 from hilctl.loop.compensator import Compensator
 from hilctl.models.base import HysteresisModel
 from hilctl.models.files import load_model
-from hilctl.waveforms import build, parts, shapes
-from hilctl.waveforms.parts import Repeat
+from hilctl.waveforms import build, shapes
+from hilctl.waveforms.build import Repeat
 from tests.published import terfenol_rdpi
 from tests.unit.experiment.test_forecast import DISPLACEMENT, MODEL, checked
 
@@ -121,7 +121,7 @@ def test_long_work_is_told(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     """Where much of it has to be worked out, and not where it repeats."""
-    for module in (arrays, build, shapes, parts):
+    for module in (types, build, shapes):
         monkeypatch.setattr(module, "CHUNK", 1000)
     monkeypatch.setattr(check_module, "_MANY", 100_000)
     monkeypatch.setattr(shapes, "LONG", 100_000)

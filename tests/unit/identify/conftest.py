@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilctl.base.arrays import F64, I64
 from hilctl.base.samples import Samples
 from hilctl.base.segments import Segment
+from hilctl.base.types import F64, I64
 from hilctl.identify.data.cycles import average_cycle
 from hilctl.identify.data.records import SteadyLoop
 from hilctl.identify.fit_data import FitData

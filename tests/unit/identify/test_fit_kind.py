@@ -10,7 +10,7 @@ from hilctl.identify.data.records import History
 from hilctl.identify.fit_kind import fit_kind
 from hilctl.identify.settings import FitSettings
 from hilctl.models.creep import Creep
-from hilctl.models.published import exponential_integrated
+from hilctl.models.integrated import exponential_integrated
 from hilctl.models.staged import FieldLag, StagedModel
 from hilctl.models.structure import Mode
 

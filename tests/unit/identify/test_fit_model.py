@@ -9,15 +9,14 @@ import numpy as np
 import pytest
 
 from hilctl.base.errors import DataError
-from hilctl.base.units import CommandUnit
+from hilctl.base.types import CommandUnit
 from hilctl.identify.data.records import History, Records, SteadyLoop
 from hilctl.identify.fit_model import FittedModel, fit_model
 from hilctl.identify.judge import judge
 from hilctl.identify.settings import FitKind, FitSettings
 from hilctl.models.files import dump_model, parse_model
-from hilctl.models.integrated import IntegratedModel
+from hilctl.models.integrated import IntegratedModel, even_thresholds, exponential_integrated
 from hilctl.models.plays import PpiModel, RdpiModel
-from hilctl.models.published import even_thresholds, exponential_integrated
 from tests.published import piezo_ppi, terfenol_rdpi
 
 Loops = Callable[..., list[SteadyLoop]]

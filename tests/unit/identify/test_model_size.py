@@ -14,8 +14,8 @@ from hilctl.identify.job import ignore_progress
 from hilctl.identify.model_size import ORDERS, choose_lag, choose_order
 from hilctl.identify.settings import FitSettings
 from hilctl.identify.workers import one_by_one
+from hilctl.models.integrated import exponential_integrated
 from hilctl.models.plays import PpiModel
-from hilctl.models.published import exponential_integrated
 from tests.published import terfenol_rdpi
 
 Loops = Callable[..., list[SteadyLoop]]

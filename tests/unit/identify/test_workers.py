@@ -12,7 +12,7 @@ from hilctl.identify.data.records import SteadyLoop
 from hilctl.identify.fit_model import fit_model
 from hilctl.identify.settings import FitSettings
 from hilctl.identify.workers import _threads, beside_each_other, workers
-from hilctl.models.published import exponential_integrated
+from hilctl.models.integrated import exponential_integrated
 
 Loops = Callable[..., list[SteadyLoop]]
 GRID = [(a, f) for a in (2.0, 3.0, 6.0) for f in (10.0, 100.0, 250.0)]

@@ -5,13 +5,21 @@ import math
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
-from scipy.signal import StateSpace, lsim
+from scipy.linalg import expm
+from scipy.signal import StateSpace, cont2discrete, lfilter, lsim
 
 from hilctl.kernels import dynamics
+from hilctl.kernels.dynamics import (
+    creep_stage,
+    exponential,
+    mode_stage,
+    uncreep_stage,
+    unmode_stage,
+)
 from hilctl.kernels.hysteresis import rest_memory
 from hilctl.models.chain import smoothing_weights
 from hilctl.models.staged import FieldLag
-from hilctl.models.structure import Structure
+from hilctl.models.structure import Mode, Structure
 
 RATE_HZ = 20_000.0
 SIGNAL = 2.0 * np.sin(np.arange(400) / 9.0) + 0.6 * np.cos(np.arange(400) / 2.3)
@@ -187,3 +195,138 @@ def test_a_stage_is_its_block_with_parameters_in_a_row(stage, block, parameters,
     np.testing.assert_array_equal(ends[0][0], ends[1][0])
     np.testing.assert_array_equal(ends[0][1], ends[1][1])
     assert (ends[0][0] != SIGNAL).any()
+
+
+LEFT, GAIN = np.array([0.5, 0.9, 0.999]), np.array([0.02, 0.004, 3e-5])
+PARAMETERS = np.concatenate((LEFT, GAIN))
+
+
+def run(kernel, values, memory=None, parameters=PARAMETERS):
+    memory = np.array([0.0, 0.0, 0.0, np.nan]) if memory is None else memory
+    out = np.empty_like(values)
+    kernel(values, parameters, memory, out)
+    return out, memory
+
+
+@pytest.fixture
+def walk():
+    return np.cumsum(np.random.default_rng(7).standard_normal(3000))
+
+
+def test_creep_is_a_sum_of_first_order_filters_a_sample_late(walk):
+    crept = sum(lfilter([0.0, g], [1.0, -a], walk) for a, g in zip(LEFT, GAIN, strict=True))
+    out, memory = run(creep_stage, walk)
+    np.testing.assert_allclose(out, walk + crept, rtol=0.0, atol=1e-10)
+    assert memory[-1] == walk[-1]
+
+
+def test_undone_to_rounding_from_any_memory(walk):
+    memory = np.array([0.3, -0.2, 0.1, 4.0])
+    y, _ = run(creep_stage, walk, memory.copy())
+    x, left = run(uncreep_stage, y, memory.copy())
+    np.testing.assert_allclose(x, walk, rtol=0.0, atol=1e-10)
+    assert left[-1] == x[-1]
+
+
+def test_output_and_input_may_be_one_array(walk):
+    wanted, _ = run(uncreep_stage, walk)
+    memory, values = np.array([0.0, 0.0, 0.0, np.nan]), walk.copy()
+    uncreep_stage(values, PARAMETERS, memory, values)
+    np.testing.assert_array_equal(values, wanted)
+
+
+@pytest.mark.parametrize("kernel", [creep_stage, uncreep_stage])
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_what_is_no_displacement_creeps_nowhere(walk, kernel, bad):
+    values = walk.copy()
+    values[100] = bad
+    out, _ = run(kernel, values)
+    assert not np.isfinite(out[100])
+    assert np.isfinite(np.delete(out, 100)).all()
+
+
+PAIR = Mode(
+    natural_hz=900.0, damping_ratio=0.04, antiresonance_hz=760.0, antiresonance_damping_ratio=0.02
+)
+MODE_PARAMETERS = PAIR._parameters(RATE_HZ)
+
+
+def run_mode(kernel, values, memory=None):
+    memory = np.full(3, np.nan) if memory is None else memory
+    out = np.empty_like(values)
+    kernel(values, MODE_PARAMETERS, memory, out)
+    return out, memory
+
+
+def test_a_pair_is_what_scipy_makes_of_its_transfer_function(walk):
+    up, down = 1.0 / (2.0 * np.pi * 760.0), 1.0 / (2.0 * np.pi * 900.0)
+    transfer = [up**2, 2.0 * 0.02 * up, 1.0], [down**2, 2.0 * 0.04 * down, 1.0]
+    numerator, denominator, _ = cont2discrete(transfer, 1.0 / RATE_HZ, method="foh")
+    wanted = lfilter(numerator[0], denominator, walk - walk[0]) + walk[0]
+    out, memory = run_mode(mode_stage, walk)
+    np.testing.assert_allclose(out, wanted, rtol=0.0, atol=1e-8)
+    assert memory[2] == walk[-1]
+
+
+def test_a_mode_is_undone_to_rounding_from_any_memory(walk):
+    memory = np.array([0.3, -0.2, 4.0])
+    y, _ = run_mode(mode_stage, walk, memory.copy())
+    x, left = run_mode(unmode_stage, y, memory.copy())
+    np.testing.assert_allclose(x, walk, rtol=0.0, atol=1e-9)
+    assert left[2] == x[-1]
+
+
+@pytest.mark.parametrize("kernel", [mode_stage, unmode_stage])
+def test_any_cut_into_blocks_gives_the_same_bits_and_output_and_input_may_be_one(walk, kernel):
+    whole, _ = run_mode(kernel, walk)
+    memory, values = np.full(3, np.nan), walk.copy()
+    for part in np.split(values, [1, 2, 700, 701]):
+        kernel(part, MODE_PARAMETERS, memory, part)
+    np.testing.assert_array_equal(values, whole)
+
+
+@pytest.mark.parametrize("kernel", [mode_stage, unmode_stage])
+def test_what_never_moved_stays(kernel):
+    out, _ = run_mode(kernel, np.full(50, 3.25))
+    np.testing.assert_allclose(out, 3.25, rtol=1e-13)
+
+
+@pytest.mark.parametrize("kernel", [mode_stage, unmode_stage])
+def test_it_begins_at_rest_whatever_was_before(kernel):
+    out, _ = run_mode(kernel, np.full(50, 3.25), np.array([1.0, 5.0, np.nan]))
+    np.testing.assert_allclose(out, 3.25, rtol=1e-13)
+
+
+@pytest.mark.parametrize("kernel", [mode_stage, unmode_stage])
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_what_is_no_displacement_is_forgotten(walk, kernel, bad):
+    values = walk.copy()
+    values[100] = bad
+    with np.errstate(invalid="ignore"):  # of Python, where it is not compiled
+        out, _ = run_mode(kernel, values)
+    assert not np.isfinite(out[100])
+    assert np.isfinite(out[103:]).all()
+
+
+@pytest.mark.parametrize("size", [1, 3, 6])
+@pytest.mark.parametrize("scale", [1e-9, 0.1, 1.0, 30.0])
+def test_it_is_scipy_s(size, scale):
+    rng = np.random.default_rng(size)
+    matrix = scale * (rng.standard_normal((size, size)) - np.eye(size))
+    wanted = expm(matrix)
+    np.testing.assert_allclose(
+        exponential(matrix), wanted, rtol=0.0, atol=1e-12 * np.abs(wanted).max()
+    )
+
+
+def test_nothing_is_one_and_a_turn_turns():
+    np.testing.assert_array_equal(exponential(np.zeros((2, 2))), np.eye(2))
+    turned = exponential(np.array([[0.0, -1.0], [1.0, 0.0]]) * math.pi / 3.0)
+    half, side = 0.5, math.sqrt(0.75)
+    np.testing.assert_allclose(turned, [[half, -side], [side, half]], rtol=1e-14)
+
+
+def test_a_stiff_one_that_is_damped_dies_away():
+    """As a structure that is much faster than the samples."""
+    stiff = 1e6 * np.array([[0.0, 1.0], [-1.0, -0.2]])
+    np.testing.assert_allclose(exponential(stiff), 0.0, atol=1e-12)

@@ -2,12 +2,14 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from hilctl.base.errors import InputError, RunError
+from hilctl.base.errors import ConfigError, InputError, RunError
 from hilctl.experiment.correction import load_correction
-from hilctl.learning.session import Session
+from hilctl.learning.session import HIGHEST_PART, Session, beginning, repeating
 from hilctl.run.result import RunResult
+from hilctl.run.start import checked_experiment
 from hilctl.run.step import unpaced
 
 SINE = Path(__file__).parents[3] / "configs" / "terfenol_sine_6a.yaml"
@@ -72,3 +74,28 @@ def test_a_folder_that_can_not_be_made_is_said_before_a_run(tmp_path):
     with pytest.raises(InputError, match="can't be made"):
         learned(tmp_path / "file" / "runs", runs)
     assert runs.settings == []
+
+
+CONFIGS = Path(__file__).parents[3] / "configs"
+SINE_repeating = CONFIGS / "terfenol_sine_6a.yaml"
+
+
+def test_a_sine_is_learned_from_nothing():
+    """As far up as an eighth of the sample rate."""
+    checked = checked_experiment(SINE_repeating, [])
+    (segment,) = repeating(checked)
+    state = beginning(checked, segment)
+    assert state.highest_hz == HIGHEST_PART * checked.reference.sample_rate_hz
+    assert not np.any(state.next_um)
+
+
+def test_without_a_compensator_there_is_no_input_to_correct():
+    checked = checked_experiment(CONFIGS / "terfenol_sine_6a_uncompensated.yaml", [])
+    with pytest.raises(ConfigError, match="compensator: is needed to learn"):
+        repeating(checked)
+
+
+def test_a_single_cycle_does_not_repeat():
+    short = ["waveform.frequency_hz=10", "waveform.duration_s=0.5"]
+    with pytest.raises(ConfigError, match="must repeat for at least 2 whole cycles"):
+        repeating(checked_experiment(SINE_repeating, short))

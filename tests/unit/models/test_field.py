@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from hilctl.base.arrays import F64
+from hilctl.base.types import F64
 from hilctl.models.field import FieldLosses, FieldModel, OutputCurve
 from hilctl.models.files import dump_model, parse_model
 from hilctl.models.staged import StagedModel

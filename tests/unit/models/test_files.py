@@ -9,9 +9,8 @@ import yaml
 from hilctl.base.errors import ConfigError, InputError
 from hilctl.models.base import Provenance
 from hilctl.models.files import AnyModel, dump_model, load_model, parse_model
-from hilctl.models.integrated import IntegratedModel
-from hilctl.models.published import exponential_integrated
-from hilctl.models.spi import SpiModel
+from hilctl.models.integrated import IntegratedModel, exponential_integrated
+from hilctl.models.plays import SpiModel
 from tests.published import piezo_ppi, terfenol_rdpi
 
 OMEGA = exponential_integrated(

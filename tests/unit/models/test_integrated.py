@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 
 from hilctl.kernels.hysteresis import play_sum_shared, rest_memory
-from hilctl.models.published import exponential_integrated
-from tests.published import terfenol_rdpi
+from hilctl.models.deadband import DeadbandFunction
+from hilctl.models.integrated import exponential_integrated
+from hilctl.models.plays import inverse_plays
+from tests.published import piezo_ppi, terfenol_rdpi
 
 SAMPLE_RATE_HZ = 50_000.0
 FREQUENCIES_HZ = [1.0, 10.0, 50.0, 100.0, 200.0, 250.0]
@@ -71,3 +73,99 @@ def test_with_rate_the_inverse_leaves_little():
         n = round(SAMPLE_RATE_HZ / frequency_hz)
         remaining.append(np.max(np.abs(back - y)[-n:]) / np.ptp(y) * 100.0)
     assert remaining[0] < 0.1 < remaining[1] < remaining[2] < 10.0
+
+
+def peak_hysteresis_percent(v, y, frequency_hz):
+    """H_P / M_P over the last cycle: widest gap between the branches over the stroke."""
+    n = round(SAMPLE_RATE_HZ / frequency_hz)
+    start = np.argmax(v[-n:])
+    v, y = np.roll(v[-n:], -start), np.roll(y[-n:], -start)
+    falling, rising = slice(0, n // 2), slice(n // 2, n)
+    grid = np.linspace(v.min(), v.max(), 2_001)[1:-1]
+    descending = np.interp(grid, v[falling][::-1], y[falling][::-1])
+    ascending = np.interp(grid, v[rising], y[rising])
+    return 100.0 * np.max(descending - ascending) / np.ptp(y)
+
+
+@pytest.mark.parametrize(("frequency_hz", "percent"), [(1.0, 18.0), (100.0, 26.6), (200.0, 34.3)])
+def test_rdpi_peak_hysteresis(frequency_hz, percent):
+    """The n = 4 model at 2.3 A has 18 % at 1 Hz and grows with the frequency as published."""
+    v = sine(2.3, frequency_hz)
+    y = terfenol_rdpi().forward(SAMPLE_RATE_HZ).process(v)
+    assert peak_hysteresis_percent(v, y, frequency_hz) == pytest.approx(percent, abs=0.3)
+
+
+@pytest.mark.parametrize("frequency_hz", FREQUENCIES_HZ)
+def test_rdpi_and_its_inverse_cancel_with_shared_thresholds(frequency_hz):
+    """Model after inverse and inverse after model return the input to 1e-12."""
+    model = terfenol_rdpi()
+    weights, thresholds = np.array(model.weights), np.array(model.thresholds)
+    inverse = model.inverse_parameters()
+    for v in (sine(2.3, frequency_hz), 1.0 + sine(0.7, frequency_hz) + sine(1.1, frequency_hz)):
+        growth = widening_of(model, v)
+        y = shared(v, growth, model.direct, weights, thresholds)
+        back = shared(y, model.direct * growth, *inverse)
+        assert np.max(np.abs(back - v)) <= 1e-12 * np.max(np.abs(v))
+        command = shared(v, model.direct * growth, *inverse)
+        again = shared(command, growth, model.direct, weights, thresholds)
+        assert np.max(np.abs(again - v)) <= 1e-12 * np.max(np.abs(v))
+
+
+def test_thresholds_that_are_not_shared_do_not_cancel():
+    """The test above means something: leaving out the scale a_0 costs far more than rounding."""
+    model = terfenol_rdpi()
+    v = sine(2.3, 100.0)
+    growth = widening_of(model, v)
+    y = shared(v, growth, model.direct, np.array(model.weights), np.array(model.thresholds))
+    back = shared(y, growth, *model.inverse_parameters())
+    assert np.max(np.abs(back - v)) > 1e-3
+
+
+def test_inverse_plays_follow_the_published_relations():
+    """Rising by (a_0 + ... + a_i)(r_{i+1} - r_i) from a_0 r_1; reciprocal slopes (5.8-5.10)."""
+    a, r = [1.2, 0.3, 0.0, 0.7, 0.2], [0.4, 0.9, 1.0, 2.5]
+    direct, weights, thresholds = inverse_plays(a[0], np.array(a[1:]), np.array(r))
+    expected = [a[0] * r[0]]
+    for i in range(1, 4):
+        expected.append(expected[-1] + sum(a[: i + 1]) * (r[i] - r[i - 1]))
+    assert direct == 1.0 / a[0]
+    np.testing.assert_allclose(thresholds, expected, rtol=1e-14)
+    relations = [1.0 / sum(a[: i + 1]) - 1.0 / sum(a[:i]) for i in range(1, 5)]
+    np.testing.assert_allclose(weights, relations, rtol=1e-14, atol=1e-16)
+
+
+def test_inverse_deadbands_follow_the_published_relations(omega):
+    """Thresholds Lambda(d_j), weights -g_j / (S_j S_{j-1}), both sides (6.13-6.16)."""
+    function, inverse = omega.deadband, omega.deadband.inverse()
+    assert inverse.slope == 1.0 / function.slope
+    for d, g, dh, gh in (
+        (function.up_thresholds, function.up_weights, inverse.up_thresholds, inverse.up_weights),
+        (function.down_thresholds, function.down_weights,
+         inverse.down_thresholds, inverse.down_weights),
+    ):  # fmt: skip
+        slope = function.slope
+        for j in range(8):
+            corner = function.slope * d[j] + sum(g[i] * (d[j] - d[i]) for i in range(j))
+            assert dh[j] == pytest.approx(corner, rel=1e-14)
+            assert gh[j] == pytest.approx(-g[j] / ((slope + g[j]) * slope), rel=1e-11)
+            slope += g[j]
+
+
+def test_exponential_parameters_are_the_published_ones(omega):
+    """Omega has evenly spaced thresholds and exponential weights of the published signs."""
+    assert omega.operators == 12
+    np.testing.assert_allclose(omega.thresholds, 0.3 * np.arange(1, 13))
+    np.testing.assert_allclose(omega.weights, 0.2 * np.exp(-0.3 * np.arange(1, 13)))
+    deadband = omega.deadband
+    assert isinstance(deadband, DeadbandFunction)
+    np.testing.assert_allclose(deadband.up_thresholds, 0.8 * np.arange(1, 9))
+    np.testing.assert_allclose(deadband.up_weights, -0.3 * np.exp(-0.1 * np.arange(1, 9)))
+    np.testing.assert_allclose(deadband.down_thresholds, -0.8 * np.arange(1, 9))
+    np.testing.assert_allclose(deadband.down_weights, 0.4 * np.exp(-0.1 * np.arange(1, 9)))
+
+
+def test_published_models_say_where_they_come_from():
+    """Units and provenance travel with the parameters."""
+    assert piezo_ppi().input_unit == "V"
+    assert terfenol_rdpi().input_unit == "A"
+    assert "Concordia" in piezo_ppi().provenance.source[0]

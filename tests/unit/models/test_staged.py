@@ -9,7 +9,7 @@ from hilctl.models.base import Provenance
 from hilctl.models.chain import smoothing_weights
 from hilctl.models.creep import Creep
 from hilctl.models.files import dump_model, parse_model
-from hilctl.models.published import exponential_integrated
+from hilctl.models.integrated import exponential_integrated
 from hilctl.models.staged import FieldLag, StagedModel
 from hilctl.models.structure import Mode, Structure
 from tests.published import piezo_ppi, terfenol_rdpi

@@ -9,7 +9,7 @@ import pytest
 from pydantic import ValidationError
 
 from hilctl.base.errors import ModelError
-from hilctl.kernels.modes import unmode_stage
+from hilctl.kernels.dynamics import unmode_stage
 from hilctl.models.structure import Mode, Structure, _decay
 
 RATE_HZ = 50e3

@@ -12,8 +12,10 @@ from hilctl.base.yaml import Document
 from hilctl.experiment.check import check
 from hilctl.experiment.load import resolve
 from hilctl.models.staged import FieldLag, StagedModel
-from hilctl.run.changes import Changes, RequestedChange, bound_refusal, command_range
+from hilctl.run import client
+from hilctl.run.changes import Changes, bound_refusal, command_range
 from hilctl.run.shared_page import SIZE, Field, SharedPage, Stop
+from tests.fakes import SteppingClock
 from tests.published import terfenol_rdpi
 
 RATE_HZ, BLOCK, SAMPLES = 10_000.0, 10, 20_000
@@ -71,16 +73,29 @@ def page():
     return made
 
 
+class Waits:
+    """The time of the changes; each wait calls ``meanwhile``."""
+
+    def __init__(self):
+        self.clock, self.meanwhile = SteppingClock(), lambda: None
+
+    def sleep(self, seconds):
+        self.clock.now += seconds
+        self.meanwhile()
+
+
 @pytest.fixture
-def changes(experiment, page):
-    return Changes(experiment, page)
+def waits():
+    return Waits()
+
+
+@pytest.fixture
+def changes(experiment, page, waits):
+    return Changes(experiment, page, waits.clock, waits.sleep)
 
 
 def change(changes, gain=None, offset=None, over_s=0.2, inverse=None):
-    made = RequestedChange(gain, offset, over_s, inverse)
-    changes.add(made)
-    changes.attend()
-    return made
+    return changes.make(gain, offset, over_s, inverse)
 
 
 def take(page, at):
@@ -90,8 +105,7 @@ def take(page, at):
 
 
 def test_a_change_reaches_the_loop_whole(changes, page):
-    made = change(changes, gain=0.5)
-    assert made.answer() == {
+    assert change(changes, gain=0.5) == {
         "gain": 0.5,
         "offset": 0.0,
         "inverse": "in",
@@ -104,17 +118,19 @@ def test_a_change_reaches_the_loop_whole(changes, page):
     assert (changes.gain, changes.offset) == (0.5, 0.0)
 
 
-def test_the_second_of_two_follows_the_first(changes, page):
+def test_the_second_of_two_follows_the_first(changes, page, waits):
     """It is not made before the loop has taken the first."""
-    first, second = change(changes, gain=0.5), change(changes, offset=3.0)
-    for _ in range(3):
-        changes.attend()
-    assert first.answer() is not None
-    assert second.answer() is None
-    assert page.get(Field.TUNE_WANTED) == 1
-    take(page, 1013)
-    changes.attend()
-    answer = second.answer()
+    wanted = []
+
+    def meanwhile():
+        wanted.append(page.get(Field.TUNE_WANTED))
+        if len(wanted) == 3:
+            take(page, 1013)
+
+    change(changes, gain=0.5)
+    waits.meanwhile = meanwhile
+    answer = change(changes, offset=3.0)
+    assert wanted == [1, 1, 1]
     assert (answer["gain"], answer["offset"]) == (0.5, 3.0)
     assert answer["begins_at_sample"] == 1020 + LEAD
     assert page.get(Field.TUNE_WANTED) == 2
@@ -122,11 +138,10 @@ def test_the_second_of_two_follows_the_first(changes, page):
 
 def test_a_refusal_changes_nothing_and_the_next_has_its_turn(changes, page):
     before = bytes(page.numbers)
-    first = change(changes, gain=90.0)
-    assert bytes(page.numbers) == before
     with pytest.raises(InputError, match=r"set: .*limits\.stroke_um"):
-        first.answer()
-    assert change(changes, offset=1.0).answer()["gain"] == 1.0
+        change(changes, gain=90.0)
+    assert bytes(page.numbers) == before
+    assert change(changes, offset=1.0)["gain"] == 1.0
 
 
 @pytest.mark.parametrize(
@@ -136,32 +151,49 @@ def test_a_refusal_changes_nothing_and_the_next_has_its_turn(changes, page):
         (Field.NEXT_SAMPLE, SAMPLES, "the waveform is over"),
     ],
 )
-def test_the_end_of_the_run_refuses_all_that_wait(changes, page, number, value, said):
+def test_the_end_of_the_run_refuses_a_change_that_waits(changes, page, waits, number, value, said):
     """Also if the loop has not taken the one before."""
-    first, second, third = (change(changes, gain=0.1 * each) for each in (1, 2, 3))
-    page.put(number, value)
-    changes.attend()
-    assert first.answer() is not None
-    for each in (second, third):
+    change(changes, gain=0.1)
+    waits.meanwhile = lambda: page.put(number, value)
+    for gain in (0.2, 0.3):
         with pytest.raises(InputError, match=said):
-            each.answer()
-    with pytest.raises(InputError, match=said):
-        change(changes, gain=1.0)
+            change(changes, gain=gain)
+    assert page.get(Field.TUNE_WANTED) == 1
+
+
+def test_a_loop_that_takes_no_change_is_not_waited_for_without_end(changes, waits):
+    """The client would have given up."""
+    change(changes, gain=0.1)
+    with pytest.raises(InputError, match="has not taken the change before"):
+        change(changes, gain=0.2)
+    assert waits.clock.now < client._SET_S
 
 
 def test_a_change_that_could_not_begin_is_refused(changes, page):
     page.put(Field.NEXT_SAMPLE, SAMPLES - LEAD)
     with pytest.raises(InputError, match="before the change could begin"):
-        change(changes, gain=0.5).answer()
+        change(changes, gain=0.5)
     assert page.get(Field.TUNE_WANTED) == 0
 
 
-def test_a_queue_that_is_full_takes_no_more(changes):
-    """The first is on the page, sixteen wait."""
-    for _ in range(17):
-        change(changes, gain=1.0)
-    with pytest.raises(InputError, match="16 changes are waiting"):
-        change(changes, gain=1.0)
+def test_a_queue_that_is_full_takes_no_more(changes, page, waits):
+    """The first is on the page, sixteen wait; each of these begins while the one before waits."""
+    refused, made = [], [change(changes, gain=1.0)]
+
+    def meanwhile():
+        if refused:
+            take(page, page.get(Field.NEXT_SAMPLE))
+            return
+        try:
+            made.append(change(changes, gain=1.0))
+        except InputError as error:
+            refused.append((len(made), str(error)))
+
+    waits.meanwhile = meanwhile
+    made.append(change(changes, gain=1.0))
+    assert len(refused) == 1
+    assert "16 changes are waiting" in refused[0][1]
+    assert len(made) == 17
 
 
 def test_a_change_of_nothing_is_refused(changes):
@@ -178,8 +210,7 @@ def test_the_inverse_goes_out_and_stays_there_until_it_is_wanted_in(changes, pag
         (4000, {"gain": 0.5}, 0.0),
         (6000, {"inverse": "in"}, 1.0),
     ):
-        made = change(changes, **wanted)
-        assert made.answer()["inverse"] == changes.inverse == ("in" if share else "out")
+        assert change(changes, **wanted)["inverse"] == changes.inverse == ("in" if share else "out")
         assert [page.get_float(each) for each in numbers] == [share, line.slope, line.at_zero]
         take(page, at)
 

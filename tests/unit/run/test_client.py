@@ -1,5 +1,11 @@
-"""Runs from outside: which one is meant, what it is asked, and what is not even sent."""
+"""Runs from outside: selection of a run, requests to it, and the signal that stops it."""
 
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -8,14 +14,17 @@ import pytest
 from hilctl.base.errors import InputError, RunError
 from hilctl.run import client
 from hilctl.run.client import (
+    ask,
     assigned,
     find_run,
     going_on,
     mark_run,
+    request_stop,
     set_run,
     status_of,
     stop_runs,
 )
+from hilctl.run.protocol import STOP_SIGNAL
 from tests.fakes import SteppingClock
 
 
@@ -140,3 +149,108 @@ def test_mark_sends_its_text(answers):
 def test_what_is_no_setting_is_refused(text, said):
     with pytest.raises(InputError, match=said):
         assigned(["offset=1", text])
+
+
+def test_a_dropped_request_is_sent_again(tmp_path):
+    """Until the timeout; a request without an answer has had no effect."""
+    path = tmp_path / "socket"
+    seen = []
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as listener:
+        listener.bind(str(path))
+        listener.listen(20)
+
+        def serve(connections, last):
+            for number in range(1, connections + 1):
+                client, _ = listener.accept()
+                with client:
+                    if number % 2 == 0:
+                        seen.append(client.recv(1000))
+                    if number == connections:
+                        client.sendall(last)
+
+        def serving(connections, last=b""):
+            # A daemon: one that waits in vain must not keep the tests from ending.
+            thread = threading.Thread(target=serve, args=(connections, last), daemon=True)
+            thread.start()
+            return thread
+
+        thread = serving(6, b'{"protocol": 1, "ok": true, "n": 1}\n')
+        assert ask(path, {"say": "hello"}) == {"n": 1}
+        thread.join(10)
+        assert seen == [b'{"say": "hello"}\n'] * 3
+        thread = serving(2, b'{"protocol": 9, "ok": false, "error": "set: ..."}\n')
+        with pytest.raises(RunError, match="speaks protocol 9, this hilctl 1"):
+            ask(path, {"say": "hello"})
+        thread.join(10)
+        serving(2)
+        with pytest.raises(RunError, match="among other clients"):
+            ask(path, {"say": "hello"}, 5.0, SteppingClock(2.0))
+        thread.join(10)
+        assert not thread.is_alive()
+
+
+@pytest.fixture
+def process():
+    """A process that ends by the first signal that comes."""
+    # What this process ignores, its children do too, until they say otherwise.
+    code = (
+        f"import signal; signal.signal({STOP_SIGNAL}, signal.SIG_DFL); print(flush=True); input()"
+    )
+    started = subprocess.Popen(
+        [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    )
+    assert started.stdout is not None
+    started.stdout.readline()
+    yield started
+    started.kill()
+    started.communicate()
+
+
+def run_of(number, *, supervised=True):
+    card = SimpleNamespace(name="a", supervisor=number)
+    return SimpleNamespace(card=card, supervised=supervised, alive=False)
+
+
+def test_the_supervisor_gets_the_signal(process):
+    assert request_stop(run_of(process.pid))
+    assert process.wait(timeout=60) == -STOP_SIGNAL
+
+
+def test_a_process_that_holds_no_lock_is_left_alone(process):
+    """Its number may be another program's by now."""
+    assert not request_stop(run_of(process.pid, supervised=False))
+    assert process.poll() is None
+
+
+def test_the_lock_is_looked_at_once_the_process_is_held(process, monkeypatch):
+    """The other way round, the number could become another's in between."""
+    order = []
+    opened = os.pidfd_open
+
+    class Going:
+        card = SimpleNamespace(name="a", supervisor=process.pid)
+        alive = False
+
+        @property
+        def supervised(self):
+            order.append("lock")
+            return True
+
+    monkeypatch.setattr(os, "pidfd_open", lambda pid: order.append("process") or opened(pid))
+    request_stop(Going())
+    assert order == ["process", "lock"]
+
+
+def test_a_supervisor_that_is_gone_is_no_error(process):
+    process.kill()
+    process.wait()
+    assert not request_stop(run_of(process.pid))
+
+
+def test_what_the_kernel_refuses_is_told(process, monkeypatch):
+    def refuse(*_):
+        raise PermissionError(1, "Operation not permitted")
+
+    monkeypatch.setattr(signal, "pidfd_send_signal", refuse)
+    with pytest.raises(RunError, match="a: can't be stopped: Operation not permitted"):
+        request_stop(run_of(process.pid))

@@ -11,7 +11,6 @@ import pytest
 from hilctl.base.errors import InputError
 from hilctl.base.events import MARK
 from hilctl.run import protocol
-from hilctl.run.changes import RequestedChange
 from hilctl.run.requests import REQUESTS, Requests
 from hilctl.run.run_folder import run_folder
 from hilctl.run.shared_page import SIZE, Field, Phase, SharedPage, Stop
@@ -58,14 +57,10 @@ def test_status_says_where_the_run_stands(requests, page):
     assert asked(requests, command="status")["state"] == "stopping"
 
 
-def test_a_change_is_answered_later(requests, page):
-    """Nothing is worked out while others wait for their answers."""
-    before = bytes(page.numbers)
-    change = asked(requests, command="set", gain=0.5, over_s=2.0)
-    assert isinstance(change, RequestedChange)
-    assert (change.gain, change.offset, change.over_s) == (0.5, None, 2.0)
-    assert change.answer() is None
-    assert bytes(page.numbers) == before
+def test_a_change_is_passed_to_the_loop(requests, page):
+    answer = asked(requests, command="set", gain=0.5, over_s=2.0)
+    assert (answer["gain"], answer["offset"], answer["over_s"]) == (0.5, 0.0, 2.0)
+    assert (page.get_float(Field.TUNE_GAIN), page.get(Field.TUNE_WANTED)) == (0.5, 1)
 
 
 def test_nobody_stops_a_run_by_its_socket(requests):

@@ -7,10 +7,10 @@ import pytest
 
 from hilctl.loop.plan import Outcome
 from hilctl.run import started_run as module
+from hilctl.run.protocol import STOP_SIGNAL
 from hilctl.run.ring import SampleRing
 from hilctl.run.shared_page import Field, SafeActionResult, Stop
 from hilctl.run.started_run import StartedRun
-from hilctl.run.stopping import STOP_SIGNAL
 
 
 class Run:

@@ -17,9 +17,9 @@ from hilctl.base.errors import InputError, RunError
 from hilctl.loop.pacer import Lateness
 from hilctl.loop.plan import Outcome
 from hilctl.run import supervisor as module
+from hilctl.run.protocol import STOP_SIGNAL
 from hilctl.run.ring import SampleRing
 from hilctl.run.shared_page import Field, PageText
-from hilctl.run.stopping import STOP_SIGNAL
 from hilctl.run.supervisor import Supervisor
 
 MS = 1_000_000
@@ -94,9 +94,7 @@ class Neighbours:
             "held_devices": lambda holds: self.around("devices", "devices let go", [*holds]),
             "Recorder": lambda *a, overwrite: self.note("claimed", self.recorder),
             "run_folder": self.run_folder,
-            "Requests": lambda *a: SimpleNamespace(
-                answer=None, attend=lambda: self.note("requests")
-            ),
+            "Requests": lambda *a: SimpleNamespace(answer=None),
             "ControlServer": self.server,
             "LoopChild": self.child,
             "RingRecorder": self.ring_recorder,
@@ -142,11 +140,7 @@ class Neighbours:
     def server(self, socket, answer):
         assert socket == self.folder.socket
         with self.around("server", "server closed", None):
-            yield SimpleNamespace(serve=self.serve)
-
-    def serve(self, wait_s):
-        assert 0.0 < wait_s <= 0.02  # meanwhile nobody sees to the ring
-        self.note("serve")
+            yield SimpleNamespace(start=lambda: self.note("serving"))
 
     def child(self, checked, folder, ring, inherits, silence_s):
         self.ring, self.silence_s = ring, silence_s
@@ -222,8 +216,7 @@ def stage(tmp_path, monkeypatch):
 def test_a_run_is_begun_in_one_order_and_undone_in_the_other(stage):
     """The start signal comes last: the loop then reads its time and its supervisor's heartbeat."""
     result = stage.run()
-    serves = ["requests", "serve"] * 3
-    assert stage.log == [*READY, *serves, "progress ended", "safety closed", *UNDONE]
+    assert stage.log == [*READY, "serving", "progress ended", "safety closed", *UNDONE]
     page = stage.ring.page
     assert page.get(Field.GO) == 1
     assert stage.guardian_looks == -1  # it was waited for, and not a moment longer
@@ -231,7 +224,7 @@ def test_a_run_is_begun_in_one_order_and_undone_in_the_other(stage):
     assert 10**12 < at_ns <= 10**12 + 20 * MS
     assert page.get(Field.START_NS) == at_ns + 50 * MS
     assert unix_ns - 10**18 == page.get(Field.START_NS)
-    assert page.get(Field.SUPERVISOR_HEARTBEAT_NS) == stage.time.now_ns
+    assert page.get(Field.SUPERVISOR_HEARTBEAT_NS) == at_ns
     assert stage.guardian == ["tcp:here", "lock"]
     assert (result.path, result.code, result.reason) == (
         stage.output, "completed", "waveform completed",
@@ -365,14 +358,14 @@ def test_a_disk_that_takes_too_long_three_times_ends_it(stage):
 
 def test_what_breaks_afterwards_costs_neither_coil_nor_recording(stage):
     """The run is seen to without all that may have broken, until its recording is closed."""
-    stage.fails["serve"] = ZeroDivisionError("a bug")
+    stage.fails["serving"] = ZeroDivisionError("a bug")
     at_ns = []
     stage.on_attend = dict.fromkeys(range(1, 5), lambda: at_ns.append(stage.time.now_ns))
     stage.run()
     assert stage.attended == [0] * 4
-    assert list(np.diff(at_ns)) == [0, 10 * MS, 10 * MS]  # not as fast as it can
-    assert stage.log[len(READY) :][:4] == [
-        "requests", "serve", "broken off: a bug", "progress ended",
+    assert list(np.diff(at_ns)) == [10 * MS] * 3  # not as fast as it can
+    assert stage.log[len(READY) :][:3] == [
+        "serving", "broken off: a bug", "progress ended",
     ]  # fmt: skip
     assert stage.log[-5:] == ["safety closed", *UNDONE]
 

@@ -1,11 +1,13 @@
 """The page of many runs."""
 
+import json
+import math
 from dataclasses import replace
 
 import pytest
 
 from hilctl.analysis import html
-from hilctl.series.page import run_table, series_page, write_series
+from hilctl.series.page import run_table, series_mapping, series_page, write_series
 
 
 @pytest.fixture(autouse=True)
@@ -57,3 +59,22 @@ def test_it_is_replaced_whole(crossed, tmp_path):
     write_series(crossed, path)
     assert path.read_text(encoding="utf-8").startswith("<!DOCTYPE html>")
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_it_is_plain_and_has_runs_trends_and_failures(crossed):
+    odd = replace(crossed.runs[0].figures, rms_error_percent=math.inf)
+    runs = (
+        replace(crossed.runs[0], figures=odd),
+        replace(crossed.runs[1], result="fault: x"),
+        *crossed.runs[2:],
+    )
+    found = json.loads(json.dumps(series_mapping(replace(crossed, runs=runs)), allow_nan=False))
+    assert found["headline"].startswith("5 of 6 runs completed, 1 failed")
+    assert [each["key"] for each in found["varied"]] == list(crossed.keys)[::-1]
+    assert found["failed"] == [2]
+    assert found["runs"][0]["rms_error_percent"] is None
+    assert found["runs"][2]["values"]["waveform.frequency_hz"] == 200.0
+    assert {trend["figure"] for trend in found["trends"]} == {
+        "loop_area",
+        "peak_hysteresis_percent",
+    }

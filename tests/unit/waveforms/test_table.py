@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hilctl.base.arrays import F64
 from hilctl.base.errors import DataError, InputError
 from hilctl.base.samples import COLUMNS, Batch, Head
 from hilctl.base.segments import Segment
+from hilctl.base.types import F64
 from hilctl.recording.messages import RecordingLayout
 from hilctl.recording.writer import RecordingWriter, RunFacts
 from hilctl.waveforms import shapes

@@ -9,8 +9,8 @@ from hilctl.base.errors import DeviceError, InputError
 from hilctl_drivers.board.profile import FrameChannel
 from hilctl_drivers.board.session import BoardSession, Values
 from hilctl_drivers.profile import load_profile
-from hilctl_drivers.wire.errors import BadRequest, Mismatch, Refused, WatchdogTripped
 from hilctl_drivers.wire.framing import binary_framing
+from hilctl_drivers.wire.links import BadRequest, Mismatch, Refused, WatchdogTripped
 
 INT = {"type": "int16", "unit": "V", "min": -10.0, "max": 10.0, "scale": 0.001}
 

@@ -14,12 +14,14 @@ from hilctl.loop.limiter import CommandLimits
 from hilctl.loop.loop import Loop
 from hilctl.loop.pacer import SystemClock
 from hilctl.loop.plan import Plan
+from hilctl_drivers.board.wire import exchange_time
 from hilctl_drivers.emulator.faults import parse_fault
 from hilctl_drivers.emulator.options import EmulatorOptions
-from hilctl_drivers.profile import shipped_profiles
+from hilctl_drivers.profile import load_profile, shipped_profiles, with_link
 from hilctl_drivers.serial.device import SerialDac
 from hilctl_drivers.serial.setup import SerialOptions
 from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
+from hilctl_drivers.wire.framing import binary_framing
 from tests.fakes import FakeHost, ShiftedClock, emulated, logged, made_safe
 
 pytestmark = pytest.mark.slow  # the board's FIFO runs empty in real time
@@ -295,3 +297,33 @@ def test_a_run_that_loses_the_board_leaves_by_the_one_way_out(board, fault):
     last = driven.events()[-1]
     assert last["event"] in {"safe", "watchdog"}
     assert last["current_a"] == 0.0
+
+
+class TestBoards:
+    """Binary frames."""
+
+    def test_serial(self) -> None:
+        """On a real serial line each byte counts, COBS overhead and CRC too."""
+        profile = with_link(load_profile("cobs_board"), usb=False)
+        framing = binary_framing("cobs", "crc16_ccitt_false")
+        request, reply = 1 + 1 + 2 + 4, 1 + 1 + 1 + 2 + 4 + 2 + 2
+        time = exchange_time(profile)
+        assert time.request_s == pytest.approx(framing.wire_size(request) * 10 / 115200)
+        assert time.reply_s == pytest.approx(framing.wire_size(reply) * 10 / 115200)
+        assert time.gaps_s == 0.0
+
+    def test_usb(self) -> None:
+        """Over USB the frame counts, not the baud."""
+        slow = load_profile("cobs_board")
+        fast = with_link(slow, usb_frame_s=125e-6)
+        assert exchange_time(slow).gaps_s == 1e-3
+        assert exchange_time(fast).gaps_s == 125e-6
+        assert exchange_time(with_link(slow, baud=9600)) == (exchange_time(slow))
+
+    def test_block(self) -> None:
+        """A stream of blocks carries more samples in the time of one frame."""
+        profile = load_profile("cobs_board_fifo")
+        one, many = (exchange_time(profile, block) for block in (1, 100))
+        assert many.samples == 100
+        assert many.highest_rate_hz > 50 * one.highest_rate_hz
+        assert many.highest_rate_hz > 50e3

@@ -19,7 +19,7 @@ from hilctl_drivers.modbus.pdu import (
 )
 from hilctl_drivers.modbus.registers import RegisterFormat
 from hilctl_drivers.profile import load_profile
-from hilctl_drivers.wire.errors import Refused
+from hilctl_drivers.wire.links import Refused
 
 FLOAT32 = RegisterFormat("float32")
 MS = 1_000_000

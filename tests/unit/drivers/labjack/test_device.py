@@ -547,6 +547,6 @@ def test_safe_is_a_stopped_stream_and_an_output_that_holds(
     safe_write = driven().device._safe_write
     encoded = safe_write._setup.output.format.encode(held_v)
     answer = SimpleNamespace(call=lambda frames: [stream.u32(running), encoded])
-    monkeypatch.setattr("hilctl_drivers.labjack.safe_write.ModbusFeedback", lambda *_: answer)
+    monkeypatch.setattr("hilctl_drivers.labjack.device.ModbusFeedback", lambda *_: answer)
     with nullcontext() if holds else pytest.raises(DeviceError):
         safe_write._check_held(SimpleNamespace(link=None), 1.0)

@@ -3,7 +3,7 @@
 import pytest
 
 from hilctl_drivers.labjack.frames import ModbusFeedback, ReadFrame, WriteFrame, frames_pdu
-from hilctl_drivers.wire.errors import BadRequest, Corrupt, Mismatch, Refused
+from hilctl_drivers.wire.links import BadRequest, Corrupt, Mismatch, Refused
 
 
 class Link:

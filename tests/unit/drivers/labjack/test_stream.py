@@ -8,7 +8,7 @@ import pytest
 from hilctl.base.errors import DeviceError
 from hilctl_drivers.labjack import stream
 from hilctl_drivers.labjack.frames import WriteFrame, frames_pdu
-from hilctl_drivers.wire.errors import Mismatch
+from hilctl_drivers.wire.links import Mismatch
 
 DOCUMENTED = {
     "SCANRATE_HZ": 4002, "NUM_ADDRESSES": 4004, "SETTLING_US": 4008, "RESOLUTION_INDEX": 4010,

@@ -38,7 +38,7 @@ from hilctl_drivers.modbus.pdu import (
     write_read_pdu,
     write_single_pdu,
 )
-from hilctl_drivers.wire.errors import BadRequest, Corrupt, Incomplete, Mismatch, Refused
+from hilctl_drivers.wire.links import BadRequest, Corrupt, Incomplete, Mismatch, Refused
 
 H = bytes.fromhex
 FOUR = H("01020304")

@@ -7,7 +7,7 @@ import struct
 import pytest
 
 from hilctl_drivers.modbus.registers import RegisterFormat
-from hilctl_drivers.wire.errors import BadRequest, FrameError, Mismatch
+from hilctl_drivers.wire.links import BadRequest, FrameError, Mismatch
 
 CODES = {"int16": "h", "uint16": "H", "int32": "i", "uint32": "I", "float32": "f", "float64": "d"}
 

@@ -17,7 +17,7 @@ from hilctl_drivers.modbus.pdu import (
     write_single_pdu,
 )
 from hilctl_drivers.modbus.transactions import RtuTransaction, TcpTransaction
-from hilctl_drivers.wire.errors import (
+from hilctl_drivers.wire.links import (
     BadRequest,
     Corrupt,
     FrameError,

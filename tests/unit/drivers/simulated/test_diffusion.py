@@ -7,7 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.special import jv
 
-from hilctl.base.arrays import F64
+from hilctl.base.types import F64
 from hilctl_drivers.simulated.diffusion import Diffusion, DiffusionParameters, magnetise
 from hilctl_drivers.simulated.rods import ROD_RADIUS_M, VACUUM_PERMEABILITY, Coil
 

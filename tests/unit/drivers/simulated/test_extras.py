@@ -9,7 +9,7 @@ import pytest
 from pydantic import ValidationError
 from scipy.signal import StateSpace, lsim
 
-from hilctl.base.arrays import F64
+from hilctl.base.types import F64
 from hilctl_drivers.simulated.pinned_cells import PinnedCellsParameters
 from hilctl_drivers.simulated.rigs import PHYSICS, SimulatedTerfenol, TerfenolOptions
 from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters

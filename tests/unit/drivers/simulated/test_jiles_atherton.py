@@ -8,7 +8,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
-from hilctl.base.arrays import F64
+from hilctl.base.types import F64
 from hilctl_drivers.simulated.jiles_atherton import (
     JilesAtherton,
     JilesAthertonParameters,

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from hilctl.base.arrays import F64
 from hilctl.base.device import Device
+from hilctl.base.types import F64
 from hilctl_drivers.simulated.device import SimulatedDevice
 from hilctl_drivers.simulated.rigs import (
     PiezoOptions,

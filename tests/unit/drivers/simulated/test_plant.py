@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hilctl.base.arrays import F64
+from hilctl.base.types import F64
 from hilctl_drivers.simulated.plant import CHUNK, SensorNoise
 from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
 

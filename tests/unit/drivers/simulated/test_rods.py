@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from hilctl.base.arrays import F64
+from hilctl.base.types import F64
 from hilctl_drivers.simulated.rigs import PHYSICS, Physics
 from hilctl_drivers.simulated.rods import Coil
 from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters

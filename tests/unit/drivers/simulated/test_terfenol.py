@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from hilctl.base.arrays import F64
+from hilctl.base.types import F64
 from hilctl_drivers.simulated.pinned_cells import PinnedCellsParameters
 from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
 

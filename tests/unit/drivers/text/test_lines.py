@@ -3,7 +3,7 @@
 import pytest
 
 from hilctl_drivers.text.lines import LineFormat, parse_number
-from hilctl_drivers.wire.errors import BadRequest, Corrupt, Incomplete
+from hilctl_drivers.wire.links import BadRequest, Corrupt, Incomplete
 
 PLAIN = LineFormat()
 DCON = LineFormat(checksum="dcon")

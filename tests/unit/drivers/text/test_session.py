@@ -7,8 +7,7 @@ import pytest
 from hilctl.base.errors import DeviceError
 from hilctl_drivers.profile import load_profile
 from hilctl_drivers.text.session import AsciiSession
-from hilctl_drivers.wire.errors import Corrupt, Mismatch, Refused, WatchdogTripped
-from hilctl_drivers.wire.links import NoAnswerError
+from hilctl_drivers.wire.links import Corrupt, Mismatch, NoAnswerError, Refused, WatchdogTripped
 
 DCON = load_profile(str(Path(__file__).parents[3] / "data" / "dcon_module.yaml"))
 PLAIN = DCON.model_copy(update={"link": DCON.link.model_copy(update={"checksum": "none"})})

@@ -14,7 +14,7 @@ from hilctl_drivers.wire.crc import (
     gen_checksum,
     named_crc,
 )
-from hilctl_drivers.wire.errors import BadRequest
+from hilctl_drivers.wire.links import BadRequest
 
 # "Catalogue of parametrised CRC algorithms": CRC-16/MODBUS, CRC-16/IBM-3740 (also called
 # CCITT-FALSE), CRC-16/XMODEM, CRC-32/ISO-HDLC.

@@ -6,8 +6,8 @@ import random
 import pytest
 
 from hilctl_drivers.wire.crc import CRCS, named_crc
-from hilctl_drivers.wire.errors import BadRequest, Corrupt, FrameError, Incomplete
 from hilctl_drivers.wire.framing import CobsFraming, LengthFraming, binary_framing
+from hilctl_drivers.wire.links import BadRequest, Corrupt, FrameError, Incomplete
 
 KINDS = [
     (kind, crc) for kind in ("cobs", "length") for crc in CRCS if (kind, crc) != ("length", "none")

@@ -11,7 +11,15 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from hilctl.base.errors import DeviceError
-from hilctl_drivers.wire.links import LostError, NoAnswerError
+from hilctl_drivers.wire import links as errors
+from hilctl_drivers.wire.links import (
+    BadRequest,
+    FrameError,
+    LostError,
+    NoAnswerError,
+    Refused,
+    WatchdogTripped,
+)
 from hilctl_drivers.wire.serial_port import SerialLink, SerialSettings
 from hilctl_drivers.wire.tcp import TcpLink
 from tests.fakes import received
@@ -258,3 +266,20 @@ def test_serial_chatter_does_not_hang(line):
     with pytest.raises(DeviceError, match="does not get quiet"):
         link.transact(b"ask", missing)
     link.close()
+
+
+def test_every_frame_error_is_a_device_error():
+    """The loop makes safe on any of them."""
+    found = [e for e in vars(errors).values() if isinstance(e, type) and issubclass(e, FrameError)]
+    assert len(found) == 7
+    assert all(issubclass(each, DeviceError) for each in found)
+    assert issubclass(BadRequest, ValueError)
+
+
+@pytest.mark.parametrize("kind", [Refused, WatchdogTripped])
+def test_a_refusal_keeps_the_device_s_code(kind):
+    """Callers that can clear a trip catch it as a refusal, too."""
+    error = kind("no", 6)
+    assert (str(error), error.code) == ("no", 6)
+    assert isinstance(error, Refused)
+    assert Refused("no").code == ""

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hilctl_drivers.wire.errors import Corrupt
+from hilctl_drivers.wire.links import Corrupt
 from hilctl_drivers.wire.splitters import DelimitedSplitter, PrefixedSplitter
 
 

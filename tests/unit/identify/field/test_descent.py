@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hilctl.base.arrays import F64
+from hilctl.base.types import F64
 from hilctl.identify.field.descent import SETTLED, STEPS, TRIALS, Place, settle
 
 MATRIX = np.random.default_rng(5).standard_normal((40, 3))

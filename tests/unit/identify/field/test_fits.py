@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from hilctl.base.arrays import F64
 from hilctl.base.errors import DataError
+from hilctl.base.types import F64
 from hilctl.identify.data.records import History, SteadyLoop
 from hilctl.identify.fit_model import fit_model
 from hilctl.identify.judge import judge

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hilctl.base.arrays import F64
+from hilctl.base.types import F64
 from hilctl.identify.field.rows import LEAST_SWING, Motion, chosen
 
 RATE_HZ = 10_000.0

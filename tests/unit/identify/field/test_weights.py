@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hilctl.base.arrays import F64
+from hilctl.base.types import F64
 from hilctl.identify.field.weights import STEEPEST, Curve, Grid, Weights, solve, table
 
 GRID = Grid(np.array([0.0, 1.0]), np.array([1.5]), -6.0, 3.0, 4, 6)

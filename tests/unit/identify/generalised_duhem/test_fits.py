@@ -5,8 +5,8 @@ from functools import cache
 import numpy as np
 import pytest
 
-from hilctl.base.arrays import F64
 from hilctl.base.errors import DataError
+from hilctl.base.types import F64
 from hilctl.identify.data.records import History, SteadyLoop
 from hilctl.identify.fit_model import FittedModel, fit_model
 from hilctl.identify.judge import judge

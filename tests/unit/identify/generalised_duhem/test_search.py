@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hilctl.base.arrays import F64
+from hilctl.base.types import F64
 from hilctl.identify.generalised_duhem.search import FIRM, FIRMER, DuhemSearch, _bounded_step
 from hilctl.identify.generalised_duhem.signals import FIRST, HIGHEST, LOWEST, NAMES, STEPS
 from hilctl.identify.generalised_duhem.tables import laid_over

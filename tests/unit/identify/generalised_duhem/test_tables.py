@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hilctl.base.arrays import F64
+from hilctl.base.types import F64
 from hilctl.identify.generalised_duhem.signals import Path
 from hilctl.identify.generalised_duhem.tables import (
     BENT,

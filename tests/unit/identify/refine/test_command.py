@@ -1,15 +1,18 @@
 """Refined models: better on what they have not seen, or not written."""
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from hilctl.base.errors import InputError
-from hilctl.identify.refine.command import refine_files, refine_runs
+from hilctl.base.errors import DataError, InputError
+from hilctl.identify.refine.command import STILL_S, _history, load_runs, refine_files, refine_runs
 from hilctl.models.files import dump_model, load_model
 from hilctl.models.refined import RefinedModel
+from hilctl.recording.reader import read
+from tests.published import piezo_ppi
 from tests.unit.identify.refine.conftest import (
     OLD,
     RATE_HZ,
@@ -157,3 +160,41 @@ def test_a_file_that_exists_is_refused_before_anything_is_read(tmp_path):
     with pytest.raises(InputError, match=r"better\.yaml"):
         refine_files(tmp_path / "none.yaml", [], output)
     assert output.read_text() == "mine"
+
+
+GOLDEN_runs = ROOT / "recordings" / "golden" / "terfenol_compensated.mcap"
+OMEGA_runs = load_model(ROOT / "configs" / "models" / "terfenol_omega.yaml")
+
+
+def test_a_run_from_rest_is_what_was_put_out_and_what_came():
+    (run,), recording = load_runs([GOLDEN_runs], OMEGA_runs), read(GOLDEN_runs)
+    assert run.ignore == 0
+    np.testing.assert_array_equal(run.command, recording.samples.command[: run.command.size])
+
+
+def test_a_run_that_goes_on_has_the_one_before_ahead_of_it():
+    """Not judged; without it, where the actuator stood could not be known."""
+    first = read(GOLDEN_runs)
+    later = replace(first, run={**first.run, "run_id": "b", "initial_state_run_id": "a"})
+    run = _history(later, {"a": first, "b": later})
+    still = round(STILL_S * first.sample_rate_hz)
+    assert run.ignore == first.samples.index.size + still
+    np.testing.assert_array_equal(run.command[: first.samples.index.size], first.samples.command)
+    assert (run.command[run.ignore - still : run.ignore] == first.samples.command[-1]).all()
+
+
+def test_a_run_that_goes_on_from_one_that_is_not_given_is_refused():
+    first = read(GOLDEN_runs)
+    later = replace(first, run={**first.run, "initial_state_run_id": "a"})
+    with pytest.raises(DataError, match="give that recording too"):
+        _history(later, {})
+
+
+def test_what_can_not_be_used_is_said(tmp_path):
+    copy = Path(shutil.copy(GOLDEN_runs, tmp_path / "run.mcap"))
+    with pytest.raises(InputError, match="named twice"):
+        load_runs([copy, copy], OMEGA_runs)
+    with pytest.raises(InputError, match="name recordings"):
+        load_runs([], OMEGA_runs)
+    with pytest.raises(DataError, match="was recorded in A, the model takes V"):
+        load_runs([copy], piezo_ppi())

@@ -6,12 +6,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hilctl.base.arrays import F64
+from hilctl.base.types import F64
 from hilctl.identify.data.records import SteadyLoop
 from hilctl.identify.fit_data import FitData
 from hilctl.identify.searched.integrated import ExponentialProblem
 from hilctl.identify.settings import FitSettings
-from hilctl.models.published import exponential_integrated
+from hilctl.models.integrated import exponential_integrated
 
 Loops = Callable[..., list[SteadyLoop]]
 

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from scipy.optimize import nnls
 
-from hilctl.base.arrays import F64
+from hilctl.base.types import F64
 from hilctl.identify.data.records import SteadyLoop
 from hilctl.identify.fit_data import FitData
 from hilctl.identify.fit_model import fit_model
 from hilctl.identify.searched.plays import PlaysProblem
 from hilctl.identify.settings import FitSettings
-from hilctl.models.published import exponential_integrated
+from hilctl.models.integrated import exponential_integrated
 
 Loops = Callable[..., list[SteadyLoop]]
 

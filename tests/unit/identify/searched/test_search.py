@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
 
-from hilctl.base.arrays import F64
+from hilctl.base.types import F64
 from hilctl.identify.linear import bounded_weights
 from hilctl.identify.searched.search import SearchSpace, first_least, refine_peak, search
 from hilctl.models.plays import PlayModel

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares, lsq_linear
 
-from hilctl.base.arrays import F64
+from hilctl.base.types import F64
 from hilctl.identify.linear import bounded_and_free
 from hilctl.identify.staged.descend import descend
 

@@ -15,7 +15,7 @@ from hilctl.identify.staged.model import (
     stages_of,
     structure_of,
 )
-from hilctl.models.published import exponential_integrated
+from hilctl.models.integrated import exponential_integrated
 from hilctl.models.structure import Structure
 
 HALF_S = 1e-5

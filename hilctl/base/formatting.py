@@ -1,6 +1,9 @@
-"""Numbers for people: fixed significant digits, and units that can be read."""
+"""Format numbers with units and printable texts for people, and JSON for programs."""
 
+import json
 import math
+from collections.abc import Mapping
+from typing import Any
 
 _DIGITS = 3
 _SCALES: dict[str, tuple[tuple[float, str], ...]] = {
@@ -57,3 +60,48 @@ def quantity(value: float | None, unit: str = "", digits: int = _DIGITS) -> str:
         )
         return f"{significant(value / scale, digits)} {name}"
     return f"{significant(value, digits)} {unit_text(unit)}".rstrip()
+
+
+MOST_SHOWN = 100
+"""Characters of a name that are shown where there is room for one line."""
+
+
+def printable(text: str, *, lines: bool = False) -> str:
+    r"""Return a text without characters that steer a terminal, a browser or a plot.
+
+    Control characters, such as an escape, and those that turn the direction of writing round stand
+    as ``\x1b`` and ``\u202e``.
+
+    Args:
+        text: Any text.
+        lines: Leave ends of lines and tabs as they are.
+    """
+    if text.isprintable():  # nearly always
+        return text
+    kept = "\n\t" if lines else ""
+    return "".join(
+        each if each.isprintable() or each in kept else each.encode("unicode_escape").decode()
+        for each in text
+    )
+
+
+def short_name(text: str) -> str:
+    """Return a printable text of at most :data:`MOST_SHOWN` characters."""
+    name = printable(text[: MOST_SHOWN + 1])
+    return name if len(name) <= MOST_SHOWN else name[: MOST_SHOWN - 3] + "..."
+
+
+def finite_json(value: Any, indent: int | None = None) -> str:
+    """Return a value as JSON, with ``null`` for numbers that are not finite."""
+    try:
+        return json.dumps(value, indent=indent, allow_nan=False)
+    except ValueError:
+        return json.dumps(_finite(value), indent=indent, allow_nan=False)
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _finite(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(each) for each in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

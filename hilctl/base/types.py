@@ -1,7 +1,7 @@
-"""Array types named once, so that signatures say what they hold."""
+"""Types of arrays and of the unit of commands, for signatures."""
 
 from collections.abc import Iterator
-from typing import TypeAlias
+from typing import Literal, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -20,6 +20,9 @@ I64: TypeAlias = npt.NDArray[np.int64]
 
 U8: TypeAlias = npt.NDArray[np.uint8]
 """A uint8 array, used for bytes."""
+
+CommandUnit: TypeAlias = Literal["A", "V"]
+"""Coil current in ampere, or drive voltage in volt."""
 
 CHUNK = 1_000_000
 """Values that are processed together, so that temporary arrays stay small."""

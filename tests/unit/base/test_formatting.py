@@ -1,0 +1,95 @@
+"""Numbers and texts for people, and JSON for programs."""
+
+import json
+import math
+
+import pytest
+
+from hilctl.base.formatting import (
+    MOST_SHOWN,
+    finite_json,
+    printable,
+    quantity,
+    short_name,
+    significant,
+    unit_text,
+)
+
+
+@pytest.mark.parametrize(
+    ("value", "unit", "text"),
+    [
+        (39910.0, "us", "39.9 ms"),
+        (999.96, "us", "1.00 ms"),
+        (0.03553, "um", "35.5 nm"),
+        (83.2149, "um", "83.2 µm"),
+        (12.0, "%", "12.0 %"),
+        (223.609, "um*um", "224 µm²"),
+        (223.609, "um*A", "224 µm·A"),
+        (2291.4, "Hz", "2290 Hz"),
+        (-0.5, "s", "-500 ms"),
+        (5400.0, "s", "1.50 h"),
+        (0.0, "um", "0 µm"),
+        (1.5e-12, "um", "1.50e-09 nm"),
+        (None, "um", "-"),
+    ],
+)
+def test_a_quantity_is_read_without_counting_zeros(value, unit, text):
+    assert quantity(value, unit) == text
+
+
+def test_digits_are_the_same_whatever_the_size():
+    assert [significant(v) for v in (0.012345, 1.0, 9.996, 12345.0, 1e7, 1e-6)] == [
+        "0.0123", "1.00", "10.0", "12300", "1.00e+07", "1.00e-06",
+    ]  # fmt: skip
+    assert significant(2291.4, 4) == "2291"
+    assert significant(math.nan) == "nan"
+    assert significant(1.7976931348623157e308) == "1.80e+308"
+
+
+def test_units_have_their_signs():
+    assert [unit_text(u) for u in ("um/A", "A", "um*V")] == ["µm/A", "A", "µm·V"]
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("sine 6 A 10 Hz, µm ü", "sine 6 A 10 Hz, µm ü"),
+        ("\x1b[31mred\x07", "\\x1b[31mred\\x07"),
+        ("a\r\nb", "a\\r\\nb"),
+        ("\u202egnp.exe", "\\u202egnp.exe"),
+        ("\x9b2Jc\rd\x7fe", "\\x9b2Jc\\rd\\x7fe"),
+    ],
+)
+def test_what_steers_a_terminal_is_written_out(text: str, shown: str) -> None:
+    assert printable(text) == shown
+
+
+def test_lines_stay_where_they_are_wanted() -> None:
+    assert printable("a:\n\tb\r", lines=True) == "a:\n\tb\\r"
+
+
+def test_names_are_short() -> None:
+    assert short_name("x" * MOST_SHOWN) == "x" * MOST_SHOWN
+    for long in ("x" * 10**6, "\x1b" * MOST_SHOWN):
+        assert len(short_name(long)) == MOST_SHOWN
+        assert short_name(long).endswith("...")
+
+
+WHOLE = {"a": [1, 0.5, None, True, "NaN"], "b": {"c": (2.5,)}}
+
+
+def refuse(constant: str) -> None:
+    raise ValueError(constant)
+
+
+@pytest.mark.parametrize("indent", [None, 2])
+def test_finite_values_stay_as_they_are(indent: int | None) -> None:
+    assert finite_json(WHOLE, indent) == json.dumps(WHOLE, indent=indent)
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+def test_what_is_not_finite_is_null(bad: float) -> None:
+    text = finite_json({"x": bad, "y": [bad, 1.0], "z": {"deep": (bad, "inf")}})
+    found = json.loads(text, parse_constant=refuse)
+    assert found == {"x": None, "y": [None, 1.0], "z": {"deep": [None, "inf"]}}
