@@ -1,7 +1,7 @@
 """Survey a recording, sound or not, and save what it holds into a new file."""
 
 from collections.abc import Iterable, Mapping
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 from mcap.records import Attachment, Channel, McapRecord, Message, Metadata, Schema
 
@@ -11,9 +11,9 @@ from hilctl.base.samples import Batch
 from hilctl.recording import schema
 from hilctl.recording.checks import SoundMessages, count_of
 from hilctl.recording.facts import CHECKSUM_FACT, sealed, unsealed
-from hilctl.recording.mcap_file import McapWriter
 from hilctl.recording.messages import MessageMaker, RecordingLayout, Topics, event_message
 from hilctl.recording.salvage import Salvage
+from hilctl.recording.writer import mcap_writer
 
 _UNKNOWN_END = (
     "what was exchanged after it is unknown: at most the last unflushed interval where hilctl was "
@@ -64,8 +64,7 @@ class Survey:
             case Message():
                 self.last_time_ns = max(self.last_time_ns, record.log_time)
                 if self._sound.topic(record.channel_id) == "/samples":
-                    block: Any = schema.message_class("SampleBlock").FromString(record.data)
-                    self.samples += block.n
+                    self.samples += schema.message_class("SampleBlock").FromString(record.data).n
         self.records += isinstance(record, Metadata | Message)
 
     @property
@@ -90,7 +89,7 @@ class Resaved:
     def __init__(self, stream: BinaryIO, survey: Survey) -> None:
         header = survey.salvage.header
         self._survey = survey
-        self._writer = McapWriter(stream)
+        self._writer = mcap_writer(stream)
         self._topics = Topics(self._writer)
         self._names: dict[int, str] = {}
         self._schemas: dict[int, int] = {0: 0}
@@ -154,7 +153,7 @@ class Resaved:
         for batch in batches:
             for message in maker.batch(batch):
                 self._topics.add(message)
-                self._last_time_ns = max(self._last_time_ns, message.last_ns)
+                self._last_time_ns = max(self._last_time_ns, message.time_ns)
         for event in events:
             self._topics.add(maker.event(event))
         self.added = maker.samples - self.samples

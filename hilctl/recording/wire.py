@@ -7,7 +7,6 @@ as long.
 
 from collections.abc import Collection
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -110,50 +109,6 @@ def sample_block(data: bytes) -> BlockArrays | None:
         previous_command=doubles.pop(PREVIOUS, _NONE),
         columns={_COLUMNS[number]: values for number, values in doubles.items() if values.size},
     )
-
-
-def block_bytes(block: BlockArrays, t_rel: F64) -> bytes:
-    """Return a ``SampleBlock`` as the protobuf library writes it, in a tenth of its time.
-
-    Args:
-        block: What it holds.
-        t_rel: float64[n], time of its samples in s.
-    """
-    lists = {T_REL: t_rel, STATE: block.state, PREVIOUS: block.previous_command}
-    lists |= {NUMBER_OF[name]: values for name, values in block.columns.items()}
-    numbers = {TICK0: block.tick0, N: block.n, _DROPPED: block.dropped}
-    # Of blocks of one sample, a column is one number in so many of the ring's.
-    packed = {field: np.ascontiguousarray(of).data for field, of in lists.items()}
-    packed[FLAGS] = memoryview(_packed(block.flags))
-    parts: list[bytes | memoryview] = []
-    for field, value in numbers.items():
-        if value:
-            parts += _number(field << 3), _number(value)
-    for field in sorted(packed):
-        if size := packed[field].nbytes:
-            parts += _list_head(field, size), packed[field]
-    return b"".join(parts)
-
-
-@lru_cache(maxsize=1024)  # one block after the other has lists of the same lengths
-def _list_head(field: int, size: int) -> bytes:
-    return _number(field << 3 | _BYTES) + _number(size)
-
-
-def _packed(values: U32) -> bytes:
-    if values.size and values.max() < _MORE:
-        return values.astype(np.uint8).tobytes()
-    return b"".join(map(_number, values.tolist()))
-
-
-def _number(value: int) -> bytes:
-    """Return a number of no sign as its bytes, lowest first, seven bits in each."""
-    found = bytearray()
-    while value >= _MORE:
-        found.append(value & (_MORE - 1) | _MORE)
-        value >>= 7
-    found.append(value)
-    return bytes(found)
 
 
 def tick_block(data: bytes) -> Ticks | None:
