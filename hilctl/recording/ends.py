@@ -15,7 +15,7 @@ from hilctl.base.errors import DataError
 from hilctl.base.remedy import reason
 from hilctl.recording.facts import CHECKSUM_FACT, unsealed
 from hilctl.recording.locks import is_being_recorded
-from hilctl.recording.records import FRAME, LARGEST_BYTES, parse
+from hilctl.recording.mcap_records import FRAME, LARGEST_BYTES, parse
 
 _HEAD_BYTES = 8192
 _TAIL_BYTES = 4096

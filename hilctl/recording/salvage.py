@@ -27,12 +27,11 @@ from mcap.records import (
 )
 from mcap.writer import MCAP0_MAGIC as MAGIC
 
-from hilctl.recording.ahead import ChunkRun, ReadAhead
 from hilctl.recording.allowance import Allowance
 from hilctl.recording.checks import SoundMessages
-from hilctl.recording.chunks import Contents, Messages, contents
+from hilctl.recording.chunk_reader import Contents, contents
 from hilctl.recording.facts import unsealed
-from hilctl.recording.records import FRAME, LARGEST_BYTES, parse
+from hilctl.recording.mcap_records import FRAME, LARGEST_BYTES, parse
 from hilctl.recording.torn import next_likely, own_channels, tail_kind, take_chunk
 
 _INDEX_KINDS = {Opcode.MESSAGE_INDEX, Opcode.DATA_END, Opcode.FOOTER}
@@ -76,13 +75,12 @@ class _Found(NamedTuple):
 
 
 class Salvage:
-    """What can be read of a file; all attributes are right once :meth:`taken` is exhausted.
+    """What can be read of a file; all attributes are right once :meth:`records` is exhausted.
 
     Args:
         stream: Open binary file that can seek.
         sound: Leaves out messages that hilctl can't have written, and notes them as damage; where
             None, they are given out.
-        ahead: Reads chunks before they are asked for.
 
     Attributes:
         size: Bytes of the file.
@@ -95,15 +93,9 @@ class Salvage:
             have been.
     """
 
-    def __init__(
-        self,
-        stream: BinaryIO,
-        sound: SoundMessages | None = None,
-        ahead: ReadAhead | None = None,
-    ) -> None:
+    def __init__(self, stream: BinaryIO, sound: SoundMessages | None = None) -> None:
         self._stream = stream
         self._sound = sound
-        self._ahead = ahead
         self.size = stream.seek(0, 2)
         self.allowance = Allowance(self.size)
         self.is_mcap = self._read(0, len(MAGIC)) == MAGIC
@@ -149,30 +141,11 @@ class Salvage:
             OSError: The file can't be read.
             DataError: It asks for more work or memory than a recording of its size can.
         """
-        for each in self.taken():
-            if isinstance(each, Messages):
-                yield from each.records(each.table)
-            else:
-                yield each
-
-    def taken(self) -> Iterator[McapRecord | Messages]:
-        """Yield what :meth:`records` does, messages of many chunks at once where that can be.
-
-        Every message comes after its channel, and every channel after its schema.
-
-        Raises:
-            OSError: The file can't be read.
-            DataError: It asks for more work or memory than a recording of its size can.
-        """
         at = len(MAGIC)
         if not self.is_mcap:
             at = next_likely(self._stream, 1, self.size)
             self._note(0, at, "damaged record")
         while at < self.size:
-            if run := self._run_of_chunks(at):
-                yield run.messages
-                at = run.end
-                continue
             found = self._whole(at)
             if found is None:
                 after = next_likely(self._stream, at + 1, self.size)
@@ -185,22 +158,15 @@ class Salvage:
                 return
             at = found.end
 
-    def taken_at(self, places: Iterable[int]) -> Iterator[McapRecord | Messages]:
-        """Yield what stands at some places, which the index of a finished file has named.
+    def records_at(self, places: Iterable[int]) -> Iterator[McapRecord]:
+        """Yield the records at some places, from the index of a finished file.
 
         Raises:
             OSError: The file can't be read.
             DataError: It asks for more work or memory than a recording of its size can.
         """
-        end = 0
         for at in places:
-            if at < end:  # it has been given out with those before it
-                continue
-            self._indexes = {}  # what follows a chunk is not looked at
-            if run := self._run_of_chunks(at):
-                yield run.messages
-                end = run.end
-                continue
+            self._indexes = {}  # what follows a chunk is not read
             found = self._whole(at)
             if found is None:
                 self._note(at, 0, "damaged record")
@@ -209,24 +175,10 @@ class Salvage:
         self.finished = True
 
     def _read(self, at: int, size: int) -> bytes:
-        found = self._ahead.read(at, size) if self._ahead else None
-        if found is None:
-            self._stream.seek(at)
-            found = self._stream.read(size)
+        self._stream.seek(at)
+        found = self._stream.read(size)
         self.allowance.read(len(found))
         return found
-
-    def _run_of_chunks(self, at: int) -> ChunkRun | None:
-        """Return chunks that have been read ahead, if all their channels are known."""
-        run = self._ahead.chunks(at) if self._ahead and not self._indexes else None
-        if run is None or not run.messages.channels <= self._channels:
-            return None
-        self._chunks += run.places
-        self.allowance.read(run.end - at)
-        self.allowance.expand(run.messages.data.size)
-        self.allowance.message(len(run.messages.table))
-        self._messages += len(run.messages.table)
-        return run
 
     def _whole(self, at: int) -> _Found | None:
         frame = self._read(at, FRAME.size)
@@ -282,9 +234,6 @@ class Salvage:
 
     def _crc(self, stop: int) -> int:
         """Return the checksum of all bytes up to some place."""
-        found = self._ahead.crc(stop) if self._ahead else None
-        if found is not None:
-            return found
         crc = 0
         self._stream.seek(0)
         for start in range(0, stop, _CRC_BYTES):

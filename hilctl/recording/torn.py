@@ -10,8 +10,8 @@ from mcap.records import Channel, Chunk, McapRecord, Message, Schema
 from hilctl.recording import schema
 from hilctl.recording.allowance import LARGEST_CHUNK_BYTES, MOST_IN_CHUNK, Allowance
 from hilctl.recording.checks import block_problem, decode
-from hilctl.recording.chunks import contents, inflate
-from hilctl.recording.records import CHUNK_HEAD, FRAME, LARGEST_BYTES, LENGTH, split
+from hilctl.recording.chunk_reader import contents, inflate
+from hilctl.recording.mcap_records import CHUNK_HEAD, FRAME, LARGEST_BYTES, LENGTH, split
 
 _WINDOW_BYTES = 4 * 2**20
 _IN_CHUNKS = {Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE}

@@ -5,7 +5,7 @@ from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Header, Metadata, Schema
 
-from hilctl.recording.records import parse
+from hilctl.recording.mcap_records import parse
 
 RECORDS = [
     (Opcode.HEADER, Header("", "hilctl 1")),

@@ -1,13 +1,9 @@
 """Chunks: whole, or not taken."""
 
-import random
 import struct
-from concurrent.futures import ThreadPoolExecutor
-
-import zstandard
 
 from hilctl.recording.allowance import Allowance
-from hilctl.recording.chunks import contents, inflate
+from hilctl.recording.chunk_reader import contents, inflate
 from tests.unit.recording.conftest import chunk, message, raw
 
 
@@ -27,18 +23,3 @@ def test_a_chunk_must_be_records_to_its_last_byte():
 def test_unknown_compression_gives_nothing():
     """What can't be decompressed is not guessed at."""
     assert inflate("brotli", b"abc", 10, Allowance(3)) == b""
-
-
-def test_threads_decompress_beside_each_other():
-    """Chunks that several threads decompress at once come out whole, each its own."""
-    wanted = [random.Random(k).randbytes(200_000) * 8 for k in range(4)]
-    packed = [zstandard.ZstdCompressor().compress(each) for each in wanted]
-
-    def wrong(k):
-        size = len(wanted[k])
-        return sum(
-            inflate("zstd", packed[k], size, Allowance(2**32)) != wanted[k] for _ in range(50)
-        )
-
-    with ThreadPoolExecutor(4) as threads:
-        assert list(threads.map(wrong, range(4))) == [0] * 4
