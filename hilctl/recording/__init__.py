@@ -8,9 +8,9 @@ writer.py        from messages to a file
 reader.py        from a file, sound or not, to a recording in memory or in pieces, which builder.py
                  makes; ends.py  the facts at both its ends
 stretch.py       a part of a run, by time; index.py  its place in a finished file
-checks.py        validation of facts and messages; segments.py, odd_segments.py  of the segments
+checks.py        validation of facts and messages; segments.py  of the segments
 allowance.py     limits of work and memory per file
-salvage.py       all whole records of a file, by mcap_records.py and chunk_reader.py; torn.py  what
+salvage.py       all whole records of a file, by mcap_records.py; torn.py  what
                  is left of truncated chunks
 recover.py       from a truncated file to a sound one; rewrite.py copies, replace.py replaces
 """

@@ -168,6 +168,8 @@ class SoundMessages:
         self._refused: dict[int, str] = {}
         self.next_sample = 0
         """Index after the last sample of all messages that were found sound."""
+        self.samples = 0
+        """Samples in them."""
 
     def topic(self, channel: int) -> str:
         """Return the topic of a channel where it is one of hilctl's; else nothing."""
@@ -215,6 +217,7 @@ class SoundMessages:
                 problem = event_problem(message, record.log_time)
         if topic == "/samples" and not problem:
             self.next_sample = message.tick0 + message.n
+            self.samples += message.n
         return message, f"{topic}: {problem}" if problem else ""
 
 

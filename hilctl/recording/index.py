@@ -22,7 +22,7 @@ from mcap.writer import MCAP0_MAGIC as MAGIC
 
 from hilctl.recording.checks import RATES_HZ, number_of
 from hilctl.recording.facts import unsealed
-from hilctl.recording.mcap_records import FRAME, LARGEST_BYTES, parse
+from hilctl.recording.mcap_records import FRAME, LARGEST_BYTES, parse, records_from
 from hilctl.recording.stretch import Stretch
 
 _FOOTER_BYTES = FRAME.size + 20
@@ -85,9 +85,7 @@ def _chosen(chunks: list[ChunkIndex], low: int, high: int, events: set[int]) -> 
 def _run_facts(stream: BinaryIO, indexes: list[AttachmentIndex | MetadataIndex]) -> dict[str, str]:
     for index in indexes:
         if isinstance(index, MetadataIndex) and index.name == "hilctl.run":
-            stream.seek(index.offset)
-            raw = stream.read(min(index.length, LARGEST_BYTES))
-            record = parse(raw[0], raw[FRAME.size :]) if len(raw) > FRAME.size else None
+            record = next(records_from(stream, index.offset, index.offset + index.length), None)
             if isinstance(record, Metadata):
                 facts, right = unsealed(record.name, record.metadata)
                 return facts if right else {}

@@ -8,7 +8,6 @@ from mcap.records import Attachment, Channel, McapRecord, Message, Metadata, Sch
 from hilctl import __version__
 from hilctl.base.events import Event
 from hilctl.base.samples import Batch
-from hilctl.recording import schema
 from hilctl.recording.checks import SoundMessages, count_of
 from hilctl.recording.facts import CHECKSUM_FACT, sealed, unsealed
 from hilctl.recording.messages import MessageMaker, RecordingLayout, Topics, event_message
@@ -32,7 +31,6 @@ class Survey:
         run: Facts of the run, empty where they are lost.
         end: Facts of its end, empty where they are lost or were never written.
         end_is_right: Whether their checksum is.
-        samples: Samples in it.
         last_time_ns: Unix time of the last message or attachment, in ns.
         records: Metadata and messages that are whole.
 
@@ -47,7 +45,6 @@ class Survey:
         self.run: dict[str, str] = {}
         self.end: dict[str, str] = {}
         self.end_is_right = True
-        self.samples = 0
         self.last_time_ns = 0
         self.records = 0
         for record in self.salvage.records():
@@ -63,9 +60,12 @@ class Survey:
                 self.last_time_ns = max(self.last_time_ns, record.log_time)
             case Message():
                 self.last_time_ns = max(self.last_time_ns, record.log_time)
-                if self._sound.topic(record.channel_id) == "/samples":
-                    self.samples += schema.message_class("SampleBlock").FromString(record.data).n
         self.records += isinstance(record, Metadata | Message)
+
+    @property
+    def samples(self) -> int:
+        """Samples in it."""
+        return self._sound.samples
 
     @property
     def next_sample(self) -> int:

@@ -29,9 +29,8 @@ from mcap.writer import MCAP0_MAGIC as MAGIC
 
 from hilctl.recording.allowance import Allowance
 from hilctl.recording.checks import SoundMessages
-from hilctl.recording.chunk_reader import Contents, contents
 from hilctl.recording.facts import unsealed
-from hilctl.recording.mcap_records import FRAME, LARGEST_BYTES, parse
+from hilctl.recording.mcap_records import FRAME, LARGEST_BYTES, Contents, contents, parse
 from hilctl.recording.torn import next_likely, own_channels, tail_kind, take_chunk
 
 _INDEX_KINDS = {Opcode.MESSAGE_INDEX, Opcode.DATA_END, Opcode.FOOTER}

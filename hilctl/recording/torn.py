@@ -8,10 +8,17 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, McapRecord, Message, Schema
 
 from hilctl.recording import schema
-from hilctl.recording.allowance import LARGEST_CHUNK_BYTES, MOST_IN_CHUNK, Allowance
+from hilctl.recording.allowance import LARGEST_CHUNK_BYTES, Allowance
 from hilctl.recording.checks import block_problem, decode
-from hilctl.recording.chunk_reader import contents, inflate
-from hilctl.recording.mcap_records import CHUNK_HEAD, FRAME, LARGEST_BYTES, LENGTH, split
+from hilctl.recording.mcap_records import (
+    CHUNK_HEAD,
+    FRAME,
+    LARGEST_BYTES,
+    LENGTH,
+    contents,
+    inflate,
+    split,
+)
 
 _WINDOW_BYTES = 4 * 2**20
 _IN_CHUNKS = {Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE}
@@ -116,13 +123,11 @@ def _believable(data: bytes) -> list[McapRecord]:
     """
     records: list[McapRecord] = []
     end = 0
-    for at, record in split(data):
+    for _, stop, record in split(data):
         if isinstance(record, Message) and not _decodes(record):
             return records[:-1]
         records.append(record)
-        if len(records) > MOST_IN_CHUNK:
-            return []
-        end = at + FRAME.size + FRAME.unpack_from(data, at)[1]
+        end = stop
     rest = data[end:]
     if len(rest) >= FRAME.size:
         opcode, length = FRAME.unpack_from(rest)

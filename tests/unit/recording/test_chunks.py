@@ -3,7 +3,7 @@
 import struct
 
 from hilctl.recording.allowance import Allowance
-from hilctl.recording.chunk_reader import contents, inflate
+from hilctl.recording.mcap_records import contents, inflate
 from tests.unit.recording.conftest import chunk, message, raw
 
 
