@@ -2,6 +2,8 @@
 
 import logging
 from collections.abc import Generator, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from pathlib import Path
 
 from hilctl.base.errors import DataError
@@ -61,8 +63,17 @@ class Pieces:
         Raises:
             DataError: As :func:`read` does, and if facts of the run follow its samples.
         """
-        pieces = _read(self.path, self.stretch, PIECE_SAMPLES)
+        pieces = _prefetched(_read(self.path, self.stretch, PIECE_SAMPLES))
         return self.stretch.cut_pieces(pieces) if self.stretch else pieces
+
+
+def _prefetched(pieces: Generator[Recording, None, None]) -> Iterator[Recording]:
+    """Yield pieces while a thread reads the next one."""
+    with closing(pieces), ThreadPoolExecutor(1) as thread:
+        coming = thread.submit(next, pieces, None)
+        while (piece := coming.result()) is not None:
+            coming = thread.submit(next, pieces, None)
+            yield piece
 
 
 def _read(

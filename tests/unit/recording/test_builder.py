@@ -1,5 +1,6 @@
 """Pieces of a recording: together they are the whole, and each is of one shape."""
 
+import threading
 from dataclasses import replace
 from pathlib import Path
 
@@ -63,8 +64,9 @@ def test_pieces_of_a_stretch_are_cut_from_the_whole(monkeypatch, recorded):
 
 
 def test_a_walk_that_is_left_leaves_nothing_behind(monkeypatch, recorded):
-    """The file is closed."""
+    """Neither the thread that reads ahead nor the open file."""
     monkeypatch.setattr(reader, "PIECE_SAMPLES", 1)
+    before = threading.active_count()
     opened, streams = Path.open, []
 
     def noted(path, *args, **named):
@@ -74,7 +76,9 @@ def test_a_walk_that_is_left_leaves_nothing_behind(monkeypatch, recorded):
     monkeypatch.setattr(Path, "open", noted)
     walk = iter(Pieces(recorded))
     next(walk)
+    assert threading.active_count() == before + 1
     walk.close()
+    assert threading.active_count() == before
     assert streams
     assert all(stream.closed for stream in streams)
 
