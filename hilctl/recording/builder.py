@@ -12,20 +12,20 @@ from hilctl.base.errors import DataError
 from hilctl.base.events import Event
 from hilctl.base.samples import COLUMNS, LAST_SAMPLE, Samples
 from hilctl.base.units import CommandUnit
-from hilctl.recording.checks import (
+from hilctl.recording.codec import BlockArrays
+from hilctl.recording.data import TICK_COLUMNS, Recording, ReplayStart, Ticks
+from hilctl.recording.facts import unsealed
+from hilctl.recording.recovery_scan import RecoveryScan
+from hilctl.recording.segments import segments_of
+from hilctl.recording.stretch import Stretch
+from hilctl.recording.validation import (
     RATES_HZ,
-    SoundMessages,
+    MessageValidator,
     count_of,
     labels_of,
     number_of,
     short,
 )
-from hilctl.recording.codec import BlockArrays
-from hilctl.recording.data import TICK_COLUMNS, Recording, ReplayStart, Ticks
-from hilctl.recording.facts import unsealed
-from hilctl.recording.salvage import Salvage
-from hilctl.recording.segments import segments_of
-from hilctl.recording.stretch import Stretch
 
 _TEXTS = {"experiment.yaml", "model.yaml", "correction.yaml"}
 _NUMBER_BYTES = 8
@@ -61,7 +61,7 @@ class RecordingBuilder:
     """Takes the records of a file, in order.
 
     Args:
-        salvage: Where they come from; it counts what is kept.
+        scan: Where they come from; it counts what is kept.
         stretch: Blocks and ticks that lie elsewhere are not kept.
 
     Attributes:
@@ -69,12 +69,12 @@ class RecordingBuilder:
         waiting: Those of them that have not been given out.
     """
 
-    def __init__(self, salvage: Salvage, stretch: Stretch | None) -> None:
-        self._salvage = salvage
-        self._allowance = salvage.allowance
+    def __init__(self, scan: RecoveryScan, stretch: Stretch | None) -> None:
+        self._scan = scan
+        self._budget = scan.budget
         self._stretch = stretch
         self._bounds: tuple[int, int] | None = None
-        self._sound = SoundMessages()
+        self._sound = MessageValidator()
         self._run: dict[str, str] = {}
         self._end: dict[str, str] = {}
         self._texts: dict[str, str] = {}
@@ -102,7 +102,7 @@ class RecordingBuilder:
                 self._message(record)
             case Metadata(name="hilctl.run"):
                 self._refuse_late("metadata hilctl.run")
-                self._run, _ = unsealed(record.name, record.metadata)  # salvage tells of damage
+                self._run, _ = unsealed(record.name, record.metadata)  # scan tells of damage
             case Metadata(name="hilctl.end"):
                 self._end, _ = unsealed(record.name, record.metadata)
             case Attachment() if record.name in _TEXTS:
@@ -124,9 +124,9 @@ class RecordingBuilder:
     def _read_or_not(self, channel: int) -> None:
         # It repeats /samples, and has nine of ten messages at 50 kHz in blocks.
         if self._sound.topic(channel) == "/scope":
-            self._salvage.unread.add(channel)
+            self._scan.unread.add(channel)
         else:
-            self._salvage.unread.discard(channel)
+            self._scan.unread.discard(channel)
 
     def _message(self, record: Message) -> None:
         decoded, problem = self._sound.decoded(record)
@@ -136,10 +136,10 @@ class RecordingBuilder:
         if topic == "/samples" and self._within(decoded.tick0, decoded.tick0 + decoded.n):
             self._block(decoded)
         elif topic == "/ticks" and self._within(*_reach(decoded)):
-            self._allowance.keep(_NUMBER_BYTES * decoded.late_ns.size * len(TICK_COLUMNS))
+            self._budget.keep(_NUMBER_BYTES * decoded.late_ns.size * len(TICK_COLUMNS))
             self._ticks.add({name: getattr(decoded, name) for name in TICK_COLUMNS})
         elif topic == "/events":
-            self._allowance.keep(_EVENT_BYTES + len(record.data))
+            self._budget.keep(_EVENT_BYTES + len(record.data))
             self._events.append((record.log_time, decoded))
 
     def _within(self, start: int, stop: int) -> bool:
@@ -159,13 +159,13 @@ class RecordingBuilder:
         return self._bounds
 
     def _block(self, block: BlockArrays) -> None:
-        self._allowance.keep(_NUMBER_BYTES * block.n * len(COLUMNS))
+        self._budget.keep(_NUMBER_BYTES * block.n * len(COLUMNS))
         self.samples += block.n
         self.waiting += block.n
         index = np.arange(block.tick0, block.tick0 + block.n)
         self._blocks.add({"index": index, "flags": block.flags, **block.columns})
         for previous in block.previous_command.tolist():
-            self._allowance.keep(_EVENT_BYTES + _NUMBER_BYTES * block.state.size)
+            self._budget.keep(_EVENT_BYTES + _NUMBER_BYTES * block.state.size)
             self._starts.append(ReplayStart(block.tick0, block.state, previous))
 
     def piece(self, path: Path, *, last: bool = False) -> Recording:
@@ -179,7 +179,7 @@ class RecordingBuilder:
             DataError: A fact of the run is missing or damaged, or a column is incomplete.
         """
         if not self._run:
-            lost = "" if self._salvage.is_mcap else "is not an MCAP file, or its start is lost: "
+            lost = "" if self._scan.is_mcap else "is not an MCAP file, or its start is lost: "
             text = f"{path}: {lost}holds no run of hilctl (metadata hilctl.run is missing)"
             raise DataError(text)
         try:

@@ -20,10 +20,10 @@ from mcap.records import (
 from mcap.stream_reader import StreamReader
 from mcap.writer import MCAP0_MAGIC as MAGIC
 
-from hilctl.recording.checks import RATES_HZ, number_of
 from hilctl.recording.facts import unsealed
 from hilctl.recording.mcap_records import FRAME, LARGEST_BYTES, parse, records_from
 from hilctl.recording.stretch import Stretch
+from hilctl.recording.validation import RATES_HZ, number_of
 
 _FOOTER_BYTES = FRAME.size + 20
 _CRC_BYTES = 4

@@ -36,7 +36,7 @@ from mcap.records import (
     SummaryOffset,
 )
 
-from hilctl.recording.allowance import LARGEST_CHUNK_BYTES, MOST_IN_CHUNK, Allowance
+from hilctl.recording.read_budget import LARGEST_CHUNK_BYTES, MOST_IN_CHUNK, ReadBudget
 
 FRAME = struct.Struct("<BQ")
 """Opcode and length before every record."""
@@ -121,7 +121,7 @@ def split(data: bytes) -> Iterator[tuple[int, int, McapRecord]]:
         at = end
 
 
-def inflate(compression: str, data: bytes, size: int, allowance: Allowance) -> bytes:
+def inflate(compression: str, data: bytes, size: int, budget: ReadBudget) -> bytes:
     """Decompress as far as the bytes go, and at most one byte more than ``size``.
 
     A decompressor returns whole blocks (zstd: up to 128 KiB), so the last block of a truncated
@@ -131,10 +131,10 @@ def inflate(compression: str, data: bytes, size: int, allowance: Allowance) -> b
         compression: ``zstd``, ``lz4`` or empty; any other returns nothing.
         data: The stream, maybe truncated or damaged.
         size: Bytes expected.
-        allowance: Counts the bytes returned.
+        budget: Counts the bytes returned.
 
     Raises:
-        DataError: The file exceeds its allowance.
+        DataError: The file exceeds its budget.
     """
     if not compression:
         return data
@@ -145,7 +145,7 @@ def inflate(compression: str, data: bytes, size: int, allowance: Allowance) -> b
         with suppress(zstandard.ZstdError):  # damaged: block by block
             if zstandard.frame_content_size(data) == size <= LARGEST_CHUNK_BYTES:
                 whole = decompressor.decompress(data, allow_extra_data=False)  # twice as fast
-                allowance.expand(size)
+                budget.expand(size)
                 return whole
         stream = decompressor.stream_reader(data)
     elif compression == "lz4":
@@ -161,7 +161,7 @@ def inflate(compression: str, data: bytes, size: int, allowance: Allowance) -> b
             break
         if not piece:
             break
-        allowance.expand(len(piece))
+        budget.expand(len(piece))
         pieces.append(piece)
         left -= len(piece)
     return b"".join(pieces)
@@ -182,17 +182,17 @@ class Contents:
     unread: int = 0
 
 
-def contents(chunk: Chunk, allowance: Allowance, unread: Collection[int] = ()) -> Contents | None:
+def contents(chunk: Chunk, budget: ReadBudget, unread: Collection[int] = ()) -> Contents | None:
     """Return the content of a chunk, or None if its checksum or a record in it is wrong.
 
     Args:
         chunk: A chunk whose own lengths are right.
-        allowance: Counts the bytes that are decompressed.
+        budget: Counts the bytes that are decompressed.
         unread: Ids of channels whose messages are only counted.
     """
     if chunk.uncompressed_size > LARGEST_CHUNK_BYTES:
         return None
-    data = inflate(chunk.compression, chunk.data, chunk.uncompressed_size, allowance)
+    data = inflate(chunk.compression, chunk.data, chunk.uncompressed_size, budget)
     if len(data) != chunk.uncompressed_size:
         return None
     if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:

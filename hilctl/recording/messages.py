@@ -14,9 +14,9 @@ from hilctl.base.events import Event
 from hilctl.base.samples import COLUMNS, Batch, Head, RecordedField, SampleColumn, Samples
 from hilctl.base.units import CommandUnit
 from hilctl.recording import schema
-from hilctl.recording.checks import MAX_UNIX_NS, RATES_HZ
 from hilctl.recording.codec import BlockArrays, encode_block, encode_scope, encode_ticks
 from hilctl.recording.data import TICK_COLUMNS
+from hilctl.recording.validation import MAX_UNIX_NS, RATES_HZ
 
 _MAX_BLOCK = 1000
 _NONE = np.empty(0)

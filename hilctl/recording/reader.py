@@ -12,7 +12,7 @@ from hilctl.recording.builder import RecordingBuilder
 from hilctl.recording.data import Recording
 from hilctl.recording.index import places_of
 from hilctl.recording.locks import is_being_recorded
-from hilctl.recording.salvage import Salvage
+from hilctl.recording.recovery_scan import RecoveryScan
 from hilctl.recording.stretch import Stretch
 
 _log = logging.getLogger(__name__)
@@ -83,13 +83,13 @@ def _read(
     try:
         with path.open("rb") as stream:
             places = places_of(stream, stretch) if stretch else None
-            salvage = Salvage(stream)
-            builder = RecordingBuilder(salvage, stretch)
-            for record in salvage.records() if places is None else salvage.records_at(places):
+            scan = RecoveryScan(stream)
+            builder = RecordingBuilder(scan, stretch)
+            for record in scan.records() if places is None else scan.records_at(places):
                 builder.take(record)
                 if piece_samples and builder.waiting >= piece_samples:
                     yield builder.piece(path)
-            live = not salvage.sound and is_being_recorded(stream)
+            live = not scan.sound and is_being_recorded(stream)
     except FileNotFoundError:
         raise DataError(no_such_file(path)) from None
     except OSError as error:
@@ -98,8 +98,8 @@ def _read(
         text = str(error).removeprefix(f"{path}: ")  # that of a piece has it already
         raise DataError(f"{path}: {text}") from None
     last = builder.piece(path, last=True)
-    if not salvage.sound:
-        problem = "is still being recorded" if live else salvage.describe()
+    if not scan.sound:
+        problem = "is still being recorded" if live else scan.describe()
         _warn(path, problem, builder.samples, live=live)
     yield last
 

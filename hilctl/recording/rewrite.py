@@ -8,10 +8,10 @@ from mcap.records import Attachment, Channel, McapRecord, Message, Metadata, Sch
 from hilctl import __version__
 from hilctl.base.events import Event
 from hilctl.base.samples import Batch
-from hilctl.recording.checks import SoundMessages, count_of
 from hilctl.recording.facts import CHECKSUM_FACT, sealed, unsealed
 from hilctl.recording.messages import MessageMaker, RecordingLayout, Topics, event_message
-from hilctl.recording.salvage import Salvage
+from hilctl.recording.recovery_scan import RecoveryScan
+from hilctl.recording.validation import MessageValidator, count_of
 from hilctl.recording.writer import mcap_writer
 
 _UNKNOWN_END = (
@@ -27,7 +27,7 @@ class Survey:
         stream: The file.
 
     Attributes:
-        salvage: What is wrong with it.
+        scan: What is wrong with it.
         run: Facts of the run, empty where they are lost.
         end: Facts of its end, empty where they are lost or were never written.
         end_is_right: Whether their checksum is.
@@ -40,14 +40,14 @@ class Survey:
     """
 
     def __init__(self, stream: BinaryIO) -> None:
-        self._sound = SoundMessages()
-        self.salvage = Salvage(stream, self._sound)
+        self._sound = MessageValidator()
+        self.scan = RecoveryScan(stream, self._sound)
         self.run: dict[str, str] = {}
         self.end: dict[str, str] = {}
         self.end_is_right = True
         self.last_time_ns = 0
         self.records = 0
-        for record in self.salvage.records():
+        for record in self.scan.records():
             self._take(record)
 
     def _take(self, record: McapRecord) -> None:
@@ -73,7 +73,7 @@ class Survey:
         return self._sound.next_sample
 
 
-class Resaved:
+class Rewritten:
     """The sound file in the making.
 
     Args:
@@ -87,7 +87,7 @@ class Resaved:
     """
 
     def __init__(self, stream: BinaryIO, survey: Survey) -> None:
-        header = survey.salvage.header
+        header = survey.scan.header
         self._survey = survey
         self._writer = mcap_writer(stream)
         self._topics = Topics(self._writer)
@@ -193,7 +193,7 @@ class Resaved:
         return reason
 
     def _reason(self, last: int, *, known: bool) -> str:
-        parts = [self._survey.salvage.describe()]
+        parts = [self._survey.scan.describe()]
         if self.added:
             parts.append(f"{self.added} samples added from the ring")
         if self.missing:

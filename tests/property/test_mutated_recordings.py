@@ -53,7 +53,7 @@ from hilctl.recording import reader, schema
 from hilctl.recording.data import Recording
 from hilctl.recording.reader import read
 from hilctl.recording.recover import recover_recording
-from hilctl.recording.salvage import Salvage
+from hilctl.recording.recovery_scan import RecoveryScan
 from hilctl.recording.stretch import Stretch
 from tests.published import terfenol_rdpi
 
@@ -98,7 +98,7 @@ MODELS: tuple[HysteresisModel, ...] = (
 def records_of(path: Path) -> list[object]:
     """Return the records of a sound recording."""
     with path.open("rb") as stream:
-        return list(Salvage(stream).records())
+        return list(RecoveryScan(stream).records())
 
 
 def rewritten(records: list[object], chance: random.Random) -> bytes:

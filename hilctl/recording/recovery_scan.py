@@ -27,11 +27,11 @@ from mcap.records import (
 )
 from mcap.writer import MCAP0_MAGIC as MAGIC
 
-from hilctl.recording.allowance import Allowance
-from hilctl.recording.checks import SoundMessages
 from hilctl.recording.facts import unsealed
 from hilctl.recording.mcap_records import FRAME, LARGEST_BYTES, Contents, contents, parse
-from hilctl.recording.torn import next_likely, own_channels, tail_kind, take_chunk
+from hilctl.recording.read_budget import ReadBudget
+from hilctl.recording.truncated_chunks import next_likely, own_channels, tail_kind, take_chunk
+from hilctl.recording.validation import MessageValidator
 
 _INDEX_KINDS = {Opcode.MESSAGE_INDEX, Opcode.DATA_END, Opcode.FOOTER}
 _CRC_BYTES = 1 << 20
@@ -73,7 +73,7 @@ class _Found(NamedTuple):
     end: int
 
 
-class Salvage:
+class RecoveryScan:
     """What can be read of a file; all attributes are right once :meth:`records` is exhausted.
 
     Args:
@@ -83,7 +83,7 @@ class Salvage:
 
     Attributes:
         size: Bytes of the file.
-        allowance: What may still be done for it.
+        budget: What may still be done for it.
         is_mcap: Whether the file begins as an MCAP file does.
         header: The file's header, where it is whole.
         damages: Stretches that could not be read.
@@ -92,11 +92,11 @@ class Salvage:
             have been.
     """
 
-    def __init__(self, stream: BinaryIO, sound: SoundMessages | None = None) -> None:
+    def __init__(self, stream: BinaryIO, sound: MessageValidator | None = None) -> None:
         self._stream = stream
         self._sound = sound
         self.size = stream.seek(0, 2)
-        self.allowance = Allowance(self.size)
+        self.budget = ReadBudget(self.size)
         self.is_mcap = self._read(0, len(MAGIC)) == MAGIC
         self.header: Header | None = None
         self.damages: list[Damage] = []
@@ -176,7 +176,7 @@ class Salvage:
     def _read(self, at: int, size: int) -> bytes:
         self._stream.seek(at)
         found = self._stream.read(size)
-        self.allowance.read(len(found))
+        self.budget.read(len(found))
         return found
 
     def _whole(self, at: int) -> _Found | None:
@@ -194,7 +194,7 @@ class Salvage:
         record = parse(opcode, body)
         inside = None
         if isinstance(record, Chunk):
-            inside = contents(record, self.allowance, self.unread)
+            inside = contents(record, self.budget, self.unread)
         if record is None or (isinstance(record, Chunk) and inside is None):
             return None
         return _Found(record, inside, end)
@@ -211,7 +211,7 @@ class Salvage:
             self._chunks.append(at)
             self._indexes = dict(found.inside.indexes)
             self._messages += found.inside.unread
-            self.allowance.message(found.inside.unread)
+            self.budget.message(found.inside.unread)
             return list(found.inside.records)
         if self._data_ended or isinstance(record, DataEnd):
             if isinstance(record, DataEnd):
@@ -271,7 +271,7 @@ class Salvage:
                     self._note(at, 0, "message of no channel")
                     continue
                 self._messages += 1
-                self.allowance.message()
+                self.budget.message()
             problem = self._sound.problem(record) if self._sound else ""
             if problem:
                 self._note(at, 0, problem)
@@ -294,7 +294,7 @@ class Salvage:
             what = "index"
         elif opcode == Opcode.CHUNK:
             raw = self._read(at, min(after - at, LARGEST_BYTES))
-            records, what = take_chunk(raw, self.allowance, last=after == self.size)
+            records, what = take_chunk(raw, self.budget, last=after == self.size)
         elif opcode in _KNOWN:
             what = "damaged record"
         else:

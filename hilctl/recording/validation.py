@@ -159,7 +159,7 @@ def _listed(lengths: Mapping[str, int]) -> str:
     return ", ".join(f"{length} of {name}" for name, length in lengths.items())
 
 
-class SoundMessages:
+class MessageValidator:
     """Tells the messages that hilctl wrote from others under its topics, in the order of a file."""
 
     def __init__(self) -> None:
