@@ -34,7 +34,6 @@ from hilctl.recording.truncated_chunks import next_likely, own_channels, tail_ki
 from hilctl.recording.validation import MessageValidator
 
 _INDEX_KINDS = {Opcode.MESSAGE_INDEX, Opcode.DATA_END, Opcode.FOOTER}
-_CRC_BYTES = 1 << 20
 _KNOWN = {opcode.value for opcode in Opcode}
 
 
@@ -103,6 +102,7 @@ class RecoveryScan:
         self.finished = False
         self.unread: set[int] = set()
         self._data_ended = False
+        self._crc = zlib.crc32(MAGIC)
         self._channels: set[int] = set()
         self._indexes: dict[int, bytes] = {}
         self._chunks: list[int] = []
@@ -188,6 +188,8 @@ class RecoveryScan:
         if opcode not in _KNOWN or length > LARGEST_BYTES or end > self.size:
             return None
         body = self._read(at + FRAME.size, length)
+        if opcode != Opcode.DATA_END:  # it covers everything before it
+            self._crc = zlib.crc32(body, zlib.crc32(frame, self._crc))
         if opcode == Opcode.MESSAGE_INDEX:  # its chunk says what it must be, byte for byte
             right = self._indexes.pop(int.from_bytes(body[:2], "little"), None)
             return _Found(None, None, end) if body == right else None
@@ -228,16 +230,8 @@ class RecoveryScan:
     def _check_data(self, at: int, end: DataEnd) -> None:
         """Compare the checksum of all bytes before the end of the data, where there is one."""
         explained = not all(damage.lasting for damage in self.damages)
-        if end.data_section_crc and not explained and self._crc(at) != end.data_section_crc:
+        if end.data_section_crc and not explained and self._crc != end.data_section_crc:
             self._note(0, at, "data section with a wrong checksum")
-
-    def _crc(self, stop: int) -> int:
-        """Return the checksum of all bytes up to some place."""
-        crc = 0
-        self._stream.seek(0)
-        for start in range(0, stop, _CRC_BYTES):
-            crc = zlib.crc32(self._stream.read(min(_CRC_BYTES, stop - start)), crc)
-        return crc
 
     def _take_summary(self, record: McapRecord) -> None:
         self._data_ended = True
