@@ -58,15 +58,15 @@ class ColumnTable:
 
 
 class RecordingBuilder:
-    """Takes the records of a file, in order.
+    """Builds recordings from the records of a file, which it takes in order.
 
     Args:
-        scan: Where they come from; it counts what is kept.
-        stretch: Blocks and ticks that lie elsewhere are not kept.
+        scan: Source of the records; its budget counts what is kept.
+        stretch: Keep only blocks and ticks that overlap it.
 
     Attributes:
         samples: Samples taken.
-        waiting: Those of them that have not been given out.
+        waiting: Samples taken since the last piece.
     """
 
     def __init__(self, scan: RecoveryScan, stretch: Stretch | None) -> None:
@@ -94,15 +94,15 @@ class RecordingBuilder:
         """Take a record.
 
         Raises:
-            DataError: hilctl can't have written it, or it stands behind samples that have been
-                given out already and says what they are.
+            DataError: hilctl can't have written it, or it is a fact of the run that follows samples
+                which have been returned already.
         """
         match record:
             case Message() if self._sound.topic(record.channel_id):
                 self._message(record)
             case Metadata(name="hilctl.run"):
                 self._refuse_late("metadata hilctl.run")
-                self._run, _ = unsealed(record.name, record.metadata)  # scan tells of damage
+                self._run, _ = unsealed(record.name, record.metadata)  # the scan notes damage
             case Metadata(name="hilctl.end"):
                 self._end, _ = unsealed(record.name, record.metadata)
             case Attachment() if record.name in _TEXTS:
@@ -143,7 +143,7 @@ class RecordingBuilder:
             self._events.append((record.log_time, decoded))
 
     def _within(self, start: int, stop: int) -> bool:
-        """Return whether samples from ``start`` up to ``stop`` are of the stretch in part."""
+        """Return whether samples from ``start`` up to ``stop`` overlap the stretch."""
         bounds = self._stretch_bounds()
         return start < bounds[1] and bounds[0] < stop
 
@@ -166,14 +166,15 @@ class RecordingBuilder:
         self._blocks.add({"index": index, "flags": block.flags, **block.columns})
         for previous in block.previous_command.tolist():
             self._budget.keep(_EVENT_BYTES + _NUMBER_BYTES * block.state.size)
-            self._starts.append(ReplayStart(block.tick0, block.state, previous))
+            self._starts.append(ReplayStart(block.tick0, block.state.copy(), previous))
 
     def piece(self, path: Path, *, last: bool = False) -> Recording:
-        """Give out what has been gathered since the piece before.
+        """Return everything taken since the last piece.
 
         Args:
-            path: The file, for what is wrong with it.
-            last: Whether nothing follows: then it has the end of the run and what is missing.
+            path: The file, for error messages.
+            last: Whether nothing follows; the last piece has the end of the run and the number of
+                missing samples.
 
         Raises:
             DataError: A fact of the run is missing or damaged, or a column is incomplete.
@@ -237,7 +238,7 @@ class RecordingBuilder:
 
 
 def _samples(index: I64, flags: U32, unit: CommandUnit, values_of: Callable[[str], F64]) -> Samples:
-    """Return samples by their fields' values; of those that are left out, what stands for them.
+    """Return samples from the values of their fields, or of the column that an omitted one equals.
 
     Raises:
         DataError: A column that every recording has is missing, or has another length.

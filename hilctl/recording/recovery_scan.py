@@ -77,18 +77,18 @@ class RecoveryScan:
 
     Args:
         stream: Open binary file that can seek.
-        sound: Leaves out messages that hilctl can't have written, and notes them as damage; where
-            None, they are given out.
+        sound: Omits messages that hilctl can't have written, and notes them as damage; if None,
+            they are yielded.
 
     Attributes:
         size: Bytes of the file.
-        budget: What may still be done for it.
+        budget: Limits of work and memory left for it.
         is_mcap: Whether the file begins as an MCAP file does.
-        header: The file's header, where it is whole.
+        header: The file's header, if it is whole.
         damages: Stretches that could not be read.
         finished: Whether footer and closing magic are there and the index fits the data.
-        unread: Ids of channels whose messages are not given out from now on; these channels must
-            have been.
+        unread: Ids of channels whose messages are omitted from now on; the channels themselves must
+            have been yielded.
     """
 
     def __init__(self, stream: BinaryIO, sound: MessageValidator | None = None) -> None:
@@ -121,7 +121,7 @@ class RecoveryScan:
         return not self.finished or not all(damage.lasting for damage in self.damages)
 
     def describe(self) -> str:
-        """Return what is wrong with the file, in one line."""
+        """Return the damage of the file in one line."""
         serious = [damage for damage in self.damages if damage.what != "index"]
         if not self.damages:
             return "its end and index are missing"
@@ -190,7 +190,7 @@ class RecoveryScan:
         body = self._read(at + FRAME.size, length)
         if opcode != Opcode.DATA_END:  # it covers everything before it
             self._crc = zlib.crc32(body, zlib.crc32(frame, self._crc))
-        if opcode == Opcode.MESSAGE_INDEX:  # its chunk says what it must be, byte for byte
+        if opcode == Opcode.MESSAGE_INDEX:  # the content of its chunk determines every byte
             right = self._indexes.pop(int.from_bytes(body[:2], "little"), None)
             return _Found(None, None, end) if body == right else None
         record = parse(opcode, body)
@@ -241,7 +241,7 @@ class RecoveryScan:
             self._indexed.append(record.chunk_start_offset)
 
     def _close(self, start: int, at: int, footer: Footer) -> None:
-        """Judge the file's end: the footer from ``start``, and what stands from ``at`` on."""
+        """Check the file's end: the footer from ``start``, and the bytes from ``at`` on."""
         begin = footer.summary_start
         summary = self._read(begin, start + FRAME.size + 16 - begin) if begin < start else b""
         right = footer.summary_crc in {0, zlib.crc32(summary)}
