@@ -14,7 +14,6 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import numpy as np
-from mcap.writer import CompressionType, Writer
 
 from hilctl.base.device import Device
 from hilctl.base.errors import DeviceError, InputError
@@ -494,28 +493,6 @@ def received(descriptor: int, size: int, wait_s: float = 5.0) -> bytes:
     while len(got) < size and select.select([descriptor], [], [], wait_s)[0]:
         got += os.read(descriptor, size - len(got))
     return got
-
-
-class PackageMcapWriter:
-    """The ``mcap`` package's writer, with what :class:`hilctl.recording.mcap_file.McapWriter` has.
-
-    Args:
-        stream: Open binary file.
-        options: Those of the package.
-    """
-
-    def __init__(self, stream, **options):
-        self._writer = Writer(
-            stream, **{"compression": CompressionType.ZSTD, "enable_data_crcs": True, **options}
-        )
-
-    def __getattr__(self, name):
-        return getattr(self._writer, name)
-
-    def add_rows(self, channel, times_ns, rows, sequence):
-        for k, data in enumerate(rows.split()):
-            time_ns = int(times_ns[k])
-            self._writer.add_message(channel, time_ns, data, time_ns, sequence + k)
 
 
 class FailingFile(io.FileIO):

@@ -324,9 +324,9 @@ def entry_of(file: Path, path: str, size_bytes: int, mtime_ns: int) -> Entry:
         mtime_ns: Its time of modification then, in ns.
     """
     # What reads recordings takes a second to import: a catalogue that is known needs none of it.
-    from hilctl.recording.checks import labels_of
     from hilctl.recording.ends import read_ends
     from hilctl.recording.segments import segments_of
+    from hilctl.recording.validation import labels_of
 
     entry = unreadable(path, size_bytes, mtime_ns, "")
     try:

@@ -17,8 +17,8 @@ from hilctl.base.samples import COLUMNS
 from hilctl.base.types import F64
 from hilctl.desk.feed import RunFeed
 from hilctl.desk.signals import ROW
+from hilctl.recording.codec import encode_scope
 from hilctl.recording.messages import Encoded, MessageMaker, RecordingLayout
-from hilctl.recording.rows import SCOPE_T_REL, scope_rows
 from hilctl.recording.schema import TOPICS
 
 SCOPE_TOPICS: dict[str, Literal["first", "low", "high"]] = {
@@ -97,7 +97,7 @@ class LiveTopics:
         self._maker = MessageMaker(self._layout)
         self._next_bucket = self._seen_events = 0
         fields = {name: COLUMNS[name].field(self._layout.command_unit) for name in _COLUMNS}
-        self._rows = {fields[name].scope: ROW[signal] for name, signal in _COLUMNS.items()}
+        self._rows = {fields[name].name: ROW[signal] for name, signal in _COLUMNS.items()}
 
     def scope(self, wanted: Collection[str] = SCOPE_TOPICS) -> Iterator[Encoded]:
         """Yield the messages of the buckets that have become whole, the oldest first.
@@ -114,11 +114,11 @@ class LiveTopics:
             values: F64 = getattr(buckets, SCOPE_TOPICS[topic])[list(self._rows.values())]
             at = np.flatnonzero(~np.isnan(values).all(axis=0))
             samples = (first + at) * width
-            doubles = dict(zip(self._rows, values[:, at], strict=True))
-            doubles[SCOPE_T_REL] = samples / self._layout.sample_rate_hz
-            rows = scope_rows(samples, np.zeros(at.size, dtype=np.uint32), doubles)
+            columns = dict(zip(self._rows, values[:, at], strict=True))
+            columns["t_rel"] = samples / self._layout.sample_rate_hz
+            messages = encode_scope(samples, np.zeros(at.size, dtype=np.uint32), columns)
             times_ns = self._layout.times_ns(samples).tolist()
-            yield from map(Encoded, repeat(topic), times_ns, rows.split())
+            yield from map(Encoded, repeat(topic), times_ns, messages)
 
     def events(self) -> Iterator[Encoded]:
         """Yield the messages of the events since the last time."""

@@ -2,24 +2,24 @@
 
 import os
 import stat
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from io import FileIO
+from itertools import islice
 from pathlib import Path
+from typing import BinaryIO
 
 from mcap.opcode import Opcode
-from mcap.records import Footer, McapRecord, Metadata, MetadataIndex, SummaryOffset
+from mcap.records import Footer, Metadata, MetadataIndex, SummaryOffset
 from mcap.writer import MCAP0_MAGIC as MAGIC
 
 from hilctl.base.errors import DataError
 from hilctl.base.remedy import reason
 from hilctl.recording.facts import CHECKSUM_FACT, unsealed
 from hilctl.recording.locks import is_being_recorded
-from hilctl.recording.records import FRAME, LARGEST_BYTES, parse
+from hilctl.recording.mcap_records import FRAME, records_from
 
-_HEAD_BYTES = 8192
-_TAIL_BYTES = 4096
-_FOOTER_BYTES = FRAME.size + 20 + len(MAGIC)
+_BUFFER_BYTES = 4096
+_FOOTER_BYTES = FRAME.size + 20
 _MOST_BEFORE = 8  # records that may stand before the facts of the run: hilctl writes a header
 
 
@@ -59,7 +59,7 @@ def read_ends(path: Path) -> RecordingEnds:
     """
     try:
         _check_is_file(path)  # first: opening a pipe waits for its writer
-        with path.open("rb", buffering=0) as stream:
+        with path.open("rb", _BUFFER_BYTES) as stream:
             return _ends(stream)
     except OSError as error:
         raise DataError(f"{path}: can't be read: {reason(error)}") from None
@@ -72,9 +72,9 @@ def _check_is_file(path: Path) -> None:
         raise DataError("is not a file")
 
 
-def _ends(stream: FileIO) -> RecordingEnds:
-    file = _Bytes(stream)
-    metadata, end_metadata = _run_metadata(file), _end_metadata(file)
+def _ends(stream: BinaryIO) -> RecordingEnds:
+    size = stream.seek(0, os.SEEK_END)
+    metadata, end_metadata = _run_metadata(stream, size), _end_metadata(stream, size)
     run, right = unsealed("hilctl.run", metadata)
     if not right:
         return RecordingEnds({}, {}, "damaged", "metadata hilctl.run: its checksum is wrong")
@@ -88,77 +88,34 @@ def _ends(stream: FileIO) -> RecordingEnds:
     return RecordingEnds(run, {}, "recording" if is_being_recorded(stream) else "unfinished")
 
 
-class _Bytes:
-    """A file of which head and tail are read once."""
-
-    def __init__(self, stream: FileIO) -> None:
-        self._stream = stream
-        self.size = os.fstat(stream.fileno()).st_size
-        self._parts = {0: self._read(0, _HEAD_BYTES)}
-        if self.size > _HEAD_BYTES:
-            tail_at = self.size - _TAIL_BYTES
-            self._parts[tail_at] = self._read(tail_at, _TAIL_BYTES)
-
-    def _read(self, start: int, size: int) -> bytes:
-        self._stream.seek(start)
-        return self._stream.read(size)
-
-    def at(self, start: int, size: int) -> bytes:
-        """Return bytes of the file; fewer at its end, none of a place or size that can't be."""
-        if not 0 <= start < self.size or not 0 < size <= LARGEST_BYTES:
-            return b""
-        for at, part in self._parts.items():
-            if at <= start and start + size <= at + len(part):
-                return part[start - at : start - at + size]
-        return self._read(start, size)
-
-    def records(self, start: int, stop: int) -> Iterator[McapRecord]:
-        """Yield whole records, up to the first that is none or is of messages."""
-        while start + FRAME.size <= stop:
-            frame = self.at(start, FRAME.size)
-            if len(frame) < FRAME.size:  # an offset that leads out of the file
-                return
-            opcode, length = FRAME.unpack(frame)
-            start += FRAME.size
-            if length > stop - start or opcode in {Opcode.CHUNK, Opcode.MESSAGE}:
-                return
-            record = parse(opcode, self.at(start, length))
-            if record is None:
-                return
-            yield record
-            start += length
-
-
-def _run_metadata(file: _Bytes) -> Mapping[str, str]:
-    if file.at(0, len(MAGIC)) != MAGIC:
+def _run_metadata(stream: BinaryIO, size: int) -> Mapping[str, str]:
+    stream.seek(0)
+    if stream.read(len(MAGIC)) != MAGIC:
         raise DataError("is not an MCAP file, or its start is lost")
-    for record, _ in zip(file.records(len(MAGIC), file.size), range(_MOST_BEFORE), strict=False):
+    for record in islice(records_from(stream, len(MAGIC), size), _MOST_BEFORE):
         if isinstance(record, Metadata) and record.name == "hilctl.run":
             return record.metadata
     raise DataError("holds no run of hilctl (metadata hilctl.run is missing)")
 
 
-def _end_metadata(file: _Bytes) -> Mapping[str, str] | None:
-    """Return the facts of the end by way of footer and index; None where those are not there."""
-    footer_at = file.size - _FOOTER_BYTES
-    if file.at(file.size - len(MAGIC), len(MAGIC)) != MAGIC:
+def _end_metadata(stream: BinaryIO, size: int) -> Mapping[str, str] | None:
+    """Return the facts of the end, found by footer and index; None if those are missing."""
+    footer_at = size - _FOOTER_BYTES - len(MAGIC)
+    stream.seek(max(0, size - len(MAGIC)))
+    if footer_at < 0 or stream.read() != MAGIC:
         return None
-    footer = next(file.records(footer_at, file.size - len(MAGIC)), None)
+    footer = next(records_from(stream, footer_at, footer_at + _FOOTER_BYTES), None)
     if not isinstance(footer, Footer):
         return None
     found: Mapping[str, str] = {}
-    for index in _metadata_indexes(file, footer.summary_offset_start or footer_at, footer_at):
-        if index.name == "hilctl.end":
-            record = next(file.records(index.offset, index.offset + index.length), None)
-            found = record.metadata if isinstance(record, Metadata) else found
-    return found
-
-
-def _metadata_indexes(file: _Bytes, start: int, stop: int) -> Iterator[MetadataIndex]:
-    """Yield the index of metadata by way of the offsets in a summary, however long that is."""
-    for group in file.records(start, stop):
+    # By the offsets in the summary: its index of chunks may be long.
+    start = footer.summary_offset_start or footer_at
+    for group in records_from(stream, start, footer_at):
         if isinstance(group, SummaryOffset) and group.group_opcode == Opcode.METADATA_INDEX:
-            end = min(group.group_start + group.group_length, stop)
-            for index in file.records(group.group_start, end):
-                if isinstance(index, MetadataIndex):
-                    yield index
+            end = min(group.group_start + group.group_length, footer_at)
+            for index in records_from(stream, group.group_start, end):
+                if isinstance(index, MetadataIndex) and index.name == "hilctl.end":
+                    stop = index.offset + index.length
+                    record = next(records_from(stream, index.offset, stop), None)
+                    found = record.metadata if isinstance(record, Metadata) else found
+    return found

@@ -2,22 +2,22 @@
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from itertools import repeat
 from typing import NamedTuple, Self
 
 import numpy as np
+from mcap.writer import Writer
 
 from hilctl.base.errors import DataError, InputError
 from hilctl.base.events import Event
 from hilctl.base.samples import COLUMNS, Batch, Head, RecordedField, SampleColumn, Samples
 from hilctl.base.types import F64, I64, U32, CommandUnit
 from hilctl.recording import schema
-from hilctl.recording.checks import MAX_UNIX_NS, RATES_HZ
+from hilctl.recording.codec import BlockArrays, encode_block, encode_scope, encode_ticks
 from hilctl.recording.data import TICK_COLUMNS
-from hilctl.recording.mcap_file import McapWriter
-from hilctl.recording.rows import SCOPE_T_REL, MessageRows, scope_rows
-from hilctl.recording.wire import BlockArrays, block_bytes
+from hilctl.recording.validation import MAX_UNIX_NS, RATES_HZ
 
-_MAX_BLOCK = 2500
+_MAX_BLOCK = 1000
 _NONE = np.empty(0)
 _TICK_HEADS = {name: int(Head[name.upper()]) for name in TICK_COLUMNS}
 _YEAR_NS = 366 * 86_400 * 10**9
@@ -29,24 +29,6 @@ class Encoded(NamedTuple):
     topic: str
     time_ns: int
     data: bytes
-
-    @property
-    def last_ns(self) -> int:
-        """Its time."""
-        return self.time_ns
-
-
-class EncodedRows(NamedTuple):
-    """Messages of one topic: their Unix times in ns, int64[n], and their bytes."""
-
-    topic: str
-    times_ns: I64
-    rows: MessageRows
-
-    @property
-    def last_ns(self) -> int:
-        """The latest of their times."""
-        return int(self.times_ns.max())
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,7 +171,7 @@ class MessageMaker:
         before = self._layout.recorded(event.before) if event.before is not None else ()
         return event_message(event, before)
 
-    def batch(self, batch: Batch) -> Iterator[Encoded | EncodedRows]:
+    def batch(self, batch: Batch) -> Iterator[Encoded]:
         """Yield the messages of all samples and ticks of a batch."""
         gaps = batch.heads[:, Head.DROPPED_BEFORE].tolist()
         block = batch.flags.shape[1]
@@ -210,10 +192,10 @@ class MessageMaker:
             row = stop
         shown = np.concatenate(on_grid)
         if shown.size:
-            doubles = {field.scope: of[shown] for field, of in columns if field.scope}
-            doubles[SCOPE_T_REL] = t_rel[shown]
-            rows = scope_rows(index[shown], flags[shown], doubles)
-            yield EncodedRows("/scope", self._layout.times_ns(index[shown]), rows)
+            scope = {field.name: values[shown] for field, values in columns if field.scope}
+            messages = encode_scope(index[shown], flags[shown], {"t_rel": t_rel[shown], **scope})
+            times_ns = self._layout.times_ns(index[shown]).tolist()
+            yield from map(Encoded, repeat("/scope"), times_ns, messages)
         yield self._ticks(batch)
 
     def _block(
@@ -234,14 +216,12 @@ class MessageMaker:
         )
         self.samples += flags.size
         self.missing += dropped
-        return Encoded("/samples", self._layout.time_ns(first), block_bytes(block, t_rel))
+        return Encoded("/samples", self._layout.time_ns(first), encode_block(block, t_rel))
 
     def _ticks(self, batch: Batch) -> Encoded:
-        out = schema.message("TickBlock")
-        for name, column in _TICK_HEADS.items():
-            getattr(out, name).extend(batch.heads[:, column].tolist())
+        columns = {name: batch.heads[:, column] for name, column in _TICK_HEADS.items()}
         first = int(batch.heads[0, Head.FIRST_SAMPLE])
-        return Encoded("/ticks", self._layout.time_ns(first), out.SerializeToString())
+        return Encoded("/ticks", self._layout.time_ns(first), encode_ticks(columns))
 
 
 class Topics:
@@ -251,7 +231,7 @@ class Topics:
         writer: File to write to.
     """
 
-    def __init__(self, writer: McapWriter) -> None:
+    def __init__(self, writer: Writer) -> None:
         self._writer = writer
         self._channels: dict[str, int] = {}
         self._sequence: dict[str, int] = {}
@@ -274,13 +254,9 @@ class Topics:
                 number = self._writer.register_schema(f"hilctl.{name}", "protobuf", descriptors)
                 self.know(topic, self._writer.register_channel(topic, "protobuf", number), 0)
 
-    def add(self, message: Encoded | EncodedRows) -> None:
-        """Write one message, or many of one topic."""
+    def add(self, message: Encoded) -> None:
+        """Write one message."""
         channel, number = self._channels[message.topic], self._sequence[message.topic]
-        if isinstance(message, Encoded):
-            time_ns = message.time_ns
-            self._writer.add_message(channel, time_ns, message.data, time_ns, number)
-            self._sequence[message.topic] += 1
-        else:
-            self._writer.add_rows(channel, message.times_ns, message.rows, number)
-            self._sequence[message.topic] += message.times_ns.size
+        time_ns = message.time_ns
+        self._writer.add_message(channel, time_ns, message.data, time_ns, number)
+        self._sequence[message.topic] += 1

@@ -17,12 +17,12 @@ from hilctl.base.errors import DataError, InputError
 from hilctl.base.events import Event
 from hilctl.base.private import HAS_LOCKS
 from hilctl.base.samples import LAST_SAMPLE, Batch, Head
-from hilctl.recording.checks import MAX_UNIX_NS, SoundMessages, sound_blocks
 from hilctl.recording.locks import lock
 from hilctl.recording.messages import RecordingLayout
-from hilctl.recording.replace import Replacement
-from hilctl.recording.rewrite import Resaved, Survey
-from hilctl.recording.salvage import Damage, Salvage
+from hilctl.recording.recovery_scan import Damage, RecoveryScan
+from hilctl.recording.rewrite import Rewritten, Survey
+from hilctl.recording.safe_replace import Replacement
+from hilctl.recording.validation import MAX_UNIX_NS, MessageValidator, sound_blocks
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,12 +104,12 @@ def recover_recording(
             survey = _survey(path, stream)
             more = list(_not_in_file(extra, survey.next_sample))
             events = [event for event in events if _is_one(event)]
-            if not survey.salvage.repairable and not more:
+            if not survey.scan.repairable and not more:
                 return _left_alone(path, survey)
             layout = _check(path, survey, more)
             with closing(Replacement(path, output)) as replacement:
-                saved = Resaved(replacement.stream, survey)
-                saved.copy(Salvage(stream, SoundMessages()).records())
+                saved = Rewritten(replacement.stream, survey)
+                saved.copy(RecoveryScan(stream, MessageValidator()).records())
                 if layout:
                     saved.add(more, events, layout)
                 reason = saved.finish(end, ended_at if ended_at < LAST_SAMPLE else 0)
@@ -130,7 +130,7 @@ def recover_recording(
         samples=saved.samples,
         added_samples=saved.added,
         missing_samples=saved.missing,
-        damages=tuple(survey.salvage.damages),
+        damages=tuple(survey.scan.damages),
     )
 
 
@@ -147,10 +147,10 @@ def _is_one(event: Event) -> bool:
 
 
 def _left_alone(path: Path, survey: Survey) -> Recovered:
-    missing, damages = survey.next_sample - survey.samples, tuple(survey.salvage.damages)
+    missing, damages = survey.next_sample - survey.samples, tuple(survey.scan.damages)
     text = "sound: nothing to recover"
     if damages:
-        text = f"{survey.salvage.describe()}; this cannot be repaired, all else is sound"
+        text = f"{survey.scan.describe()}; this cannot be repaired, all else is sound"
     return Recovered(path, None, text, survey.samples, 0, missing, damages)
 
 

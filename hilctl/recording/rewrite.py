@@ -1,19 +1,18 @@
 """Survey a recording, sound or not, and save what it holds into a new file."""
 
 from collections.abc import Iterable, Mapping
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 from mcap.records import Attachment, Channel, McapRecord, Message, Metadata, Schema
 
 from hilctl import __version__
 from hilctl.base.events import Event
 from hilctl.base.samples import Batch
-from hilctl.recording import schema
-from hilctl.recording.checks import SoundMessages, count_of
 from hilctl.recording.facts import CHECKSUM_FACT, sealed, unsealed
-from hilctl.recording.mcap_file import McapWriter
 from hilctl.recording.messages import MessageMaker, RecordingLayout, Topics, event_message
-from hilctl.recording.salvage import Salvage
+from hilctl.recording.recovery_scan import RecoveryScan
+from hilctl.recording.validation import MessageValidator, count_of
+from hilctl.recording.writer import mcap_writer
 
 _UNKNOWN_END = (
     "what was exchanged after it is unknown: at most the last unflushed interval where hilctl was "
@@ -28,11 +27,10 @@ class Survey:
         stream: The file.
 
     Attributes:
-        salvage: What is wrong with it.
+        scan: What is wrong with it.
         run: Facts of the run, empty where they are lost.
         end: Facts of its end, empty where they are lost or were never written.
         end_is_right: Whether their checksum is.
-        samples: Samples in it.
         last_time_ns: Unix time of the last message or attachment, in ns.
         records: Metadata and messages that are whole.
 
@@ -42,15 +40,14 @@ class Survey:
     """
 
     def __init__(self, stream: BinaryIO) -> None:
-        self._sound = SoundMessages()
-        self.salvage = Salvage(stream, self._sound)
+        self._sound = MessageValidator()
+        self.scan = RecoveryScan(stream, self._sound)
         self.run: dict[str, str] = {}
         self.end: dict[str, str] = {}
         self.end_is_right = True
-        self.samples = 0
         self.last_time_ns = 0
         self.records = 0
-        for record in self.salvage.records():
+        for record in self.scan.records():
             self._take(record)
 
     def _take(self, record: McapRecord) -> None:
@@ -63,10 +60,12 @@ class Survey:
                 self.last_time_ns = max(self.last_time_ns, record.log_time)
             case Message():
                 self.last_time_ns = max(self.last_time_ns, record.log_time)
-                if self._sound.topic(record.channel_id) == "/samples":
-                    block: Any = schema.message_class("SampleBlock").FromString(record.data)
-                    self.samples += block.n
         self.records += isinstance(record, Metadata | Message)
+
+    @property
+    def samples(self) -> int:
+        """Samples in it."""
+        return self._sound.samples
 
     @property
     def next_sample(self) -> int:
@@ -74,7 +73,7 @@ class Survey:
         return self._sound.next_sample
 
 
-class Resaved:
+class Rewritten:
     """The sound file in the making.
 
     Args:
@@ -88,9 +87,9 @@ class Resaved:
     """
 
     def __init__(self, stream: BinaryIO, survey: Survey) -> None:
-        header = survey.salvage.header
+        header = survey.scan.header
         self._survey = survey
-        self._writer = McapWriter(stream)
+        self._writer = mcap_writer(stream)
         self._topics = Topics(self._writer)
         self._names: dict[int, str] = {}
         self._schemas: dict[int, int] = {0: 0}
@@ -154,7 +153,7 @@ class Resaved:
         for batch in batches:
             for message in maker.batch(batch):
                 self._topics.add(message)
-                self._last_time_ns = max(self._last_time_ns, message.last_ns)
+                self._last_time_ns = max(self._last_time_ns, message.time_ns)
         for event in events:
             self._topics.add(maker.event(event))
         self.added = maker.samples - self.samples
@@ -194,7 +193,7 @@ class Resaved:
         return reason
 
     def _reason(self, last: int, *, known: bool) -> str:
-        parts = [self._survey.salvage.describe()]
+        parts = [self._survey.scan.describe()]
         if self.added:
             parts.append(f"{self.added} samples added from the ring")
         if self.missing:

@@ -8,7 +8,6 @@ from functools import cache
 from typing import Any, TypeAlias
 
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
-from google.protobuf.message import Message
 
 from hilctl.base.samples import RECORDED_FIELDS
 
@@ -83,8 +82,13 @@ _MESSAGES: dict[str, _Fields] = {
 
 
 @cache
-def file_descriptor() -> descriptor_pb2.FileDescriptorProto:
-    """Return the descriptor of all messages."""
+def file_descriptor(*, lists_as_bytes: bool = False) -> descriptor_pb2.FileDescriptorProto:
+    """Return the descriptor of all messages.
+
+    Args:
+        lists_as_bytes: Declare each list of ``double`` or ``uint32`` as ``bytes``. The wire format
+            is the same, because proto3 packs lists of numbers.
+    """
     file = descriptor_pb2.FileDescriptorProto(name=_FILE, package=_PACKAGE, syntax="proto3")
     for message_name, fields in _MESSAGES.items():
         message = file.message_type.add(name=message_name)
@@ -92,6 +96,8 @@ def file_descriptor() -> descriptor_pb2.FileDescriptorProto:
             field = message.field.add(name=name, number=number, type=kind)
             labels = descriptor_pb2.FieldDescriptorProto
             field.label = labels.LABEL_REPEATED if repeated else labels.LABEL_OPTIONAL
+            if lists_as_bytes and repeated and kind in {_DOUBLE, _UINT32}:
+                field.type, field.label = labels.TYPE_BYTES, labels.LABEL_OPTIONAL
     return file
 
 
@@ -101,16 +107,20 @@ def descriptor_set() -> bytes:
 
 
 @cache
-def message_class(name: str) -> type[Message]:
-    """Return the class of a message by its name without the package."""
+def message_class(name: str, *, lists_as_bytes: bool = False) -> Any:
+    """Return the class of a message by its name without the package.
+
+    It is typed Any, because its fields exist only at run time.
+
+    Args:
+        name: Name of the message.
+        lists_as_bytes: Return its twin, see :func:`file_descriptor`.
+    """
     pool = descriptor_pool.DescriptorPool()
-    pool.Add(file_descriptor())
-    found: type[Message] = message_factory.GetMessageClass(
-        pool.FindMessageTypeByName(f"{_PACKAGE}.{name}")
-    )
-    return found
+    pool.Add(file_descriptor(lists_as_bytes=lists_as_bytes))
+    return message_factory.GetMessageClass(pool.FindMessageTypeByName(f"{_PACKAGE}.{name}"))
 
 
 def message(name: str) -> Any:
-    """Return an empty message; typed Any, because its fields exist only at run time."""
+    """Return an empty message."""
     return message_class(name)()

@@ -1,25 +1,34 @@
-"""The stretches of a run, from the fact of it that lists them.
+"""The segments of a run, from the fact that lists them."""
 
-What hilctl writes is plain to see. For all else there is :mod:`hilctl.recording.odd_segments`,
-which says what is wrong, and takes longer to import than a short recording to read.
-"""
-
-import json
-import math
 from collections.abc import Iterable, Iterator
-from dataclasses import fields
-from typing import Any
+from typing import Annotated
+
+from pydantic import Field, TypeAdapter, ValidationError
 
 from hilctl.base.samples import LAST_SAMPLE
 from hilctl.base.segments import SHORTEST_PERIOD, Segment
+from hilctl.base.strict import Strict
 
 _MOST_TEXT = 2**24
-_KINDS = {each.name: each.type for each in fields(Segment)}
-_INDICES = [name for name, kind in _KINDS.items() if kind is int]
+_Index = Annotated[int, Field(ge=0, lt=LAST_SAMPLE)]
+
+
+class _RecordedSegment(Strict):
+    """The fields of a :class:`~hilctl.base.segments.Segment` as a recording has them."""
+
+    label: str
+    start: _Index
+    stop: _Index
+    steady_start: _Index
+    steady_stop: _Index
+    period: Annotated[float, Field(ge=0.0, allow_inf_nan=False)] = 0.0
+
+
+_SEGMENTS = TypeAdapter(list[_RecordedSegment])
 
 
 def segments_of(text: str) -> tuple[Segment, ...]:
-    """Return the stretches of a run from a fact of it.
+    """Return the segments of a run from a fact of it.
 
     Raises:
         ValueError: They are not what :meth:`~hilctl.base.segments.Segment.to_mapping` gives, do not
@@ -28,28 +37,15 @@ def segments_of(text: str) -> tuple[Segment, ...]:
     if len(text) > _MOST_TEXT:
         raise ValueError(f"segments: {len(text)} characters are more than any run has")
     try:
-        given = json.loads(text)
-        if not (isinstance(given, list) and all(map(is_plain, given))):
-            from hilctl.recording.odd_segments import understood
-
-            given = understood(given)
-    except RecursionError:
-        raise ValueError("segments: nested too deep") from None
-    segments = tuple(map(Segment.from_mapping, given))
+        recorded = _SEGMENTS.validate_json(text)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        where = ".".join(map(str, first["loc"])) or "the text"
+        raise ValueError(f"segments: {where}: {first['msg']}") from None
+    segments = tuple(Segment(**each.model_dump()) for each in recorded)
     for problem in _problems(segments):
         raise ValueError(f"segments: {problem}")
     return segments
-
-
-def is_plain(each: Any) -> bool:
-    """Return whether a segment has all fields, each of its own kind and in its range."""
-    return (
-        isinstance(each, dict)
-        and each.keys() == _KINDS.keys()
-        and all(type(each[name]) is kind for name, kind in _KINDS.items())
-        and all(0 <= each[name] < LAST_SAMPLE for name in _INDICES)
-        and 0.0 <= each["period"] < math.inf
-    )
 
 
 def _problems(segments: Iterable[Segment]) -> Iterator[str]:

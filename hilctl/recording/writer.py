@@ -13,6 +13,9 @@ from contextlib import suppress
 from dataclasses import dataclass
 from io import FileIO
 from pathlib import Path
+from typing import IO, cast
+
+from mcap.writer import Writer
 
 from hilctl import __version__
 from hilctl.base.events import Event
@@ -21,8 +24,15 @@ from hilctl.base.samples import Batch
 from hilctl.base.segments import Segment
 from hilctl.recording.facts import sealed
 from hilctl.recording.locks import lock
-from hilctl.recording.mcap_file import McapWriter, Sink
 from hilctl.recording.messages import MessageMaker, RecordingLayout, Topics
+
+_CHUNK_BYTES = 5 << 20
+"""Size at which a chunk is closed: about 2 s of samples at 50 kHz, the default flush interval."""
+
+
+def mcap_writer(stream: "IO[bytes] | PendingFile") -> Writer:
+    """Return a writer of compressed chunks with all checksums; it does not close the stream."""
+    return Writer(cast(IO[bytes], stream), chunk_size=_CHUNK_BYTES, enable_data_crcs=True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,8 +64,8 @@ class RecordingWriter:
         run: Facts of the run.
     """
 
-    def __init__(self, stream: Sink, run: RunFacts) -> None:
-        self._writer = McapWriter(stream)
+    def __init__(self, stream: "IO[bytes] | PendingFile", run: RunFacts) -> None:
+        self._writer = mcap_writer(stream)
         self._topics = Topics(self._writer)
         self._maker = MessageMaker(run.layout)
         self._late_missing = 0

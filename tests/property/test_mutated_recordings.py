@@ -53,7 +53,7 @@ from hilctl.recording import reader, schema
 from hilctl.recording.data import Recording
 from hilctl.recording.reader import read
 from hilctl.recording.recover import recover_recording
-from hilctl.recording.salvage import Salvage
+from hilctl.recording.recovery_scan import RecoveryScan
 from hilctl.recording.stretch import Stretch
 from tests.published import terfenol_rdpi
 
@@ -98,7 +98,7 @@ MODELS: tuple[HysteresisModel, ...] = (
 def records_of(path: Path) -> list[object]:
     """Return the records of a sound recording."""
     with path.open("rb") as stream:
-        return list(Salvage(stream).records())
+        return list(RecoveryScan(stream).records())
 
 
 def rewritten(records: list[object], chance: random.Random) -> bytes:
@@ -339,8 +339,7 @@ def _export(recording: Recording, path: Path) -> None:
 
 def _pieces(_recording: Recording, path: Path) -> None:
     """Read it in pieces, as the commands do: refused where the whole is not, never otherwise."""
-    usual = reader.PIECE_SAMPLES, reader.LONG_BYTES, reader.LONG_CHUNKS
-    reader.PIECE_SAMPLES, reader.LONG_BYTES, reader.LONG_CHUNKS = 300, 0, 0
+    usual, reader.PIECE_SAMPLES = reader.PIECE_SAMPLES, 300
     try:
         for stretch in (None, Stretch(0.01, 0.05)):
             pieces = reader.Pieces(path, stretch)
@@ -350,7 +349,7 @@ def _pieces(_recording: Recording, path: Path) -> None:
                 json.dumps(replay(pieces).to_mapping())
             export(pieces, path.with_suffix(".npz"), overwrite=True)
     finally:
-        reader.PIECE_SAMPLES, reader.LONG_BYTES, reader.LONG_CHUNKS = usual
+        reader.PIECE_SAMPLES = usual
 
 
 def _identify(recording: Recording, _path: Path) -> None:

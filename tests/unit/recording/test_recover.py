@@ -14,15 +14,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from mcap.reader import NonSeekingReader, SeekingReader
-from mcap.writer import CompressionType, IndexType
+from mcap.writer import CompressionType, IndexType, Writer
 
 from hilctl.base.errors import DataError, HilctlError
-from hilctl.recording import reader
 from hilctl.recording.ends import read_ends
 from hilctl.recording.reader import read
 from hilctl.recording.recover import recover_recording
 from hilctl.recording.rewrite import Survey
-from tests.fakes import PackageMcapWriter
 
 PEERS = Path(__file__).parents[2] / "peers"
 CHUNK, CHUNK_INDEX, STATISTICS, METADATA, DATA_END = 0x06, 0x08, 0x0B, 0x0C, 0x0F
@@ -148,7 +146,7 @@ def test_no_flipped_bit_leaves_a_file_sound(sound):
             survey = Survey(io.BytesIO(damaged))
         except DataError:
             continue
-        assert not survey.salvage.sound, at
+        assert not survey.scan.sound, at
 
 
 @pytest.mark.parametrize("name", ["hilctl.run", "hilctl.end"])
@@ -174,12 +172,8 @@ def test_a_flipped_bit_in_the_facts_is_told_by_all_who_read_them(sound, tmp_path
     assert len(list(tmp_path.iterdir())) == 2
 
 
-@pytest.mark.parametrize("long_bytes", [0, 1 << 30])
-def test_a_bit_that_no_other_checksum_covers_is_noticed(
-    sound, tmp_path, caplog, monkeypatch, long_bytes
-):
-    """The time of a chunk, also where the file is read ahead."""
-    monkeypatch.setattr(reader, "LONG_BYTES", long_bytes)
+def test_a_bit_that_no_other_checksum_covers_is_noticed(sound, tmp_path, caplog):
+    """The time of a chunk."""
     start = [start for opcode, start, _ in sound.records if opcode == CHUNK][-1]
     damaged = bytearray(sound.data)
     damaged[start + 9] ^= 1
@@ -225,7 +219,7 @@ def test_messages_of_a_torn_chunk_are_saved(sound, tmp_path):
     recovered = recover_recording(path)
     (damage,) = recovered.damages
     assert (damage.what, damage.start, damage.size) == ("torn chunk", last[0], cut - last[0])
-    assert damage.saved >= 5
+    assert damage.saved >= 2
     assert f"{damage.saved} messages of it saved" in recovered.reason
     assert "is unknown" in recovered.reason
 
@@ -236,8 +230,7 @@ def test_other_compressions(sound, make, tmp_path, kind, monkeypatch):
     import hilctl.recording.writer as module
 
     stream = io.BytesIO()
-    other = partial(PackageMcapWriter, compression=kind)
-    monkeypatch.setattr(module, "McapWriter", other)
+    monkeypatch.setattr(module, "mcap_writer", partial(Writer, compression=kind))
     make.write(stream, [make.batch(0, 4), make.batch(200, 240, seed=1)])
     data = stream.getvalue()
     every = messages(io.BytesIO(data))
@@ -337,7 +330,7 @@ def test_missing_message_indexes_are_made(make, tmp_path, monkeypatch):
     import hilctl.recording.writer as module
 
     kinds = IndexType.ALL & ~IndexType.MESSAGE
-    monkeypatch.setattr(module, "McapWriter", partial(PackageMcapWriter, index_types=kinds))
+    monkeypatch.setattr(module, "mcap_writer", partial(Writer, index_types=kinds))
     path = tmp_path / "run.mcap"
     with path.open("wb") as stream:
         make.write(stream, [make.batch(0, 4), make.batch(200, 4)])

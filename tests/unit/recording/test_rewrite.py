@@ -5,8 +5,8 @@ import io
 import pytest
 from mcap.reader import make_reader
 
-from hilctl.recording.rewrite import Resaved, Survey
-from hilctl.recording.salvage import Salvage
+from hilctl.recording.recovery_scan import RecoveryScan
+from hilctl.recording.rewrite import Rewritten, Survey
 
 
 @pytest.fixture
@@ -19,8 +19,8 @@ def torn(make):
 
 def resaved(survey, **finish):
     out = io.BytesIO()
-    saved = Resaved(out, survey)
-    saved.copy(Salvage(survey.salvage._stream).records())
+    saved = Rewritten(out, survey)
+    saved.copy(RecoveryScan(survey.scan._stream).records())
     reason = saved.finish(**{"end": None, "ended_at": 0, **finish})
     facts = {m.name: m.metadata for m in make_reader(io.BytesIO(out.getvalue())).iter_metadata()}
     return saved, reason, facts["hilctl.end"]
@@ -31,7 +31,7 @@ def test_a_survey_counts_what_is_whole(torn):
     assert (survey.samples, survey.next_sample) == (400, 400)
     assert survey.run["compensator"] == "rdpi"
     assert survey.end == {}
-    assert not survey.salvage.sound
+    assert not survey.scan.sound
 
 
 def test_what_is_not_known_is_said(torn):

@@ -9,7 +9,7 @@ import pytest
 from hilctl.analysis.report import summarize
 from hilctl.base.errors import DataError
 from hilctl.base.segments import Segment
-from hilctl.recording.allowance import Allowance
+from hilctl.recording.read_budget import ReadBudget
 from hilctl.recording.reader import read
 from hilctl.recording.stretch import Stretch
 
@@ -49,15 +49,15 @@ def test_no_sample_between_the_times_is_an_error(from_s, to_s):
 
 
 def test_blocks_elsewhere_are_not_kept(monkeypatch):
-    """The allowance counts what stays in memory."""
+    """The budget counts what stays in memory."""
     kept = []
 
-    class Counting(Allowance):
+    class Counting(ReadBudget):
         def keep(self, size):
             kept.append(size)
             super().keep(size)
 
-    monkeypatch.setattr("hilctl.recording.salvage.Allowance", Counting)
+    monkeypatch.setattr("hilctl.recording.recovery_scan.ReadBudget", Counting)
     read(GOLDEN)
     whole = sum(kept)
     del kept[:]

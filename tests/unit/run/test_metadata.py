@@ -7,7 +7,7 @@ from pathlib import Path
 from hilctl.base.samples import COLUMNS
 from hilctl.loop.pacer import Lateness
 from hilctl.loop.plan import Outcome
-from hilctl.recording.checks import labels_of
+from hilctl.recording.validation import labels_of
 from hilctl.run.metadata import end_facts, experiment_sha256, run_facts
 from hilctl.run.shared_page import SIZE, SharedPage
 from hilctl.run.start import checked_experiment

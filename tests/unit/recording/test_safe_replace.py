@@ -75,7 +75,7 @@ def test_output_leaves_the_file_where_it_is(torn):
 
 def test_a_full_disk_changes_nothing(torn, monkeypatch):
     """Where the new file can't be written, the old one is as it was and nothing is left over."""
-    import hilctl.recording.replace as module
+    import hilctl.recording.safe_replace as module
 
     def full(number):
         raise OSError(28, "No space left on device")
@@ -89,7 +89,7 @@ def test_a_full_disk_changes_nothing(torn, monkeypatch):
 
 def test_without_hard_links_the_old_file_is_renamed(torn, monkeypatch):
     """On file systems that have none, the old file is kept all the same."""
-    import hilctl.recording.replace as module
+    import hilctl.recording.safe_replace as module
 
     def refuse(self, target):
         raise OSError(1, "Operation not permitted")

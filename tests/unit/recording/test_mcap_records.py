@@ -1,11 +1,14 @@
-"""Single records: whole, or not taken."""
+"""Records and chunks: whole, or not taken."""
+
+import struct
 
 import pytest
-from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Header, Metadata, Schema
 
-from hilctl.recording.records import parse
+from hilctl.recording.mcap_records import contents, inflate, parse
+from hilctl.recording.read_budget import ReadBudget
+from tests.unit.recording.conftest import chunk, message, raw
 
 RECORDS = [
     (Opcode.HEADER, Header("", "hilctl 1")),
@@ -14,12 +17,6 @@ RECORDS = [
     (Opcode.SCHEMA, Schema(1, b"abc", "protobuf", "hilctl.Event")),
     (Opcode.CHANNEL, Channel(1, "/events", "protobuf", {"a": "1"}, 1)),
 ]
-
-
-def raw(record):
-    builder = RecordBuilder()
-    record.write(builder)
-    return builder.end()
 
 
 @pytest.mark.parametrize(("opcode", "record"), RECORDS)
@@ -38,3 +35,21 @@ def test_an_attachment_has_a_checksum():
     body = bytearray(raw(RECORDS[2][1])[9:])
     body[body.index(b"x: 1")] ^= 1
     assert parse(Opcode.ATTACHMENT, bytes(body)) is None
+
+
+def test_a_chunk_must_be_records_to_its_last_byte():
+    """Without a checksum, what is in a chunk still has to fit."""
+    data = raw(message(1)) + raw(message(2))
+    found = contents(chunk(data), ReadBudget(2**20))
+    assert found.records == (message(1), message(2))
+    assert found.indexes == {4: struct.pack("<HIQQQQ", 4, 32, 1, 0, 2, len(data) // 2)}
+    for wrong in (data[:-1], data + b"\x05"):
+        assert contents(chunk(wrong), ReadBudget(2**20)) is None
+    assert contents(chunk(data, size=len(data) + 1), ReadBudget(2**20)) is None
+    assert contents(chunk(data, size=2**40), ReadBudget(2**20)) is None
+    assert contents(chunk(data, crc=1), ReadBudget(2**20)) is None
+
+
+def test_unknown_compression_gives_nothing():
+    """What can't be decompressed is not guessed at."""
+    assert inflate("brotli", b"abc", 10, ReadBudget(3)) == b""

@@ -1,4 +1,4 @@
-"""What has been read of a recording, gathered into arrays and given out, whole or in pieces."""
+"""Builds a recording from the records of its file, whole or in pieces."""
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -11,76 +11,97 @@ from hilctl.base.errors import DataError
 from hilctl.base.events import Event
 from hilctl.base.samples import COLUMNS, LAST_SAMPLE, Samples
 from hilctl.base.types import F64, I64, U32, CommandUnit
-from hilctl.recording.blocks import Blocks, Bounds, TickTable
-from hilctl.recording.checks import (
+from hilctl.recording.codec import BlockArrays
+from hilctl.recording.data import TICK_COLUMNS, Recording, ReplayStart, Ticks
+from hilctl.recording.facts import unsealed
+from hilctl.recording.recovery_scan import RecoveryScan
+from hilctl.recording.segments import segments_of
+from hilctl.recording.stretch import Stretch
+from hilctl.recording.validation import (
     RATES_HZ,
-    SoundMessages,
+    MessageValidator,
     count_of,
     labels_of,
     number_of,
     short,
 )
-from hilctl.recording.chunks import Messages
-from hilctl.recording.data import TICK_COLUMNS, Recording, ReplayStart, Ticks
-from hilctl.recording.facts import unsealed
-from hilctl.recording.salvage import Salvage
-from hilctl.recording.segments import segments_of
-from hilctl.recording.stretch import Stretch
-from hilctl.recording.wire import BlockArrays
 
 _TEXTS = {"experiment.yaml", "model.yaml", "correction.yaml"}
 _NUMBER_BYTES = 8
-_EVENT_BYTES = 2048  # what Python itself takes for a message that is kept
+_EVENT_BYTES = 2048  # Python objects of a message that is kept
+_MOST_LOOSE = 512
 
 
-class Gathering:
-    """Takes the records of a file, in order.
+class ColumnTable:
+    """Columns that grow; small blocks are joined, because an array takes 100 bytes by itself."""
+
+    def __init__(self) -> None:
+        self._joined: dict[str, list[Any]] = {}
+        self._loose: dict[str, list[Any]] = {}
+        self._added = 0
+
+    def add(self, columns: Mapping[str, Any]) -> None:
+        """Append rows."""
+        for name, values in columns.items():
+            self._loose.setdefault(name, []).append(values)
+        self._added += 1
+        if self._added % _MOST_LOOSE == 0:
+            for name, parts in self._loose.items():
+                self._joined.setdefault(name, []).append(np.concatenate(parts))
+            self._loose = {}
+
+    def pop(self, name: str, kind: Any = np.float64) -> Any:
+        """Remove a column and return its values; empty if there is none."""
+        parts = [*self._joined.pop(name, []), *self._loose.pop(name, [])]
+        return np.concatenate(parts).astype(kind, copy=False) if parts else np.empty(0, dtype=kind)
+
+
+class RecordingBuilder:
+    """Builds recordings from the records of a file, which it takes in order.
 
     Args:
-        salvage: Where they come from; it counts what is kept.
-        stretch: Blocks and ticks that lie elsewhere are not kept.
+        scan: Source of the records; its budget counts what is kept.
+        stretch: Keep only blocks and ticks that overlap it.
 
     Attributes:
         samples: Samples taken.
-        waiting: Those of them that have not been given out.
+        waiting: Samples taken since the last piece.
     """
 
-    def __init__(self, salvage: Salvage, stretch: Stretch | None) -> None:
-        self._salvage = salvage
-        self._allowance = salvage.allowance
+    def __init__(self, scan: RecoveryScan, stretch: Stretch | None) -> None:
+        self._scan = scan
+        self._budget = scan.budget
         self._stretch = stretch
-        self._bounds: Bounds | None = None
-        self._sound = SoundMessages()
+        self._bounds: tuple[int, int] | None = None
+        self._sound = MessageValidator()
         self._run: dict[str, str] = {}
         self._end: dict[str, str] = {}
         self._texts: dict[str, str] = {}
         self._facts: dict[str, Any] = {}
         self._recorded: set[str] | None = None
-        self.samples = self.waiting = 0
-        self._blocks, self._ticks = Blocks(), TickTable()
+        self.samples = 0
         self._begin()
 
     def _begin(self) -> None:
         """Begin a piece."""
         self.waiting = 0
+        self._blocks, self._ticks = ColumnTable(), ColumnTable()
         self._starts: list[ReplayStart] = []
         self._events: list[tuple[int, Any]] = []
 
-    def take(self, record: McapRecord | Messages) -> None:
+    def take(self, record: McapRecord) -> None:
         """Take a record.
 
         Raises:
-            DataError: hilctl can't have written it, or it stands behind samples that have been
-                given out already and says what they are.
+            DataError: hilctl can't have written it, or it is a fact of the run that follows samples
+                which have been returned already.
         """
         match record:
-            case Messages():
-                self._take_all(record)
             case Message() if self._sound.topic(record.channel_id):
                 self._message(record)
             case Metadata(name="hilctl.run"):
                 self._refuse_late("metadata hilctl.run")
-                self._run, _ = unsealed(record.name, record.metadata)  # salvage tells of damage
+                self._run, _ = unsealed(record.name, record.metadata)  # the scan notes damage
             case Metadata(name="hilctl.end"):
                 self._end, _ = unsealed(record.name, record.metadata)
             case Attachment() if record.name in _TEXTS:
@@ -102,9 +123,9 @@ class Gathering:
     def _read_or_not(self, channel: int) -> None:
         # It repeats /samples, and has nine of ten messages at 50 kHz in blocks.
         if self._sound.topic(channel) == "/scope":
-            self._salvage.unread.add(channel)
+            self._scan.unread.add(channel)
         else:
-            self._salvage.unread.discard(channel)
+            self._scan.unread.discard(channel)
 
     def _message(self, record: Message) -> None:
         decoded, problem = self._sound.decoded(record)
@@ -114,56 +135,18 @@ class Gathering:
         if topic == "/samples" and self._within(decoded.tick0, decoded.tick0 + decoded.n):
             self._block(decoded)
         elif topic == "/ticks" and self._within(*_reach(decoded)):
-            self._allowance.keep(_NUMBER_BYTES * decoded.late_ns.size * len(TICK_COLUMNS))
-            self._ticks.add(decoded)
+            self._budget.keep(_NUMBER_BYTES * decoded.late_ns.size * len(TICK_COLUMNS))
+            self._ticks.add({name: getattr(decoded, name) for name in TICK_COLUMNS})
         elif topic == "/events":
-            self._allowance.keep(_EVENT_BYTES + len(record.data))
+            self._budget.keep(_EVENT_BYTES + len(record.data))
             self._events.append((record.log_time, decoded))
 
-    def _take_all(self, messages: Messages) -> None:
-        """Take the messages of some chunks: blocks and ticks at once where they are plain."""
-        topics = {channel: self._sound.topic(channel) for channel in messages.channels}
-        # Of two channels with one topic, the order of the messages counts.
-        orderly = len(set(topics.values())) == len(topics)
-        taken = {
-            channel
-            for channel, topic in topics.items()
-            if topic == "/scope" or (orderly and self._at_once(topic, messages, channel))
-        }
-        if left := messages.channels - taken:
-            rows = messages.under(*left)
-            for record in messages.records(rows):
-                self.take(record)
-
-    def _at_once(self, topic: str, messages: Messages, channel: int) -> bool:
-        """Take the messages of a topic; return False where one is not plain, and none is taken."""
-        if topic == "/samples":
-            found = self._blocks.add_all(
-                messages,
-                messages.under(channel),
-                self._sound.next_sample,
-                self._stretch_bounds(),
-            )
-            if found is None:
-                return False
-            self._sound.next_sample, samples, starts = found
-            self._count(samples)
-            for start in starts:
-                self._begins(start)
-            return True
-        if topic == "/ticks":
-            rows = messages.under(channel)
-            ticks = self._ticks.add_all(messages, rows, self._stretch_bounds())
-            self._allowance.keep(_NUMBER_BYTES * (ticks or 0) * len(TICK_COLUMNS))
-            return ticks is not None
-        return False
-
     def _within(self, start: int, stop: int) -> bool:
-        """Return whether samples from ``start`` up to ``stop`` are of the stretch in part."""
+        """Return whether samples from ``start`` up to ``stop`` overlap the stretch."""
         bounds = self._stretch_bounds()
         return start < bounds[1] and bounds[0] < stop
 
-    def _stretch_bounds(self) -> Bounds:
+    def _stretch_bounds(self) -> tuple[int, int]:
         if self._stretch is None:
             return 0, LAST_SAMPLE
         if self._bounds is None:
@@ -174,33 +157,29 @@ class Gathering:
             self._bounds = self._stretch.samples(rate_hz)
         return self._bounds
 
-    def _count(self, samples: int) -> None:
-        self._allowance.keep(_NUMBER_BYTES * samples * len(COLUMNS))
-        self.samples += samples
-        self.waiting += samples
-
     def _block(self, block: BlockArrays) -> None:
-        self._count(block.n)
-        self._blocks.add(block)
+        self._budget.keep(_NUMBER_BYTES * block.n * len(COLUMNS))
+        self.samples += block.n
+        self.waiting += block.n
+        index = np.arange(block.tick0, block.tick0 + block.n)
+        self._blocks.add({"index": index, "flags": block.flags, **block.columns})
         for previous in block.previous_command.tolist():
-            self._begins(ReplayStart(block.tick0, block.state.copy(), previous))
-
-    def _begins(self, start: ReplayStart) -> None:
-        self._allowance.keep(_EVENT_BYTES + _NUMBER_BYTES * start.state.size)
-        self._starts.append(start)
+            self._budget.keep(_EVENT_BYTES + _NUMBER_BYTES * block.state.size)
+            self._starts.append(ReplayStart(block.tick0, block.state.copy(), previous))
 
     def piece(self, path: Path, *, last: bool = False) -> Recording:
-        """Give out what has been gathered since the piece before.
+        """Return everything taken since the last piece.
 
         Args:
-            path: The file, for what is wrong with it.
-            last: Whether nothing follows: then it has the end of the run and what is missing.
+            path: The file, for error messages.
+            last: Whether nothing follows; the last piece has the end of the run and the number of
+                missing samples.
 
         Raises:
             DataError: A fact of the run is missing or damaged, or a column is incomplete.
         """
         if not self._run:
-            lost = "" if self._salvage.is_mcap else "is not an MCAP file, or its start is lost: "
+            lost = "" if self._scan.is_mcap else "is not an MCAP file, or its start is lost: "
             text = f"{path}: {lost}holds no run of hilctl (metadata hilctl.run is missing)"
             raise DataError(text)
         try:
@@ -222,7 +201,7 @@ class Gathering:
             end=self._end if last else {},
             samples=self._blocks_of(unit),
             dropped=self._dropped() if last else 0,
-            ticks=self._ticks.ticks(),
+            ticks=Ticks(**{name: self._ticks.pop(name, np.int64) for name in TICK_COLUMNS}),
             events=tuple(_event(time_ns, each, unit) for time_ns, each in self._events),
             starts=tuple(self._starts),
         )
@@ -242,8 +221,8 @@ class Gathering:
         }
 
     def _blocks_of(self, unit: CommandUnit) -> Samples:
-        index, flags = self._blocks.index_and_flags()
-        samples = _samples(index, flags, unit, self._blocks.column)
+        index, flags = self._blocks.pop("index", np.int64), self._blocks.pop("flags", np.uint32)
+        samples = _samples(index, flags, unit, self._blocks.pop)
         if samples.index.size:
             recorded = {name for name, values in samples.columns().items() if values.size}
             if recorded != (self._recorded or recorded):
@@ -258,7 +237,7 @@ class Gathering:
 
 
 def _samples(index: I64, flags: U32, unit: CommandUnit, values_of: Callable[[str], F64]) -> Samples:
-    """Return samples by their fields' values; of those that are left out, what stands for them.
+    """Return samples from the values of their fields, or of the column that an omitted one equals.
 
     Raises:
         DataError: A column that every recording has is missing, or has another length.

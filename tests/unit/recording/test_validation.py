@@ -12,18 +12,18 @@ from hilctl.base.errors import DataError, InputError
 from hilctl.base.events import INVERSE, TUNED, Event
 from hilctl.base.samples import Head
 from hilctl.recording import schema
-from hilctl.recording.checks import (
+from hilctl.recording.facts import sealed, unsealed
+from hilctl.recording.messages import RecordingLayout
+from hilctl.recording.reader import read
+from hilctl.recording.recover import recover_recording
+from hilctl.recording.recovery_scan import RecoveryScan
+from hilctl.recording.validation import (
     LAST_SAMPLE,
     count_of,
     labels_of,
     number_of,
     sound_blocks,
 )
-from hilctl.recording.facts import sealed, unsealed
-from hilctl.recording.messages import RecordingLayout
-from hilctl.recording.reader import read
-from hilctl.recording.recover import recover_recording
-from hilctl.recording.salvage import Salvage
 
 FADE = {"share": 0.0, "samples": 10.0, "slope": 0.1, "at_zero": 0.0}
 
@@ -39,7 +39,7 @@ def crafted(tmp_path, make):
         writer = Writer(stream)
         writer.start("", "")
         topics = {}
-        for record in Salvage(sound).records():
+        for record in RecoveryScan(sound).records():
             if isinstance(record, Channel):
                 topics[record.id] = record.topic
             if isinstance(record, Message):

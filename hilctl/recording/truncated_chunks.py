@@ -8,10 +8,17 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, McapRecord, Message, Schema
 
 from hilctl.recording import schema
-from hilctl.recording.allowance import LARGEST_CHUNK_BYTES, MOST_IN_CHUNK, Allowance
-from hilctl.recording.checks import block_problem, decode
-from hilctl.recording.chunks import contents, inflate
-from hilctl.recording.records import CHUNK_HEAD, FRAME, LARGEST_BYTES, LENGTH, split
+from hilctl.recording.mcap_records import (
+    CHUNK_HEAD,
+    FRAME,
+    LARGEST_BYTES,
+    LENGTH,
+    contents,
+    inflate,
+    split,
+)
+from hilctl.recording.read_budget import LARGEST_CHUNK_BYTES, ReadBudget
+from hilctl.recording.validation import block_problem, decode
 
 _WINDOW_BYTES = 4 * 2**20
 _IN_CHUNKS = {Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE}
@@ -49,27 +56,27 @@ def tail_kind(stream: BinaryIO, at: int, size: int) -> str:
     return "zeros"
 
 
-def take_chunk(raw: bytes, allowance: Allowance, *, last: bool) -> tuple[list[McapRecord], str]:
+def take_chunk(raw: bytes, budget: ReadBudget, *, last: bool) -> tuple[list[McapRecord], str]:
     """Take what can be had of a chunk that is not whole.
 
     Args:
         raw: The chunk from its opcode on, up to the next readable record.
-        allowance: Counts what comes out of it.
+        budget: Counts what comes out of it.
         last: Whether the file ends with these bytes.
 
     Returns:
-        Records, and what the stretch is (see :class:`hilctl.recording.salvage.Damage`).
+        Records, and what the stretch is (see :class:`hilctl.recording.recovery_scan.Damage`).
     """
     chunk = _as_far_as_it_goes(raw)
     if chunk is None:
         return [], "torn chunk" if last else "damaged chunk"
-    inside = contents(chunk, allowance)
+    inside = contents(chunk, budget)
     if inside is not None:  # only the frame around it is damaged
         return list(inside.records), "index"
     if not last or not _is_cut(chunk, raw):
         return [], "damaged chunk"
     whole = _before_zeros(chunk)
-    data = inflate(chunk.compression, whole, chunk.uncompressed_size, allowance)
+    data = inflate(chunk.compression, whole, chunk.uncompressed_size, budget)
     return _believable(data), "torn chunk"
 
 
@@ -116,13 +123,11 @@ def _believable(data: bytes) -> list[McapRecord]:
     """
     records: list[McapRecord] = []
     end = 0
-    for at, record in split(data):
+    for _, stop, record in split(data):
         if isinstance(record, Message) and not _decodes(record):
             return records[:-1]
         records.append(record)
-        if len(records) > MOST_IN_CHUNK:
-            return []
-        end = at + FRAME.size + FRAME.unpack_from(data, at)[1]
+        end = stop
     rest = data[end:]
     if len(rest) >= FRAME.size:
         opcode, length = FRAME.unpack_from(rest)

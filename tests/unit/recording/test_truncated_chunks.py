@@ -5,8 +5,8 @@ import struct
 
 from mcap.records import Metadata
 
-from hilctl.recording.allowance import Allowance
-from hilctl.recording.torn import next_likely, own_channels, take_chunk
+from hilctl.recording.read_budget import ReadBudget
+from hilctl.recording.truncated_chunks import next_likely, own_channels, take_chunk
 from tests.unit.recording.conftest import chunk, message, raw
 
 
@@ -20,7 +20,7 @@ def test_nonsense_behind_a_message_costs_that_message():
     two = raw(message(1, b"\x08\x01")) + raw(message(2, b"\x08\x01"))
 
     def saved(behind):
-        records, what = take_chunk(torn(two + behind), Allowance(2**20), last=True)
+        records, what = take_chunk(torn(two + behind), ReadBudget(2**20), last=True)
         assert what == "torn chunk"
         return len(records)
 
@@ -28,19 +28,19 @@ def test_nonsense_behind_a_message_costs_that_message():
     assert saved(b"\x05" + struct.pack("<Q", 90) + b"\x99") == 2
     assert saved(b"\x99") == saved(b"\x99" * 20) == 1
     assert saved(b"\x05" + struct.pack("<Q", 22) + b"\x99" * 40) == 1
-    assert take_chunk(torn(two), Allowance(2**20), last=False) == ([], "damaged chunk")
+    assert take_chunk(torn(two), ReadBudget(2**20), last=False) == ([], "damaged chunk")
 
 
 def test_a_whole_chunk_with_a_wrong_checksum_gives_nothing():
     """That the file ends behind it is no reason to believe what is in it."""
     wrong = raw(chunk(raw(message(1, b"\x08\x01")), crc=1))
-    assert take_chunk(wrong, Allowance(2**20), last=True) == ([], "damaged chunk")
+    assert take_chunk(wrong, ReadBudget(2**20), last=True) == ([], "damaged chunk")
 
 
 def test_zeros_at_the_end_cost_the_message_that_they_end():
     """What ends in zeros may have been something else before the power failed."""
     two = raw(message(1, b"\x08\x01")) + raw(message(2, b"\x08\x01"))
-    records, _ = take_chunk(torn(two)[:-1] + b"\0", Allowance(2**20), last=True)
+    records, _ = take_chunk(torn(two)[:-1] + b"\0", ReadBudget(2**20), last=True)
     assert records == [message(1, b"\x08\x01")]
 
 
@@ -51,11 +51,11 @@ def test_a_sector_of_zeros_ends_a_compressed_stream(make):
     data = stream.getvalue()
     start = data.index(b"\x04\0\0\0zstd") - 37
     whole = data[start : start + 9 + struct.unpack_from("<Q", data, start + 1)[0]]
-    every, what = take_chunk(whole, Allowance(2**20), last=True)
+    every, what = take_chunk(whole, ReadBudget(2**20), last=True)
     assert (what, len(every) > 90) == ("index", True)
     for at in (3000, 100_000, 150_000):
         holed = whole[:at] + bytes(600) + whole[at + 600 : -5000]
-        records, what = take_chunk(holed, Allowance(2**20), last=True)
+        records, what = take_chunk(holed, ReadBudget(2**20), last=True)
         assert what == "torn chunk"
         assert records == every[: len(records)]
         assert len(records) > 5 or at < 150_000
@@ -63,7 +63,7 @@ def test_a_sector_of_zeros_ends_a_compressed_stream(make):
 
 def test_a_likely_record_is_found_across_windows(monkeypatch):
     """The search goes on from window to window without missing one on the border."""
-    import hilctl.recording.torn as module
+    import hilctl.recording.truncated_chunks as module
 
     monkeypatch.setattr(module, "_WINDOW_BYTES", 100)
     record = raw(Metadata("hilctl.end", {"code": "completed"}))

@@ -7,7 +7,7 @@ within one another, messages without content. What hilctl writes stays far below
 from hilctl.base.errors import DataError
 
 LARGEST_CHUNK_BYTES = 32 * 2**20
-"""Largest chunk, uncompressed; hilctl closes one behind 3 MiB, and did so behind 8."""
+"""Largest chunk, uncompressed; hilctl closes one at 5 MiB, and closed older ones at 8 MiB."""
 MOST_IN_CHUNK = 2**18
 """Most records in a chunk; 8 MiB of messages as short as hilctl's are a third of that."""
 
@@ -18,7 +18,7 @@ _MESSAGES = 100_000
 _BYTES_A_MESSAGE = 16  # that much of the file is its entry in the index
 
 
-class Allowance:
+class ReadBudget:
     """Counts down what may still be done for one file.
 
     Args:

@@ -5,7 +5,7 @@ import io
 import pytest
 from mcap.records import Message, Metadata
 
-from hilctl.recording.salvage import Damage, Salvage
+from hilctl.recording.recovery_scan import Damage, RecoveryScan
 
 
 @pytest.fixture
@@ -16,8 +16,8 @@ def data(make):
 
 
 def salvaged(data):
-    salvage = Salvage(io.BytesIO(data))
-    return salvage, list(salvage.records())
+    scan = RecoveryScan(io.BytesIO(data))
+    return scan, list(scan.records())
 
 
 def count(records):
@@ -25,16 +25,16 @@ def count(records):
 
 
 def test_a_sound_file_has_no_damage(data):
-    salvage, records = salvaged(data)
-    assert salvage.sound
-    assert salvage.is_mcap
+    scan, records = salvaged(data)
+    assert scan.sound
+    assert scan.is_mcap
     assert count(records) > 4
     assert [r.name for r in records if isinstance(r, Metadata)] == ["hilctl.run", "hilctl.end"]
 
 
 def test_a_file_that_ends_early_lacks_end_and_index(data):
-    salvage, records = salvaged(data[: len(data) // 2])
-    assert not salvage.sound
+    scan, records = salvaged(data[: len(data) // 2])
+    assert not scan.sound
     assert 0 < count(records) < count(salvaged(data)[1])
 
 
@@ -42,15 +42,15 @@ def test_a_damaged_stretch_costs_no_record_behind_it(data):
     """One flipped byte inside the file: facts of the end are still found."""
     broken = bytearray(data)
     broken[len(data) // 3] ^= 0x10
-    salvage, records = salvaged(bytes(broken))
-    assert not salvage.sound
-    assert len(salvage.damages) >= 1
+    scan, records = salvaged(bytes(broken))
+    assert not scan.sound
+    assert len(scan.damages) >= 1
     assert "hilctl.end" in [r.name for r in records if isinstance(r, Metadata)]
 
 
 def test_what_is_no_mcap_file_holds_nothing():
-    salvage, records = salvaged(b"time,current\n" * 100)
-    assert not salvage.is_mcap
+    scan, records = salvaged(b"time,current\n" * 100)
+    assert not scan.is_mcap
     assert records == []
 
 
@@ -69,6 +69,6 @@ def test_what_is_no_mcap_file_holds_nothing():
     ],
 )
 def test_damages_are_described_in_one_line(damages, text):
-    salvage = Salvage(io.BytesIO(b""))
-    salvage.damages = damages
-    assert salvage.describe() == text
+    scan = RecoveryScan(io.BytesIO(b""))
+    scan.damages = damages
+    assert scan.describe() == text

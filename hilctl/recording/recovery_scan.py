@@ -27,16 +27,13 @@ from mcap.records import (
 )
 from mcap.writer import MCAP0_MAGIC as MAGIC
 
-from hilctl.recording.ahead import ChunkRun, ReadAhead
-from hilctl.recording.allowance import Allowance
-from hilctl.recording.checks import SoundMessages
-from hilctl.recording.chunks import Contents, Messages, contents
 from hilctl.recording.facts import unsealed
-from hilctl.recording.records import FRAME, LARGEST_BYTES, parse
-from hilctl.recording.torn import next_likely, own_channels, tail_kind, take_chunk
+from hilctl.recording.mcap_records import FRAME, LARGEST_BYTES, Contents, contents, parse
+from hilctl.recording.read_budget import ReadBudget
+from hilctl.recording.truncated_chunks import next_likely, own_channels, tail_kind, take_chunk
+from hilctl.recording.validation import MessageValidator
 
 _INDEX_KINDS = {Opcode.MESSAGE_INDEX, Opcode.DATA_END, Opcode.FOOTER}
-_CRC_BYTES = 1 << 20
 _KNOWN = {opcode.value for opcode in Opcode}
 
 
@@ -75,43 +72,37 @@ class _Found(NamedTuple):
     end: int
 
 
-class Salvage:
-    """What can be read of a file; all attributes are right once :meth:`taken` is exhausted.
+class RecoveryScan:
+    """What can be read of a file; all attributes are right once :meth:`records` is exhausted.
 
     Args:
         stream: Open binary file that can seek.
-        sound: Leaves out messages that hilctl can't have written, and notes them as damage; where
-            None, they are given out.
-        ahead: Reads chunks before they are asked for.
+        sound: Omits messages that hilctl can't have written, and notes them as damage; if None,
+            they are yielded.
 
     Attributes:
         size: Bytes of the file.
-        allowance: What may still be done for it.
+        budget: Limits of work and memory left for it.
         is_mcap: Whether the file begins as an MCAP file does.
-        header: The file's header, where it is whole.
+        header: The file's header, if it is whole.
         damages: Stretches that could not be read.
         finished: Whether footer and closing magic are there and the index fits the data.
-        unread: Ids of channels whose messages are not given out from now on; these channels must
-            have been.
+        unread: Ids of channels whose messages are omitted from now on; the channels themselves must
+            have been yielded.
     """
 
-    def __init__(
-        self,
-        stream: BinaryIO,
-        sound: SoundMessages | None = None,
-        ahead: ReadAhead | None = None,
-    ) -> None:
+    def __init__(self, stream: BinaryIO, sound: MessageValidator | None = None) -> None:
         self._stream = stream
         self._sound = sound
-        self._ahead = ahead
         self.size = stream.seek(0, 2)
-        self.allowance = Allowance(self.size)
+        self.budget = ReadBudget(self.size)
         self.is_mcap = self._read(0, len(MAGIC)) == MAGIC
         self.header: Header | None = None
         self.damages: list[Damage] = []
         self.finished = False
         self.unread: set[int] = set()
         self._data_ended = False
+        self._crc = zlib.crc32(MAGIC)
         self._channels: set[int] = set()
         self._indexes: dict[int, bytes] = {}
         self._chunks: list[int] = []
@@ -130,7 +121,7 @@ class Salvage:
         return not self.finished or not all(damage.lasting for damage in self.damages)
 
     def describe(self) -> str:
-        """Return what is wrong with the file, in one line."""
+        """Return the damage of the file in one line."""
         serious = [damage for damage in self.damages if damage.what != "index"]
         if not self.damages:
             return "its end and index are missing"
@@ -149,30 +140,11 @@ class Salvage:
             OSError: The file can't be read.
             DataError: It asks for more work or memory than a recording of its size can.
         """
-        for each in self.taken():
-            if isinstance(each, Messages):
-                yield from each.records(each.table)
-            else:
-                yield each
-
-    def taken(self) -> Iterator[McapRecord | Messages]:
-        """Yield what :meth:`records` does, messages of many chunks at once where that can be.
-
-        Every message comes after its channel, and every channel after its schema.
-
-        Raises:
-            OSError: The file can't be read.
-            DataError: It asks for more work or memory than a recording of its size can.
-        """
         at = len(MAGIC)
         if not self.is_mcap:
             at = next_likely(self._stream, 1, self.size)
             self._note(0, at, "damaged record")
         while at < self.size:
-            if run := self._run_of_chunks(at):
-                yield run.messages
-                at = run.end
-                continue
             found = self._whole(at)
             if found is None:
                 after = next_likely(self._stream, at + 1, self.size)
@@ -185,22 +157,15 @@ class Salvage:
                 return
             at = found.end
 
-    def taken_at(self, places: Iterable[int]) -> Iterator[McapRecord | Messages]:
-        """Yield what stands at some places, which the index of a finished file has named.
+    def records_at(self, places: Iterable[int]) -> Iterator[McapRecord]:
+        """Yield the records at some places, from the index of a finished file.
 
         Raises:
             OSError: The file can't be read.
             DataError: It asks for more work or memory than a recording of its size can.
         """
-        end = 0
         for at in places:
-            if at < end:  # it has been given out with those before it
-                continue
-            self._indexes = {}  # what follows a chunk is not looked at
-            if run := self._run_of_chunks(at):
-                yield run.messages
-                end = run.end
-                continue
+            self._indexes = {}  # what follows a chunk is not read
             found = self._whole(at)
             if found is None:
                 self._note(at, 0, "damaged record")
@@ -209,24 +174,10 @@ class Salvage:
         self.finished = True
 
     def _read(self, at: int, size: int) -> bytes:
-        found = self._ahead.read(at, size) if self._ahead else None
-        if found is None:
-            self._stream.seek(at)
-            found = self._stream.read(size)
-        self.allowance.read(len(found))
+        self._stream.seek(at)
+        found = self._stream.read(size)
+        self.budget.read(len(found))
         return found
-
-    def _run_of_chunks(self, at: int) -> ChunkRun | None:
-        """Return chunks that have been read ahead, if all their channels are known."""
-        run = self._ahead.chunks(at) if self._ahead and not self._indexes else None
-        if run is None or not run.messages.channels <= self._channels:
-            return None
-        self._chunks += run.places
-        self.allowance.read(run.end - at)
-        self.allowance.expand(run.messages.data.size)
-        self.allowance.message(len(run.messages.table))
-        self._messages += len(run.messages.table)
-        return run
 
     def _whole(self, at: int) -> _Found | None:
         frame = self._read(at, FRAME.size)
@@ -237,13 +188,15 @@ class Salvage:
         if opcode not in _KNOWN or length > LARGEST_BYTES or end > self.size:
             return None
         body = self._read(at + FRAME.size, length)
-        if opcode == Opcode.MESSAGE_INDEX:  # its chunk says what it must be, byte for byte
+        if opcode != Opcode.DATA_END:  # it covers everything before it
+            self._crc = zlib.crc32(body, zlib.crc32(frame, self._crc))
+        if opcode == Opcode.MESSAGE_INDEX:  # the content of its chunk determines every byte
             right = self._indexes.pop(int.from_bytes(body[:2], "little"), None)
             return _Found(None, None, end) if body == right else None
         record = parse(opcode, body)
         inside = None
         if isinstance(record, Chunk):
-            inside = contents(record, self.allowance, self.unread)
+            inside = contents(record, self.budget, self.unread)
         if record is None or (isinstance(record, Chunk) and inside is None):
             return None
         return _Found(record, inside, end)
@@ -260,7 +213,7 @@ class Salvage:
             self._chunks.append(at)
             self._indexes = dict(found.inside.indexes)
             self._messages += found.inside.unread
-            self.allowance.message(found.inside.unread)
+            self.budget.message(found.inside.unread)
             return list(found.inside.records)
         if self._data_ended or isinstance(record, DataEnd):
             if isinstance(record, DataEnd):
@@ -277,19 +230,8 @@ class Salvage:
     def _check_data(self, at: int, end: DataEnd) -> None:
         """Compare the checksum of all bytes before the end of the data, where there is one."""
         explained = not all(damage.lasting for damage in self.damages)
-        if end.data_section_crc and not explained and self._crc(at) != end.data_section_crc:
+        if end.data_section_crc and not explained and self._crc != end.data_section_crc:
             self._note(0, at, "data section with a wrong checksum")
-
-    def _crc(self, stop: int) -> int:
-        """Return the checksum of all bytes up to some place."""
-        found = self._ahead.crc(stop) if self._ahead else None
-        if found is not None:
-            return found
-        crc = 0
-        self._stream.seek(0)
-        for start in range(0, stop, _CRC_BYTES):
-            crc = zlib.crc32(self._stream.read(min(_CRC_BYTES, stop - start)), crc)
-        return crc
 
     def _take_summary(self, record: McapRecord) -> None:
         self._data_ended = True
@@ -299,7 +241,7 @@ class Salvage:
             self._indexed.append(record.chunk_start_offset)
 
     def _close(self, start: int, at: int, footer: Footer) -> None:
-        """Judge the file's end: the footer from ``start``, and what stands from ``at`` on."""
+        """Check the file's end: the footer from ``start``, and the bytes from ``at`` on."""
         begin = footer.summary_start
         summary = self._read(begin, start + FRAME.size + 16 - begin) if begin < start else b""
         right = footer.summary_crc in {0, zlib.crc32(summary)}
@@ -323,7 +265,7 @@ class Salvage:
                     self._note(at, 0, "message of no channel")
                     continue
                 self._messages += 1
-                self.allowance.message()
+                self.budget.message()
             problem = self._sound.problem(record) if self._sound else ""
             if problem:
                 self._note(at, 0, problem)
@@ -346,7 +288,7 @@ class Salvage:
             what = "index"
         elif opcode == Opcode.CHUNK:
             raw = self._read(at, min(after - at, LARGEST_BYTES))
-            records, what = take_chunk(raw, self.allowance, last=after == self.size)
+            records, what = take_chunk(raw, self.budget, last=after == self.size)
         elif opcode in _KNOWN:
             what = "damaged record"
         else:

@@ -18,10 +18,10 @@ from mcap.records import Channel, McapRecord, Message, Schema
 from hilctl.base.events import CHANGES, INVERSE
 from hilctl.base.samples import COLUMNS, LAST_SAMPLE, LONGEST_NS, RECORDED_FIELDS, Batch, Head
 from hilctl.base.types import CommandUnit
-from hilctl.recording import schema, wire
+from hilctl.recording import schema
+from hilctl.recording.codec import BlockArrays, decode_block, decode_ticks
 from hilctl.recording.data import TICK_COLUMNS, Ticks
 from hilctl.recording.facts import LABELS_FACT, LabelValue
-from hilctl.recording.wire import BlockArrays
 
 MAX_UNIX_NS = 2**63 - 1
 """Latest time that 64 bits hold with a sign, as NumPy and Parquet have it: in the year 2262."""
@@ -34,28 +34,25 @@ _MOST_DIGITS = 15
 _LINE = 60
 
 
+_DECODERS: dict[str, Callable[[bytes], Any]] = {
+    "/samples": decode_block,
+    "/ticks": decode_ticks,
+    "/scope": schema.message_class("Sample").FromString,
+    "/events": schema.message_class("Event").FromString,
+}
+
+
 def decode(topic: str, data: bytes) -> tuple[Any, str]:
-    """Return a message of one of hilctl's topics, and why it is none of hilctl's, if so.
+    """Return a message of one of hilctl's topics, and why it can't be decoded, if so.
 
     Returns:
-        Of ``/samples`` a :class:`~hilctl.recording.wire.BlockArrays`, of ``/ticks``
-        :class:`~hilctl.recording.data.Ticks`, else a message of the protobuf library.
+        For ``/samples`` a :class:`~hilctl.recording.codec.BlockArrays`, for ``/ticks``
+        :class:`~hilctl.recording.data.Ticks`, otherwise a message of the protobuf library.
     """
-    plain = _PLAIN.get(topic)
-    if plain and (found := plain[0](data)) is not None:
-        return found, ""
-    decoded = schema.message(schema.TOPICS[topic])
     try:
-        decoded.ParseFromString(data)
-    except DecodeError as error:
-        return decoded, f"can't be decoded: {error}"
-    return plain[1](decoded) if plain else decoded, ""
-
-
-_PLAIN: dict[str, tuple[Callable[[bytes], Any], Callable[[Any], Any]]] = {
-    "/samples": (wire.sample_block, wire.BlockArrays.of),
-    "/ticks": (wire.tick_block, wire.ticks_of),
-}
+        return _DECODERS[topic](data), ""
+    except (DecodeError, ValueError) as error:
+        return None, f"can't be decoded: {error}"
 
 
 def block_problem(block: BlockArrays, next_sample: int) -> str:
@@ -162,7 +159,7 @@ def _listed(lengths: Mapping[str, int]) -> str:
     return ", ".join(f"{length} of {name}" for name, length in lengths.items())
 
 
-class SoundMessages:
+class MessageValidator:
     """Tells the messages that hilctl wrote from others under its topics, in the order of a file."""
 
     def __init__(self) -> None:
@@ -171,6 +168,8 @@ class SoundMessages:
         self._refused: dict[int, str] = {}
         self.next_sample = 0
         """Index after the last sample of all messages that were found sound."""
+        self.samples = 0
+        """Samples in them."""
 
     def topic(self, channel: int) -> str:
         """Return the topic of a channel where it is one of hilctl's; else nothing."""
@@ -218,6 +217,7 @@ class SoundMessages:
                 problem = event_problem(message, record.log_time)
         if topic == "/samples" and not problem:
             self.next_sample = message.tick0 + message.n
+            self.samples += message.n
         return message, f"{topic}: {problem}" if problem else ""
 
 

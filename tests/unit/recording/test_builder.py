@@ -10,6 +10,7 @@ import pytest
 from hilctl.base.errors import DataError
 from hilctl.base.samples import COLUMNS
 from hilctl.recording import reader
+from hilctl.recording.builder import ColumnTable
 from hilctl.recording.data import TICK_COLUMNS
 from hilctl.recording.reader import Pieces, read
 from hilctl.recording.stretch import Stretch
@@ -48,12 +49,8 @@ def test_pieces_are_the_whole(monkeypatch, recorded, size, stretch):
     assert not any(piece.end or piece.dropped for piece in pieces[:-1])
 
 
-@pytest.mark.parametrize("long_bytes", [0, 2**60])
-def test_pieces_of_a_stretch_are_cut_from_the_whole(monkeypatch, recorded, long_bytes):
-    """By many chunks at once and record by record."""
+def test_pieces_of_a_stretch_are_cut_from_the_whole(monkeypatch, recorded):
     monkeypatch.setattr(reader, "PIECE_SAMPLES", 500)
-    monkeypatch.setattr(reader, "LONG_CHUNKS", 0)
-    monkeypatch.setattr(reader, "LONG_BYTES", long_bytes)
     stretch = Stretch(0.0123, 0.05)
     cut, pieces = stretch.cut(read(recorded)), list(Pieces(recorded, stretch))
     assert cut.samples.index.size > 1000
@@ -67,7 +64,7 @@ def test_pieces_of_a_stretch_are_cut_from_the_whole(monkeypatch, recorded, long_
 
 
 def test_a_walk_that_is_left_leaves_nothing_behind(monkeypatch, recorded):
-    """Neither the thread that gathers pieces nor the open file."""
+    """Neither the thread that reads ahead nor the open file."""
     monkeypatch.setattr(reader, "PIECE_SAMPLES", 1)
     before = threading.active_count()
     opened, streams = Path.open, []
@@ -84,6 +81,17 @@ def test_a_walk_that_is_left_leaves_nothing_behind(monkeypatch, recorded):
     assert threading.active_count() == before
     assert streams
     assert all(stream.closed for stream in streams)
+
+
+def test_many_small_blocks_take_no_array_each():
+    """They are joined as they come."""
+    table = ColumnTable()
+    for number in range(2000):
+        table.add({"a": np.array([number])} | ({"b": np.array([number])} if number % 7 else {}))
+        assert len(table._loose.get("a", [])) < 512
+    assert table.pop("a", np.int64).tolist() == list(range(2000))
+    assert table.pop("b", np.int64).tolist() == [n for n in range(2000) if n % 7]
+    assert table.pop("a", np.int64).size == 0
 
 
 def test_a_walk_can_be_repeated(recorded):

@@ -1,0 +1,221 @@
+"""MCAP records and chunks from bytes that may be damaged.
+
+A record is whole only if writing it again gives the same bytes: then every length in it is right,
+and so is the checksum of an attachment. A chunk is whole if its checksum is right.
+"""
+
+import os
+import struct
+import zlib
+from collections.abc import Collection, Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from io import BytesIO
+from typing import Any, BinaryIO
+
+import lz4.frame
+import zstandard
+from mcap.data_stream import ReadDataStream, RecordBuilder
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import (
+    Attachment,
+    AttachmentIndex,
+    Channel,
+    Chunk,
+    ChunkIndex,
+    DataEnd,
+    Footer,
+    Header,
+    McapRecord,
+    Message,
+    Metadata,
+    MetadataIndex,
+    Schema,
+    Statistics,
+    SummaryOffset,
+)
+
+from hilctl.recording.read_budget import LARGEST_CHUNK_BYTES, MOST_IN_CHUNK, ReadBudget
+
+FRAME = struct.Struct("<BQ")
+"""Opcode and length before every record."""
+LARGEST_BYTES = 2 * LARGEST_CHUNK_BYTES
+"""No record that hilctl writes is larger; a length beyond it is a damaged one."""
+CHUNK_HEAD = struct.Struct("<QQQII")
+"""First and last time of a chunk, its uncompressed size, its checksum, and the length of the name
+of its compression, which follows, and then the length of its data and the data."""
+LENGTH = struct.Struct("<Q")
+
+_MESSAGE = struct.Struct("<BQHIQQ")  # opcode and length as well
+_MESSAGE_OPCODE = int(Opcode.MESSAGE)  # comparing with an enumeration is slow
+_PIECE_BYTES = 65536
+_KINDS: dict[int, Any] = {
+    Opcode.HEADER: Header,
+    Opcode.FOOTER: Footer,
+    Opcode.SCHEMA: Schema,
+    Opcode.CHANNEL: Channel,
+    Opcode.CHUNK: Chunk,
+    Opcode.CHUNK_INDEX: ChunkIndex,
+    Opcode.ATTACHMENT: Attachment,
+    Opcode.ATTACHMENT_INDEX: AttachmentIndex,
+    Opcode.STATISTICS: Statistics,
+    Opcode.METADATA: Metadata,
+    Opcode.METADATA_INDEX: MetadataIndex,
+    Opcode.SUMMARY_OFFSET: SummaryOffset,
+    Opcode.DATA_END: DataEnd,
+}
+
+
+def parse(opcode: int, body: bytes) -> McapRecord | None:
+    """Return the record, or None if the bytes are not exactly one of its kind."""
+    stream, builder = ReadDataStream(BytesIO(body)), RecordBuilder()
+    try:
+        if opcode == Opcode.MESSAGE:
+            record: McapRecord = Message.read(stream, len(body))
+        elif opcode in _KINDS:
+            record = _KINDS[opcode].read(stream)
+        else:
+            return None
+        record.write(builder)
+    except (McapError, struct.error, ValueError, OverflowError):  # impossible lengths
+        return None
+    return record if builder.end()[FRAME.size :] == body else None
+
+
+def records_from(stream: BinaryIO, start: int, stop: int) -> Iterator[McapRecord]:
+    """Yield whole records of a file, up to the first that is damaged or holds messages."""
+    stop = min(stop, stream.seek(0, os.SEEK_END))
+    while start + FRAME.size <= stop:
+        stream.seek(start)
+        opcode, length = FRAME.unpack(stream.read(FRAME.size))
+        start += FRAME.size + length
+        if length > LARGEST_BYTES or start > stop or opcode in {Opcode.CHUNK, Opcode.MESSAGE}:
+            return
+        record = parse(opcode, stream.read(length))
+        if record is None:
+            return
+        yield record
+
+
+def split(data: bytes) -> Iterator[tuple[int, int, McapRecord]]:
+    """Yield start, end and record of the content of a chunk, up to the first that is not whole."""
+    at = 0
+    for _ in range(MOST_IN_CHUNK):
+        if at + FRAME.size > len(data):
+            return
+        opcode, length = FRAME.unpack_from(data, at)
+        end = at + FRAME.size + length
+        if end > len(data):
+            return
+        record: McapRecord | None
+        if opcode == _MESSAGE_OPCODE and end - at >= _MESSAGE.size:  # the library is slow
+            _, _, channel_id, sequence, log_time, publish_time = _MESSAGE.unpack_from(data, at)
+            body = data[at + _MESSAGE.size : end]
+            record = Message(channel_id, log_time, body, publish_time, sequence)
+        else:
+            record = parse(opcode, data[at + FRAME.size : end])
+        if record is None:
+            return
+        yield at, end, record
+        at = end
+
+
+def inflate(compression: str, data: bytes, size: int, budget: ReadBudget) -> bytes:
+    """Decompress as far as the bytes go, and at most one byte more than ``size``.
+
+    A decompressor returns whole blocks (zstd: up to 128 KiB), so the last block of a truncated
+    stream is lost.
+
+    Args:
+        compression: ``zstd``, ``lz4`` or empty; any other returns nothing.
+        data: The stream, maybe truncated or damaged.
+        size: Bytes expected.
+        budget: Counts the bytes returned.
+
+    Raises:
+        DataError: The file exceeds its budget.
+    """
+    if not compression:
+        return data
+    stream: Any
+    if compression == "zstd":
+        # A frame may ask for a window of gigabytes.
+        decompressor = zstandard.ZstdDecompressor(max_window_size=LARGEST_CHUNK_BYTES)
+        with suppress(zstandard.ZstdError):  # damaged: block by block
+            if zstandard.frame_content_size(data) == size <= LARGEST_CHUNK_BYTES:
+                whole = decompressor.decompress(data, allow_extra_data=False)  # twice as fast
+                budget.expand(size)
+                return whole
+        stream = decompressor.stream_reader(data)
+    elif compression == "lz4":
+        stream = lz4.frame.open(BytesIO(data))
+    else:
+        return b""
+    pieces: list[bytes] = []
+    left = size + 1
+    while left > 0:
+        try:
+            piece = stream.read(min(_PIECE_BYTES, left))
+        except (zstandard.ZstdError, RuntimeError, EOFError):  # damaged from here on
+            break
+        if not piece:
+            break
+        budget.expand(len(piece))
+        pieces.append(piece)
+        left -= len(piece)
+    return b"".join(pieces)
+
+
+@dataclass(frozen=True, slots=True)
+class Contents:
+    """The content of a whole chunk.
+
+    Attributes:
+        records: Schemas, channels and messages in order.
+        indexes: Channel id to the expected bytes of its message index.
+        unread: Messages that are left out of ``records``.
+    """
+
+    records: tuple[McapRecord, ...]
+    indexes: dict[int, bytes]
+    unread: int = 0
+
+
+def contents(chunk: Chunk, budget: ReadBudget, unread: Collection[int] = ()) -> Contents | None:
+    """Return the content of a chunk, or None if its checksum or a record in it is wrong.
+
+    Args:
+        chunk: A chunk whose own lengths are right.
+        budget: Counts the bytes that are decompressed.
+        unread: Ids of channels whose messages are only counted.
+    """
+    if chunk.uncompressed_size > LARGEST_CHUNK_BYTES:
+        return None
+    data = inflate(chunk.compression, chunk.data, chunk.uncompressed_size, budget)
+    if len(data) != chunk.uncompressed_size:
+        return None
+    if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
+        return None
+    records: list[McapRecord] = []
+    entries: dict[int, list[int]] = {}
+    left_out = end = 0
+    for start, stop, record in split(data):
+        end = stop
+        if isinstance(record, Channel) and record.id in unread:  # its topic may have changed
+            unread = ()
+        if isinstance(record, Message):
+            entries.setdefault(record.channel_id, []).extend((record.log_time, start))
+            if record.channel_id in unread:
+                left_out += 1
+                continue
+        records.append(record)
+    if end != len(data):
+        return None
+    indexes = {channel_id: _index(channel_id, each) for channel_id, each in entries.items()}
+    return Contents(tuple(records), indexes, left_out)
+
+
+def _index(channel_id: int, entries: list[int]) -> bytes:
+    """Return the message index of a channel: time and place of each message."""
+    return struct.pack(f"<HI{len(entries)}Q", channel_id, 8 * len(entries), *entries)
