@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from hilctl.cli.volume import Volume
+from hilctl.cli.verbosity import Verbosity
 
 if TYPE_CHECKING:
     from numba.core.event import Event
@@ -22,7 +22,7 @@ def compiling_shown() -> Iterator[None]:
     """
     from hilctl.kernels.elsewhere import compiled_elsewhere
 
-    if Volume.quiet or not sys.stderr.isatty():
+    if Verbosity.quiet or not sys.stderr.isatty():
         with compiled_elsewhere():
             yield
         return

@@ -60,7 +60,7 @@ def emulate(
         bool, typer.Option("--json", help="Print one line of JSON once it answers.")
     ] = False,
 ) -> None:
-    """Serve the simulated rig as a real device would, until Ctrl-C."""
+    """Emulate a device with the simulated rig, until Ctrl-C."""
     say = _say_json if as_json else _say
     faults = tuple(parse_fault(text) for text in fault or ())
     if is_experiment(profile):

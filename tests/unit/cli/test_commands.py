@@ -39,11 +39,11 @@ def test_every_command_loads_and_says_what_the_table_says(name):
     assert command.help.splitlines()[0] == COMMANDS[name].help
 
 
-@pytest.mark.parametrize("place", ["hilctl_absent.command:run", "hilctl.cli.machine:absent"])
+@pytest.mark.parametrize("place", ["hilctl_absent.command:run", "hilctl.cli.devices:absent"])
 def test_a_command_that_is_not_installed_is_one_line(place, monkeypatch):
     """The message says which command, and what is missing."""
     monkeypatch.setitem(COMMANDS, "emulate", CommandEntry(place, "Serve."))
-    with pytest.raises(InputError, match=r"emulate can't be loaded: .*absent"):
+    with pytest.raises(InputError, match=r"emulate: .*absent"):
         load("emulate")
 
 
@@ -74,7 +74,7 @@ def test_memory_that_has_run_out_is_said_once(in_here, monkeypatch, error, remar
         del lost
         raise MemoryError
 
-    monkeypatch.setattr(cli, "_command", broken)
+    monkeypatch.setattr(cli, "_run_app", broken)
     code, _, said = in_here("check")
     assert (code, said) == (3, "hilctl: not enough memory\n")
     assert len(heard) == remarks
@@ -87,8 +87,8 @@ def test_data_that_end_unexpectedly_are_not_taken_for_ctrl_d(in_here, monkeypatc
     def ended() -> None:
         raise EOFError("Ran out of input")
 
-    monkeypatch.setattr("hilctl.cli.reading.report", ended)
-    monkeypatch.setattr("hilctl.cli.running.check", ended)
+    monkeypatch.setattr("hilctl.cli.reports.report", ended)
+    monkeypatch.setattr("hilctl.cli.run.check", ended)
     code, _, stderr = in_here(name)
     assert code == 3
     assert stderr.startswith("hilctl: ")
@@ -99,7 +99,7 @@ def test_clock_beyond_what_can_be_told_is_refused(in_here, monkeypatch):
     def beyond():
         raise OverflowError("timestamp too large to convert to C _PyTime_t")
 
-    monkeypatch.setattr(cli, "_command", beyond)
+    monkeypatch.setattr(cli, "_run_app", beyond)
     with pytest.raises(OverflowError):  # whatever else overflows is a fault of hilctl
         cli.main()
     monkeypatch.setattr("time.time_ns", beyond)

@@ -6,7 +6,7 @@ import numba
 import pytest
 
 from hilctl.cli.compiling import compiling_shown
-from hilctl.cli.volume import Volume
+from hilctl.cli.verbosity import Verbosity
 from hilctl.kernels import jit
 
 
@@ -68,7 +68,7 @@ def test_no_program_reads_it(capsys):
 
 def test_nor_who_wants_quiet(at_terminal, monkeypatch):
     terminal = at_terminal()
-    monkeypatch.setattr(Volume, "quiet", True)
+    monkeypatch.setattr(Verbosity, "quiet", True)
     with compiling_shown():
         compile_something()
     assert terminal.getvalue() == ""

@@ -19,7 +19,7 @@ def served(monkeypatch):
         given.update(chosen=chosen, over=over, port=port)
         on_url("http://127.0.0.1:5/#x")
 
-    monkeypatch.setattr("hilctl.desk.live.serve_runs", serve_runs)
+    monkeypatch.setattr("hilctl.cli.live.serve_runs", serve_runs)
     return given
 
 
@@ -40,7 +40,7 @@ def test_foxglove_is_served_at_its_own_port_unless_another_is_given(monkeypatch)
         ports.append(port)
         on_url("ws://127.0.0.1:5")
 
-    monkeypatch.setattr("hilctl.desk.live.serve_foxglove", serve_foxglove)
+    monkeypatch.setattr("hilctl.cli.live.serve_foxglove", serve_foxglove)
     said = CliRunner().invoke(app, ["live", "--foxglove"])
     assert said.output == "Foxglove server: ws://127.0.0.1:5\n"
     CliRunner().invoke(app, ["live", "--foxglove", "--port", "0"])

@@ -3,8 +3,6 @@
 import os
 import pty
 import select
-import signal
-import subprocess
 import sys
 import termios
 from contextlib import nullcontext
@@ -139,7 +137,7 @@ def test_a_change_that_takes_time_does_not_delay_a_stop(monkeypatch):
     view.press(b"is")
     assert len(started) == 2
     started[1]()
-    assert view.message == "stop: the run is over"
+    assert view.message == "stop: the run has ended"
 
 
 def test_a_mark_is_typed_and_its_letters_are_no_keys(sent, capsys):
@@ -363,23 +361,3 @@ def test_a_run_that_ended_before_the_subprocess_saw_it_is_one_message(run, monke
     monkeypatch.setattr(sys, "argv", ["watch", "7"])
     module.main()
     assert capsys.readouterr().err == "hilctl: demo-7: gone\n"
-
-
-@pytest.mark.parametrize("ignores", ["", "signal.signal(15, signal.SIG_IGN);"])
-def test_the_subprocess_ends_with_the_run(monkeypatch, ignores):
-    monkeypatch.setattr(module, "_END_S", 0.2)
-    started = []
-
-    class Started(subprocess.Popen):
-        def __init__(self, command):
-            code = f"import signal, time; {ignores} print(flush=True); time.sleep(60)"
-            super().__init__([sys.executable, "-c", code], stdout=subprocess.PIPE)
-            self.stdout.readline()
-            started.append((command, self))
-
-    monkeypatch.setattr(subprocess, "Popen", Started)
-    with module.watched_beside():
-        assert started[0][1].poll() is None
-    ((command, process),) = started
-    assert command[-2:] == ["hilctl.cli.watch", str(os.getpid())]
-    assert process.returncode == -(signal.SIGKILL if ignores else signal.SIGTERM)

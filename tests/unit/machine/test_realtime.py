@@ -364,7 +364,7 @@ def test_command_line_requires_real_time(monkeypatch):
         raise InputError("far enough")
 
     monkeypatch.setattr(start, "start_run", refuse)
-    monkeypatch.setattr("hilctl.cli.running.finish_orphans", lambda: None)  # not this machine's own
+    monkeypatch.setattr("hilctl.cli.run.finish_dead_runs", lambda: None)  # not this machine's own
     runner = CliRunner()
     for flags in ([], ["--require-rt"], ["--require-rt", "--set", "name=other"]):
         runner.invoke(app, ["run", "experiment.yaml", *flags])
