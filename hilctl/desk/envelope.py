@@ -1,7 +1,7 @@
-"""Lowest, highest and first value of each signal in buckets of samples, as samples come.
+"""Compute minimum, maximum and first value of each signal per bucket of samples.
 
-A bucket is one or more samples wide. What lies between its lowest and its highest value is drawn,
-so that one sample far away is as well seen in an hour as in a second.
+A bucket is one or more samples wide. A plot draws the range from minimum to maximum, so that a
+single outlier is visible in a window of any length.
 """
 
 from dataclasses import dataclass
@@ -14,12 +14,12 @@ from hilctl.desk.signals import SIGNALS, Traces
 
 @dataclass(frozen=True, slots=True)
 class Buckets:
-    """Some buckets after one another.
+    """Consecutive buckets.
 
     Attributes:
-        low: float64[len(SIGNALS), n]; NaN where a bucket has no sample.
+        low: float64[len(SIGNALS), n]; NaN if a bucket has no sample.
         high: The same shape.
-        first: The same shape: values of one sample, so that they belong together.
+        first: The same shape; values of one sample.
     """
 
     low: F64
@@ -31,9 +31,9 @@ class Envelope:
     """The newest buckets of a run.
 
     Args:
-        origin: Sample with which bucket 0 begins.
-        width: Samples in a bucket, >= 1, not necessarily whole.
-        keep: Number of buckets that are kept.
+        origin: First sample of bucket 0.
+        width: Samples per bucket, >= 1, not necessarily an integer.
+        keep: Number of buckets to keep.
     """
 
     def __init__(self, origin: float, width: float, keep: int) -> None:
@@ -45,7 +45,7 @@ class Envelope:
         self._first = np.full(shape, np.nan)
 
     def add(self, traces: Traces) -> None:
-        """Take the next samples; those before the origin, or older than the newest, are left."""
+        """Add the next samples; those before the origin or older than the newest are ignored."""
         numbers = np.floor((traces.index - self.origin) / self.width).astype(np.int64)
         begin = int(np.searchsorted(numbers, max(self.newest, 0)))
         if begin == numbers.size:
@@ -56,7 +56,7 @@ class Envelope:
         low = np.fmin.reduceat(values, starts, axis=1)
         high = np.fmax.reduceat(values, starts, axis=1)
         self._clear(int(numbers[-1]))
-        if numbers[0] == self.newest:  # it has samples from before
+        if numbers[0] == self.newest:  # it already has samples
             slot = self.newest % self.keep
             low[:, 0] = np.fmin(low[:, 0], self._low[:, slot])
             high[:, 0] = np.fmax(high[:, 0], self._high[:, slot])
@@ -68,14 +68,14 @@ class Envelope:
         self.newest = int(numbers[-1])
 
     def _clear(self, newest: int) -> None:
-        """Empty the buckets that come after the newest, up to the one that will be it."""
+        """Clear the buckets after the newest, up to the given one."""
         numbers = np.arange(max(self.newest + 1, newest - self.keep + 1), newest + 1)
         slots = numbers % self.keep
         for values in (self._low, self._high, self._first):
             values[:, slots] = np.nan
 
     def window(self, begin: int, count: int) -> Buckets:
-        """Return the buckets from number ``begin`` on, empty ones where there is none."""
+        """Return the buckets from number ``begin`` on; missing ones are empty."""
         numbers: I64 = np.arange(begin, begin + count)
         there = (numbers >= 0) & (numbers <= self.newest) & (numbers > self.newest - self.keep)
         slots = numbers % self.keep

@@ -1,4 +1,4 @@
-"""How late the ticks of a run wake, as they come."""
+"""Count the wake-up lateness of the ticks of a run."""
 
 import numpy as np
 
@@ -11,20 +11,20 @@ _TICKS = 20_000
 
 
 class LatenessCounts:
-    """Histogram of the whole run, as far as it was seen, and percentiles of its newest ticks."""
+    """Histogram of all ticks read, and percentiles of the newest ticks."""
 
     def __init__(self) -> None:
         self.counts: I64 = np.zeros(EDGES_US.size - 1, dtype=np.int64)
         self._newest_us: F64 = np.empty(0)
 
     def add(self, batch: Batch) -> None:
-        """Take the next blocks."""
+        """Add the next blocks."""
         late_us = np.maximum(batch.heads[:, Head.LATE_NS] * 1e-3, 0.0)
         self.counts += np.histogram(np.minimum(late_us, EDGES_US[-1]), EDGES_US)[0]
         self._newest_us = np.concatenate((self._newest_us, late_us))[-_TICKS:]
 
     def percentiles_us(self) -> dict[str, float]:
-        """Return ``p50``, ``p99`` and ``max`` of the newest ticks; nothing before the first."""
+        """Return ``p50``, ``p99`` and ``max`` of the newest ticks; empty before the first."""
         if not self._newest_us.size:
             return {}
         p50, p99, most = np.percentile(self._newest_us, (50.0, 99.0, 100.0))

@@ -1,4 +1,4 @@
-"""The files of the page; nothing else is served, and nothing of a run stands in them."""
+"""Serve the files of the page and nothing else; they contain no data of a run."""
 
 from functools import cache
 from http import HTTPStatus
@@ -35,7 +35,7 @@ def _content(name: str) -> bytes:
 
 
 def file_response(path: str) -> Response:
-    """Return the file at a path; 404 where there is none."""
+    """Return the file at a path, or 404."""
     if path not in FILES:
         return plain_response(HTTPStatus.NOT_FOUND, "no such file")
     name, kind = FILES[path]
@@ -43,7 +43,7 @@ def file_response(path: str) -> Response:
 
 
 def plain_response(status: HTTPStatus, text: str) -> Response:
-    """Return a line of text."""
+    """Return a response with one line of text."""
     return _response(status, "text/plain; charset=utf-8", f"{text}\n".encode())
 
 

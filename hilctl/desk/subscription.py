@@ -1,4 +1,4 @@
-"""Frames of a live run for programs: its newest signals, figures, and events as they come."""
+"""Provide frames of a live run for programs: newest signals, metrics and events."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -16,11 +16,11 @@ class RunFrame:
     """A run at one time.
 
     Attributes:
-        status: Where it stands: figures, limits, lateness; see :meth:`RunFeed.status`.
-        events: Those since the frame before.
-        t_s: float64[n], beginning of each bucket of samples, up to 0 for the newest.
-        low: Lowest value in each bucket by signal, float64[n]; NaN where there is none.
-        high: Highest value, likewise: no spike is lost.
+        status: State, metrics, limits and lateness; see :meth:`RunFeed.status`.
+        events: Events since the previous frame.
+        t_s: float64[n], start of each bucket of samples; 0 is the end of the newest.
+        low: Minimum of each bucket by signal, float64[n]; NaN if there is no value.
+        high: Maximum of each bucket, likewise.
     """
 
     status: dict[str, Any]
@@ -37,14 +37,14 @@ def frames_of(
     clock: Callable[[], float],
     sleep: Callable[[float], None],
 ) -> Iterator[RunFrame]:
-    """Give frames of a run until it is over, the last of them after its end.
+    """Yield frames of a run until it has ended, the last one after its end.
 
     Args:
-        feed: The run.
-        every_s: Time from one frame to the next; one that is taken late does not hurry the next.
-        window_s: Time that each shows; the nearest that is kept.
+        feed: Reader of the run.
+        every_s: Interval between frames; a late frame does not shorten the next interval.
+        window_s: Time window of each frame; the nearest available one is used.
         clock: Monotonic time in s.
-        sleep: Lets that many s pass.
+        sleep: Sleeps for the given time in s.
     """
     window_s, seen = nearest_window_s(window_s), 0
     while True:
