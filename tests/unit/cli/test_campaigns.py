@@ -41,13 +41,13 @@ def file(tmp_path):
 
 
 def run_campaign(file, **more):
-    """Call the command as typer would, with its defaults."""
+    """Call the command with its defaults."""
     wanted = {"folder": file.parent / "runs", "settings": None, "fast": True}
     wanted |= {"scheduler": "none", "dry_run": False, "as_json": False, **more}
     campaign(file, **wanted)
 
 
-def test_people_read_each_step_and_where_the_table_is(file, capsys):
+def test_campaign_prints_steps_and_table(file, capsys):
     run_campaign(file)
     shown = capsys.readouterr().out
     assert "few: 4 steps; 2 s of rig time" in shown
@@ -58,7 +58,7 @@ def test_people_read_each_step_and_where_the_table_is(file, capsys):
     assert "4 done earlier" in capsys.readouterr().out
 
 
-def test_programs_read_one_object(file, capsys):
+def test_campaign_prints_one_json_object(file, capsys):
     run_campaign(file, as_json=True)
     printed = json.loads(capsys.readouterr().out)
     assert printed["results"] == {"completed": 4}
@@ -68,7 +68,7 @@ def test_programs_read_one_object(file, capsys):
     assert (plan["left"], plan["rig_time_s"], len(plan["steps"])) == (0, 0.0, 4)
 
 
-def test_a_dry_run_leaves_nothing(file, capsys):
+def test_dry_run_writes_nothing(file, capsys):
     run_campaign(file, dry_run=True)
     shown = capsys.readouterr().out
     assert "coil A rms" in shown
@@ -76,7 +76,7 @@ def test_a_dry_run_leaves_nothing(file, capsys):
     assert not (file.parent / "runs").exists()
 
 
-def test_a_fault_is_exit_code_3(file, capsys):
+def test_fault_has_exit_code_3(file, capsys):
     file.write_text(CAMPAIGN + "  device.fault: [{kind: sensor_nan, at_sample: 100}]\n")
     with pytest.raises(typer.Exit) as ended:
         run_campaign(file)
@@ -84,7 +84,7 @@ def test_a_fault_is_exit_code_3(file, capsys):
     assert "fault: step 1" in capsys.readouterr().err
 
 
-def test_a_stop_has_the_signal_s_exit_code(file, capsys, monkeypatch):
+def test_stop_has_the_exit_code_of_its_signal(file, capsys, monkeypatch):
     def stopped(plan, host):
         return session.SeriesResult(plan, {}, (), "step 1: Ctrl-C", 2)
 
@@ -103,12 +103,12 @@ def test_a_stop_has_the_signal_s_exit_code(file, capsys, monkeypatch):
     assert ended.value.exit_code == 130
 
 
-def test_a_scheduler_is_for_fast_runs(file):
+def test_scheduler_needs_fast(file):
     with pytest.raises(InputError, match="--scheduler"):
         run_campaign(file, fast=False, scheduler="processes")
 
 
-def test_a_sweep_is_a_campaign_in_a_line(file, capsys):
+def test_sweep_runs_a_campaign(file, capsys):
     sweep(
         file.with_name("rig.yaml"),
         ["waveform.amplitude=1,2", "waveform.frequency_hz=10:40:3log"],
@@ -124,7 +124,7 @@ def test_a_sweep_is_a_campaign_in_a_line(file, capsys):
     assert (file.parent / "runs" / "rig-sweep.csv").is_file()
 
 
-def test_values_of_a_sweep(tmp_path):
+def test_sweep_values(tmp_path):
     document = sweep_document(tmp_path / "rig.yaml", ["a.b=1:3:3", "c=none,{model: x.yaml}"], 2)
     vary = document.data["vary"]
     assert vary == {"a.b": "1:3:3", "c": ("none", {"model": "x.yaml"})}
@@ -136,7 +136,7 @@ def test_values_of_a_sweep(tmp_path):
         sweep_document(tmp_path / "rig.yaml", ["a=1", "a=2"], 1)
 
 
-def test_notes_go_to_standard_error(capsys):
+def test_notes_are_printed_to_standard_error(capsys):
     campaigns._note("died")
     assert capsys.readouterr().err == "hilctl: died\n"
 
@@ -148,7 +148,7 @@ def plan(tmp_path):
     return planned(load_campaign(path), tmp_path, {}, 0.0)
 
 
-def test_a_plan_says_each_step(tmp_path, capsys):
+def test_plan_lists_each_step(tmp_path, capsys):
     found = plan(tmp_path)
     print_plan(found, fast=False, every_step=True)
     shown = capsys.readouterr().out
@@ -161,7 +161,7 @@ def test_a_plan_says_each_step(tmp_path, capsys):
     }
 
 
-def test_a_row_says_what_came_out(capsys):
+def test_row_prints_metrics_or_fault(capsys):
     step = SeriesStep(7, {"waveform.amplitude": 2.5}, 1, False, ())
     figures = RunFigures(peak_to_peak_um=12.345, natural_hz=300.0)
     print_row(step, SeriesRow("completed", figures, "a.mcap", "completed", kept=True))
@@ -171,7 +171,7 @@ def test_a_row_says_what_came_out(capsys):
     assert second == "   7  waveform.amplitude=2.5  fault: late"
 
 
-def test_a_result_says_the_drift(tmp_path, capsys):
+def test_result_prints_the_drift(tmp_path, capsys):
     found = plan(tmp_path)
     figures = RunFigures(peak_to_peak_um=10.0)
     row = SeriesRow("completed", figures, "a.mcap", "completed")
@@ -200,7 +200,7 @@ CORRECTION = Correction(
 
 @pytest.fixture
 def taught(monkeypatch, tmp_path):
-    """Let learning end at once, as told; return a function that says how."""
+    """Return a function that sets the result of learning."""
     (tmp_path / "experiment.yaml").write_text("name: taught\n")
     monkeypatch.setattr("hilctl.cli.campaigns.finish_dead_runs", lambda: None)
 
@@ -219,13 +219,13 @@ def taught(monkeypatch, tmp_path):
 
 
 def command(tmp_path, **more):
-    """Call the command as typer would, with its defaults."""
+    """Call the command with its defaults."""
     wanted = {"cycles": 5, "folder": None, "settings": None, "fast": True, "overwrite": False}
     wanted |= {"as_json": False, **more}
     learn(tmp_path / "experiment.yaml", tmp_path / "correction.yaml", **wanted)
 
 
-def test_people_read_rows_and_where_the_correction_is(taught, tmp_path, capsys):
+def test_learn_prints_iterations_and_correction(taught, tmp_path, capsys):
     taught()
     command(tmp_path)
     shown = capsys.readouterr().out
@@ -236,7 +236,7 @@ def test_people_read_rows_and_where_the_correction_is(taught, tmp_path, capsys):
     assert (tmp_path / "correction.yaml").is_file()
 
 
-def test_learn_prints_one_object(taught, tmp_path, capsys):
+def test_learn_prints_one_json_object(taught, tmp_path, capsys):
     taught()
     command(tmp_path, as_json=True)
     printed = json.loads(capsys.readouterr().out)
@@ -246,8 +246,8 @@ def test_learn_prints_one_object(taught, tmp_path, capsys):
 
 
 @pytest.mark.parametrize(("how", "code"), [({"stop_signal": 2}, 130), ({"fault": True}, 3)])
-def test_the_exit_code_says_how_it_ended(taught, tmp_path, how, code):
-    """What was learned until then is written all the same."""
+def test_exit_code_of_learn(taught, tmp_path, how, code):
+    """The correction is written in every case."""
     taught(**how)
     with pytest.raises(typer.Exit) as ended:
         command(tmp_path)
@@ -255,8 +255,8 @@ def test_the_exit_code_says_how_it_ended(taught, tmp_path, how, code):
     assert (tmp_path / "correction.yaml").is_file()
 
 
-def test_nothing_is_run_over_what_exists(taught, tmp_path):
-    """Neither over a correction nor into a folder with runs."""
+def test_learn_refuses_existing_files(taught, tmp_path):
+    """An existing correction, or a folder with runs."""
     taught()
     (tmp_path / "correction-runs").mkdir()
     (tmp_path / "correction-runs" / "run-00.mcap").touch()

@@ -27,7 +27,7 @@ __all__ = ["experiment", "limits", "limits_with"]
 
 @pytest.fixture
 def ends(monkeypatch, limits):
-    """Let a campaign end as told; return what was asked of it."""
+    """Replace the characterisation; return its arguments and result."""
     monkeypatch.setattr("hilctl.api.campaigns.finish_dead_runs", lambda: None)
     measured = FOUND.measured.also(growing=(), reversal=None)
     asked = {"found": replace(FOUND, measured=measured, held_out=())}
@@ -54,13 +54,13 @@ def ends(monkeypatch, limits):
 
 
 def command(tmp_path, **more):
-    """Call the command as typer would, with its defaults."""
+    """Call the command with its defaults."""
     wanted = {"folder": None, "settings": None, "highest_hz": None, "fast": True}
     wanted |= {"dry_run": False, "overwrite": False, "as_json": False, **more}
     characterise(tmp_path / "rig.yaml", tmp_path / "model.yaml", **wanted)
 
 
-def test_people_read_what_it_does_and_what_came_of_it(ends, tmp_path, capsys):
+def test_plan_and_result_are_printed(ends, tmp_path, capsys):
     command(tmp_path)
     shown = capsys.readouterr().out
     assert "within -4 to 4 A, -50 to 50 µm; loops at 0.5 to 80 Hz" in shown
@@ -72,7 +72,7 @@ def test_people_read_what_it_does_and_what_came_of_it(ends, tmp_path, capsys):
     assert "discarded" not in ends
 
 
-def test_programs_read_one_object(ends, tmp_path, capsys):
+def test_one_json_object_is_printed(ends, tmp_path, capsys):
     command(tmp_path, as_json=True, fast=False, highest_hz=20.0)
     printed = json.loads(capsys.readouterr().out)
     assert printed["page"] == str(tmp_path / "model.html")
@@ -81,7 +81,7 @@ def test_programs_read_one_object(ends, tmp_path, capsys):
 
 
 @pytest.mark.parametrize("as_json", [False, True])
-def test_a_dry_run_says_what_it_would_do_and_does_nothing(ends, tmp_path, capsys, as_json):
+def test_dry_run_prints_the_plan_only(ends, tmp_path, capsys, as_json):
     command(tmp_path, dry_run=True, as_json=as_json)
     shown = capsys.readouterr().out
     assert "ran" not in ends
@@ -92,8 +92,8 @@ def test_a_dry_run_says_what_it_would_do_and_does_nothing(ends, tmp_path, capsys
         assert "noise" in shown
 
 
-def test_a_problem_of_the_rig_is_exit_code_3(ends, tmp_path, capsys):
-    """What was measured is on the page."""
+def test_problem_of_the_rig_has_exit_code_3(ends, tmp_path, capsys):
+    """The page has the measured values."""
     ends["found"] = replace(ends["found"], problem="no reaction: look", problem_code="no_reaction")
     with pytest.raises(typer.Exit) as ended:
         command(tmp_path)
@@ -102,7 +102,7 @@ def test_a_problem_of_the_rig_is_exit_code_3(ends, tmp_path, capsys):
     assert (tmp_path / "model.html").is_file()
 
 
-def test_what_is_no_model_is_exit_code_1(ends, tmp_path, capsys):
+def test_invalid_model_has_exit_code_1(ends, tmp_path, capsys):
     ends["is_model"] = False
     with pytest.raises(typer.Exit) as ended:
         command(tmp_path, as_json=True)
@@ -114,7 +114,7 @@ def test_what_is_no_model_is_exit_code_1(ends, tmp_path, capsys):
     ("error", "code"),
     [(StepStoppedError("rest: stopped", 15), 143), (KeyboardInterrupt(), 130)],
 )
-def test_a_stop_says_how_to_go_on(ends, tmp_path, capsys, error, code):
+def test_message_of_a_stop_says_how_to_resume(ends, tmp_path, capsys, error, code):
     ends["error"] = error
     with pytest.raises(typer.Exit) as ended:
         command(tmp_path)
@@ -122,13 +122,13 @@ def test_a_stop_says_how_to_go_on(ends, tmp_path, capsys, error, code):
     assert "the same command resumes" in capsys.readouterr().err
 
 
-def test_a_fault_says_how_to_go_on(ends, tmp_path):
+def test_message_of_a_fault_says_how_to_resume(ends, tmp_path):
     ends["error"] = RunError("slow-loops: the cable was pulled")
     with pytest.raises(RunError, match="the cable was pulled; the same command resumes"):
         command(tmp_path)
 
 
-def test_nothing_is_written_over_what_exists(ends, tmp_path):
+def test_existing_model_is_refused(ends, tmp_path):
     (tmp_path / "model.yaml").write_text("mine")
     with pytest.raises(InputError, match="overwrite"):
         command(tmp_path)
@@ -137,8 +137,8 @@ def test_nothing_is_written_over_what_exists(ends, tmp_path):
     assert ends["discarded"]
 
 
-def test_a_page_of_somebody_else_is_kept(ends, tmp_path):
-    """One of this campaign, whose recordings stand there, is written anew."""
+def test_existing_page_is_refused(ends, tmp_path):
+    """A page of this characterisation (with its recordings) is replaced."""
     (tmp_path / "model.html").write_text("mine")
     with pytest.raises(InputError, match="overwrite"):
         command(tmp_path)
@@ -147,25 +147,25 @@ def test_a_page_of_somebody_else_is_kept(ends, tmp_path):
     command(tmp_path)
 
 
-def test_a_model_can_not_have_the_name_of_its_page(ends, tmp_path):
+def test_model_must_not_have_the_name_of_its_page(ends, tmp_path):
     with pytest.raises(InputError, match="is the name of the page"):
         characterise(tmp_path / "rig.yaml", tmp_path / "model.html")
 
 
-def test_a_plan_says_heat_where_there_is_a_budget(limits_with, capsys):
+def test_plan_prints_cooling_with_a_thermal_limit(limits_with, capsys):
     budget = limits_with("limits.rms_current_a=1.0", "limits.thermal_time_constant_s=9.0")
     for kept_to, text in ((limits_with(), "no thermal limit"), (budget, "7 s for the coil")):
         print_plan(CampaignPlan(kept_to, FOUND.steps, 7.0, 5000.0), Path("runs"))
         assert text in capsys.readouterr().out
 
 
-def test_a_plan_for_programs(limits):
+def test_plan_mapping(limits):
     mapping = plan_mapping(CampaignPlan(limits, FOUND.steps, 7.0, 5000.0))
     assert mapping["band_hz"] == [0.5, 80.0]
     assert mapping["steps"] == [{"name": "rest", "purpose": "noise", "seconds": 2.0}]
 
 
-def test_a_step_that_stood_already_is_told_from_one_that_was_run(capsys):
+def test_earlier_and_new_steps_differ(capsys):
     for kept, text in ((True, "done"), (False, "2.0 s")):
         print_step(StepRow("rest", "noise", 2.0, 0.1, "[b]0.03 um[/b]", "x.mcap", kept))
         shown = capsys.readouterr().out
@@ -173,7 +173,7 @@ def test_a_step_that_stood_already_is_told_from_one_that_was_run(capsys):
         assert "[b]0.03 um[/b]" in shown
 
 
-def test_the_held_out_error_comes_first(capsys):
+def test_validation_error_is_printed_first(capsys):
     found = replace(FOUND, identification=identification())
     print_characterisation(found, Path("model.yaml"), Path("model.html"))
     shown = capsys.readouterr().out

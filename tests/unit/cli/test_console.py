@@ -18,16 +18,15 @@ class Terminal(io.StringIO):
 
 
 @pytest.mark.parametrize(("quiet", "stream"), [(True, Terminal()), (False, io.StringIO())])
-def test_nothing_is_shown_to_programs(monkeypatch, quiet, stream):
-    """Neither where output is JSON, nor where standard error is a file."""
+def test_no_progress_without_a_terminal(monkeypatch, quiet, stream):
+    """With JSON output, or if standard error is a file."""
     monkeypatch.setattr("sys.stderr", stream)
     with progress_bar("identify", quiet=quiet) as report:
         report(0.5, "half")
     assert stream.getvalue().strip() == ""
 
 
-def test_a_terminal_sees_what_is_done(monkeypatch):
-    """The text of the last report, on standard error."""
+def test_terminal_shows_progress(monkeypatch):
     stream = Terminal()
     monkeypatch.setattr("sys.stderr", stream)
     monkeypatch.setenv("TERM", "xterm")
@@ -40,7 +39,7 @@ def test_a_terminal_sees_what_is_done(monkeypatch):
 
 @pytest.fixture
 def printed(monkeypatch, capsys):
-    """Return a function that gives what a terminal with colours gets."""
+    """Return a function that returns the output for a terminal with colours."""
     monkeypatch.setenv("COLUMNS", "120")
     monkeypatch.setenv("FORCE_COLOR", "1")
     monkeypatch.setenv("TERM", "xterm")
@@ -53,16 +52,16 @@ def printed(monkeypatch, capsys):
     return of
 
 
-def test_nothing_is_taken_for_markup(printed):
-    """File names and labels may look like markup, or like the name of a picture."""
+def test_markup_is_not_interpreted(printed):
+    """File names and labels may look like markup or emoji names."""
     table = Table("[/x]", title="[red]a[/]")
     table.add_row(":smile: [/b]")
     text = printed(table)
     assert all(each in text for each in ("[/x]", "[red]a[/]", ":smile: [/b]"))
 
 
-def test_styles_are_sent_and_control_characters_shown(printed):
-    """Wherever the text stands: alone, styled, in a cell or in a title."""
+def test_styles_are_kept_and_control_characters_escaped(printed):
+    """Plain text, styled text, cells and titles."""
     hostile = "a\x1b[2Jb"
     table = Table(hostile, title=Text(hostile))
     table.add_row(Text(hostile, "green"))

@@ -15,7 +15,7 @@ def call(name, words):
 
 @pytest.fixture
 def answering(monkeypatch):
-    """A run that answers as told."""
+    """Replace the run that commands find."""
 
     class Card:
         name, recording = "sine-7", "a.mcap"
@@ -31,19 +31,19 @@ def stopped(*, ended, name="sine-7"):
     return {"name": name, "recording": "a.mcap", "ended": ended, "error": ""}
 
 
-def test_no_run_is_an_empty_list(capsys):
+def test_status_without_runs_is_an_empty_list(capsys):
     assert call("status", ["--json"]) == 0
     assert json.loads(capsys.readouterr().out) == {"runs": []}
 
 
-def test_a_run_that_does_not_end_in_time_is_a_failure(answering, capsys):
+def test_stop_timeout_has_exit_code_3(answering, capsys):
     answering.setattr("hilctl.cli.control.stop_runs", lambda runs, wait_s: [stopped(ended=False)])
     assert call("stop", ["--wait", "2"]) == 3
     assert "sine-7 is still active after 2 s" in capsys.readouterr().out
 
 
-def test_all_runs_are_stopped_and_each_is_told(answering, capsys):
-    """One that goes on is a failure; none at all is not."""
+def test_stop_all_reports_each_run(answering, capsys):
+    """A run that stays active is a failure; no run is not."""
     chosen = []
 
     def stop_runs(runs, wait_s):
@@ -61,7 +61,7 @@ def test_all_runs_are_stopped_and_each_is_told(answering, capsys):
         call("stop", ["--all", "--run", "a"])
 
 
-def test_set_says_what_was_taken(answering, capsys):
+def test_set_prints_the_new_values(answering, capsys):
     answer = {"gain": 0.5, "offset": -2.0, "over_s": 1.5, "inverse": None}
     asked = []
 
@@ -75,7 +75,7 @@ def test_set_says_what_was_taken(answering, capsys):
     assert asked == [{"gain": 0.5, "offset": -2.0, "over_s": 1.5}]
 
 
-def test_a_mark_is_one_text_however_many_words_it_has(answering, capsys):
+def test_mark_joins_its_words(answering, capsys):
     sent = []
 
     def mark_run(run, text):
@@ -112,7 +112,7 @@ RUNNING = {
 
 @pytest.fixture
 def shown(monkeypatch, capsys):
-    """Return a function that gives the lines that a terminal of 80 columns gets."""
+    """Return a function that returns the lines for a terminal of 80 columns."""
     monkeypatch.setenv("COLUMNS", "80")
 
     def of(*found: dict) -> list[str]:
@@ -122,8 +122,8 @@ def shown(monkeypatch, capsys):
     return of
 
 
-def test_a_run_is_a_block_of_lines(shown):
-    """Every figure stands on a line with its name; no line but the path's is cut or wrapped."""
+def test_status_of_one_run(shown):
+    """Each value is on a line with its name; no line is wrapped."""
     assert shown(RUNNING) == [
         "terfenol_sine_6a-12345  running",
         "  time       12.5 of 30.0 s",
@@ -135,8 +135,7 @@ def test_a_run_is_a_block_of_lines(shown):
     ]
 
 
-def test_runs_follow_one_another(shown):
-    """Each has a block of its own."""
+def test_status_of_several_runs(shown):
     lines = shown(RUNNING, {**RUNNING, "name": "other[1]"})
     assert [line for line in lines if not line.startswith(" ")] == [
         "terfenol_sine_6a-12345  running",
@@ -144,8 +143,8 @@ def test_runs_follow_one_another(shown):
     ]
 
 
-def test_trouble_is_told(shown):
-    """A recording that can't be written, and a run that does not answer, say so."""
+def test_status_prints_errors(shown):
+    """Of the recording, and of a run that does not answer."""
     assert shown({**RUNNING, "recording_error": "full"})[-1] == "  error      full"
     silent = {key: RUNNING[key] for key in ("name", "recording")}
     assert shown({**silent, "state": "not answering", "error": "timed out"}) == [
@@ -155,18 +154,17 @@ def test_trouble_is_told(shown):
     ]
 
 
-def test_no_run_is_told(shown):
-    """Silence could be taken for an error."""
+def test_status_without_runs(shown):
     assert shown() == ["no active run"]
 
 
 @pytest.mark.parametrize(("inverse", "said"), [(None, ""), ("out", ", inverse out")])
-def test_a_change_is_one_line(capsys, inverse, said):
+def test_change_is_one_line(capsys, inverse, said):
     print_change("sine-7", {"gain": 0.5, "offset": -2.0, "inverse": inverse, "over_s": 1.5})
     assert capsys.readouterr().out == f"sine-7: gain 0.5, offset -2{said}, over 1.5 s\n"
 
 
-def test_each_stopped_run_has_a_line(capsys):
+def test_stop_prints_one_line_per_run(capsys):
     print_stopped(
         [
             {"name": "a", "recording": "a.mcap", "ended": True, "error": ""},

@@ -32,7 +32,7 @@ DEMO = Path(__file__).parents[3] / "configs" / "demo.yaml"
 
 @pytest.fixture
 def devices():
-    """Return a function that runs `hilctl devices` with words; it must end well."""
+    """Return a function that runs `hilctl devices` and returns its output."""
 
     def run(*words):
         ended = CliRunner().invoke(devices_app, list(map(str, words)))
@@ -42,7 +42,7 @@ def devices():
     return run
 
 
-def test_devices_are_listed_for_people_and_programs(devices):
+def test_devices_are_listed(devices):
     listed = json.loads(devices("--json"))
     assert "simulated_terfenol" in listed["devices"]
     assert "labjack_t7" in listed["profiles"]
@@ -51,8 +51,7 @@ def test_devices_are_listed_for_people_and_programs(devices):
     assert "labjack_t7" in shown
 
 
-def test_a_device_is_probed_instead_of_listed(devices):
-    """The self-test's answer, and no list."""
+def test_probe_prints_the_answers_of_a_device(devices):
     probed = json.loads(devices("probe", DEMO, "--json"))
     assert probed["name"] == "simulated_terfenol"
     assert probed["max_rate_hz"] > 0.0
@@ -61,8 +60,7 @@ def test_a_device_is_probed_instead_of_listed(devices):
     assert "profiles" not in shown
 
 
-def test_a_device_that_says_what_can_not_be_is_a_fault(monkeypatch):
-    """The exit code of a fault, for people and for programs."""
+def test_implausible_answer_has_exit_code_3(monkeypatch):
     wrong = Probed("rig", "a device", 1.0, "", "", {}, 2.8e20, None, "A", ("too far",))
     monkeypatch.setattr("hilctl.run.probe.probe", lambda path, settings: wrong)
     for words in ([], ["--json"]):
@@ -76,8 +74,8 @@ def wide(monkeypatch):
     monkeypatch.setenv("COLUMNS", "150")
 
 
-def test_bars_grow_with_the_logarithm_of_the_count():
-    """One late tick among thousands still has a bar."""
+def test_bars_are_logarithmic():
+    """One late tick among thousands has a visible bar."""
     late_ns = np.array([1500] * 9_999 + [70_000], dtype=np.int64)
     console = Console(file=io.StringIO(), width=120)
     console.print(render_diagnosis(Diagnosis((), Latency(1000.0, late_ns, ()))))
@@ -86,7 +84,7 @@ def test_bars_grow_with_the_logarithm_of_the_count():
     assert min(bars) == round(40 * np.log(2.0) / np.log(10_000.0))
 
 
-def test_ports_are_listed_or_said_to_be_none(capsys):
+def test_serial_ports_are_listed(capsys):
     print_inventory(Inventory({"rig": "a:b"}, {"labjack_t7": "x"}, ()))
     assert "no serial port found" in capsys.readouterr().out
     print_inventory(Inventory({}, {}, (SerialPort("/dev/ttyUSB0", "an adapter"),)))
@@ -95,7 +93,7 @@ def test_ports_are_listed_or_said_to_be_none(capsys):
     assert "no serial port" not in shown
 
 
-def test_what_is_known_of_a_profile_is_printed_as_it_stands(capsys):
+def test_profile_is_printed_without_markup(capsys):
     channel = {"min": 0.0, "max": 5.0, "unit": "V"}
     profile = {"model": "[T7]", "outputs": {"DAC0": channel}, "notes": ("one\nnote", "another")}
     print_described(Described("t7", "t7.yaml", (), profile))
@@ -104,7 +102,7 @@ def test_what_is_known_of_a_profile_is_printed_as_it_stands(capsys):
         assert text in shown
 
 
-def test_options_that_must_be_given_are_said(capsys):
+def test_required_options_are_marked(capsys):
     options = (DeviceOption("host", None, "where it is"), DeviceOption("port", "502", "its port"))
     print_described(Described("dac", "a:B", options, {}))
     shown = capsys.readouterr().out
@@ -112,7 +110,7 @@ def test_options_that_must_be_given_are_said(capsys):
     assert "502" in shown
 
 
-def test_no_bar_where_output_is_for_programs(capsys):
+def test_no_progress_with_json(capsys):
     with measurement_progress(1.0, quiet=True) as report:
         report(0.5)
     assert capsys.readouterr().err == ""
@@ -124,8 +122,7 @@ PROBED = Probed(
 )  # fmt: skip
 
 
-def test_what_a_device_says_is_no_markup(capsys):
-    """Brackets of its own stay as they are; reading, output and faults are there."""
+def test_answers_of_a_device_are_printed_without_markup(capsys):
     print_probed(PROBED)
     shown = capsys.readouterr().out
     assert "rig answers: a [bold] device\n" in shown

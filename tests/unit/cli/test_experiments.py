@@ -17,7 +17,7 @@ from hilctl.run.result import RunResult
 GOLDEN = Path(__file__).parents[3] / "recordings" / "golden" / "terfenol_uncompensated.mcap"
 
 
-def test_a_list_of_them_for_people_and_for_programs(capsys):
+def test_examples_are_listed(capsys):
     examples()
     printed = capsys.readouterr().out
     assert "terfenol_sweep_6a" in printed
@@ -28,7 +28,7 @@ def test_a_list_of_them_for_people_and_for_programs(capsys):
     assert all(Path(example["path"]).is_file() for example in listed)
 
 
-def test_copies_are_named(tmp_path, capsys):
+def test_copied_files_are_printed(tmp_path, capsys):
     examples("demo", into=tmp_path)
     assert str(tmp_path / "models" / "terfenol_staged.yaml") in capsys.readouterr().out
     examples("demo", into=tmp_path, as_json=True)
@@ -39,7 +39,7 @@ def test_copies_are_named(tmp_path, capsys):
 
 @pytest.fixture
 def runs(tmp_path, monkeypatch):
-    """Let each run leave a copy of a golden recording, and end as told."""
+    """Replace runs by copies of a golden recording; return their arguments and result."""
     seen, ends = [], {"code": "completed", "stop_signal": 0}
 
     def start_run(experiment, settings, output, overwrite, on_progress):
@@ -57,7 +57,7 @@ def runs(tmp_path, monkeypatch):
     return seen, ends
 
 
-def test_the_demonstration_runs_the_same_sine_without_and_with(tmp_path, runs, capsys):
+def test_demo_runs_without_and_with_the_inverse(tmp_path, runs, capsys):
     demo(tmp_path / "d", as_json=True)
     seen, _ = runs
     assert [name for name, _ in seen] == ["terfenol_sine_6a_uncompensated.yaml", "demo.yaml"]
@@ -70,7 +70,7 @@ def test_the_demonstration_runs_the_same_sine_without_and_with(tmp_path, runs, c
 
 
 @pytest.mark.parametrize(("code", "stop_signal", "left"), [("fault", 0, 3), ("stopped", 2, 130)])
-def test_a_demonstration_that_did_not_end_well_says_so(tmp_path, runs, code, stop_signal, left):
+def test_exit_code_of_demo(tmp_path, runs, code, stop_signal, left):
     seen, ends = runs
     ends.update(code=code, stop_signal=stop_signal)
     with pytest.raises(typer.Exit) as error:
@@ -85,7 +85,7 @@ def here(tmp_path, monkeypatch):
     return tmp_path
 
 
-def test_without_a_terminal_it_says_what_is_to_be_set(here, capsys):
+def test_init_lists_required_values(here, capsys):
     init("labjack_t7", settings=["device.host=10.0.0.5", "device.amplifier.gain_a_per_v=2"])
     said = capsys.readouterr().out
     assert "set device.sensor.um_per_v" in said
@@ -94,33 +94,33 @@ def test_without_a_terminal_it_says_what_is_to_be_set(here, capsys):
     assert (here / "schema.json").stat().st_size > 0
 
 
-def test_for_programs(here, capsys):
+def test_init_prints_one_json_object(here, capsys):
     init("simulated_piezo", output=here / "p.yaml", as_json=True)
     found = json.loads(capsys.readouterr().out)
     assert found["experiment"] == str(here / "p.yaml")
     assert found["to_be_set"] == []
 
 
-def test_it_replaces_nothing(here):
+def test_init_refuses_existing_files(here):
     (here / "simulated_piezo.yaml").write_text("mine")
     with pytest.raises(InputError, match="exists already"):
         init("simulated_piezo")
     assert (here / "simulated_piezo.yaml").read_text() == "mine"
 
 
-def test_it_writes_nothing_that_may_not_start(here):
+def test_init_refuses_invalid_settings(here):
     with pytest.raises(InputError, match="must lie within"):
         init("simulated_terfenol", settings=["limits.peak_current_a=50"])
     assert not list(here.iterdir())
 
 
-def test_it_must_be_told_for_what(here):
+def test_init_needs_a_device(here):
     with pytest.raises(InputError, match=r"DEVICE.*labjack_t7"):
         init()
 
 
-def test_in_a_terminal_it_asks(here, monkeypatch, capsys):
-    """An empty answer keeps what would stand."""
+def test_init_asks_in_a_terminal(here, monkeypatch, capsys):
+    """An empty answer keeps the default."""
     answers = {
         "device, profile": "labjack_t7",
         "name or address": "10.0.0.7",

@@ -25,7 +25,6 @@ from tests.unit.identify.refine.conftest import OLD, actuator, history
 
 
 def test_every_setting_is_listed(capsys: pytest.CaptureFixture[str]) -> None:
-    """The list has each setting's name, where --help says that it is."""
     print_settings()
     shown = capsys.readouterr().out
     for name in (*IdentifySettings.model_fields.keys() - {"table"}, "table.rate_hz"):
@@ -33,7 +32,7 @@ def test_every_setting_is_listed(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def given(monkeypatch, tmp_path, truth):
-    """Have the command find runs of an actuator, and return model file and output."""
+    """Replace the runs to load; return model file, paths and output."""
     runs = [history(truth, i, noise_um=0.05) for i in range(4)]
     monkeypatch.setattr("hilctl.identify.refine.command.load_runs", lambda paths, model: runs)
     (tmp_path / "old.yaml").write_text(dump_model(OLD))
@@ -42,7 +41,7 @@ def given(monkeypatch, tmp_path, truth):
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
-def test_what_is_better_is_written(monkeypatch, tmp_path, capsys):
+def test_better_model_is_written(monkeypatch, tmp_path, capsys):
     model, runs, output = given(monkeypatch, tmp_path, actuator())
     refine(model, runs, output, html=tmp_path / "page.html", as_json=True)
     printed = json.loads(capsys.readouterr().out)
@@ -54,7 +53,7 @@ def test_what_is_better_is_written(monkeypatch, tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_what_is_no_better_ends_with_one_and_no_file(monkeypatch, tmp_path, capsys):
+def test_no_better_model_has_exit_code_1(monkeypatch, tmp_path, capsys):
     model, runs, output = given(monkeypatch, tmp_path, OLD)
     with pytest.raises(typer.Exit) as ended:
         refine(model, runs, output)
@@ -75,18 +74,17 @@ OMEGA = ROOT / "configs" / "models" / "terfenol_omega.yaml"
 
 
 def ignore(done, text):
-    """Take a progress report."""
+    """Ignore progress."""
 
 
 @pytest.fixture(scope="module")
 def comparison():
-    """Two models of the catalogue and one of a file, tried at 100 Hz."""
+    """Two models of the catalogue and one of a file, tested at 100 Hz."""
     request = ComparisonRequest([GOLDEN], ["duhem", "straight", str(OMEGA)], frequencies_hz=[100.0])
     return compare(request, SteppingClock(1e-3), ignore)
 
 
-def test_the_table_has_a_column_a_trial(comparison):
-    """Each row has as many texts as there are columns."""
+def test_table_has_a_column_per_trial(comparison):
     rows = list(table_rows(comparison))
     assert headings(comparison)[-1] == "100 Hz"
     assert {len(row) for row in rows} == {len(headings(comparison))}
@@ -96,7 +94,6 @@ def test_the_table_has_a_column_a_trial(comparison):
 
 
 def test_frequencies_are_numbers():
-    """The command line's list of frequencies."""
     assert _numbers(None) is None
     assert _numbers("1, 2.5,1e2") == [1.0, 2.5, 100.0]
     with pytest.raises(InputError, match="--frequencies"):
@@ -104,5 +101,5 @@ def test_frequencies_are_numbers():
 
 
 @pytest.mark.parametrize(("text", "column"), [("3", 3), ("drive", "drive"), (None, None)])
-def test_a_column_is_a_number_or_a_name(text, column):
+def test_column_is_a_number_or_a_name(text, column):
     assert _column(text) == column

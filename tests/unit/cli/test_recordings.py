@@ -26,7 +26,7 @@ def own_cache(tmp_path, monkeypatch):
 
 @pytest.fixture
 def folder(tmp_path):
-    """Three runs, one that hides behind escapes, and a file that is none."""
+    """Three runs, one with control characters, and an invalid file."""
     made = tmp_path / "recordings"
     shutil.copytree(GOLDEN, made)
     (made / "a\x1b[2J.mcap").write_text("hello")
@@ -42,7 +42,7 @@ def folder(tmp_path):
     return made
 
 
-def test_the_table_has_a_line_a_run_and_nothing_that_steers_a_terminal(folder, capsys):
+def test_table_has_a_line_per_run_without_control_characters(folder, capsys):
     list_recordings([str(folder)])
     out, err = capsys.readouterr()
     lines = out.splitlines()
@@ -61,7 +61,7 @@ def test_the_table_has_a_line_a_run_and_nothing_that_steers_a_terminal(folder, c
     assert all(each.isprintable() for each in (*lines, *err.splitlines()))
 
 
-def test_columns_stand_below_one_another(folder, capsys):
+def test_columns_are_aligned(folder, capsys):
     list_recordings([str(folder)])
     lines = capsys.readouterr().out.splitlines()[:-1]
     for heading in ("name", "result", "labels", "recording"):
@@ -69,7 +69,7 @@ def test_columns_stand_below_one_another(folder, capsys):
         assert all(line[column] == " " and line[column + 1] != " " for line in lines)
 
 
-def test_programs_get_all_that_is_known(folder, capsys):
+def test_json_has_all_keys(folder, capsys):
     list_recordings([str(folder), "--json", "--where", "label.sample == 'A7'"])
     found = json.loads(capsys.readouterr().out)
     assert (found["folder"], found["of"]) == (str(folder), 5)
@@ -80,7 +80,7 @@ def test_programs_get_all_that_is_known(folder, capsys):
     assert json.loads(capsys.readouterr().out)["recordings"] == []
 
 
-def test_rows_are_chosen_and_sorted(folder, capsys):
+def test_rows_are_selected_and_sorted(folder, capsys):
     words = ["--where", "frequency_hz BETWEEN 1 AND 1e6", "--sort", "size_bytes", "--reverse"]
     list_recordings([str(folder), *words])
     lines = capsys.readouterr().out.splitlines()
@@ -91,13 +91,13 @@ def test_rows_are_chosen_and_sorted(folder, capsys):
         list_recordings([str(folder), "--sort", "siez"])
 
 
-def test_keys_are_printed_one_a_line(folder, capsys):
+def test_keys_are_printed_one_per_line(folder, capsys):
     list_recordings([str(folder), "--keys"])
     keys = capsys.readouterr().out.splitlines()
     assert {"frequency_hz", "label.sample", "device.load_kg", "peak_hysteresis_percent"} <= {*keys}
 
 
-def test_without_a_folder_it_is_the_one_that_runs_go_to(tmp_path, monkeypatch, capsys):
+def test_default_folder_is_recordings(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(InputError, match="recordings: can't be listed"):
         list_recordings([])
@@ -106,7 +106,7 @@ def test_without_a_folder_it_is_the_one_that_runs_go_to(tmp_path, monkeypatch, c
     assert capsys.readouterr().out == "0 of 0 recordings\n"
 
 
-def test_a_damaged_run_is_dismissed_by_its_name(capsys):
+def test_damaged_run_is_dismissed_by_name(capsys):
     folder = base_folder() / "sine-7"
     folder.mkdir()
     (folder / "run.json").write_text('{"started": "x"}')
@@ -116,6 +116,6 @@ def test_a_damaged_run_is_dismissed_by_its_name(capsys):
 
 
 @pytest.mark.parametrize("given", [{}, {"recording": "a", "dismissed": "b"}])
-def test_one_of_a_recording_and_a_name_is_given(given):
+def test_recover_needs_either_run_or_name(given):
     with pytest.raises(InputError, match="--dismiss NAME alone"):
         recover(**given)

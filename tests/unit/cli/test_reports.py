@@ -43,7 +43,6 @@ def printed(capsys):
 
 
 def test_report_replay_recover_and_export_agree_on_the_samples(recording, tmp_path, capsys):
-    """One object each, on standard output, of one recording."""
     report([recording], as_json=True)
     samples = printed(capsys)["recorded_samples"]
     replay(recording, as_json=True)
@@ -55,8 +54,7 @@ def test_report_replay_recover_and_export_agree_on_the_samples(recording, tmp_pa
     assert len((tmp_path / "run.csv").read_text().splitlines()) == samples + 1
 
 
-def test_a_replay_that_differs_ends_with_one(recording, monkeypatch):
-    """A script notices without reading."""
+def test_different_replay_has_exit_code_1(recording, monkeypatch):
     found = replaying.replay
 
     def different(recording, model):
@@ -69,7 +67,7 @@ def test_a_replay_that_differs_ends_with_one(recording, monkeypatch):
 
 
 def test_all_recordings_of_a_folder_are_exported(tmp_path, monkeypatch, capsys):
-    """What is left out is said, and ends with one."""
+    """Exit code 1 if a file is not exported."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     folder = Path(shutil.copytree(UNCOMPENSATED.parent, tmp_path / "recordings"))
     export(folder, tmp_path / "out", every=True)
@@ -84,8 +82,7 @@ def test_all_recordings_of_a_folder_are_exported(tmp_path, monkeypatch, capsys):
         export(folder, tmp_path / "out", every=True, overwrite=True)
 
 
-def test_words_become_what_a_command_takes(recording, tmp_path, capsys):
-    """Options may stand between and before what a command is about."""
+def test_options_and_arguments_in_any_order(recording, tmp_path, capsys):
     stretch = ["--from", "0.1", "--to=0.2"]
     assert read_recording("report", ["--json", str(recording), *stretch]) == 0
     samples = printed(capsys)["recorded_samples"]
@@ -105,7 +102,7 @@ def test_words_become_what_a_command_takes(recording, tmp_path, capsys):
         (["run.mcap", "run.mcap", "--from", "1"], "--from, --to"),
     ],
 )
-def test_options_that_do_not_go_together(words, text):
+def test_incompatible_options_are_refused(words, text):
     with pytest.raises(InputError, match=text):
         read_recording("report", words)
 
@@ -116,7 +113,7 @@ GOLDEN = Path(__file__).parents[3] / "recordings" / "golden"
 RUN = GOLDEN / "terfenol_uncompensated.mcap"
 
 
-def test_several_runs_make_one_object_or_a_table(capsys):
+def test_several_runs_are_one_object_or_a_table(capsys):
     report([RUN, RUN], as_json=True)
     found = json.loads(capsys.readouterr().out)
     assert found["headline"].startswith("2 runs, all completed.")
@@ -127,7 +124,7 @@ def test_several_runs_make_one_object_or_a_table(capsys):
     assert "2: terfenol_uncompensated.mcap" in shown
 
 
-def test_a_folder_makes_one_page(tmp_path, monkeypatch, capsys):
+def test_folder_is_one_page(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(html, "drawn", lambda sheet: None)
     monkeypatch.setattr(html, "svg", lambda figure: "<svg></svg>")
     page = tmp_path / "page.html"
@@ -138,7 +135,7 @@ def test_a_folder_makes_one_page(tmp_path, monkeypatch, capsys):
         report([GOLDEN], html=page)
 
 
-def test_options_of_one_recording_are_refused_for_many():
+def test_options_of_one_recording_are_refused_for_several():
     with pytest.raises(InputError, match="--before"):
         report([RUN, RUN], from_s=1.0)
     with pytest.raises(InputError, match="--model"):
@@ -147,7 +144,7 @@ def test_options_of_one_recording_are_refused_for_many():
         report([RUN], before=RUN)
 
 
-def test_figures_go_to_a_folder(tmp_path, capsys):
+def test_figures_are_written_to_a_folder(tmp_path, capsys):
     folder = tmp_path / "runs"
     folder.mkdir()
     for name in ("terfenol_uncompensated", "terfenol_compensated"):
@@ -160,7 +157,7 @@ def test_figures_go_to_a_folder(tmp_path, capsys):
         figures([folder], formats="gif")
 
 
-def test_what_could_not_be_read_is_said_and_nothing_steers_the_terminal(capsys):
+def test_unreadable_runs_are_listed_without_control_characters(capsys):
     runs = (grown(3.0, 10.0), grown(3.0, 100.0, 2))
     missing = ("lost.mcap: \x1b[2J[bold]no such file",)
     print_rich(render_series(RunSeries("[red]two", runs, ("waveform.frequency_hz",), missing)))
@@ -203,8 +200,7 @@ def terminal(report: RunReport) -> str:
     return console.export_text()
 
 
-def test_floor_stands_beside_the_hysteresis(lagging) -> None:
-    """The figure that noise can fake is never shown without its floor."""
+def test_noise_floor_is_printed_with_the_hysteresis(lagging) -> None:
     recording = lagging()
     recording.samples.displacement_um[:] += np.random.default_rng(2).normal(0.0, 0.03, 5000)
     report = summarize(recording)
@@ -213,15 +209,13 @@ def test_floor_stands_beside_the_hysteresis(lagging) -> None:
     assert f"noise floor {report.noise_floor_percent:.4g} %" in line
 
 
-def test_simulation_is_told(lagging) -> None:
-    """A simulated device is called so, a real one is not."""
+def test_simulated_device_is_marked(lagging) -> None:
     simulated = lagging(run={"name": "x", "device": "my_rig", "simulated": "true"})
     assert "no hardware was driven" in terminal(summarize(simulated))
     assert "no hardware was driven" not in terminal(summarize(lagging()))
 
 
 def test_names_are_not_markup(lagging) -> None:
-    """Square brackets in names and labels are shown as they are."""
     parts = [segment(0, 2000, 1000.0, "[red]a[/red]"), segment(2000, 3000, 1000.0, "[b]")]
     run = {"name": "[bold]name", "device": "[dac]"}
     text = terminal(summarize(lagging(run=run, segments=parts)))
@@ -230,7 +224,7 @@ def test_names_are_not_markup(lagging) -> None:
 
 
 def test_uncompensated_run_shows_no_errors(make_recording) -> None:
-    """Rows that can't have a value in such a run are left out."""
+    """Rows without a value are omitted."""
     recording = make_recording(wave(1000.0, 3), segments=[segment(0, 3000, 1000.0)])
     text = terminal(summarize(recording))
     assert "error" not in text
@@ -238,7 +232,7 @@ def test_uncompensated_run_shows_no_errors(make_recording) -> None:
 
 
 def test_segments_have_a_table_without_empty_columns(make_recording) -> None:
-    """Several segments are listed; columns that no segment fills are left out."""
+    """Columns without a value are omitted."""
     parts = [segment(0, 3000, 1000.0, "first"), segment(3000, 3000, 1000.0, "second")]
     recording = make_recording(wave(1000.0, 6, LAG), command=wave(1000.0, 6), segments=parts)
     text = terminal(summarize(recording))
@@ -247,14 +241,13 @@ def test_segments_have_a_table_without_empty_columns(make_recording) -> None:
     assert "err. %" not in text
 
 
-def test_incomplete_run_is_told(lagging) -> None:
-    """A run cut short can't be taken for a whole one."""
+def test_incomplete_run_is_marked(lagging) -> None:
     assert "NOT complete" in terminal(summarize(replace(lagging(), end={})))
 
 
 @pytest.mark.parametrize(("minutes", "shown"), [(20, range(20)), (21, range(1, 21))])
-def test_of_many_minutes_the_worst_are_shown(lagging, minutes, shown) -> None:
-    """In their order, with whole numbers of ticks."""
+def test_worst_minutes_are_shown(lagging, minutes, shown) -> None:
+    """In chronological order."""
     late = {"p50": 80.0, "p90": 90.0, "p99": 95.0, "p99.9": 99.0}
     rows = [{"minute": k, "ticks": 60_000, **late, "max": 100.0 + k} for k in range(minutes)]
     text = terminal(replace(summarize(lagging()), lateness_by_minute=rows))
@@ -279,7 +272,7 @@ OTHER = replace(
 
 @pytest.fixture
 def shown(monkeypatch, capsys):
-    """Return a function that gives what a terminal of 120 columns gets."""
+    """Return a function that returns the output for a terminal of 120 columns."""
     monkeypatch.setenv("COLUMNS", "120")
 
     def of(result, **more):
@@ -289,22 +282,21 @@ def shown(monkeypatch, capsys):
     return of
 
 
-def test_the_same_bits_are_one_line(shown):
+def test_identical_replay_is_one_line(shown):
     assert shown(SAME) == "identical: 900 commands, bit for bit\n"
 
 
-def test_other_bits_are_counted_and_placed(shown):
+def test_different_commands_are_counted(shown):
     text = shown(OTHER)
     assert "different: 3 of 900 commands, the first at sample 12" in text
     assert "largest difference 0.5 A" in text
 
 
-def test_another_model_is_never_called_identical(shown, tmp_path):
-    """What it would have done is said with its range, and not judged."""
+def test_replay_with_another_model_is_not_called_identical(shown, tmp_path):
     text = shown(SAME, other="m.yaml")
     assert "identical" not in text
     assert "with m.yaml the command ranges from -1.5 to 2.25 A, 7 samples limited" in text
 
 
-def test_samples_behind_lost_ones_are_told(shown):
+def test_samples_after_a_gap_are_counted(shown):
     assert shown(replace(SAME, left_out_samples=50)).startswith("50 samples after a gap")

@@ -21,7 +21,7 @@ DEMO = Path(__file__).parents[3] / "configs" / "demo.yaml"
 
 @pytest.fixture
 def ended(monkeypatch):
-    """Let a run end at once, as told; collect what it was started with."""
+    """Return a function that sets the result of a run and returns the arguments of its start."""
     started = []
 
     def so(code, stop_signal=0):
@@ -39,7 +39,7 @@ def ended(monkeypatch):
 @pytest.mark.parametrize(
     ("code", "stop_signal", "exit_code"), [("fault", 0, 3), ("stopped", signal.SIGTERM, 143)]
 )
-def test_a_run_that_did_not_complete_says_so_by_its_exit_code(ended, code, stop_signal, exit_code):
+def test_exit_code_of_an_incomplete_run(ended, code, stop_signal, exit_code):
     before = signal.getsignal(signal.SIGTERM)
     ended(code, stop_signal)
     try:
@@ -50,15 +50,14 @@ def test_a_run_that_did_not_complete_says_so_by_its_exit_code(ended, code, stop_
     assert left.value.exit_code == exit_code
 
 
-def test_require_rt_is_one_more_setting(ended, capsys):
-    """Behind those that were given, which it goes before."""
+def test_require_rt_is_the_last_setting(ended, capsys):
     started = ended("completed")
     run(DEMO, settings=["block=25"], require_rt=True, as_json=True)
     assert started == [(DEMO, ["block=25", "realtime.require=true"], None, False)]
     assert json.loads(capsys.readouterr().out)["code"] == "completed"
 
 
-def test_check_moves_nothing_and_says_what_would(capsys):
+def test_check_prints_the_forecast(capsys):
     check(DEMO, ["waveform.duration_s=1.0"], as_json=True)
     printed = json.loads(capsys.readouterr().out)
     assert printed["experiment"] == str(DEMO)
@@ -66,8 +65,7 @@ def test_check_moves_nothing_and_says_what_would(capsys):
 
 
 @pytest.mark.parametrize("as_json", [True, False])
-def test_an_output_that_is_not_known_to_be_safe_is_an_error(monkeypatch, capsys, as_json):
-    """Exit code 3, as after a run."""
+def test_unconfirmed_safe_value_has_exit_code_3(monkeypatch, capsys, as_json):
     put = SafeResult("a device", 0.0, "A", "unknown", "no answer")
     monkeypatch.setattr("hilctl.run.by_hand.put_safe", lambda path, settings: put)
     with pytest.raises(typer.Exit) as left:
@@ -78,15 +76,15 @@ def test_an_output_that_is_not_known_to_be_safe_is_an_error(monkeypatch, capsys,
     assert not as_json or json.loads(out)["output_safe"] is False
 
 
-def test_a_confirmed_safe_value_is_said(monkeypatch, capsys):
+def test_confirmed_safe_value_is_printed(monkeypatch, capsys):
     put = SafeResult("a device", 0.25, "A", "confirmed", "")
     monkeypatch.setattr("hilctl.run.by_hand.put_safe", lambda path, settings: put)
     safe(DEMO)
     assert "0.25 A" in capsys.readouterr().out
 
 
-def test_an_address_with_its_token_goes_into_no_log():
-    """That of a run in the background may be read by others."""
+def test_detach_excludes_live():
+    """The log of a background run must not contain the token of the page."""
     with pytest.raises(InputError, match="hilctl live"):
         run(DEMO, detach=True, live=True)
 
@@ -94,7 +92,7 @@ def test_an_address_with_its_token_goes_into_no_log():
 ENDED = RunResult(Path("a.mcap"), "stopped", "stopped by hilctl stop", "confirmed", 15, 0, 3, 2)
 
 
-def test_a_program_reads_how_the_run_ended():
+def test_run_mapping():
     assert run_mapping(ENDED, None) == {
         "recorded_samples": 0,
         "dropped": 3,
@@ -109,7 +107,7 @@ def test_a_program_reads_how_the_run_ended():
     }
 
 
-def test_the_address_of_a_page_is_printed_once_there_is_something_to_look_at(capsys):
+def test_address_of_the_page_is_printed_with_the_first_samples(capsys):
     with LiveView(quiet=True, addresses=["http://127.0.0.1:5/#x"]) as view:
         assert capsys.readouterr().err == ""
         view.update(None)
@@ -117,13 +115,12 @@ def test_the_address_of_a_page_is_printed_once_there_is_something_to_look_at(cap
         assert capsys.readouterr().err == "live page: http://127.0.0.1:5/#x\n"
 
 
-def test_no_report_is_made_of_no_sample():
-    """The file is not even opened."""
+def test_run_without_samples_has_no_report():
     assert report_of(ENDED, every=False) is None
 
 
 @pytest.mark.parametrize("safe", [True, False])
-def test_an_output_that_may_not_be_safe_is_said(capsys, safe):
+def test_unsafe_output_is_printed(capsys, safe):
     result = RunResult(
         Path("a.mcap"), "fault", "lost", "confirmed" if safe else "unknown", 0, 0, 0, 0
     )
@@ -134,7 +131,7 @@ def test_an_output_that_may_not_be_safe_is_said(capsys, safe):
     assert ("Not safe" in shown) is not safe
 
 
-def test_what_was_adapted_is_said_of_a_run_without_a_report(capsys):
+def test_adaptation_is_printed_without_a_report(capsys):
     adapted = {"offset_um": 1.25, "gain": 1.02, "weight_1": -0.005}
     print_run(
         RunResult(Path("a.mcap"), "completed", "", "confirmed", 0, 9, 0, 0, adapted=adapted), None
@@ -143,7 +140,7 @@ def test_what_was_adapted_is_said_of_a_run_without_a_report(capsys):
 
 
 @pytest.mark.parametrize("ignores", ["", "signal.signal(15, signal.SIG_IGN);"])
-def test_the_view_s_subprocess_ends_with_the_run(monkeypatch, ignores):
+def test_subprocess_of_the_view_ends_with_the_run(monkeypatch, ignores):
     monkeypatch.setattr(module, "_VIEW_END_S", 0.2)
     started = []
 

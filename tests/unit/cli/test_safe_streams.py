@@ -23,7 +23,7 @@ def wrapped(target, encoding="utf-8"):
     return io.TextIOWrapper(target, encoding=encoding)
 
 
-def test_plain_and_styled_text_come_out_in_order():
+def test_escaped_and_styled_text_stay_in_order():
     target = io.BytesIO()
     below = wrapped(target)
     stream = SafeStream(below)
@@ -34,7 +34,7 @@ def test_plain_and_styled_text_come_out_in_order():
     assert target.getvalue() == b"one\\x1b\n\x1b[1mtwo\x1b[0m\nthree\n"
 
 
-def test_letters_that_the_locale_lacks_are_written_out():
+def test_characters_outside_the_encoding_are_escaped():
     target = io.BytesIO()
     below = wrapped(target, "ascii")
     print("40 µm", file=(stream := SafeStream(below)))
@@ -42,8 +42,8 @@ def test_letters_that_the_locale_lacks_are_written_out():
     assert target.getvalue() == b"40 \\xb5m\n"
 
 
-def test_nobody_reads_and_nothing_fails():
-    """A run must not end by it; what went wrong is kept, and later output goes nowhere."""
+def test_closed_pipe_is_no_error():
+    """The first error is kept, and later output is discarded."""
     reading, writing = os.pipe()
     os.close(reading)
     with os.fdopen(writing, "w") as below:
@@ -70,19 +70,19 @@ PRINTING = (
 
 
 def test_lost_output_is_an_error():
-    """A full disk below a redirection is said; the exit code is not 0."""
+    """For example a full disk."""
     ended = in_a_process(PRINTING, "> /dev/full")
     assert ended.returncode == 3
     assert ended.stderr == "hilctl: standard output: No space left on device\n"
 
 
-def test_exit_code_stays_where_output_is_lost():
+def test_exit_code_is_kept_if_output_is_lost():
     ended = in_a_process(f"{PRINTING}\n    raise SystemExit(2)", "> /dev/full")
     assert ended.returncode == 2
 
 
 @pytest.mark.parametrize("code", [0, 130])
-def test_what_a_command_has_done_counts_and_not_whether_it_could_be_said(code):
+def test_lost_output_does_not_change_the_exit_code_of_acting_commands(code):
     acting = PRINTING.replace("safe_streams():", "safe_streams(acts=True):")
     ended = in_a_process(f"{acting}\n    raise SystemExit({code})", "> /dev/full")
     assert ended.returncode == code
@@ -93,15 +93,15 @@ def test_acting_commands_are_commands():
     assert set(ACTING) <= set(COMMANDS)
 
 
-def test_a_reader_who_leaves_is_no_error():
+def test_reader_that_closes_early_is_no_error():
     code = f"import time\n{PRINTING}; time.sleep(0.0)\n    print('x' * 10**6)"
     ended = in_a_process(code, "| head -c 2")
     assert ended.stderr == ""
 
 
 @pytest.mark.parametrize("closed", ["0<&-", "1>&-", "2>&-", "0<&- 1>&- 2>&-"])
-def test_a_closed_descriptor_is_not_given_to_a_file(closed):
-    """Else a recording would be what others take for their standard output."""
+def test_closed_descriptor_is_not_reused_by_a_file(closed):
+    """Otherwise a recording could become the standard output of other processes."""
     code = """
 import os, sys
 from hilctl.cli.safe_streams import safe_streams
@@ -113,7 +113,7 @@ raise SystemExit(0 if opened > 2 else 1)
     assert in_a_process(code, closed).returncode == 0
 
 
-def test_streams_are_as_before_afterwards(capsys):
+def test_streams_are_restored(capsys):
     before = sys.stdout, sys.stderr
     with safe_streams():
         print(HOSTILE)

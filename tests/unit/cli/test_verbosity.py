@@ -31,7 +31,7 @@ def as_before():
         ("--quiet run", "--quiet run", False, False),
     ],
 )
-def test_they_may_stand_anywhere(words, left, quiet, verbose):
+def test_options_are_accepted_anywhere(words, left, quiet, verbose):
     given = words.split()
     take_verbosity(given)
     assert given == left.split()
@@ -54,7 +54,7 @@ def talks():
     logging.getLogger("hilctl.x").info("detail")
 
 
-def test_quiet_leaves_warnings(monkeypatch, capsys):
+def test_quiet_prints_warnings_only(monkeypatch, capsys):
     assert run(monkeypatch, capsys, talks) == (0, "a table\n", "hilctl: mind\n")
     assert run(monkeypatch, capsys, talks, "--quiet") == (0, "", "hilctl: mind\n")
     assert run(monkeypatch, capsys, talks, "--quiet", "--json")[1] == "a table\n"
@@ -72,7 +72,7 @@ def refuses():
     raise InputError("no")
 
 
-def test_verbose_says_where_it_was_refused(monkeypatch, capsys):
+def test_verbose_prints_the_traceback(monkeypatch, capsys):
     assert run(monkeypatch, capsys, refuses, "--quiet") == (2, "", "hilctl: no\n")
     code, out, err = run(monkeypatch, capsys, refuses, "--verbose")
     assert (code, out) == (2, "")
