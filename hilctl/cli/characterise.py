@@ -59,7 +59,7 @@ def characterise(
             print_json(plan_mapping(plan))
 
     with progress_bar("characterise", quiet=as_json) as on_progress:
-        found = _characterise(
+        result = _characterise(
             experiment,
             output,
             folder=chosen,
@@ -72,13 +72,13 @@ def characterise(
             on_plan=on_plan,
             on_step=(lambda row: None) if as_json else print_step,
         )
-    if found is not None:
-        _finish(found, output, output.with_suffix(".html"), chosen, as_json=as_json)
+    if result is not None:
+        _finish(result, output, output.with_suffix(".html"), chosen, as_json=as_json)
 
 
-def _characterise(experiment: Path, output: Path, **asked: Any) -> Characterisation | None:
+def _characterise(experiment: Path, output: Path, **options: Any) -> Characterisation | None:
     try:
-        return api.characterise(experiment, output, **asked)
+        return api.characterise(experiment, output, **options)
     except (StepStoppedError, KeyboardInterrupt) as error:
         number = getattr(error, "signal", signal.SIGINT)
         print(f"hilctl: stopped: {error or 'Ctrl-C'}; {_RESUMES}", file=sys.stderr)
@@ -88,22 +88,22 @@ def _characterise(experiment: Path, output: Path, **asked: Any) -> Characterisat
 
 
 def _finish(
-    found: Characterisation, output: Path, page: Path, folder: Path, *, as_json: bool
+    result: Characterisation, output: Path, page: Path, folder: Path, *, as_json: bool
 ) -> None:
-    model = output if found.is_model else None
+    model = output if result.is_model else None
     if as_json:
         places = {"output": str(model) if model else None, "page": str(page)}
-        print_json({**found.to_mapping(), **places, "folder": str(folder)})
+        print_json({**result.to_mapping(), **places, "folder": str(folder)})
     else:
-        print_characterisation(found, model, page)
-    if found.problem:
-        print(f"hilctl: {found.problem}", file=sys.stderr)
+        print_characterisation(result, model, page)
+    if result.problem:
+        print(f"hilctl: {result.problem}", file=sys.stderr)
         print(
             "hilctl: fix this, then use --overwrite to measure again (see the page for results)",
             file=sys.stderr,
         )
         raise typer.Exit(3)
-    if not found.is_model:
+    if not result.is_model:
         raise typer.Exit(1)
 
 
@@ -153,16 +153,16 @@ def print_step(row: StepRow) -> None:
     print(f"{row.name:16s} {how:>7s}  {row.text}", flush=True)
 
 
-def print_characterisation(found: Characterisation, model: Path | None, page: Path) -> None:
+def print_characterisation(result: Characterisation, model: Path | None, page: Path) -> None:
     """Print the validation error, the measured values and the files."""
     terminal = console()
-    if found.held_out:
+    if result.held_out:
         title = Text("validation errors (references that were not fitted)")
-        terminal.print(_table(title, HELD_OUT_HEADINGS, held_out_rows(found)))
-        terminal.print(f"verdict: {found.verdict}", soft_wrap=True)
-        for note in found.verdict.notes if found.verdict else ():
+        terminal.print(_table(title, HELD_OUT_HEADINGS, held_out_rows(result)))
+        terminal.print(f"verdict: {result.verdict}", soft_wrap=True)
+        for note in result.verdict.notes if result.verdict else ():
             terminal.print(note, soft_wrap=True)
-    figures = list(figure_rows(found))
+    figures = list(figure_rows(result))
     if figures:
         terminal.print(_table(Text("measured"), ("quantity", "value"), figures))
     if model is not None:

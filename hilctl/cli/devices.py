@@ -179,29 +179,29 @@ def measurement_progress(seconds: float, *, quiet: bool) -> Iterator[Callable[[f
         yield lambda elapsed_s: progress.update(task, completed=min(elapsed_s, seconds))
 
 
-def print_inventory(found: Inventory) -> None:
+def print_inventory(listed: Inventory) -> None:
     """Print devices, profiles and serial ports."""
     table = Table(title="devices", title_justify="left", show_header=False, box=None)
-    for kind, place in sorted(found.devices.items()):
+    for kind, place in sorted(listed.devices.items()):
         table.add_row(kind, place)
     profiles = Table(title="profiles", title_justify="left", show_header=False, box=None)
-    for name in found.profiles:
+    for name in listed.profiles:
         profiles.add_row(name)
     ports = Table(title="serial ports", title_justify="left", show_header=False, box=None)
-    for port in found.serial_ports:
+    for port in listed.serial_ports:
         ports.add_row(port.path, port.description)
     terminal = console()
     terminal.print(table, profiles)
-    terminal.print(ports if found.serial_ports else "no serial port found", soft_wrap=True)
+    terminal.print(ports if listed.serial_ports else "no serial port found", soft_wrap=True)
 
 
-def print_described(found: Described) -> None:
+def print_described(described: Described) -> None:
     """Print the options of a device, or the content of a profile."""
     terminal = console()
-    terminal.print(f"{found.name}: {found.place}", soft_wrap=True, markup=False)
-    if found.options:
-        terminal.print(_options(found))
-    profile = found.profile
+    terminal.print(f"{described.name}: {described.place}", soft_wrap=True, markup=False)
+    if described.options:
+        terminal.print(_options(described))
+    profile = described.profile
     for key in ("vendor", "model", "verified", "unverified", "max_rate_hz"):
         if key in profile:
             terminal.print(f"{key}: {_plain(profile[key])}", markup=False)
@@ -214,11 +214,11 @@ def print_described(found: Described) -> None:
             terminal.print(f"{key}: {_plain(text)}", markup=False, soft_wrap=True)
 
 
-def _options(found: Described) -> Table:
+def _options(described: Described) -> Table:
     table = Table(box=None)
     for heading in ("key", "default", "meaning"):
         table.add_column(heading, no_wrap=heading == "key")
-    for option in found.options:
+    for option in described.options:
         default = "required" if option.default is None else option.default
         table.add_row(option.name, Text(default), Text(option.description))
     return table

@@ -80,8 +80,8 @@ Frequencies = Annotated[
 ]
 
 
-def _list_settings(wanted: bool) -> None:
-    if wanted:
+def _list_settings(requested: bool) -> None:
+    if requested:
         print_settings()
         raise typer.Exit
 
@@ -132,7 +132,7 @@ def identify(
     texts = [f"{key}={json.dumps(value)}" for key, value in table.items() if value is not None]
     finish_dead_runs()
     with progress_bar("identify", quiet=as_json) as progress:
-        found = api.identify(
+        result = api.identify(
             files,
             output,
             model=model,
@@ -143,13 +143,13 @@ def identify(
             on_progress=progress,
         )
     if html is not None:
-        write_identification(found, html)
-    refused = found.verdict.grade == "not a model"
+        write_identification(result, html)
+    refused = result.verdict.grade == "not a model"
     if as_json:
         written = str(output) if output and not refused else None
-        print_json({"output": written, **found.to_mapping()})
+        print_json({"output": written, **result.to_mapping()})
     else:
-        print_identification(found, output)
+        print_identification(result, output)
     if refused:
         raise typer.Exit(1)
 
@@ -177,34 +177,34 @@ def refine(
         check_writable(html, overwrite=overwrite, inputs=[model, *runs, *(validate or [])])
     finish_dead_runs()
     with progress_bar("refine", quiet=as_json) as progress:
-        found = api.refine(
+        result = api.refine(
             model, runs, output, validate=validate or [], overwrite=overwrite, on_progress=progress
         )
     if html is not None:
-        write_refinement(found, html)
+        write_refinement(result, html)
     if as_json:
-        print_json({"output": str(output) if output and found.better else None,
-                    **found.to_mapping()})  # fmt: skip
+        print_json({"output": str(output) if output and result.better else None,
+                    **result.to_mapping()})  # fmt: skip
     else:
-        print_refinement(found, output)
-    if not found.better:
+        print_refinement(result, output)
+    if not result.better:
         raise typer.Exit(1)
 
 
-def print_refinement(found: Refinement, output: Path | None) -> None:
+def print_refinement(result: Refinement, output: Path | None) -> None:
     """Print the validation errors of the old and the new model."""
     terminal = console()
-    terminal.print(str(found))
-    table = Table(title=f"validation: {found.choice.after.how}")
+    terminal.print(str(result))
+    table = Table(title=f"validation: {result.choice.after.how}")
     for name in REFINEMENT_HEADINGS:
         table.add_column(name, justify="left" if name == REFINEMENT_HEADINGS[0] else "right")
-    for row in refinement_rows(found):
+    for row in refinement_rows(result):
         table.add_row(*row)
     terminal.print(table)
-    if found.choice.own:
+    if result.choice.own:
         terminal.print("offset, creep and drift of single runs were not learned")
     if output is not None:
-        written = f"model: {output}" if found.better else f"{output}: not written"
+        written = f"model: {output}" if result.better else f"{output}: not written"
         terminal.print(written, soft_wrap=True)
 
 
@@ -257,21 +257,21 @@ def _numbers(text: str | None) -> list[float] | None:
         ) from None
 
 
-def print_identification(found: Identification, output: Path | None) -> None:
+def print_identification(result: Identification, output: Path | None) -> None:
     """Print the quality of a model, its errors per loop, its parameters and its file."""
     terminal = console()
-    fit, held_out = found.fit, found.held_out
-    for line in summary(found):
+    fit, held_out = result.fit, result.held_out
+    for line in summary(result):
         terminal.print(line)
-    if found.orders:
-        terminal.print(_orders_table(found.orders))
+    if result.orders:
+        terminal.print(_orders_table(result.orders))
     if held_out is not None:
         terminal.print(_errors_table(f"validation: {held_out.how}", held_out.judgement.errors))
     terminal.print(_errors_table(f"fit: {fit.model.provenance.method}", fit.errors))
     rows = ", ".join(f"{name} {text}" for name, text in parameter_texts(fit))
     if rows:
         terminal.print(f"parameters: {rows}")
-    if output is not None and found.verdict.grade != "not a model":
+    if output is not None and result.verdict.grade != "not a model":
         terminal.print(f"model: {output}", soft_wrap=True)
     elif output is not None:
         terminal.print(f"{output}: not written", soft_wrap=True)

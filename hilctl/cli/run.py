@@ -108,8 +108,8 @@ def _run(
     finish_dead_runs()
     quiet = as_json or watch
     with (
-        _served(wanted=live) as addresses,
-        _watched(wanted=watch),
+        _served(requested=live) as addresses,
+        _watched(requested=watch),
         LiveView(quiet=quiet, addresses=addresses) as view,
     ):
         result = api.run(
@@ -134,9 +134,9 @@ def _run(
 
 
 @contextmanager
-def _watched(*, wanted: bool) -> Iterator[None]:
+def _watched(*, requested: bool) -> Iterator[None]:
     """Show the run from a subprocess, so that a blocked terminal cannot delay the run."""
-    if not wanted:
+    if not requested:
         yield
         return
     with subprocess.Popen([sys.executable, "-Pm", "hilctl.cli.watch", str(os.getpid())]) as process:
@@ -150,9 +150,9 @@ def _watched(*, wanted: bool) -> Iterator[None]:
 
 
 @contextmanager
-def _served(*, wanted: bool) -> Iterator[list[str]]:
+def _served(*, requested: bool) -> Iterator[list[str]]:
     """Serve the live page if requested; yield its addresses."""
-    if not wanted:
+    if not requested:
         yield []
         return
     from hilctl.desk.live import served_beside

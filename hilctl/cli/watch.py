@@ -60,15 +60,15 @@ def main() -> None:
     """Show the run of the supervisor whose PID is the first argument, until the run ends."""
     for number in (signal.SIGINT, *JOB_CONTROL):  # Ctrl-C and Ctrl-Z are meant for the run
         signal.signal(number, signal.SIG_IGN)
-    supervisor, found = int(sys.argv[1]), None
+    supervisor, run = int(sys.argv[1]), None
     with safe_streams():
-        while not found and os.getppid() == supervisor:
+        while not run and os.getppid() == supervisor:
             time.sleep(_SEARCH_S)
             own = (each for each in runs() if each.card.supervisor == supervisor)
-            found = next((each for each in own if each.description.exists()), None)
-        if found:
+            run = next((each for each in own if each.description.exists()), None)
+        if run:
             try:
-                _watch(found)
+                _watch(run)
             except RunError as error:
                 print(f"hilctl: {error}", file=sys.stderr)
 
