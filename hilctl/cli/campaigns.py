@@ -15,7 +15,7 @@ from rich.text import Text
 
 from hilctl import api
 from hilctl.api.campaigns import run_steps
-from hilctl.api.running import runs_folder
+from hilctl.api.given import runs_folder
 from hilctl.base.errors import ConfigError, InputError, Problem
 from hilctl.base.yaml import Document
 from hilctl.campaign.plan import SeriesPlan

@@ -10,7 +10,7 @@ from rich.table import Table
 from rich.text import Text
 
 from hilctl import api
-from hilctl.api.running import runs_folder
+from hilctl.api.given import runs_folder
 from hilctl.base.errors import RunError
 from hilctl.characterise.page import HELD_OUT_HEADINGS, figure_rows, held_out_rows
 from hilctl.characterise.results import Characterisation, StepRow

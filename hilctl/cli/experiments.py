@@ -20,6 +20,8 @@ from hilctl.cli.safe_streams import print_json
 from hilctl.experiment.examples import copy_example, examples_folder, shipped_examples
 from hilctl.experiment.inventory import shipped_profiles
 from hilctl.experiment.registry import known_devices
+from hilctl.experiment.schema import schema_text
+from hilctl.experiment.starting import LIMITS_ASKED, starting_device
 from hilctl.run.architecture import require_linux
 from hilctl.run.dead_runs import finish_dead_runs
 
@@ -134,8 +136,6 @@ def init(
     refuse_existing(path)  # before any question is asked
     chosen = list(settings or [])
     if asks:
-        from hilctl.experiment.starting import LIMITS_ASKED, starting_device  # imports numba
-
         begun = starting_device(name, path.parent, unit, reader)
         chosen += _answers({**begun.asked, **LIMITS_ASKED[unit]}, begun.section, chosen)
     written = api.init(name, path, unit=unit, reader=reader, settings=chosen)
@@ -191,8 +191,6 @@ def schema(
     as_json: AsJson = False,
 ) -> None:
     """Print the JSON schema of experiment files, for editors."""
-    from hilctl.experiment.schema import schema_text  # imports numba
-
     del as_json  # the output is always JSON
     if output is None:
         print(schema_text(), end="")

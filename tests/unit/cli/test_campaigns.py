@@ -24,7 +24,6 @@ from hilctl.cli.campaigns import (
     sweep_document,
 )
 from hilctl.experiment.correction import Correction, LearnedCycle
-from hilctl.learning import session as learning_session
 from hilctl.learning.results import Learned, Row
 from hilctl.series.run_figures import RunFigures
 from tests.unit.campaign.conftest import CAMPAIGN, EXPERIMENT
@@ -88,7 +87,7 @@ def test_stop_has_the_exit_code_of_its_signal(file, capsys, monkeypatch):
     def stopped(plan, host):
         return session.SeriesResult(plan, {}, (), "step 1: Ctrl-C", 2)
 
-    monkeypatch.setattr(session, "run_series", stopped)
+    monkeypatch.setattr("hilctl.api.campaigns.run_series", stopped)
     with pytest.raises(typer.Exit) as ended:
         run_campaign(file, fast=False)
     assert ended.value.exit_code == 130
@@ -97,7 +96,7 @@ def test_stop_has_the_exit_code_of_its_signal(file, capsys, monkeypatch):
     def between(plan, host):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(session, "run_series", between)
+    monkeypatch.setattr("hilctl.api.campaigns.run_series", between)
     with pytest.raises(typer.Exit) as ended:
         run_campaign(file, fast=False)
     assert ended.value.exit_code == 130
@@ -213,7 +212,7 @@ def taught(monkeypatch, tmp_path):
                 on_rows([ROW])
                 return Learned(CORRECTION, (ROW,), (), "the noise floor is reached", **how)
 
-        monkeypatch.setattr(learning_session, "Session", Done)
+        monkeypatch.setattr("hilctl.api.campaigns.Session", Done)
 
     return ends
 

@@ -8,7 +8,6 @@ import pytest
 import typer
 
 from hilctl.base.errors import InputError, RunError
-from hilctl.characterise import session
 from hilctl.characterise.results import Characterisation, StepRow
 from hilctl.characterise.session import CampaignPlan
 from hilctl.cli.characterise import (
@@ -49,7 +48,7 @@ def ends(monkeypatch, limits):
                 raise asked["error"]
             return asked["found"]
 
-    monkeypatch.setattr(session, "Campaign", Done)
+    monkeypatch.setattr("hilctl.api.campaigns.Campaign", Done)
     return asked
 
 
