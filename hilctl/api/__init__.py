@@ -1,4 +1,4 @@
-"""Everything that the command line does, from Python: small, typed, and kept.
+"""The public Python interface: all functions of the command line, typed and stable.
 
     from hilctl import api
 
@@ -8,36 +8,41 @@
     frame = recorded.table.to_pandas()
 
 starting.py     init: a first experiment for a device
-running.py      load, check, run, learn: what moves an actuator
-campaigns.py    characterise, campaign: many runs
+running.py      load, check, run
+campaigns.py    characterise, campaign, learn: many runs
 recordings.py   read, summarize, report_page, report_runs, replay, export, list_runs, figures
 models.py       identify, refine, compare
-connection.py   connect: a run that is going on
+connection.py   connect: an active run
 table.py        samples as named columns with units
 
-The names in ``__all__``, their arguments, and the fields of what they return are kept: what goes
-away is deprecated for one minor version first, and new arguments have defaults. All else in hilctl
-may change. Errors are :class:`hilctl.base.errors.HilctlError`: ``InputError`` where nothing has
-moved and nothing was written. Each function imports what it needs when it is called.
+The names in ``__all__``, their arguments, and the fields of their results are stable: a name is
+deprecated for one minor version before it is removed, and new arguments have defaults. Everything
+else in hilctl may change. Errors are :class:`hilctl.base.errors.HilctlError`; an ``InputError``
+means that nothing has moved and nothing was written. A module is imported when one of its names is
+first used.
 """
 
-from hilctl.api.campaigns import campaign, characterise
-from hilctl.api.connection import RunConnection, connect
-from hilctl.api.models import compare, identify, refine
-from hilctl.api.recordings import (
-    RecordedRun,
-    export,
-    figures,
-    list_runs,
-    read,
-    replay,
-    report_page,
-    report_runs,
-    summarize,
-)
-from hilctl.api.running import check, learn, load, run
-from hilctl.api.starting import WrittenExperiment, init
-from hilctl.api.table import SampleTable
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from hilctl.api.campaigns import campaign, characterise, learn
+    from hilctl.api.connection import RunConnection, connect
+    from hilctl.api.models import compare, identify, refine
+    from hilctl.api.recordings import (
+        RecordedRun,
+        export,
+        figures,
+        list_runs,
+        read,
+        replay,
+        report_page,
+        report_runs,
+        summarize,
+    )
+    from hilctl.api.running import check, load, run
+    from hilctl.api.starting import WrittenExperiment, init
+    from hilctl.api.table import SampleTable
 
 __all__ = [
     "RecordedRun",
@@ -64,3 +69,38 @@ __all__ = [
     "run",
     "summarize",
 ]
+
+_MODULES = {
+    "RecordedRun": "recordings",
+    "RunConnection": "connection",
+    "SampleTable": "table",
+    "WrittenExperiment": "starting",
+    "campaign": "campaigns",
+    "characterise": "campaigns",
+    "check": "running",
+    "compare": "models",
+    "connect": "connection",
+    "export": "recordings",
+    "figures": "recordings",
+    "identify": "models",
+    "init": "starting",
+    "learn": "campaigns",
+    "list_runs": "recordings",
+    "load": "running",
+    "read": "recordings",
+    "refine": "models",
+    "replay": "recordings",
+    "report_page": "recordings",
+    "report_runs": "recordings",
+    "run": "running",
+    "summarize": "recordings",
+}
+"""The module of each name."""
+
+if not TYPE_CHECKING:
+
+    def __getattr__(name):
+        """Return a public name; its module is imported when it is first used."""
+        if name not in _MODULES:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)

@@ -1,23 +1,35 @@
-"""Many runs after one another: to characterise an actuator, or with other values of keys."""
+"""Run an experiment repeatedly: characterisation, campaigns, iterative learning."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from hilctl.api.given import PathLike, Settings, path_or_none, texts_of
-from hilctl.api.running import runs_folder
+from hilctl.api.given import PathLike, Settings, path_or_none, runs_folder, texts_of
 from hilctl.base.errors import InputError
+from hilctl.base.files import check_no_input, check_writable
+from hilctl.campaign.fast import planned_fast, run_fast
+from hilctl.campaign.folder import campaign_folder
+from hilctl.campaign.plan import SeriesPlan
+from hilctl.campaign.session import (
+    SeriesHost,
+    SeriesResult,
+    planned_in_real_time,
+    prepared,
+    run_series,
+)
+from hilctl.campaign.steps import CampaignSteps, SeriesStep, load_campaign
+from hilctl.campaign.table import SeriesRow
+from hilctl.characterise.page import write_characterisation
+from hilctl.characterise.results import Characterisation, StepRow
+from hilctl.characterise.session import Campaign, CampaignHost, CampaignPlan
+from hilctl.experiment.correction import write_correction
+from hilctl.experiment.load import inputs_of
+from hilctl.learning.results import Learned, Row
+from hilctl.learning.session import Session
+from hilctl.recording.ends import recordings_in
 from hilctl.run.dead_runs import finish_dead_runs
-
-if TYPE_CHECKING:
-    from hilctl.campaign.plan import SeriesPlan
-    from hilctl.campaign.session import SeriesHost, SeriesResult
-    from hilctl.campaign.steps import CampaignSteps, SeriesStep
-    from hilctl.campaign.table import SeriesRow
-    from hilctl.characterise.results import Characterisation, StepRow
-    from hilctl.characterise.session import CampaignPlan
+from hilctl.run.step import paced, unpaced
 
 
 def _nothing(*_ignored: object) -> None:
@@ -62,12 +74,6 @@ def characterise(
         InputError: Something can't be used or written; nothing has moved.
         RunError: A step ended by a fault; those before it stand.
     """
-    from hilctl.base.files import check_no_input, check_writable
-    from hilctl.characterise.session import Campaign, CampaignHost
-    from hilctl.experiment.load import inputs_of
-    from hilctl.recording.ends import recordings_in
-    from hilctl.run.step import paced, unpaced
-
     file, chosen = Path(output), runs_folder(output, folder)
     page = file.with_suffix(".html")
     if page == file:
@@ -88,7 +94,6 @@ def characterise(
     if overwrite:
         measured.discard()
     found = measured.characterise(file, overwrite=overwrite)
-    from hilctl.characterise.page import write_characterisation
 
     write_characterisation(found, page)
     return found
@@ -128,15 +133,51 @@ def campaign(
         InputError: Something can't be used; nothing has moved.
         RunError: A danger to device or rig ended it; what stands is kept.
     """
-    from hilctl.campaign.session import SeriesHost
-    from hilctl.campaign.steps import load_campaign
-
     host = replace(SeriesHost(), on_progress=on_progress, on_row=on_row, on_note=on_note)
     steps = load_campaign(Path(file), texts_of(settings))
     return run_steps(
         steps, path_or_none(folder), host,
         fast=fast, scheduler=scheduler, dry_run=dry_run, on_plan=on_plan,
     )  # fmt: skip
+
+
+def learn(
+    experiment: PathLike,
+    output: PathLike,
+    *,
+    cycles: int = 20,
+    folder: PathLike | None = None,
+    settings: Settings = (),
+    fast: bool = False,
+    overwrite: bool = False,
+    on_rows: "Callable[[Sequence[Row]], None]" = lambda rows: None,
+) -> "Learned":
+    """Learn a correction for a reference that repeats: run, correct, and run again.
+
+    Args:
+        experiment: Experiment file (YAML).
+        output: Correction file to write.
+        cycles: Most runs after the first.
+        folder: Where each run is kept; ``OUTPUT-runs`` where None.
+        settings: Over the experiment.
+        fast: Do not wait for real time; simulated devices only.
+        overwrite: Whether files of these names may be replaced.
+        on_rows: Called with the figures of each run.
+
+    Raises:
+        InputError: Something can't be used or written; nothing has moved.
+    """
+    file, chosen = Path(output), runs_folder(output, folder)
+    inputs = inputs_of(Path(experiment), texts_of(settings))
+    check_writable(file, overwrite=overwrite, inputs=inputs)
+    for path in chosen.glob("run-*.*"):
+        check_no_input(path, inputs)
+    if not overwrite and any(chosen.glob("run-*.mcap")):
+        raise InputError(f"{chosen}: holds runs already: give another --folder, or --overwrite")
+    session = Session(Path(experiment), texts_of(settings), chosen, unpaced if fast else paced)
+    learned = session.learn(cycles, on_rows)
+    write_correction(file, learned.correction, overwrite=overwrite)
+    return learned
 
 
 def run_steps(
@@ -150,12 +191,6 @@ def run_steps(
     on_plan: "Callable[[SeriesPlan], None]",
 ) -> "SeriesResult | None":
     """Run the steps of a campaign, wherever they come from; see :func:`campaign`."""
-    from hilctl.base.files import check_no_input
-    from hilctl.campaign.fast import run_fast
-    from hilctl.campaign.folder import campaign_folder
-    from hilctl.campaign.session import prepared, run_series
-    from hilctl.experiment.load import inputs_of
-
     if scheduler != "none" and not fast:
         rule = "for fast runs only; those that keep real time follow each other"
         raise InputError(f"scheduler: {rule}")
@@ -172,8 +207,6 @@ def run_steps(
 
 
 def _plan(steps: "CampaignSteps", folder: Path, host: "SeriesHost", *, fast: bool) -> "SeriesPlan":
-    from hilctl.campaign.fast import planned_fast
-    from hilctl.campaign.session import planned_in_real_time
 
     host.on_progress(0.0, "check every step")
     if fast:

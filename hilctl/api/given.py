@@ -1,4 +1,4 @@
-"""How callers may give what all functions take."""
+"""Convert arguments that all functions accept."""
 
 import json
 import os
@@ -34,3 +34,9 @@ def paths_of(given: Paths) -> list[Path]:
 def path_or_none(given: PathLike | None) -> Path | None:
     """Return a path that may be left out."""
     return None if given is None else Path(given)
+
+
+def runs_folder(output: PathLike, folder: PathLike | None = None) -> Path:
+    """Return where the runs that lead to a file are kept."""
+    file = Path(output)
+    return path_or_none(folder) or file.with_name(f"{file.stem}-runs")

@@ -1,18 +1,19 @@
-"""Models: identified, refined, compared."""
+"""Identify, refine and compare models."""
 
 import time
 from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from hilctl.api.given import PathLike, Paths, Settings, path_or_none, paths_of, texts_of
+from hilctl.base.files import check_writable
+from hilctl.comparison import compare as library
+from hilctl.comparison.compare import Comparison
+from hilctl.comparison.page import write_comparison
+from hilctl.experiment.load import inputs_of
+from hilctl.identify.command import Identification, identify_files, settings_from
+from hilctl.identify.refine.command import Refinement, refine_files
 from hilctl.run.dead_runs import finish_dead_runs
-
-if TYPE_CHECKING:
-    from hilctl.comparison.compare import Comparison
-    from hilctl.identify.command import Identification
-    from hilctl.identify.refine.command import Refinement
 
 
 def identify(
@@ -46,8 +47,6 @@ def identify(
     Raises:
         InputError: A file or a setting can't be used; nothing is written.
     """
-    from hilctl.identify.command import identify_files, settings_from
-
     return identify_files(
         paths_of(files),
         settings_from(model, texts_of(settings)),
@@ -81,8 +80,6 @@ def refine(
     Raises:
         InputError: A file can't be used; nothing is written.
     """
-    from hilctl.identify.refine.command import refine_files
-
     return refine_files(
         Path(model),
         paths_of(runs),
@@ -124,10 +121,6 @@ def compare(
     Raises:
         InputError: A file or a model can't be used, or a file can't be written.
     """
-    from hilctl.base.files import check_writable
-    from hilctl.comparison import compare as library
-    from hilctl.experiment.load import inputs_of
-
     inputs = [*paths_of(recordings), *map(Path, models)]
     if experiment is not None:
         inputs += inputs_of(Path(experiment), texts_of(settings))
@@ -148,8 +141,6 @@ def compare(
     )
     comparison = library.compare(request, time.perf_counter, on_progress)
     if html is not None:
-        from hilctl.comparison.page import write_comparison
-
         write_comparison(comparison, Path(html))
     if save is not None:
         created = datetime.now(UTC).isoformat(timespec="seconds")

@@ -1,4 +1,4 @@
-"""Recordings, read and judged."""
+"""Read and evaluate recordings."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -6,20 +6,26 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from hilctl.analysis.catalogue import read_catalogue, select
+from hilctl.analysis.export import columns, units
+from hilctl.analysis.export import export as write
+from hilctl.analysis.figures import RunReport
+from hilctl.analysis.report import summarize as judge
 from hilctl.api.given import PathLike, Paths, paths_of
 from hilctl.api.table import SampleTable
 from hilctl.base.errors import InputError
+from hilctl.base.files import check_writable
+from hilctl.recording.data import Recording
+from hilctl.recording.reader import Pieces
+from hilctl.recording.reader import read as read_file
+from hilctl.recording.stretch import Stretch
 from hilctl.run.dead_runs import finish_dead_runs
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from hilctl.analysis.figures import RunReport
     from hilctl.analysis.replay import ReplayResult
     from hilctl.analysis.sheet import Sheet
-    from hilctl.recording.data import Recording
-    from hilctl.recording.reader import Pieces
-    from hilctl.recording.stretch import Stretch
     from hilctl.series.collect import RunSeries
 
 
@@ -52,8 +58,6 @@ class RecordedRun:
     @cached_property
     def table(self) -> SampleTable:
         """The samples as named columns: ``sample``, ``t_s``, those recorded, ``flags``."""
-        from hilctl.analysis.export import columns, units
-
         return SampleTable(columns(self.recording), units(self.recording))
 
 
@@ -70,14 +74,11 @@ def read(path: PathLike, *, from_s: float | None = None, to_s: float | None = No
         InputError: There is no such file.
         DataError: It is no recording, or holds no sample of that stretch.
     """
-    from hilctl.recording.reader import read as read_file
-
     finish_dead_runs()
     return RecordedRun(read_file(Path(path), _stretch(from_s, to_s)))
 
 
 def _stretch(from_s: float | None, to_s: float | None) -> "Stretch | None":
-    from hilctl.recording.stretch import Stretch
 
     return None if from_s is None and to_s is None else Stretch(from_s, to_s)
 
@@ -96,8 +97,6 @@ def summarize(
         InputError: There is no such file.
         DataError: It is no recording.
     """
-    from hilctl.analysis.report import summarize as judge
-
     return judge(run.recording if isinstance(run, RecordedRun) else _pieces(run, from_s, to_s))
 
 
@@ -126,7 +125,6 @@ def report_page(
     """
     from hilctl.analysis.overview import overview
     from hilctl.analysis.run_page import write_html
-    from hilctl.base.files import check_writable
 
     page = Path(html)
     check_writable(page, overwrite=overwrite)
@@ -157,8 +155,6 @@ def report_runs(
         InputError: A run or the model can't be read, or the page can't be written.
         DataError: A recording that was named can't be read.
     """
-    from hilctl.base.files import check_writable
-
     if html is not None:
         inputs = [] if model is None else [Path(model)]
         check_writable(Path(html), overwrite=overwrite, inputs=inputs)
@@ -182,7 +178,6 @@ def _series(
 
 
 def _pieces(run: PathLike, from_s: float | None = None, to_s: float | None = None) -> "Pieces":
-    from hilctl.recording.reader import Pieces
 
     finish_dead_runs()
     return Pieces(Path(run), _stretch(from_s, to_s))
@@ -228,8 +223,6 @@ def export(
         InputError: A file can't be read or written, or the format is unknown; nothing is written.
         DataError: There is no sample.
     """
-    from hilctl.analysis.export import export as write
-
     stretch = _stretch(from_s, to_s)
     if isinstance(run, RecordedRun):
         if stretch is not None:
@@ -252,8 +245,6 @@ def list_runs(
     Raises:
         InputError: The folder can't be listed, the condition is not valid, or a key is unknown.
     """
-    from hilctl.analysis.catalogue import read_catalogue, select
-
     return select(read_catalogue(Path(folder)), where, sort, reverse=reverse)
 
 

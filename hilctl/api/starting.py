@@ -1,15 +1,15 @@
-"""The first experiment for a device."""
+"""Write a first experiment for a device."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from hilctl.api.given import PathLike, Settings, path_or_none, texts_of
-
-if TYPE_CHECKING:
-    from hilctl.base.device import DeviceInfo
-    from hilctl.base.types import CommandUnit
+from hilctl.base.device import DeviceInfo
+from hilctl.base.files import already_there, write_text
+from hilctl.base.types import CommandUnit
+from hilctl.experiment.examples import copy_schema
+from hilctl.experiment.starting import starting_device, starting_experiment
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,10 +53,6 @@ def init(
         InputError: There is no such device, the file is there already, or with these settings it
             may not start; nothing was written.
     """
-    from hilctl.base.files import write_text
-    from hilctl.experiment.examples import copy_schema
-    from hilctl.experiment.starting import starting_device, starting_experiment
-
     path, texts = path_or_none(output) or default_path(device), texts_of(settings)
     refuse_existing(path)
     begun = starting_device(device, path.parent, unit, reader)
@@ -77,8 +73,6 @@ def refuse_existing(path: Path) -> None:
     Raises:
         InputError: It is.
     """
-    from hilctl.base.files import already_there
-
     if path.exists():
         raise already_there(path, "give another name with --output")
 

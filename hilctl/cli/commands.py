@@ -1,7 +1,7 @@
-"""The application: which commands there are, and a group that imports one only when it is called.
+"""The typer application: a table of commands, each imported when it is called.
 
-A name stands for where its function is, so that a command may come from ``hilctl_drivers``, which
-``hilctl`` never imports, and ``--help`` costs no more than this table.
+This is the only place of lazy imports on the command line; the commands' modules import what they
+need at the top. The table allows a command of ``hilctl_drivers``, which ``hilctl`` never imports.
 """
 
 from importlib import import_module
@@ -12,16 +12,16 @@ from typer.core import TyperCommand, TyperGroup
 
 from hilctl import __version__
 from hilctl.base.errors import InputError, RunError
-from hilctl.cli import OF_LINUX, machine_refused
-from hilctl.cli.volume import QUIET, VERBOSE
+from hilctl.cli import LINUX_MODULES, system_error_text
+from hilctl.cli.verbosity import QUIET, VERBOSE
 
 
 class CommandEntry(NamedTuple):
-    """Where a command stands.
+    """Location and help of a command.
 
     Attributes:
         place: ``module:function``, or ``module:app`` for a group of commands.
-        help: What it does, in a line; as its docstring begins.
+        help: First line of the function's docstring.
     """
 
     place: str
@@ -30,116 +30,120 @@ class CommandEntry(NamedTuple):
 
 COMMANDS: dict[str, CommandEntry] = {
     "demo": CommandEntry(
-        "hilctl.cli.examples:demo",
-        "Run the simulated rig without and with the inverse, and show what it does.",
+        "hilctl.cli.experiments:demo",
+        "Run the simulated rig without and with the inverse and compare the results.",
     ),
     "examples": CommandEntry(
-        "hilctl.cli.examples:examples",
-        "List the examples, or copy one and the files it names to where they can be changed.",
+        "hilctl.cli.experiments:examples",
+        "List the examples, or copy one with the files it refers to.",
     ),
     "init": CommandEntry(
-        "hilctl.cli.starting:init",
-        "Write a first experiment for a device, small, slow and explained; it asks in a terminal.",
+        "hilctl.cli.experiments:init",
+        "Write a first experiment for a device (asks questions in a terminal).",
     ),
     "run": CommandEntry(
-        "hilctl.cli.running:run",
-        "Run an experiment and record it; Ctrl-C ramps to the safe value first.",
+        "hilctl.cli.run:run",
+        "Run an experiment and record it (Ctrl-C ramps to the safe value first).",
     ),
     "check": CommandEntry(
-        "hilctl.cli.running:check",
-        "Check an experiment and say what it would do; nothing moves.",
+        "hilctl.cli.run:check",
+        "Check an experiment and show what it would do (nothing moves).",
     ),
     "status": CommandEntry(
-        "hilctl.cli.steering:status", "Say which runs are going on, and where each stands."
+        "hilctl.cli.control:status",
+        "List active runs and their progress.",
     ),
     "set": CommandEntry(
-        "hilctl.cli.steering:set_",
-        "Move a run's reference without a bump, or take its inverse out and in.",
+        "hilctl.cli.control:set_",
+        "Change the gain or offset of a running reference smoothly, or bypass the inverse.",
     ),
     "mark": CommandEntry(
-        "hilctl.cli.steering:mark", "Set a mark in a run's recording, at the present sample."
+        "hilctl.cli.control:mark",
+        "Add a mark to a run's recording at the current sample.",
     ),
     "stop": CommandEntry(
-        "hilctl.cli.steering:stop", "End a run by its safe ramp, close, and record why."
+        "hilctl.cli.control:stop",
+        "Stop a run: ramp to the safe value, close the device, record the reason.",
     ),
     "watch": CommandEntry(
         "hilctl.cli.watch:watch",
-        "Show a run in the terminal as it goes on, with keys to stop and change it.",
+        "Show a run in the terminal, with keys to stop and change it.",
     ),
     "live": CommandEntry(
         "hilctl.cli.live:live",
-        "Serve a page that shows runs as they go on, until Ctrl-C or the end of RUN.",
+        "Serve a live page of active runs, until Ctrl-C or the end of RUN.",
     ),
     "safe": CommandEntry(
-        "hilctl.cli.running:safe",
-        "Put a device at its safe value by hand, where no run holds it.",
+        "hilctl.cli.run:safe",
+        "Set a device to its safe value (refused while a run uses it).",
     ),
     "list": CommandEntry(
-        "hilctl.cli.listing:list_recordings",
-        "List the recordings below a folder, by what their first and last bytes say.",
+        "hilctl.cli.recordings:list_recordings",
+        "List the recordings in a folder (reads metadata only).",
     ),
     "report": CommandEntry(
-        "hilctl.cli.reading:report",
-        "Judge a recording: hysteresis, error, noise, lateness; or many, or a campaign's folder.",
+        "hilctl.cli.reports:report",
+        "Evaluate a recording (hysteresis, error, noise, lateness), several, or a campaign.",
     ),
     "figures": CommandEntry(
-        "hilctl.cli.series:figures",
-        "Draw the figures that apply to runs, by what varied among them: loops, trends, errors.",
+        "hilctl.cli.reports:figures",
+        "Plot the results of runs by what was varied: loops, trends, errors.",
     ),
     "replay": CommandEntry(
-        "hilctl.cli.reading:replay",
+        "hilctl.cli.reports:replay",
         "Recompute the commands from the recorded reference and compare them bit for bit.",
     ),
     "export": CommandEntry(
-        "hilctl.cli.reading:export",
-        "Write a recording's samples as CSV, NumPy, Parquet or MATLAB file.",
+        "hilctl.cli.recordings:export",
+        "Export a recording's samples to CSV, NumPy, Parquet or MATLAB.",
     ),
     "recover": CommandEntry(
         "hilctl.cli.recordings:recover",
-        "Make a recording that was cut short whole again; the bytes as they were stay as RUN.torn.",
+        "Repair a truncated recording; the original is kept as RUN.torn.",
     ),
     "identify": CommandEntry(
-        "hilctl.cli.recordings:identify",
+        "hilctl.cli.models:identify",
         "Identify a model's parameters from recordings or measured tables.",
     ),
     "refine": CommandEntry(
-        "hilctl.cli.refining:refine",
-        "Improve a model from recordings of runs; it is written only where it has become better.",
+        "hilctl.cli.models:refine",
+        "Improve a model from recordings of runs (written only if it is better).",
     ),
     "compare": CommandEntry(
-        "hilctl.cli.comparing:compare",
-        "Identify models of the literature on the same loops, and compare them.",
+        "hilctl.cli.models:compare",
+        "Identify models of the literature on the same loops and compare them.",
     ),
     "characterise": CommandEntry(
-        "hilctl.cli.characterising:characterise",
-        "Find a model of a wired actuator: measure within its limits, identify, judge.",
+        "hilctl.cli.characterise:characterise",
+        "Measure a connected actuator within its limits, then identify and validate a model.",
     ),
     "campaign": CommandEntry(
-        "hilctl.cli.campaigning:campaign",
-        "Run an experiment again and again with other values of its keys; goes on where it was.",
+        "hilctl.cli.campaigns:campaign",
+        "Run an experiment with each combination of varied keys (resumes where it stopped).",
     ),
     "sweep": CommandEntry(
-        "hilctl.cli.campaigning:sweep",
-        "Run an experiment with several values of one or more of its keys: a campaign in one line.",
+        "hilctl.cli.campaigns:sweep",
+        "Run an experiment with several values of one or more keys (a campaign in one line).",
     ),
     "learn": CommandEntry(
-        "hilctl.cli.learning:learn",
-        "Learn a correction for a reference that repeats: run, correct, and run again.",
+        "hilctl.cli.campaigns:learn",
+        "Learn a correction for a periodic reference: run, correct, and run again.",
     ),
     "doctor": CommandEntry(
-        "hilctl.cli.machine:doctor",
-        "Say what keeps this machine from real time, and measure whether it keeps a rate.",
+        "hilctl.cli.devices:doctor",
+        "Check this computer for real-time problems and measure whether it keeps a rate.",
     ),
     "devices": CommandEntry(
-        "hilctl.cli.machine:devices_app",
-        "List devices, shipped profiles and the serial ports of this machine; nothing is opened.",
+        "hilctl.cli.devices:devices_app",
+        "List devices, shipped profiles and serial ports (opens none).",
     ),
     "emulate": CommandEntry(
         "hilctl_drivers.emulator.command:emulate",
-        "Serve the simulated rig as a real device would, until Ctrl-C.",
+        "Emulate a device with the simulated rig, until Ctrl-C.",
     ),
     "schema": CommandEntry(
-        "hilctl.cli.machine:schema", "Print the JSON schema of experiment files, for editors."
+        "hilctl.cli.experiments:schema",
+        "Print the JSON schema of experiment files, for editors.",
     ),
 }
 
@@ -147,20 +151,20 @@ HELP_NAMES = {"help_option_names": ["-h", "--help"]}
 
 
 class CommandTable(TyperGroup):
-    """The commands of :data:`COMMANDS`; help and suggestions know them before they are loaded."""
+    """The commands of :data:`COMMANDS`; help and suggestions do not import them."""
 
     def __init__(self, **settings: Any) -> None:
         lines = {name: TyperCommand(name, help=entry.help) for name, entry in COMMANDS.items()}
         super().__init__(**{**settings, "commands": lines})
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
-        """Write each command's whole line, where typer would cut it."""
+        """Write each command's help line in full (typer would truncate it)."""
         del ctx
         with formatter.section("Commands"):
             formatter.write_dl([(name, entry.help) for name, entry in COMMANDS.items()])
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """Return the name of the command that is called, the command, and its arguments."""
+        """Return the name of the called command, the command, and its arguments."""
         name, line, rest = super().resolve_command(ctx, args)
         return name, line and load(line.name or ""), rest
 
@@ -168,35 +172,35 @@ class CommandTable(TyperGroup):
         """Run the command.
 
         Raises:
-            RunError: Data ended unexpectedly. typer would report that as Ctrl-D at a prompt, for
-                which a prompt itself raises ``typer.Abort``.
+            RunError: Data ended unexpectedly. typer would report an ``EOFError`` as Ctrl-D at a
+                prompt, but prompts raise ``typer.Abort``.
         """
         try:
             return super().invoke(ctx)
         except EOFError as error:
-            raise RunError(machine_refused(error)) from error
+            raise RunError(system_error_text(error)) from error
 
 
 def load(name: str) -> Any:
-    """Return a command of the table, ready to be called.
+    """Return a command of the table.
 
     Raises:
-        InputError: It can't be imported: a part of the installation is missing.
+        InputError: It cannot be imported because a part of the installation is missing.
     """
     module_name, _, attribute = COMMANDS[name].place.partition(":")
     try:
-        found = getattr(import_module(module_name), attribute)
+        command = getattr(import_module(module_name), attribute)
     except (ImportError, AttributeError) as error:
-        if error.name in OF_LINUX:
+        if error.name in LINUX_MODULES:
             raise
-        raise InputError(f"{name} can't be loaded: {error}") from error
-    if isinstance(found, typer.Typer):
-        group = typer.main.get_group(found)
+        raise InputError(f"cannot load {name}: {error}") from error
+    if isinstance(command, typer.Typer):
+        group = typer.main.get_group(command)
         group.name = name
         return group
-    alone = typer.Typer(add_completion=False, rich_markup_mode=None, context_settings=HELP_NAMES)
-    alone.command(name)(found)
-    return typer.main.get_command(alone)
+    single = typer.Typer(add_completion=False, rich_markup_mode=None, context_settings=HELP_NAMES)
+    single.command(name)(command)
+    return typer.main.get_command(single)
 
 
 app = typer.Typer(
@@ -206,13 +210,13 @@ app = typer.Typer(
     no_args_is_help=True,
     add_completion=True,
     pretty_exceptions_enable=False,
-    rich_markup_mode=None,  # rich takes longer to import than all of the rest
+    rich_markup_mode=None,  # rich takes longer to import than everything else
     context_settings=HELP_NAMES,
 )
 
 
-def _version(wanted: bool) -> None:
-    if wanted:
+def _version(requested: bool) -> None:
+    if requested:
         print(f"hilctl {__version__}")
         raise typer.Exit
 
@@ -223,10 +227,11 @@ def _root(
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
     ] = False,
     quiet: Annotated[
-        bool, typer.Option(QUIET, help="Every command: only warnings and errors; or --json.")
+        bool,
+        typer.Option(QUIET, help="Print warnings, errors and --json output only (any command)."),
     ] = False,
     verbose: Annotated[
-        bool, typer.Option(VERBOSE, help="Every command: the whole log, and where errors arose.")
+        bool, typer.Option(VERBOSE, help="Print the full log and tracebacks (any command).")
     ] = False,
 ) -> None:
-    del version, quiet, verbose  # those two are taken before, wherever they stand
+    del version, quiet, verbose  # take_verbosity has removed the last two

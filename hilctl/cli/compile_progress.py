@@ -4,7 +4,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from hilctl.cli.volume import Volume
+from hilctl.cli.verbosity import Verbosity
 
 _ONCE = "hilctl: compiling for this machine, about 10 s in all, and only this once:"
 
@@ -12,7 +12,7 @@ _ONCE = "hilctl: compiling for this machine, about 10 s in all, and only this on
 @contextmanager
 def compile_progress() -> Iterator[None]:
     """Print the name of each kernel that is compiled meanwhile; only to a terminal."""
-    if Volume.quiet or not sys.stderr.isatty():
+    if Verbosity.quiet or not sys.stderr.isatty():
         yield
         return
     from numba.core.event import Event, Listener, install_listener

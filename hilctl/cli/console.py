@@ -1,30 +1,26 @@
-"""Tables and colours in a terminal: the only console, and results of studies on it."""
+"""Print tables, styled text and progress bars to a terminal."""
 
 import io
 import sys
-from collections.abc import Iterable
-from pathlib import Path
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 
 from rich.console import Console, ConsoleOptions, RenderableType
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.segment import Segment
-from rich.text import Text
 
-from hilctl.base.formatting import printable, quantity
-from hilctl.cli.streams import PlainStream
-from hilctl.cli.volume import Volume
-
-if TYPE_CHECKING:
-    from hilctl.analysis.replay import ReplayResult
+from hilctl.base.formatting import printable
+from hilctl.cli.safe_streams import SafeStream
+from hilctl.cli.verbosity import Verbosity
 
 
-class PlainConsole(Console):
-    """A console that takes no text for markup, and shows control characters in all it is given."""
+class SafeConsole(Console):
+    """A console that escapes control characters in every text."""
 
     def render(
         self, renderable: RenderableType, options: ConsoleOptions | None = None
     ) -> Iterable[Segment]:
-        """Return the segments of what is to be printed; those that move the cursor stay."""
+        """Return the segments to print; only those that move the cursor are not escaped."""
         for segment in super().render(renderable, options):
             text, style, control = segment
             yield (
@@ -37,10 +33,10 @@ class PlainConsole(Console):
 def console(*, stderr: bool = False) -> Console:
     """Return the console on standard output or error."""
     stream = sys.stderr if stderr else sys.stdout
-    if stderr and Volume.quiet:  # bars of progress; what is wrong does not come this way
+    if stderr and Verbosity.quiet:  # progress only; errors are printed elsewhere
         stream = io.StringIO()
-    return PlainConsole(
-        file=stream.styled if isinstance(stream, PlainStream) else stream,
+    return SafeConsole(
+        file=stream.styled if isinstance(stream, SafeStream) else stream,
         markup=False,
         emoji=False,
         highlight=False,
@@ -52,33 +48,19 @@ def print_rich(renderable: RenderableType) -> None:
     console().print(renderable)
 
 
-def print_replay(result: "ReplayResult", *, other: Path | None) -> None:
-    """Print how recomputed commands compare with the recorded ones."""
-    terminal = console()
-    unit = result.command_unit
-    if result.left_out_samples:
-        terminal.print(f"{result.left_out_samples} samples behind lost ones can't be replayed")
-    if other is None and result.identical:
-        terminal.print(Text("identical", "green") + f": {result.samples} commands, bit for bit")
-        return
-    if other is None:
-        terminal.print(
-            Text("different", "red") + f": {result.differing_samples} of {result.samples} "
-            f"commands, the first at sample {result.first_difference}"
-        )
-    else:
-        terminal.print(
-            f"with {other} the command would have run from {result.command_min:.4g} to "
-            f"{result.command_max:.4g} {unit}, {result.limited_samples} samples limited"
-        )
-    if (error := result.predicted) is not None:
-        terminal.print(
-            f"error that it would have had: {quantity(error.peak_percent, '%')} peak, "
-            f"{quantity(error.rms_percent, '%')} rms; recorded on the same samples: "
-            f"{quantity(error.recorded_peak_percent, '%')} peak, "
-            f"{quantity(error.recorded_rms_percent, '%')} rms"
-        )
-    terminal.print(
-        f"largest difference {result.largest_difference:.4g} {unit}, "
-        f"rms {result.rms_difference:.4g} {unit}"
+@contextmanager
+def progress_bar(name: str, *, quiet: bool) -> Iterator[Callable[[float, str], None]]:
+    """Show a progress bar on standard error; yield its update function (fraction done, text)."""
+    terminal = console(stderr=True)
+    columns = (
+        BarColumn(bar_width=24),
+        TimeElapsedColumn(),
+        TextColumn("{task.description}", markup=False),
     )
+    hidden = quiet or not terminal.is_terminal
+    # No refresh thread, because a campaign forks processes while the bar is shown.
+    with Progress(
+        *columns, console=terminal, disable=hidden, transient=True, auto_refresh=False
+    ) as bar:
+        task = bar.add_task(name, total=1.0)
+        yield lambda done, text: bar.update(task, completed=done, description=text, refresh=True)

@@ -1,18 +1,22 @@
-"""The live page of runs that are going on, until Ctrl-C."""
+"""The command ``hilctl live``: serve a live page of active runs."""
 
 from typing import Annotated
 
 import typer
 
 from hilctl.cli.options import AsJson
-from hilctl.cli.output import print_json
+from hilctl.cli.safe_streams import print_json
+from hilctl.desk.live import ShowsRuns, UntilEnded, serve_foxglove, serve_runs
+from hilctl.run.architecture import require_linux
+from hilctl.run.client import find_run
+from hilctl.run.run_folder import RunFolder
 
 
 def live(
     name: Annotated[
         str | None,
         typer.Argument(
-            metavar="RUN", help="Run to show first, or the beginning of its name; any if left out."
+            metavar="RUN", help="Run to show first (or the beginning of its name); default: any."
         ),
     ] = None,
     port: Annotated[
@@ -20,25 +24,20 @@ def live(
         typer.Option(
             min=0,
             max=65535,
-            help="Port on this machine; any that is free if left out, 8765 with --foxglove.",
+            help="Port on this computer; default: any free port, 8765 with --foxglove.",
         ),
     ] = None,
     foxglove: Annotated[
         bool,
         typer.Option(
-            "--foxglove", help="Serve Foxglove, Lichtblick or PlotJuggler instead of a page."
+            "--foxglove",
+            help="Serve data to Foxglove, Lichtblick or PlotJuggler instead of a page.",
         ),
     ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Serve a page that shows runs as they go on, until Ctrl-C or the end of RUN."""
-    from hilctl.run.architecture import require_linux
-
+    """Serve a live page of active runs, until Ctrl-C or the end of RUN."""
     require_linux()
-    from hilctl.desk.live import ShowsRuns, UntilEnded, serve_foxglove, serve_runs
-    from hilctl.run.client import find_run
-    from hilctl.run.run_folder import RunFolder
-
     first = find_run(name) if name is not None else None
 
     def chosen(runs: list[RunFolder]) -> RunFolder | None:
@@ -51,7 +50,7 @@ def live(
     def over(server: ShowsRuns) -> bool:
         if first is None:
             return False
-        # One that has ended before it could be looked at leaves nothing to wait for.
+        # A run that ended before the server could read it has no feed.
         return ended(server) or (server.feed(None) is None and not first.alive)
 
     def on_url(url: str) -> None:

@@ -1,4 +1,4 @@
-"""Options that the commands share."""
+"""Options that several commands share."""
 
 from pathlib import Path
 from typing import Annotated
@@ -12,26 +12,22 @@ RecordingFile = Annotated[Path, typer.Argument(help="Recording (MCAP).", metavar
 Settings = Annotated[
     list[str] | None,
     typer.Option(
-        "--set", metavar="KEY=VALUE", help="Set a dotted key over the file; may be repeated."
+        "--set", metavar="KEY=VALUE", help="Override a dotted key of the file; may be repeated."
     ),
 ]
 LabelTexts = Annotated[
     list[str] | None,
-    typer.Option("--label", metavar="KEY=VALUE", help="What the run is found by; may be repeated."),
+    typer.Option("--label", metavar="KEY=VALUE", help="Label to find the run by; may be repeated."),
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object for programs.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace the file if it exists.")]
-
-
-def with_labels(settings: list[str] | None, labels: list[str] | None) -> list[str]:
-    """Return the settings of a command, and its labels as more of them.
-
-    Raises:
-        ConfigError: A label is not key=value.
-    """
-    chosen = list(settings or [])
-    if labels:
-        from hilctl.experiment.labels import label_settings
-
-        chosen += label_settings(labels)
-    return chosen
+FromTime = Annotated[
+    float | None, typer.Option("--from", metavar="S", help="Start at this time of the run, s.")
+]
+ToTime = Annotated[
+    float | None, typer.Option("--to", metavar="S", help="Stop at this time of the run, s.")
+]
+Fast = Annotated[
+    bool, typer.Option("--fast", help="Simulate without waiting (simulated devices only).")
+]
+DryRun = Annotated[bool, typer.Option("--dry-run", help="Show the plan only (nothing moves).")]

@@ -1,164 +1,202 @@
-"""Commands about recordings: recover, identify."""
+"""Commands on recording files: list, export, recover."""
 
 import json
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict
+from functools import cache
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
+from hilctl import api
+from hilctl.analysis.catalogue import Entry, keys_of, read_catalogue, select
+from hilctl.analysis.export_all import export_all
 from hilctl.base.errors import InputError
-from hilctl.cli.comparing import check_page
-from hilctl.cli.options import AsJson, Overwrite
-from hilctl.cli.output import finish_orphans, print_json
+from hilctl.base.formatting import finite_json, printable, short_name
+from hilctl.cli.console import progress_bar
+from hilctl.cli.options import AsJson, FromTime, Overwrite, ToTime
+from hilctl.cli.safe_streams import print_json
+from hilctl.recording.facts import LABELS_FACT, RECORDINGS
+from hilctl.recording.recover import recover_recording
+from hilctl.run.dead_runs import finish_dead_runs
+from hilctl.run.run_folder import dismiss
 
-IdentifyInput = Annotated[
-    list[Path], typer.Argument(metavar="FILE", help="Recordings (MCAP) or text tables.")
-]
-TableUnit = Annotated[str | None, typer.Option(help="Unit of a table's command, A or V.")]
-TableColumn = Annotated[str | None, typer.Option(help="Column of a table: name, or number from 1.")]
-RateHz = Annotated[float | None, typer.Option(help="Of a table without a time column.")]
-Whole = Annotated[bool, typer.Option(help="Judge whole histories, not steady cycles.")]
-LeaveOut = Annotated[
-    list[str] | None,
-    typer.Option(
-        metavar="LABEL", help="Loop not to use, by its label or how that begins; may be repeated."
-    ),
-]
-Validate = Annotated[
-    list[Path] | None,
-    typer.Option(metavar="FILE", help="File to judge the model on; may be repeated."),
-]
-Scheduler = Annotated[
-    str | None,
-    typer.Option(
-        help="none, threads, processes, or a Dask scheduler's address; threads where it is auto."
-    ),
-]
-FitTexts = Annotated[
-    list[str] | None,
-    typer.Option("--set", metavar="KEY=VALUE", help="--settings lists all keys. May be repeated."),
-]
+_MISSING = "-"
+_SHOWN = {
+    "started": "started (UTC)",
+    "name": "name",
+    "waveform": "waveform",
+    "duration_s": "s",
+    "code": "result",
+    "peak_hysteresis_percent": "hyst. %",
+    "peak_error_percent": "error %",
+    "skipped_ticks": "missed",
+    LABELS_FACT: "labels",
+    "path": "recording",
+}
+"""Columns of the table, and their headings."""
+_NUMBERS = {"duration_s", "peak_hysteresis_percent", "peak_error_percent", "skipped_ticks"}
+_TO_SECONDS = len("2000-01-01T00:00:00")
+
+
+def list_recordings(
+    folder: Annotated[
+        Path, typer.Argument(metavar="FOLDER", help="Folder to search, with its subfolders.")
+    ] = Path(RECORDINGS),
+    where: Annotated[str, typer.Option(metavar="WHERE", help="SQL condition to select runs.")] = "",
+    sort: Annotated[str, typer.Option(metavar="KEY", help="Key to sort by.")] = "started",
+    reverse: Annotated[bool, typer.Option("--reverse", help="Sort in descending order.")] = False,
+    keys: Annotated[
+        bool, typer.Option("--keys", help="Print the keys of these recordings.")
+    ] = False,
+    as_json: AsJson = False,
+) -> None:
+    """List the recordings in a folder (reads metadata only).
+
+    Example: --where 'frequency_hz > 100 and label.sample == "A7"'
+    """
+    finish_dead_runs()
+    catalogue = read_catalogue(folder)
+    if keys:
+        print("\n".join(map(printable, keys_of(catalogue))))
+        return
+    entries = select(catalogue, where, sort, reverse=reverse)
+    if as_json:
+        _print_json(entries, len(catalogue), folder)
+    else:
+        _print_table(entries, len(catalogue))
+
+
+def _print_json(entries: Sequence[Entry], count: int, folder: Path) -> None:
+    """Print one JSON object with one line per recording (indentation would take seconds)."""
+    lines = ",\n".join(map(finite_json, entries))
+    head = f'"folder": {json.dumps(str(folder))}, "of": {count}'
+    print(f'{{{head}, "recordings": [\n{lines}\n]}}')
+
+
+def _print_table(entries: Sequence[Entry], count: int) -> None:
+    columns = [[_cell(name, entry) for entry in entries] for name in _SHOWN]
+    if entries:
+        headed = zip(_SHOWN.items(), columns, strict=True)
+        padded = [_padded(name, [heading, *cells]) for (name, heading), cells in headed]
+        print("\n".join(map("  ".join, zip(*padded, strict=True))))
+    problems = [entry for entry in entries if entry["problem"]]
+    for entry in problems:
+        where = printable(entry["path"])
+        print(f"hilctl: {where}: {printable(entry['problem'])}", file=sys.stderr)
+    unreadable = f", {len(problems)} of them unreadable" if problems else ""
+    print(f"{len(entries)} of {count} recordings{unreadable}")
+
+
+def _padded(name: str, cells: list[str]) -> list[str]:
+    width = max(map(len, cells))
+    if name in _NUMBERS:
+        return [cell.rjust(width) for cell in cells]
+    return cells if name == "path" else [cell.ljust(width) for cell in cells]
+
+
+def _cell(name: str, entry: Entry) -> str:
+    value = entry[name]
+    if name == "code":  # without a result, show the state of the file
+        return short_name(value or entry["state"])
+    if name == LABELS_FACT:
+        return short_name(", ".join(f"{key} {each}" for key, each in value.items())) or _MISSING
+    if name == "started":
+        return short_name((value or _MISSING)[:_TO_SECONDS].replace("T", " "))
+    return printable(value) if name == "path" else _text(value)
+
+
+@cache
+def _text(value: Any) -> str:
+    if value is None or value == "":
+        return _MISSING
+    return f"{value:.4g}" if isinstance(value, float) else short_name(str(value))
+
+
+def export(
+    recording: Annotated[
+        Path,
+        typer.Argument(
+            metavar="RUN", help="Recording (MCAP), or a folder of recordings with --all."
+        ),
+    ],
+    output: Annotated[
+        Path,
+        typer.Argument(
+            metavar="OUTPUT",
+            help="File to write (.csv, .npz, .parquet or .mat), or a folder with --all.",
+        ),
+    ],
+    every: Annotated[
+        bool, typer.Option("--all", help="Export all recordings of a folder as Hive-style Parquet.")
+    ] = False,
+    from_s: FromTime = None,
+    to_s: ToTime = None,
+    overwrite: Overwrite = False,
+    as_json: AsJson = False,
+) -> None:
+    """Export a recording's samples to CSV, NumPy, Parquet or MATLAB."""
+    finish_dead_runs()
+    if every:
+        if overwrite or from_s is not None or to_s is not None:
+            raise InputError(
+                "--all excludes --from, --to and --overwrite: it exports complete recordings once"
+            )
+        _export_all(recording, output, as_json=as_json)
+        return
+    rows = api.export(recording, output, from_s=from_s, to_s=to_s, overwrite=overwrite)
+    if as_json:
+        print_json({"output": str(output), "rows": rows})
+    else:
+        print(f"{output}: {rows} samples")
+
+
+def _export_all(folder: Path, output: Path, *, as_json: bool) -> None:
+    with progress_bar("export", quiet=as_json) as progress:
+        done = export_all(folder, output, progress)
+    if as_json:
+        print_json({"output": str(output), **asdict(done)})
+    else:
+        print(f"{output}: {done.written} recordings written, {done.there} already present")
+        for path, why in done.left_out.items():
+            print(f"hilctl: {path}: not exported: {why}", file=sys.stderr)
+    if done.left_out:
+        raise typer.Exit(1)
 
 
 def recover(
     recording: Annotated[
         Path | None, typer.Argument(metavar="RUN", help="Recording (MCAP).")
     ] = None,
-    output: Annotated[
-        Path | None, typer.Option(help="Put the whole file here, and leave RUN as it is.")
-    ] = None,
-    given_up: Annotated[
+    output: Annotated[Path | None, typer.Option(help="File to write; RUN stays unchanged.")] = None,
+    dismissed: Annotated[
         str | None,
         typer.Option(
             "--dismiss",
             metavar="NAME",
-            help="Give up what the dead run of that name has left in memory.",
+            help="Discard the unrecorded samples of the crashed run NAME.",
         ),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Make a recording that was cut short whole again; the bytes as they were stay as RUN.torn."""
-    from hilctl.recording.recover import recover_recording
-    from hilctl.run.run_folder import dismiss
-
-    if (recording is None) == (given_up is None) or (given_up is not None and output is not None):
-        raise InputError("recover: give a RUN to recover, or --dismiss NAME alone")
-    if given_up is not None:
-        removed = dismiss(given_up)
+    """Repair a truncated recording; the original is kept as RUN.torn."""
+    if (recording is None) == (dismissed is None) or (dismissed is not None and output is not None):
+        raise InputError("specify either a RUN to recover or --dismiss NAME alone")
+    if dismissed is not None:
+        removed = dismiss(dismissed)
         if as_json:
             print_json({"dismissed": str(removed)})
         else:
             print(f"{removed}: removed")
         return
     assert recording is not None
-    finish_orphans()
+    finish_dead_runs()
     recovered = recover_recording(recording, output=output)
     if as_json:
         print_json(recovered.to_mapping())
         return
     print(f"{recovered.path}: {recovered.reason}")
     if recovered.original:
-        print(f"{recovered.samples} samples; the file as it was: {recovered.original}")
-
-
-def _list_settings(wanted: bool) -> None:
-    if wanted:
-        from hilctl.cli.identify_view import print_settings
-
-        print_settings()
-        raise typer.Exit
-
-
-ListSettings = Annotated[
-    bool,
-    typer.Option(
-        "--settings", callback=_list_settings, is_eager=True,
-        help="Print all kinds of model and all settings.",
-    ),
-]  # fmt: skip
-
-
-def identify(
-    files: IdentifyInput,
-    model: Annotated[str, typer.Option(help="Kind of model, or auto.")] = "integrated",
-    output: Annotated[Path | None, typer.Option(help="Model file to write.")] = None,
-    settings: FitTexts = None,
-    list_settings: ListSettings = False,
-    unit: TableUnit = None,
-    command_column: TableColumn = None,
-    displacement_column: TableColumn = None,
-    time_column: TableColumn = None,
-    rate_hz: RateHz = None,
-    whole: Whole = False,
-    leave_out: LeaveOut = None,
-    validate: Validate = None,
-    scheduler: Scheduler = None,
-    html: Annotated[Path | None, typer.Option(help="Page of model against data to write.")] = None,
-    overwrite: Overwrite = False,
-    as_json: AsJson = False,
-) -> None:
-    """Identify a model's parameters from recordings or measured tables."""
-    from hilctl import api
-    from hilctl.cli.identify_view import print_identification
-    from hilctl.cli.progress import shown_progress
-
-    del list_settings
-    check_page(html, overwrite=overwrite, inputs=[*files, *(validate or [])])
-    table = {
-        "table.unit": unit,
-        "table.command_column": _column(command_column),
-        "table.displacement_column": _column(displacement_column),
-        "table.time_column": _column(time_column),
-        "table.rate_hz": rate_hz,
-        "whole": whole or None,
-        "leave_out": leave_out or None,
-    }
-    texts = [f"{key}={json.dumps(value)}" for key, value in table.items() if value is not None]
-    finish_orphans()
-    with shown_progress("identify", quiet=as_json) as progress:
-        found = api.identify(
-            files,
-            output,
-            model=model,
-            settings=[*texts, *(settings or [])],
-            validate=validate or [],
-            scheduler=scheduler,
-            overwrite=overwrite,
-            on_progress=progress,
-        )
-    if html is not None:
-        from hilctl.identify.page import write_identification
-
-        write_identification(found, html)
-    refused = found.verdict.grade == "not a model"
-    if as_json:
-        written = str(output) if output and not refused else None
-        print_json({"output": written, **found.to_mapping()})
-    else:
-        print_identification(found, output)
-    if refused:
-        raise typer.Exit(1)
-
-
-def _column(text: str | None) -> str | int | None:
-    return int(text) if text is not None and text.isdecimal() else text
+        print(f"{recovered.samples} samples; original file: {recovered.original}")

@@ -4,14 +4,13 @@ import os
 import re
 import select
 import signal
-import subprocess
 import sys
 import termios
 import threading
 import time
 import tty
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 from typing import Annotated, Any
 
 import numpy as np
@@ -24,7 +23,7 @@ from hilctl.base.errors import HilctlError, RunError
 from hilctl.base.events import Event
 from hilctl.base.formatting import printable
 from hilctl.cli.console import console
-from hilctl.cli.streams import plain_streams
+from hilctl.cli.safe_streams import safe_streams
 from hilctl.desk.feed import RunFeed
 from hilctl.desk.scope import WINDOWS_S
 from hilctl.desk.signals import ROW
@@ -32,7 +31,7 @@ from hilctl.run.client import find_run, mark_run, request_stop, set_run
 from hilctl.run.protocol import JOB_CONTROL, MAX_MARK
 from hilctl.run.run_folder import RunFolder, runs
 
-_FRAME_S, _SEARCH_S, _END_S, _OVER_S = 0.15, 0.05, 2.0, 0.5
+_FRAME_S, _SEARCH_S, _OVER_S = 0.15, 0.05, 0.5
 _LINE_FRAMES, _EVENTS, _MIN_WIDTH, _MIN_HEIGHT = 7, 3, 40, 14
 _FIGURES = (
     ("hyst.", "peak_hysteresis_percent", "%"),
@@ -46,39 +45,29 @@ _FIGURES = (
 def watch(
     name: Annotated[
         str | None,
-        typer.Argument(metavar="RUN", help="Run, or the beginning of its name, if not the only."),
+        typer.Argument(
+            metavar="RUN",
+            help="Run (or the beginning of its name); required if several are active.",
+        ),
     ] = None,
 ) -> None:
-    """Show a run in the terminal as it goes on, with keys to stop and change it."""
+    """Show a run in the terminal, with keys to stop and change it."""
     _watch(find_run(name))
-
-
-@contextmanager
-def watched_beside() -> Iterator[None]:
-    """Show the run of this process from a subprocess: a blocked terminal must not delay the run."""
-    with subprocess.Popen([sys.executable, "-Pm", "hilctl.cli.watch", str(os.getpid())]) as process:
-        try:
-            yield
-        finally:
-            process.terminate()  # restores the terminal first
-            with suppress(subprocess.TimeoutExpired):
-                process.wait(_END_S)
-            process.kill()
 
 
 def main() -> None:
     """Show the run of the supervisor whose PID is the first argument, until the run ends."""
     for number in (signal.SIGINT, *JOB_CONTROL):  # Ctrl-C and Ctrl-Z are meant for the run
         signal.signal(number, signal.SIG_IGN)
-    supervisor, found = int(sys.argv[1]), None
-    with plain_streams():
-        while not found and os.getppid() == supervisor:
+    supervisor, run = int(sys.argv[1]), None
+    with safe_streams():
+        while not run and os.getppid() == supervisor:
             time.sleep(_SEARCH_S)
             own = (each for each in runs() if each.card.supervisor == supervisor)
-            found = next((each for each in own if each.description.exists()), None)
-        if found:
+            run = next((each for each in own if each.description.exists()), None)
+        if run:
             try:
-                _watch(found)
+                _watch(run)
             except RunError as error:
                 print(f"hilctl: {error}", file=sys.stderr)
 
@@ -89,8 +78,10 @@ def _watch(run: RunFolder) -> None:
     signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))  # by way of finally
     with suppress(KeyboardInterrupt):  # ends the view only
         View(feed).show() if _has_keys() else print_lines(feed)
-    reason = feed.status()["reason"] or "its end was not seen"
-    ended = f": {feed.state}: {reason}" if feed.ended else " goes on: hilctl watch, hilctl stop"
+    reason = feed.status()["reason"] or "unknown reason"
+    ended = (
+        f": {feed.state}: {reason}" if feed.ended else " is still active: hilctl watch, hilctl stop"
+    )
     print(run.card.name + ended)
 
 
@@ -178,7 +169,7 @@ class View:
         def ask() -> None:
             try:
                 done = request(self.feed.folder, **values)
-                self.message = f"{what}: {'done' if done else 'the run is over'}"
+                self.message = f"{what}: {'done' if done else 'the run has ended'}"
             except HilctlError as error:
                 self.message = f"{what}: refused: {error}"
 

@@ -1,17 +1,17 @@
-"""Who looks on: the live page of a running experiment, its server, and the frames behind it.
+"""The live views of a run: web page, Foxglove server and frames for programs.
 
-Nothing here is part of a run: it maps the run's ring so that it can't write to it, and asks for
-changes by the run's own control socket. Kill it at any time, and the run does not notice.
+A live view is not part of a run: it maps the run's ring read-only and sends changes to the run's
+control socket. Killing it does not affect the run.
 
 signals.py    the columns that are shown
-scope.py      windows over time, rolling or triggered to the waveform's cycle, and its loops;
-              lowest and highest of each signal in buckets of samples: no spike is lost
-figures.py    running figures of quality; headroom.py  what is left to each limit
-feed.py       all of it from one run's folder, with error spectrum and lateness
-frames.py     as bytes for a page and as arrays for programs; foxglove_topics.py  for Foxglove
-feeds.py      the runs that are going on
+scope.py      time windows, rolling or triggered by the waveform's cycle, and hysteresis loops;
+              minimum and maximum of each signal per bucket of samples
+figures.py    running metrics; headroom.py  use of each limit
+feed.py       reader of one run's folder, with error spectrum and lateness
+frames.py     frames for a page and for programs; foxglove_topics.py  for Foxglove
+feeds.py      the active runs
 server.py     the page, its files and its connections, on loopback
-admission.py  who is let in; viewer.py  one page: what it asks for, and how much it gets
-foxglove_server.py  the same without a page, for Foxglove and its like
-live.py       the servers as processes
+admission.py  authentication; viewer.py  session of one page: requests and rate limit
+foxglove_server.py  server for Foxglove and compatible applications
+live.py       server processes
 """

@@ -1,8 +1,8 @@
-"""Who may look on: checked in the upgrade itself, before there is a connection to speak of.
+"""Authenticate requests to the live page.
 
-Every process of every user of this machine can reach a port of loopback, and so can every page in
-a browser. So a request must name this server as its host, an upgrade must come from a page of this
-server and bring the token; and those who connect without asking anything are few at a time.
+Every process of every user of this computer can reach a loopback port, and so can every web page in
+a browser. A request must name this server as its host; an upgrade must come from a page of this
+server and carry the token. The number of unauthenticated connections is limited.
 """
 
 import asyncio
@@ -18,16 +18,16 @@ from websockets.typing import Subprotocol
 
 PROTOCOL = Subprotocol("hilctl.live.1")
 """Subprotocol of the page's connection; its number changes with the messages."""
-TOKEN_PREFIX = "token."  # noqa: S105  not one itself
+TOKEN_PREFIX = "token."  # noqa: S105  not a token itself
 MOST_PENDING = 64
 """Connections at a time that have not been let in; the oldest gives way."""
 
 
 class Admission:
-    """Decides on requests.
+    """Accepts or refuses requests.
 
     Args:
-        port: That the server listens at.
+        port: Port of the server.
         token: 32 hexadecimal digits.
     """
 
@@ -37,11 +37,11 @@ class Admission:
         self._origins = {f"http://{host}" for host in self._hosts}
 
     def refusal(self, headers: Headers, *, upgrade: bool) -> tuple[HTTPStatus, str] | None:
-        """Return why a request is refused, or None.
+        """Return the reason to refuse a request, or None.
 
         Args:
-            headers: Of the request.
-            upgrade: Whether it asks for the live connection, and not for a file.
+            headers: Headers of the request.
+            upgrade: Whether it requests the live connection rather than a file.
         """
         hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
         if len(hosts) != 1 or hosts[0].lower() not in self._hosts:
@@ -66,10 +66,10 @@ class Admission:
 
 
 class PendingConnections:
-    """Connections that have not been let in; the oldest is cut where there are too many.
+    """Connections that are not authenticated yet; the oldest is aborted if there are too many.
 
     Args:
-        most: How many there may be.
+        most: Largest number of connections.
     """
 
     def __init__(self, most: int = MOST_PENDING) -> None:
@@ -77,13 +77,13 @@ class PendingConnections:
         self._abort: dict[object, Callable[[], None]] = {}
 
     def add(self, connection: object, abort: Callable[[], None]) -> None:
-        """Let one in the waiting room; ``abort`` cuts it."""
+        """Add a connection; ``abort`` closes it."""
         while len(self._abort) >= self._most:
             self._abort.pop(next(iter(self._abort)))()
         self._abort[connection] = abort
 
     def remove(self, connection: object) -> None:
-        """Let one out: it was let in, or is gone."""
+        """Remove a connection that is authenticated or closed."""
         self._abort.pop(connection, None)
 
     def __len__(self) -> int:
@@ -91,18 +91,18 @@ class PendingConnections:
 
 
 def bounded(pending: PendingConnections) -> type[ServerConnection]:
-    """Return a kind of connection that waits its turn among those pending."""
+    """Return a connection class that is registered as pending until it is authenticated."""
 
     class BoundedConnection(ServerConnection):
-        """A connection that is cut where others come after it and it has not been let in."""
+        """A connection that may be aborted until it is authenticated."""
 
         def connection_made(self, transport: asyncio.BaseTransport) -> None:
-            """Begin; some other one may be cut for it."""
+            """Register the connection; the oldest pending one may be aborted."""
             super().connection_made(transport)
             pending.add(self, self.transport.abort)
 
         def connection_lost(self, exc: Exception | None) -> None:
-            """End."""
+            """Unregister the connection."""
             pending.remove(self)
             super().connection_lost(exc)
 

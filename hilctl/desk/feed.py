@@ -1,7 +1,7 @@
-"""A live run, seen from outside: its newest signals, figures, limits and events.
+"""Read a live run from outside: its newest signals, metrics, limits and events.
 
-The ring is mapped so that nothing can be written to it, and what is copied is looked at again: the
-loop and the recorder go on as if nobody were there. Time is an argument.
+The ring is mapped read-only and copied data are validated, so that the loop and the recorder are
+not affected. Time is an argument.
 """
 
 import math
@@ -94,15 +94,15 @@ class LatenessCounts:
 
 
 _EVENTS = 60
-_LOOK_S = 0.5  # so often the run's locks and the disk are looked at
+_LOOK_S = 0.5  # interval of checks of the run's locks and the disk
 
 
 @dataclass(frozen=True, slots=True)
 class DiskRoom:
-    """The disk that the recording goes to.
+    """Free space on the disk of the recording.
 
     Attributes:
-        free_bytes: Left on it.
+        free_bytes: Free space.
         recorded_bytes: Size of the recording.
     """
 
@@ -111,21 +111,21 @@ class DiskRoom:
 
 
 class RunFeed:
-    """One run as it goes on.
+    """Reader of one active run.
 
     Args:
-        folder: Its folder.
+        folder: Folder of the run.
 
     Attributes:
-        description: What it says of itself.
+        description: Description of the run.
         scope: Its windows and loops.
-        spectrum: Of its error.
+        spectrum: Spectrum of its error.
         events: Its newest events, the oldest first.
-        missed: Samples that were not seen: dropped by the run, or gone before they were looked at.
-        ended: Whether the run is over, so that nothing more will come.
+        missed: Number of samples not read: dropped by the run, or overwritten too early.
+        ended: Whether the run has ended and no data can follow.
 
     Raises:
-        RunError: It has ended, or is not one that can be looked at.
+        RunError: The run has ended, or cannot be read.
     """
 
     def __init__(self, folder: RunFolder) -> None:
@@ -134,7 +134,7 @@ class RunFeed:
             self.description = RunDescription.read(folder.description)
             self._ring = SampleRing(folder.ring, look_only=True)
         except (OSError, ValueError) as error:
-            raise RunError(f"{folder.card.name}: can't be looked at: {error}") from None
+            raise RunError(f"{folder.card.name}: cannot read the run: {error}") from None
         self._page = self._ring.page
         self.scope = Scope(self.description.sample_rate_hz, [], self.loop_input)
         self._waveform_at = -1
@@ -152,11 +152,11 @@ class RunFeed:
 
     @property
     def loop_input(self) -> str:
-        """Signal on the loop's abscissa: the reference where there is one in um."""
+        """Signal on the abscissa of the loop: the reference if there is one in um."""
         return "reference" if self.description.waveform_unit == "um" else "command"
 
     def poll(self, now_s: float) -> bool:
-        """Take what is new.
+        """Read new data.
 
         Args:
             now_s: Monotonic time.
@@ -166,7 +166,7 @@ class RunFeed:
         """
         if now_s - self._looked_s >= _LOOK_S:
             self._looked_s = now_s
-            # Asked first: of a run that is over, nothing can come after that.
+            # Checked first: an ended run writes no more data after this.
             self.ended = not self.folder.alive
             self._disk = _disk_room(Path(self.folder.card.recording))
         if self._page.observe(Field.PHASE) < Phase.RUNNING:
@@ -184,7 +184,7 @@ class RunFeed:
         return True
 
     def _begin(self) -> None:
-        """Learn where the waveform begins, which the loop knows once it runs."""
+        """Read the first sample of the waveform, which is known once the loop runs."""
         if self._waveform_at < 0:
             self._waveform_at = self._page.get(Field.WAVEFORM_AT)
             segments = self.description.segments_at(self._waveform_at)
@@ -200,18 +200,18 @@ class RunFeed:
         self._headroom.add(traces)
 
     def events_since(self, seen: int) -> tuple[list[Event], int]:
-        """Return the events after the first ``seen`` of all, and how many there have been."""
+        """Return the events after the first ``seen``, and the number of all events."""
         new = min(self._events_seen - seen, len(self.events))
         return self.events[len(self.events) - new :], self._events_seen
 
     @property
     def start_ns(self) -> int:
-        """When sample 0 was due, monotonic time in ns; 0 before that is known."""
+        """Monotonic time of sample 0 in ns; 0 while unknown."""
         return self._page.get(Field.START_NS)
 
     @property
     def state(self) -> str:
-        """Where the run stands, in a word."""
+        """State of the run in one word."""
         outcome = self._page.outcome()
         if outcome is not None:
             return outcome.code
@@ -223,19 +223,19 @@ class RunFeed:
 
     @property
     def figures(self) -> FigureValues:
-        """Running figures of quality by name with unit; empty before the first whole cycle."""
+        """Running metrics by name with unit; empty before the first complete cycle."""
         return self._figures.newest
 
     @property
     def inverse(self) -> str | None:
-        """Where the last change leads the inverse, ``in`` or ``out``; None without one."""
+        """State of the inverse after the last change, ``in`` or ``out``; None without one."""
         if not self.description.compensator:
             return None
         changed = self._page.get(Field.TUNE_WANTED)
         return "out" if changed and not self._page.get_float(Field.TUNE_INVERSE_SHARE) else "in"
 
     def status(self) -> dict[str, Any]:
-        """Return all that is not a trace, as plain values for JSON."""
+        """Return everything except the traces, as plain values for JSON."""
         page, rate_hz = self._page, self.description.sample_rate_hz
         outcome = page.outcome()
         late = self._lateness.percentiles_us()
@@ -279,7 +279,7 @@ def _plain_event(event: Event, rate_hz: float) -> dict[str, Any]:
 
 
 def _disk_room(recording: Path) -> DiskRoom | None:
-    """Return the room there is for a recording; None where the disk does not say."""
+    """Return the disk space for a recording; None if it is unknown."""
     try:
         disk = os.statvfs(recording.parent)
         return DiskRoom(disk.f_bavail * disk.f_frsize, recording.stat().st_size)

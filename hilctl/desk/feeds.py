@@ -1,4 +1,4 @@
-"""The runs that a server shows: found as they start, let go once they are over."""
+"""Keep readers of the active runs: add them when a run starts, remove them when it has ended."""
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
@@ -12,13 +12,13 @@ _LOOK_S = 1.0
 
 
 class RunFeeds:
-    """Feeds of the runs that are going on, each from when it is first asked for.
+    """Readers of the active runs, each created when it is first requested.
 
     Args:
-        chosen: Returns the run that is shown where none is named; None where there is none.
+        chosen: Returns the run to show if none is named; None if there is none.
 
     Attributes:
-        runs: All that are going on.
+        runs: All active runs.
     """
 
     def __init__(self, chosen: Callable[[list[RunFolder]], RunFolder | None]) -> None:
@@ -29,15 +29,15 @@ class RunFeeds:
         self._looked_s = float("-inf")
 
     def __iter__(self) -> Iterator[RunFeed]:
-        """Iterate over those that were asked for."""
+        """Iterate over the readers that were requested."""
         return iter(self._feeds.values())
 
     def look(self, now_s: float, shown: Iterable[str | None] = ()) -> None:
-        """Look once a second which runs there are, and let go of those over that nobody looks at.
+        """Update the list of active runs once per second; remove ended runs that are not shown.
 
         Args:
             now_s: Monotonic time.
-            shown: Names of the runs that are looked at; None for the main one.
+            shown: Names of the runs that are shown; None for the main one.
         """
         if now_s - self._looked_s < _LOOK_S:
             return
@@ -50,19 +50,19 @@ class RunFeeds:
         }
 
     def feed(self, name: str | None) -> RunFeed | None:
-        """Return the feed of a run that is going on, or was when it was first asked for."""
+        """Return the reader of a run that is active, or was when first requested."""
         if name is None:
             name = self._main = self._main_run()
         if name in self._feeds:
             return self._feeds[name]
         found = next((run for run in self.runs if run.card.name == name), None)
         if found is not None:
-            with suppress(RunError):  # being started or removed at this moment
+            with suppress(RunError):  # the run is just being started or removed
                 self._feeds[name] = RunFeed(found)
         return self._feeds.get(name)
 
     def _main_run(self) -> str:
-        """Return the run of those who name none; one that is over stays until there is another."""
+        """Return the default run; an ended run remains until there is another."""
         feed = self._feeds.get(self._main)
         if feed is not None and not feed.ended:
             return self._main

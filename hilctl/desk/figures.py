@@ -1,6 +1,6 @@
-"""Running figures of quality: of the newest whole cycles, by the functions of a report.
+"""Compute running metrics of the newest complete cycles with the functions of a report.
 
-Of a waveform without a period they are of the newest half second, and only those that need none.
+Without a period, the metrics that need none are computed over the newest half second.
 """
 
 import math
@@ -30,11 +30,11 @@ _LEFT_OUT = NO_WAVEFORM | Flag.SENSOR_INVALID
 
 
 class RunningFigures:
-    """Figures of one run as it goes on.
+    """Running metrics of one run.
 
     Args:
-        sample_rate_hz: Samples a second.
-        loop_input: Signal on the loop's abscissa.
+        sample_rate_hz: Samples per second.
+        loop_input: Signal on the abscissa of the loop.
     """
 
     def __init__(self, sample_rate_hz: float, loop_input: str) -> None:
@@ -45,11 +45,11 @@ class RunningFigures:
         """Those of the last group of cycles that is whole, by name with unit; empty before."""
 
     def add(self, traces: Traces, segment: Segment | None) -> None:
-        """Take the next samples.
+        """Add the next samples.
 
         Args:
             traces: The samples.
-            segment: The stretch that the newest of them is in.
+            segment: Segment of the newest sample.
         """
         if segment is None:
             return
@@ -66,7 +66,7 @@ class RunningFigures:
             traces, self._group = traces.part(group.stop, math.inf), None
 
     def _begin(self, segment: Segment, sample: int) -> "_Group":
-        """Return the next group: whole cycles from a cycle's beginning on."""
+        """Return the next group: complete cycles from the start of a cycle."""
         if segment.period <= 0.0:
             start = max(sample, segment.start)
             return _Group(start, start + max(1, round(_GROUP_S * self._rate_hz)), segment)
@@ -78,12 +78,12 @@ class RunningFigures:
 
 
 class _Group:
-    """Some cycles after one another.
+    """Consecutive cycles.
 
     Args:
         start: First sample.
         stop: Sample after the last.
-        segment: Stretch that they are of.
+        segment: Segment of the cycles.
     """
 
     def __init__(self, start: int, stop: int, segment: Segment) -> None:
@@ -97,7 +97,7 @@ class _Group:
         self._displacement_um: F64 = np.empty(0)
 
     def add(self, traces: Traces, loop_input: int) -> None:
-        """Take more samples of it, with the row of the loop's input."""
+        """Add samples; one row is the input of the loop."""
         traces = _trusted(traces)
         if not traces.index.size:
             return
@@ -116,7 +116,7 @@ class _Group:
         self._displacement_um = newest_um[-_NOISE_SAMPLES:]
 
     def figures(self) -> FigureValues:
-        """Return what there is to say of it; nothing where it has no displacement."""
+        """Return the metrics; none without a displacement."""
         if not math.isfinite(self._low_um):
             return {}
         noise_um = sensor_noise_um(self._index, self._displacement_um)
@@ -132,7 +132,7 @@ class _Group:
         return found
 
     def _of_cycle(self, folding: Folding, noise_um: float | None) -> FigureValues:
-        """Return the figures of the average cycle."""
+        """Return the metrics of the mean cycle."""
         cycle = folding.fold()
         if not cycle.whole:
             return {}

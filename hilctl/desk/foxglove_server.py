@@ -1,8 +1,8 @@
-"""Runs for Foxglove, Lichtblick and PlotJuggler: a server of Foxglove's protocol, on loopback.
+"""Serve runs to Foxglove, Lichtblick and PlotJuggler with Foxglove's protocol, on loopback.
 
-It only shows: no client can change anything by it. But the library checks neither who asks nor from
-which page, so that every user and every page in a browser of this machine can look on while it is
-there; therefore it is only where it is asked for.
+Clients are read-only. The library checks neither the user nor the origin of a request, so every
+user and every web page on this computer can read the run while the server is active. It is
+therefore started on request only.
 """
 
 import logging
@@ -39,18 +39,18 @@ _BACKLOG = 4096  # messages for one client, about a second of them; the oldest a
 
 
 class FoxgloveServer:
-    """Serves the run that is going on.
+    """Serves the active run.
 
     Args:
         chosen: See :class:`hilctl.desk.feeds.RunFeeds`.
-        port: To listen at; 0 for any.
+        port: Port to listen on; 0 for any.
         clock: Monotonic time in s.
         unix_ns: Unix time in ns.
-        sleep: Lets that many s pass.
+        sleep: Sleeps for the given time in s.
 
     Raises:
         InputError: The library is not installed.
-        RunError: The port can't be had.
+        RunError: The port is not available.
     """
 
     def __init__(
@@ -73,7 +73,7 @@ class FoxgloveServer:
         return f"ws://127.0.0.1:{self._server.port}"
 
     def run(self, over: Callable[["FoxgloveServer"], bool]) -> None:
-        """Serve until ``over`` says that it is."""
+        """Serve until ``over`` returns true."""
         number = 0
         try:
             while not over(self):
@@ -88,7 +88,7 @@ class FoxgloveServer:
             stopping.join(_STOP_S)
 
     def feed(self, name: str | None) -> RunFeed | None:
-        """Return the feed of a run, see :meth:`hilctl.desk.feeds.RunFeeds.feed`."""
+        """Return the reader of a run, see :meth:`hilctl.desk.feeds.RunFeeds.feed`."""
         return self._feeds.feed(name)
 
     def _show(self, number: int) -> None:
@@ -101,7 +101,7 @@ class FoxgloveServer:
         if feed is not self._shown and feed.start_ns:
             start_unix_ns = self._unix_ns() - round(now_s * 1e9) + feed.start_ns
             if self._shown is not None:
-                self._server.clear_session()  # what clients have kept is of another run
+                self._server.clear_session()  # discards client data of another run
             self._shown, self._topics = feed, LiveTopics(feed, start_unix_ns)
         if self._topics is None:
             return
@@ -119,7 +119,7 @@ class FoxgloveServer:
 
 @contextmanager
 def _logging_as_before() -> Iterator[None]:
-    """Keep the level and handlers of all logs: the library sets its own for everybody's."""
+    """Restore the level and handlers of all logs, which the library changes globally."""
     root = logging.getLogger()
     level, handlers = root.level, root.handlers[:]
     yield
@@ -128,13 +128,13 @@ def _logging_as_before() -> Iterator[None]:
 
 
 def _started(port: int) -> tuple["Context", dict[str, "Channel"], "WebSocketServer"]:
-    """Return the channels by their topics, the server that has them, and what holds them together.
+    """Return the channels by topic, the server, and the context that keeps them alive.
 
-    Without their context, channels would be gone from the server.
+    Without the context, the channels would be removed from the server.
 
     Raises:
         InputError: The library is not installed.
-        RunError: The port can't be had.
+        RunError: The port is not available.
     """
     try:
         import foxglove
@@ -143,7 +143,7 @@ def _started(port: int) -> tuple["Context", dict[str, "Channel"], "WebSocketServ
             "--foxglove: its library is not installed: pip install 'hilctl[foxglove]'"
         ) from None
     with _logging_as_before():
-        foxglove.set_log_level("ERROR")  # what strangers send, nobody should have to read
+        foxglove.set_log_level("ERROR")  # discards messages on invalid requests
     context = foxglove.Context()
     descriptors = schema.descriptor_set()
     channels = {
@@ -155,7 +155,7 @@ def _started(port: int) -> tuple["Context", dict[str, "Channel"], "WebSocketServ
             topic, schema=form, message_encoding="protobuf", context=context
         )
     try:
-        # No capability is given: clients can subscribe, and that is all.
+        # No capabilities: clients can only subscribe.
         server = foxglove.start_server(
             name="hilctl",
             host="127.0.0.1",

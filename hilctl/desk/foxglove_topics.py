@@ -1,9 +1,8 @@
-"""A live run as messages for Foxglove: the topics of its recording, and diagnostics.
+"""Encode a live run for Foxglove: the topics of its recording, and diagnostics.
 
-`/scope` and `/events` have the schemas of a recording, so that one layout opens both. A run has too
-many samples for it: `/scope` has the first sample of each bucket, as the loops of the page have,
-`/scope_low` and `/scope_high` have the lowest and highest value of each signal in it, whichever
-samples they are of, so that no spike is lost.
+`/scope` and `/events` have the schemas of a recording, so that one layout opens both. `/scope` has
+the first sample of each bucket, like the loops of the page; `/scope_low` and `/scope_high` have the
+minimum and maximum of each signal per bucket, so that every spike is visible.
 """
 
 import json
@@ -31,7 +30,7 @@ MESSAGES = {"/events": TOPICS["/events"], **dict.fromkeys(SCOPE_TOPICS, TOPICS["
 """Message of each topic that a recording has too, or one like it; all are of package ``hilctl``."""
 DIAGNOSTICS = "/diagnostics"
 DIAGNOSTICS_SCHEMA: dict[str, Any] = {
-    "title": "diagnostic_msgs/DiagnosticArray",  # by this name the panels know it
+    "title": "diagnostic_msgs/DiagnosticArray",  # name expected by the panels
     "type": "object",
     "properties": {
         "header": {
@@ -66,22 +65,22 @@ DIAGNOSTICS_SCHEMA: dict[str, Any] = {
     },
 }
 """Schema of ``/diagnostics``, which is JSON."""
-_WINDOW_S = 0.5  # its buckets are 1/1200 s long: about what the /scope of a recording has
+_WINDOW_S = 0.5  # buckets of 1/1200 s, similar to /scope of a recording
 _LEVELS = {"info": 0, "warning": 1, "error": 2}
 _COLUMNS = {
     "reference_um": "reference",
     "wanted": "wanted",
     "command": "command",
     "displacement_um": "displacement",
-}  # columns of a recording's /scope, and the signals that they are
+}  # columns of a recording's /scope and their signals
 
 
 class LiveTopics:
-    """The messages of one run as they come.
+    """The messages of one run.
 
     Args:
-        feed: The run.
-        start_unix_ns: Unix time of its sample 0.
+        feed: Reader of the run.
+        start_unix_ns: Unix time of sample 0.
     """
 
     def __init__(self, feed: RunFeed, start_unix_ns: int) -> None:
@@ -100,12 +99,12 @@ class LiveTopics:
         self._rows = {fields[name].name: ROW[signal] for name, signal in _COLUMNS.items()}
 
     def scope(self, wanted: Collection[str] = SCOPE_TOPICS) -> Iterator[Encoded]:
-        """Yield the messages of the buckets that have become whole, the oldest first.
+        """Yield the messages of completed buckets, the oldest first.
 
-        Those that are gone before they were asked for are left out: the newest count.
+        Buckets that were overwritten before the call are omitted.
 
         Args:
-            wanted: Topics that somebody listens to.
+            wanted: Topics with subscribers.
         """
         first, buckets = self._feed.scope.whole_buckets(_WINDOW_S, self._next_bucket)
         count, width = buckets.first.shape[1], self._feed.scope.bucket_samples(_WINDOW_S)
@@ -121,12 +120,12 @@ class LiveTopics:
             yield from map(Encoded, repeat(topic), times_ns, messages)
 
     def events(self) -> Iterator[Encoded]:
-        """Yield the messages of the events since the last time."""
+        """Yield the messages of the events since the last call."""
         events, self._seen_events = self._feed.events_since(self._seen_events)
         yield from map(self._maker.event, events)
 
     def diagnostics(self, now_unix_ns: int) -> Encoded:
-        """Return where the run stands, and how much of each limit it uses."""
+        """Return the state of the run and its use of each limit."""
         status = self._feed.status()
         seconds, nanoseconds = divmod(now_unix_ns, 10**9)
         stamp = {"sec": seconds, "nsec": nanoseconds}
@@ -135,7 +134,7 @@ class LiveTopics:
 
 
 def _statuses(status: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return the parts of ``/diagnostics`` by :meth:`hilctl.desk.feed.RunFeed.status`."""
+    """Return the parts of ``/diagnostics`` from :meth:`hilctl.desk.feed.RunFeed.status`."""
     run, failed = status["run"], status["state"] == "fault" or status["safe"] is False
     told = ("t_s", "total_s", "segment", "gain", "offset", "inverse", "recording")
     late = {f"{name}_us": value for name, value in status["lateness_us"].items()}

@@ -1,8 +1,8 @@
-"""Frames as they go to a page: a line of JSON that says what follows, and float32 values.
+"""Encode frames for a page: a JSON header and float32 values.
 
-uint32 little endian   bytes of the JSON, with spaces up to a multiple of 4
+uint32 little endian   size of the JSON in bytes, with spaces up to a multiple of 4
 JSON                   ``mode`` of the window, its ``n`` buckets, ``loop`` points of the loops
-                       and ``cycle`` points in one of them
+                       and ``cycle`` points per cycle
 float32 little endian  t_s[n], low[signals, n], high[signals, n], input[loop], output[loop]
 """
 
@@ -24,16 +24,16 @@ ScopeMode: TypeAlias = Literal["roll", "cycle"]
 
 
 def nearest_window_s(wanted_s: float) -> float:
-    """Return the one of :data:`hilctl.desk.scope.WINDOWS_S` that is nearest by ratio."""
+    """Return the value of :data:`hilctl.desk.scope.WINDOWS_S` with the nearest ratio."""
     return min(WINDOWS_S, key=lambda each: max(each / wanted_s, wanted_s / each))
 
 
 def frame_of(scope: Scope, mode: ScopeMode, window_s: float) -> bytes:
-    """Return what a page shows now.
+    """Return the current frame of a page.
 
     Args:
         scope: The windows of a run.
-        mode: ``cycle`` is triggered to the waveform's cycle; where it has none, it rolls.
+        mode: ``cycle`` is triggered by the waveform's cycle; without a cycle it rolls.
         window_s: Length of a rolling window, one of :data:`hilctl.desk.scope.WINDOWS_S`.
     """
     window = scope.triggered() if mode == "cycle" else None

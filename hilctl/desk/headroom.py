@@ -1,4 +1,4 @@
-"""How much of each limit and interlock a run uses, as it goes on."""
+"""Compute the current use of each limit and interlock of a run."""
 
 import math
 from dataclasses import dataclass
@@ -17,13 +17,13 @@ _HOLD_S = 1.0
 
 @dataclass(frozen=True, slots=True)
 class Gauge:
-    """One limit.
+    """Use of one limit.
 
     Attributes:
-        name: For people.
-        used: Part of it that is used, 0 to 1, and more beyond it.
-        value: Where the run stands.
-        limit: What it is held to.
+        name: Name to display.
+        used: Fraction of the limit in use; more than 1 if it is exceeded.
+        value: Current value.
+        limit: Limit of the value.
         unit: Unit of both.
     """
 
@@ -35,17 +35,17 @@ class Gauge:
 
     @property
     def level(self) -> Literal["info", "warning", "error"]:
-        """How much it should worry people."""
+        """Severity to display."""
         if self.used > ERROR_USED:
             return "error"
         return "warning" if self.used > WARNING_USED else "info"
 
 
 class Headroom:
-    """The limits of one run; each holds the most of the last second.
+    """The limits of one run; each gauge holds the peak of the last second.
 
     Args:
-        description: The run.
+        description: Description of the run.
     """
 
     def __init__(self, description: RunDescription) -> None:
@@ -57,7 +57,7 @@ class Headroom:
         self._held: dict[str, list[tuple[int, float, float]]] = {}
 
     def add(self, traces: Traces) -> None:
-        """Take the next samples."""
+        """Add the next samples."""
         if not traces.index.size:
             return
         command = traces.values[ROW["command"]]
@@ -74,10 +74,10 @@ class Headroom:
             self._warm(np.fmax(np.abs(command), np.abs(measured)))
 
     def gauges(self, late_s: float) -> list[Gauge]:
-        """Return all that the run has.
+        """Return the gauges of the run.
 
         Args:
-            late_s: How late the newest ticks woke at most.
+            late_s: Largest wake-up lateness of the newest ticks.
         """
         limits, unit = self._limits, self._unit
         found = []
@@ -115,7 +115,7 @@ class Headroom:
     def _hold(self, name: str, used: float, value: float) -> None:
         now, kept = self._next_sample, self._held.get(name, [])
         oldest = now - _HOLD_S * self._rate_hz
-        # What is smaller than what came after it will never be the largest.
+        # A value smaller than a later one can never become the maximum.
         kept = [each for each in kept if each[0] > oldest and each[1] > used]
         self._held[name] = [*kept, (now, used, value)]
 

@@ -1,6 +1,6 @@
-"""The page's server as a process: beside a run that was asked for it, or by itself.
+"""Run the servers as processes: beside a run that requested one, or alone.
 
-Started beside a run as ``python -m hilctl.desk.live`` with the supervisor's process number on its
+Beside a run it is started as ``python -m hilctl.desk.live`` with the supervisor's process number on
 standard input; its first line of output is the address. It ends with its run.
 """
 
@@ -27,15 +27,15 @@ _START_S = 30.0
 
 
 class ShowsRuns(Protocol):
-    """A server, as far as its end goes."""
+    """A server whose end depends on its runs."""
 
     def feed(self, name: str | None) -> RunFeed | None:
-        """Return the feed of a run; None for the one that is shown first."""
+        """Return the reader of a run; None for the default run."""
         ...
 
 
 class UntilEnded:
-    """Says that a server is over some time after its run is, so that pages hear of the end.
+    """Returns whether a server has ended: some time after its run, so that pages show the end.
 
     Args:
         clock: Monotonic time in s.
@@ -46,7 +46,7 @@ class UntilEnded:
         self._ended_s: float | None = None
 
     def __call__(self, server: ShowsRuns) -> bool:
-        """Return whether it is."""
+        """Return whether the server has ended."""
         feed = server.feed(None)
         if feed is None or not feed.ended:
             self._ended_s = None
@@ -65,12 +65,12 @@ def serve_runs(
 
     Args:
         chosen: See :class:`hilctl.desk.server.LiveServer`.
-        over: Whether it is.
-        on_url: Called with the page's address, token included.
-        port: To listen at; 0 for any.
+        over: Returns whether to end the server.
+        on_url: Called with the address of the page, including its token.
+        port: Port to listen on; 0 for any.
 
     Raises:
-        RunError: The port can't be had.
+        RunError: The port is not available.
     """
     _come_last()
     server = LiveServer(chosen, port)
@@ -84,28 +84,28 @@ def serve_foxglove(
     on_url: Callable[[str], None],
     port: int | None = None,
 ) -> None:
-    """Serve runs to Foxglove and its like until it is over.
+    """Serve runs to Foxglove and compatible applications until it is over.
 
     Args:
         chosen: See :class:`hilctl.desk.feeds.RunFeeds`.
-        over: Whether it is.
-        on_url: Called with the server's address.
-        port: To listen at; 0 for any, None for the one that the applications look for.
+        over: Returns whether to end the server.
+        on_url: Called with the address of the server.
+        port: Port to listen on; 0 for any, None for the default port of the applications.
 
     Raises:
         InputError: The library is not installed.
-        RunError: The port can't be had.
+        RunError: The port is not available.
     """
     from hilctl.desk.foxglove_server import PORT, FoxgloveServer
 
-    _come_last()  # before the library starts threads, which take over how nice this one is
+    _come_last()  # before the library starts threads, which inherit the priority
     server = FoxgloveServer(chosen, PORT if port is None else port)
     on_url(server.url)
     server.run(over)
 
 
 def _come_last() -> None:
-    """Let the loop, the recorder and the guardian come before whoever looks on."""
+    """Lower the priority of this process below that of loop, recorder and guardian."""
     be_ordinary()
     os.nice(_NICE)
 
@@ -115,13 +115,13 @@ def served_beside() -> Iterator[str]:
     """Serve the page of the run that this process is about to supervise.
 
     Yields:
-        The page's address, token included.
+        Address of the page, including its token.
 
     Raises:
-        RunError: There is no such server to be had.
+        RunError: The server cannot be started.
     """
     process = subprocess.Popen(
-        # -P: what lies in the working folder is not to be imported.
+        # -P: never import from the working folder.
         [sys.executable, "-P", "-m", "hilctl.desk.live"],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
@@ -130,28 +130,28 @@ def served_beside() -> Iterator[str]:
     )
     try:
         yield _url_of(process)
-        with suppress(subprocess.TimeoutExpired):  # it tells its pages of the end first
+        with suppress(subprocess.TimeoutExpired):  # it first sends the end to its pages
             process.wait(2.0 * _LAST_S)
     finally:
         _end(process)
 
 
 def _url_of(process: "subprocess.Popen[str]") -> str:
-    """Tell the server whose run it serves; return its address."""
+    """Send the supervisor's process number to the server and return its address."""
     assert process.stdin is not None
     assert process.stdout is not None
-    with suppress(BrokenPipeError):  # seen by the address that does not come
+    with suppress(BrokenPipeError):  # detected by the missing address
         process.stdin.write(f"{os.getpid()}\n")
         process.stdin.flush()
     ready, _, _ = select.select([process.stdout], [], [], _START_S)
     url = process.stdout.readline().strip() if ready else ""
     if not url:
-        raise RunError("the server of the live page could not be started")
+        raise RunError("cannot start the server of the live page")
     return url
 
 
 def _end(process: "subprocess.Popen[str]") -> None:
-    """End the server, also one that is stopped or hangs."""
+    """Stop the server, even if it is suspended or hangs."""
     process.terminate()
     with suppress(subprocess.TimeoutExpired):
         process.wait(_LAST_S)
@@ -163,7 +163,7 @@ def _end(process: "subprocess.Popen[str]") -> None:
 
 
 def main() -> None:
-    """Serve the run of a supervisor, until either is gone."""
+    """Serve the run of a supervisor until the run or the supervisor has ended."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     supervisor, ended = int(sys.stdin.readline()), UntilEnded()
 

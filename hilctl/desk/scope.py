@@ -1,4 +1,4 @@
-"""Windows over time and loops, for an oscilloscope's two ways to look: rolling and triggered."""
+"""Provide the windows of an oscilloscope (rolling or triggered) and hysteresis loops."""
 
 import math
 from dataclasses import dataclass
@@ -101,11 +101,11 @@ _LOOP_S = 2.0
 
 @dataclass(frozen=True, slots=True)
 class Window:
-    """What a scope shows.
+    """Content of a scope.
 
     Attributes:
-        t_s: float64[n], when each bucket begins: before now where it rolls, after the cycle's
-            beginning where it is triggered.
+        t_s: float64[n], start of each bucket: relative to now if rolling, to the start of the cycle
+            if triggered.
         buckets: The signals.
     """
 
@@ -117,9 +117,9 @@ class Scope:
     """The windows of one run.
 
     Args:
-        sample_rate_hz: Samples a second.
-        segments: Stretches of the run, in order.
-        loop_input: Signal on the loop's abscissa.
+        sample_rate_hz: Samples per second.
+        segments: Segments of the run, in order.
+        loop_input: Signal on the abscissa of the loop.
     """
 
     def __init__(self, sample_rate_hz: float, segments: list[Segment], loop_input: str) -> None:
@@ -134,7 +134,7 @@ class Scope:
         """The stretch that the newest sample of the waveform is in."""
 
     def add(self, traces: Traces) -> None:
-        """Take the next samples."""
+        """Add the next samples."""
         for envelope in self._rolling.values():
             envelope.add(traces)
         running = traces.index[(traces.flags & NO_WAVEFORM) == 0]
@@ -163,27 +163,27 @@ class Scope:
         return Window(t_s.astype(np.float64), envelope.window(envelope.newest - count + 1, count))
 
     def whole_buckets(self, window_s: float, since: int) -> tuple[int, Buckets]:
-        """Return the buckets of a rolling window that no sample will come to any more.
+        """Return the completed buckets of a rolling window.
 
         Args:
             window_s: One of :data:`WINDOWS_S`; a bucket is one of its :data:`BUCKETS` parts.
-            since: Number of the first bucket that is wanted.
+            since: Number of the first requested bucket.
 
         Returns:
-            Number of the first that is still kept, and the buckets from there on.
+            Number of the first bucket that is still stored, and the buckets from there on.
         """
         envelope = self._rolling[window_s]
         first = max(since, envelope.newest - envelope.keep + 1, 0)
         return first, envelope.window(first, max(0, envelope.newest - first))
 
     def bucket_samples(self, window_s: float) -> int:
-        """Return how many samples a bucket of a rolling window has."""
+        """Return the number of samples per bucket of a rolling window."""
         return int(self._rolling[window_s].width)
 
     def triggered(self, cycles: int = 2) -> Window | None:
-        """Return the newest whole cycles of the waveform; None where it has none yet.
+        """Return the newest complete cycles of the waveform; None before the first.
 
-        A cycle that takes long is shown as it comes.
+        A long cycle is shown while it is recorded.
         """
         envelope, segment = self._cycles, self.segment
         if envelope is None or segment is None or segment.period <= 0.0:
@@ -202,7 +202,7 @@ class Scope:
     def loops(self) -> F64:
         """Return the newest loops: float64[2, n], oldest first.
 
-        Input and displacement; of one sample each, so that they belong together.
+        Input and displacement of the same sample.
         """
         envelope, segment = self._cycles, self.segment
         if envelope is None or segment is None:
@@ -213,7 +213,7 @@ class Scope:
         return first[[self._input, ROW["displacement"]]]
 
     def points_a_cycle(self) -> int:
-        """Return how many points of :meth:`loops` are one cycle."""
+        """Return the number of points of :meth:`loops` per cycle."""
         segment = self.segment
         if segment is None or segment.period <= 0.0 or self._cycles is None:
             return _CYCLE_BUCKETS

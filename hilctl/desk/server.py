@@ -1,7 +1,7 @@
-"""The server of the page: files, and one live connection for each page, on loopback only.
+"""Serve the page: files, and one live connection per page, on loopback only.
 
-It is a process of its own that only looks on. What is asked for goes the way of ``hilctl set`` and
-``hilctl stop``, so that a run needs no server, and a stop no more of it than to pass a signal on.
+The server is a separate, read-only process. Requests are sent to the run like those of ``hilctl
+set`` and ``hilctl stop``, so that a run does not depend on a server.
 """
 
 import asyncio
@@ -81,7 +81,7 @@ def _response(status: HTTPStatus, kind: str, body: bytes) -> Response:
 _log = logging.getLogger(__name__)
 
 FRAME_S = 1.0 / 30.0
-_STATUS_FRAMES = 6  # figures that change more often can't be read
+_STATUS_FRAMES = 6  # values that change more often are unreadable
 _MOST_VIEWERS = 16
 _LIVE = "/live"
 _REQUEST_S = 30.0
@@ -91,15 +91,15 @@ class LiveServer:
     """Serves the page of all runs of this user.
 
     Args:
-        chosen: Returns the run that a page shows unless it says another; None where there is none.
-        port: To listen at; 0 for any.
+        chosen: Returns the run that a page shows by default; None if there is none.
+        port: Port to listen on; 0 for any.
         clock: Monotonic time in s.
 
     Attributes:
-        port: That it listens at.
+        port: Port that it listens on.
 
     Raises:
-        RunError: The port can't be had.
+        RunError: The port is not available.
     """
 
     def __init__(
@@ -119,15 +119,15 @@ class LiveServer:
 
     @property
     def url(self) -> str:
-        """Address of the page; the token is in its fragment, which no browser sends anywhere."""
+        """Address of the page; the token is in the fragment, which browsers never send."""
         return f"http://127.0.0.1:{self.port}/#{self._token}"
 
     async def run(self, over: Callable[["LiveServer"], bool]) -> None:
-        """Serve until ``over`` says that it is."""
+        """Serve until ``over`` returns true."""
         settings: dict[str, Any] = {
             "process_request": self._let_in,
             "select_subprotocol": _our_protocol,
-            "compression": None,  # it would take longer than loopback does
+            "compression": None,  # slower than loopback
             "server_header": None,
             "open_timeout": 3.0,
             "close_timeout": 1.0,
@@ -142,7 +142,7 @@ class LiveServer:
             await self._tick(over)
 
     def feed(self, name: str | None) -> RunFeed | None:
-        """Return the feed of a run, see :meth:`hilctl.desk.feeds.RunFeeds.feed`."""
+        """Return the reader of a run, see :meth:`hilctl.desk.feeds.RunFeeds.feed`."""
         return self._feeds.feed(name)
 
     def _let_in(self, connection: ServerConnection, request: Request) -> Response | None:
@@ -179,7 +179,7 @@ class LiveServer:
         if message.ask == "view":
             return {"ok": True}
         if feed is None:
-            raise InputError("no such run is going on")
+            raise InputError("no such active run")
         if message.ask == "stop":
             # Without a supervisor its loop ramps down by itself.
             requested = request_stop(feed.folder)
@@ -194,14 +194,14 @@ class LiveServer:
             self._show(number)
             number, due_s = number + 1, due_s + FRAME_S
             now_s = self._clock()
-            # Frames that there was no time for are left out.
+            # Skip frames if there was no time.
             due_s = max(due_s, now_s + FRAME_S / 4.0)
             await asyncio.sleep(due_s - now_s)
 
     def _show(self, number: int) -> None:
         now_s = self._clock()
         self._feeds.look(now_s, [each.view.run for each in self._viewers])
-        self.feed(None)  # from its first sample on, though nobody may be looking yet
+        self.feed(None)  # read from the first sample, even without a page
         for feed in self._feeds:
             feed.poll(now_s)
         frames: dict[tuple[str, str, float], bytes] = {}
@@ -233,13 +233,13 @@ class LiveServer:
 def _our_protocol(
     connection: ServerConnection, offered: Sequence[Subprotocol]
 ) -> Subprotocol | None:
-    """Choose the one of the page; the token is offered too, and never chosen."""
+    """Select the protocol of the page; the token is offered too, and never selected."""
     del connection
     return PROTOCOL if PROTOCOL in offered else None
 
 
 def _quiet() -> logging.Logger:
-    """Return a log for what strangers send: nobody should have to read it."""
+    """Return a log that discards messages on invalid requests."""
     log = _log.getChild("strangers")
     log.propagate = False
     log.addHandler(logging.NullHandler())
@@ -247,17 +247,17 @@ def _quiet() -> logging.Logger:
 
 
 def _listeners(port: int) -> list[socket.socket]:
-    """Return sockets at one port of 127.0.0.1 and, where there is IPv6, of ::1.
+    """Return sockets on one port of 127.0.0.1 and, if IPv6 is available, of ::1.
 
     Raises:
-        RunError: The port can't be had.
+        RunError: The port is not available.
     """
     with ExitStack() as stack:
         try:
             first = stack.enter_context(socket.create_server(("127.0.0.1", port)))
             found = [first]
             if socket.has_ipv6:
-                with suppress(OSError):  # switched off on this machine
+                with suppress(OSError):  # IPv6 is disabled
                     address = ("::1", first.getsockname()[1])
                     found.append(socket.create_server(address, family=socket.AF_INET6))
         except OSError as error:

@@ -1,4 +1,4 @@
-"""The signals that are shown of a run."""
+"""Define the signals that are shown of a run."""
 
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
@@ -16,8 +16,8 @@ class Signal:
     """One signal.
 
     Attributes:
-        name: For programs.
-        label: For people.
+        name: Name for programs.
+        label: Name to display.
         unit: ``um``, or the unit of the run's commands.
     """
 
@@ -44,7 +44,7 @@ class Traces:
 
     Attributes:
         index: int64[n], sample index since the start of the run; a jump is a gap.
-        values: float64[len(SIGNALS), n]; NaN where there is none.
+        values: float64[len(SIGNALS), n]; NaN if there is no value.
         flags: uint32[n], bits of :class:`hilctl.base.samples.Flag`.
     """
 
@@ -53,17 +53,17 @@ class Traces:
     flags: U32
 
     def rows(self, chosen: slice) -> "Traces":
-        """Return some samples."""
+        """Return the selected samples."""
         return Traces(self.index[chosen], self.values[:, chosen], self.flags[chosen])
 
     def part(self, start: float, stop: float) -> "Traces":
-        """Return the samples whose index lies in [start, stop)."""
+        """Return the samples with an index in [start, stop)."""
         low, high = np.searchsorted(self.index, (start, stop))
         return self.rows(slice(int(low), int(high)))
 
 
 def traces_of(batch: Batch, waveform_unit: str) -> Traces:
-    """Return the signals of some blocks; without a reference in um there is no error either."""
+    """Return the signals of blocks; without a reference in um there is no error."""
     samples = batch.samples()
     reference = samples.reference_um
     if waveform_unit != "um":

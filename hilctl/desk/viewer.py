@@ -1,7 +1,7 @@
-"""One page that looks on: what it asks for, and the newest frame for it.
+"""Session of one page: its requests and the newest frame for it.
 
-Nothing waits in a queue for it: a frame is made when the one before has left, so that a slow page
-sees fewer of them, and the newest. One that takes nothing for seconds is cut.
+Frames are not queued: a frame is made when the previous one has been sent, so that a slow page gets
+fewer frames, always the newest. A page that reads nothing for seconds is disconnected.
 """
 
 import asyncio
@@ -25,12 +25,12 @@ _RATE_HZ, _BURST = 20.0, 40.0
 
 
 class PageView(Strict):
-    """What a page shows.
+    """Selection of a page.
 
     Attributes:
-        run: Name of the run; None for the one that the server was started for.
-        mode: Of its scope.
-        window_s: Length of its window where it rolls.
+        run: Name of the run; None for the default run of the server.
+        mode: Mode of its scope.
+        window_s: Length of a rolling window.
     """
 
     run: str | None = None
@@ -39,14 +39,14 @@ class PageView(Strict):
 
 
 class PageMessage(Strict):
-    """What a page says.
+    """Message of a page.
 
     Attributes:
-        id: Number that the answer comes with.
-        ask: ``view`` changes what it shows, ``stop`` ends the run by its safe ramp, ``run`` passes
-            a request on to the run's control socket.
-        view: What it shows from now on, a :class:`PageView`.
-        request: The request to the run.
+        id: Number that is returned with the answer.
+        ask: ``view`` changes the selection, ``stop`` stops the run, ``run`` sends a request to the
+            run's control socket.
+        view: New selection, a :class:`PageView`.
+        request: Request to the run.
     """
 
     id: int
@@ -61,11 +61,11 @@ def answer_text(message: PageMessage, **said: Any) -> str:
 
 
 class Allowance:
-    """A rate with a burst.
+    """Rate limiter with a burst.
 
     Args:
-        rate_hz: How many a second, in the long run.
-        burst: How many at once.
+        rate_hz: Number per second in the long run.
+        burst: Number at once.
         clock: Monotonic time in s.
     """
 
@@ -74,7 +74,7 @@ class Allowance:
         self._left, self._at = burst, clock()
 
     def take(self) -> bool:
-        """Take one; False where there is none."""
+        """Take one; return False if none is left."""
         now = self._clock()
         self._left = min(self._burst, self._left + (now - self._at) * self._rate_hz)
         self._at = now
@@ -85,15 +85,15 @@ class Allowance:
 
 
 class Viewer:
-    """A page that was let in.
+    """Session of an authenticated page.
 
     Args:
-        connection: To it.
-        answer: Follows what it asks for, and returns the answer to send.
+        connection: Connection to the page.
+        answer: Executes a request and returns the answer to send.
         clock: Monotonic time in s.
 
     Attributes:
-        view: What it shows.
+        view: Current selection.
     """
 
     def __init__(
@@ -110,7 +110,7 @@ class Viewer:
 
     @property
     def ready(self) -> bool:
-        """Whether all that was sent before has left; a page that is too slow is cut."""
+        """Whether all earlier messages were sent; a page that is too slow is disconnected."""
         if self._sending is None or self._sending.done():
             return True
         if self._clock() - self._began_s > SLOW_S:
@@ -118,7 +118,7 @@ class Viewer:
         return False
 
     def offer(self, *messages: str | bytes) -> None:
-        """Send messages, after one another; only to one that is :attr:`ready`."""
+        """Send messages in order; call it only if the session is :attr:`ready`."""
         self._began_s = self._clock()
         self._sending = asyncio.create_task(self._send(messages))
 
@@ -130,7 +130,7 @@ class Viewer:
             return
 
     async def attend(self) -> None:
-        """Follow what it asks for until it is gone."""
+        """Execute the requests of the page until it disconnects."""
         async for raw in self._connection:
             if not self._allowance.take():
                 await self._connection.close(1008, "too many messages")

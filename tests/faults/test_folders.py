@@ -60,7 +60,7 @@ GONE = 'mkdir gone; cd gone; rmdir ../gone; exec "$@"'
 @pytest.mark.parametrize(
     ("experiment", "output", "code", "said"),
     [
-        ("demo.yaml", "/run.mcap", 3, "the folder that it is started in has been deleted: change"),
+        ("demo.yaml", "/run.mcap", 3, "the working folder has been deleted: change"),
         ("/demo.yaml", "run.mcap", 2, "run.mcap: can't be written: No such file or directory"),
         pytest.param("/demo.yaml", "/run.mcap", 0, "", marks=pytest.mark.long),
     ],
@@ -100,7 +100,7 @@ def test_folder_that_is_deleted_while_a_run_starts(tmp_path, device, inside):
         shutil.rmtree(lab)
         _, err = process.communicate(timeout=240)
     # Inside, it depends on how far it has come which of the two is noticed first.
-    gone = "hilctl: the folder that it is started in has been deleted: change to another one"
+    gone = "hilctl: the working folder has been deleted: change to another one"
     taken = "run.mcap: can't be written: the file was deleted or renamed"
     (line,) = err.splitlines()
     assert line.endswith(taken) or (inside and line == gone)

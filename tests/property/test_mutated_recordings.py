@@ -35,7 +35,7 @@ from hilctl.analysis.report import summarize
 from hilctl.analysis.run_page import page
 from hilctl.base.errors import ConfigError, HilctlError
 from hilctl.base.segments import Segment
-from hilctl.cli.report_view import render
+from hilctl.cli.reports import render_report
 from hilctl.experiment.initial_state import initial_state_after
 from hilctl.identify.data.cycles import loops_from_recording
 from hilctl.identify.data.files import history_from_recording
@@ -321,7 +321,7 @@ def damaged(number: int, seed: int) -> bytes:
 def _report(recording: Recording, _path: Path) -> None:
     summary = summarize(recording)
     json.dumps(summary.to_mapping())
-    render(summary)
+    render_report(summary)
 
 
 def _html(recording: Recording, _path: Path) -> None:

@@ -25,49 +25,52 @@ def emulate(
     profile: Annotated[
         str,
         typer.Argument(
-            help="Shipped profile, path of one, or an experiment, whose wiring it takes.",
+            help="Shipped profile, path of a profile, or an experiment (uses its wiring).",
             metavar="PROFILE|EXPERIMENT",
         ),
     ],
-    link: Annotated[str | None, typer.Option(help="tcp or rtu; else the profile's own.")] = None,
+    link: Annotated[str | None, typer.Option(help="tcp or rtu; default: from the profile.")] = None,
     host: Annotated[str, typer.Option(help="Address to listen on.")] = EmulatorOptions.host,
     port: Annotated[
-        int, typer.Option(min=0, max=65535, help="TCP port; 0 takes a free one.")
+        int, typer.Option(min=0, max=65535, help="TCP port; 0 for any free port.")
     ] = EmulatorOptions.port,
-    log: Annotated[Path | None, typer.Option(help="File for a log of every write.")] = None,
+    log: Annotated[Path | None, typer.Option(help="Log file for every write.")] = None,
     fault: Annotated[
         list[str] | None,
         typer.Option(metavar="KIND@WHEN", help="KIND@COUNT or KIND@SECONDSs; may be repeated."),
     ] = None,
     output: Annotated[str | None, typer.Option(help="Output that drives the rig.")] = None,
     sensor: Annotated[
-        str | None, typer.Option(help="Input that shows the displacement; or READER:INPUT.")
+        str | None, typer.Option(help="Input that reads the displacement, or READER:INPUT.")
     ] = None,
     reader: Annotated[
-        str | None, typer.Option(help="Profile of the device that has the input, if another one.")
+        str | None, typer.Option(help="Profile of the device with the input, if separate.")
     ] = None,
     reader_line: Annotated[
-        str | None, typer.Option(help="The reader's: same or own; same for Modbus RTU, else own.")
+        str | None,
+        typer.Option(
+            help="Line of the reader: same or own; default: same for Modbus RTU, otherwise own."
+        ),
     ] = None,
-    reader_unit_id: Annotated[int | None, typer.Option(help="The reader's unit id.")] = None,
+    reader_unit_id: Annotated[int | None, typer.Option(help="Unit id of the reader.")] = None,
     reader_port: Annotated[
-        int, typer.Option(min=0, max=65535, help="The reader's own TCP port; 0 takes a free one.")
+        int, typer.Option(min=0, max=65535, help="The reader's own TCP port; 0 for any free port.")
     ] = EmulatorOptions.reader_port,
     current_a: Annotated[
-        float | None, typer.Option(help="Current at the start, A; else as the device powers up.")
+        float | None, typer.Option(help="Initial current, A; default: as after power-up.")
     ] = None,
     as_json: Annotated[
-        bool, typer.Option("--json", help="Print one line of JSON once it answers.")
+        bool, typer.Option("--json", help="Print one line of JSON when ready.")
     ] = False,
 ) -> None:
-    """Serve the simulated rig as a real device would, until Ctrl-C."""
+    """Emulate a device with the simulated rig, until Ctrl-C."""
     say = _say_json if as_json else _say
     faults = tuple(parse_fault(text) for text in fault or ())
     if is_experiment(profile):
         own = {"--link": link, "--output": output, "--sensor": sensor, "--reader": reader,
                "--reader-line": reader_line, "--reader-unit-id": reader_unit_id}  # fmt: skip
         if given := [name for name, value in own.items() if value is not None]:
-            raise InputError(f"{', '.join(given)}: {profile} says that itself")
+            raise InputError(f"{', '.join(given)}: specified by {profile} already")
         wired = wired_experiment(Path(profile), port, host)
         options = replace(wired.options, log=log, faults=faults, current_a=current_a)
         if reader_port:

@@ -1,15 +1,15 @@
-// The live page: it draws what the server sends, and asks for what is pressed. It keeps nothing: a
-// reload, a second page or none at all is the same to the run.
+// The live page: draws the data of the server and sends the user's requests. It has no state, so a
+// reload or a second page does not affect the run.
 
 const PROTOCOL = "hilctl.live.1";
 const WINDOWS_S = [0.02, 0.1, 0.5, 2, 10, 60, 600];
 const FIGURES = [
   ["peak_hysteresis_percent", "peak hysteresis", "%", 2],
-  ["noise_floor_percent", "its noise floor", "%", 2],
+  ["noise_floor_percent", "noise floor", "%", 2],
   ["peak_error_percent", "peak error", "%", 2],
   ["rms_error_percent", "rms error", "%", 2],
-  ["peak_error_um", "peak error, each sample", "µm", 3],
-  ["rms_error_um", "rms error, each sample", "µm", 3],
+  ["peak_error_um", "peak error, single samples", "µm", 3],
+  ["rms_error_um", "rms error, single samples", "µm", 3],
   ["peak_to_peak_um", "stroke", "µm", 2],
   ["sensor_noise_um", "sensor noise", "µm", 4],
 ];
@@ -33,7 +33,7 @@ const waiting = new Map();
 
 function connect() {
   if (!token) {
-    notice("This address has no token: open the one that hilctl has printed.");
+    notice("This address has no token: open the address that hilctl printed.");
     return;
   }
   socket = new WebSocket(`ws://${location.host}/live`, [PROTOCOL, `token.${token}`]);
@@ -45,9 +45,9 @@ function connect() {
   };
   socket.onclose = () => {
     socket = null;
-    for (const [id] of waiting) answered({ id, ok: false, error: "the page's server is gone" });
+    for (const [id] of waiting) answered({ id, ok: false, error: "the server of the page has ended" });
     if (!over()) {
-      notice("No connection to the page's server. The run goes on: end it by hilctl stop.");
+      notice("No connection to the server of the page. The run is still active: stop it with hilctl stop.");
       badge("lost", "no connection");
     }
     setTimeout(connect, 1000);
@@ -62,7 +62,7 @@ function ask(what, more, then = () => {}) {
   const id = nextId++;
   waiting.set(id, then);
   if (socket === null || socket.readyState !== WebSocket.OPEN) {
-    answered({ id, ok: false, error: "no connection to the page's server" });
+    answered({ id, ok: false, error: "no connection to the server of the page" });
   } else {
     socket.send(JSON.stringify({ id, ask: what, ...more }));
   }
@@ -79,7 +79,7 @@ function said(message) {
   else { status = message; showStatus(); }
 }
 
-// ---- words and numbers
+// ---- text and numbers
 
 function notice(text, kind = "bad") {
   $("notice").hidden = !text;
@@ -121,7 +121,7 @@ function unit(kind) {
 function showStatus() {
   showRuns();
   if (!status.description) {
-    badge("lost", "no run is going on");
+    badge("lost", "no active run");
     return;
   }
   const { description } = status;
@@ -137,7 +137,7 @@ function showStatus() {
   $("room").textContent = `${disk}ring ${(100 * status.ring_used).toFixed(0)} % full · `
     + `${status.missed_samples} samples not seen`;
   $("stop").disabled = status.ended;
-  if (status.ended) notice(`Run over: ${status.reason || status.state}${safeText()}`, status.state === "fault" || status.safe === false ? "bad" : "calm");
+  if (status.ended) notice(`Run ended: ${status.reason || status.state}${safeText()}`, status.state === "fault" || status.safe === false ? "bad" : "calm");
   showFigures();
   showGauges();
   showControls();
@@ -273,7 +273,7 @@ function showKeys() {
 
 // ---- plots
 
-// Read once a theme: asking the style for one at each frame costs as much as the drawing.
+// Read once per theme: reading the style in each frame costs as much as drawing.
 const colours = new Map();
 function colour(name) {
   if (!colours.has(name)) {
@@ -284,7 +284,7 @@ function colour(name) {
 let letter = 16;
 const ranges = new Map();
 
-// A range grows at once and shrinks only after a while, by steps: axes that jump can't be read.
+// A range grows immediately and shrinks later, in steps: jumping axes are unreadable.
 function steady(name, low, high) {
   if (!(low <= high)) { low = -1; high = 1; }
   const now = performance.now();
@@ -308,7 +308,7 @@ function steady(name, low, high) {
   return had.range;
 }
 
-// One pixel wide where that can be seen: wider lines of a thousand points take twice the time.
+// One pixel wide if that is visible: wider lines of a thousand points take twice the time.
 function series(label, stroke, more = {}) {
   return { label, stroke, width: letter < 18 ? 1 : 0.1 * letter, points: { show: false }, ...more };
 }
@@ -411,9 +411,9 @@ function unpack(buffer) {
     input: values.subarray(end, end + loop), output: values.subarray(end + loop, end + 2 * loop) };
 }
 
-// Each bucket is two points, so that what lies between its lowest and highest value is drawn; in
-// the order of the slope, or a smooth signal would look like a saw. Where both would be in the same
-// place it is one, and the other is undefined, which is drawn over: points are what drawing costs.
+// Each bucket is two points, its minimum and maximum, in the order of the slope (otherwise a smooth
+// signal would look like a sawtooth). If both coincide, the second is undefined and skipped, because
+// the number of points determines the cost.
 function line(low, high, still) {
   const found = new Array(2 * low.length);
   let before = NaN;
@@ -445,7 +445,7 @@ function draw(data) {
       return line(data.low[row], data.high[row], still);
     })]);
   }
-  $("mode").textContent = data.mode === "cycle" ? "triggered to the cycle" : "rolling";
+  $("mode").textContent = data.mode === "cycle" ? "triggered by the cycle" : "rolling";
   $("window").disabled = data.mode === "cycle";
   drawLoops(data);
 }
@@ -546,15 +546,15 @@ function tidy(value) {
   return String(Number(value.toPrecision(6)));
 }
 
-// ---- what is pressed
+// ---- controls
 
 function stop() {
   $("stop").textContent = "STOP …";
   notice("STOP requested, not yet acknowledged.");
   ask("stop", {}, (answer) => {
     $("stop").textContent = answer.ok ? "STOP ✓" : "STOP";
-    if (answer.ok) notice("STOP acknowledged: the run goes to its safe value.", "calm");
-    else notice(`STOP is NOT acknowledged: ${answer.error}. Use hilctl stop, or the rig's own switch.`);
+    if (answer.ok) notice("STOP acknowledged: the run ramps to its safe value.", "calm");
+    else notice(`STOP is NOT acknowledged: ${answer.error}. Use hilctl stop or the emergency switch of the rig.`);
   });
 }
 
@@ -606,7 +606,7 @@ addEventListener("keydown", (event) => {
   else if (key === "r") toggleMode();
 });
 
-// ---- look
+// ---- theme
 
 function theme(name) {
   document.documentElement.dataset.theme = name;
@@ -620,7 +620,7 @@ new ResizeObserver(() => {
   for (const [id, { plot }] of Object.entries(plots)) plot.setSize(sizes($(id)));
 }).observe(document.querySelector("main"));
 
-// ---- one frame a refresh at most, and none that nobody has seen before
+// ---- at most one frame per refresh, each drawn once
 
 function refresh(now) {
   requestAnimationFrame(refresh);

@@ -39,9 +39,7 @@ def test_a_model_is_identified_and_written(table, tmp_path):
 def test_what_is_given_is_passed_on(monkeypatch, tmp_path):
     """One path or several, texts or values; nothing is left out."""
     seen = {}
-    monkeypatch.setattr(
-        "hilctl.identify.refine.command.refine_files", lambda *given, **named: (given, named)
-    )
+    monkeypatch.setattr("hilctl.api.models.refine_files", lambda *given, **named: (given, named))
     monkeypatch.setattr("hilctl.comparison.compare.compare", lambda *given: seen.update(all=given))
     given, named = api.refine("m.yaml", ["a.mcap", "b.mcap"], validate="c.mcap", overwrite=True)
     assert [str(path) for path in (given[0], *given[1], *given[3])] == [
@@ -65,5 +63,5 @@ def test_what_is_given_is_passed_on(monkeypatch, tmp_path):
     ],
 )
 def test_candidates_are_fitted_beside_each_other(monkeypatch, model, asked, where):
-    monkeypatch.setattr("hilctl.identify.command.identify_files", lambda *given, **named: given[4])
+    monkeypatch.setattr("hilctl.api.models.identify_files", lambda *given, **named: given[4])
     assert api.identify("a.mcap", model=model, scheduler=asked) == where

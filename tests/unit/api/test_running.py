@@ -52,7 +52,7 @@ def test_a_real_device_does_not_run_fast(tmp_path):
 
 def test_a_real_run_goes_the_way_of_the_command(monkeypatch, tmp_path):
     """It keeps real time, in processes of its own."""
-    monkeypatch.setattr("hilctl.run.start.start_run", lambda *given: given)
+    monkeypatch.setattr("hilctl.api.running.start_run", lambda *given: given)
     seen = print
     given = api.run(SINE, settings={"block": 5}, overwrite=True, on_progress=seen)
     assert given == (SINE, ["block=5"], None, True, seen)

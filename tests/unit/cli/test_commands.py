@@ -20,7 +20,7 @@ def in_a_process(code, *arguments):
 
 @pytest.fixture
 def in_here(monkeypatch, capsys):
-    """Run a command in this process, which has loaded all of it; return its code and streams."""
+    """Return a function that runs a command in this process and returns exit code and streams."""
 
     def run(*arguments):
         monkeypatch.setattr(sys, "argv", ["hilctl", *arguments])
@@ -32,29 +32,27 @@ def in_here(monkeypatch, capsys):
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_every_command_loads_and_says_what_the_table_says(name):
-    """Its own help begins with the line that the list of commands shows."""
+def test_help_of_every_command_matches_the_table(name):
     command = load(name)
     assert command.name == name
     assert command.help.splitlines()[0] == COMMANDS[name].help
 
 
-@pytest.mark.parametrize("place", ["hilctl_absent.command:run", "hilctl.cli.machine:absent"])
-def test_a_command_that_is_not_installed_is_one_line(place, monkeypatch):
-    """The message says which command, and what is missing."""
+@pytest.mark.parametrize("place", ["hilctl_absent.command:run", "hilctl.cli.devices:absent"])
+def test_missing_command_is_an_input_error(place, monkeypatch):
     monkeypatch.setitem(COMMANDS, "emulate", CommandEntry(place, "Serve."))
-    with pytest.raises(InputError, match=r"emulate can't be loaded: .*absent"):
+    with pytest.raises(InputError, match=r"emulate: .*absent"):
         load("emulate")
 
 
-def test_a_slip_of_the_finger_is_answered_with_the_nearest_command():
-    """The commands are known without being loaded."""
+def test_similar_command_is_suggested():
+    """Commands are suggested without being imported."""
     ended = in_a_process("from hilctl.cli import main; main()", "stauts")
     assert "No such command 'stauts'. Did you mean 'status'?" in ended.stderr
 
 
 class Unraised:
-    """Breaks where nobody can be told: Python only remarks it."""
+    """Raises where the error cannot be caught."""
 
     def __init__(self, error):
         self._error = error
@@ -64,8 +62,8 @@ class Unraised:
 
 
 @pytest.mark.parametrize(("error", "remarks"), [(MemoryError, 0), (ValueError, 1)])
-def test_memory_that_has_run_out_is_said_once(in_here, monkeypatch, error, remarks):
-    """By the command's own message, not by what Python remarks beside it as well."""
+def test_memory_error_is_printed_once(in_here, monkeypatch, error, remarks):
+    """Python's own message on it is suppressed."""
     heard = []
     monkeypatch.setattr(sys, "unraisablehook", heard.append)
 
@@ -74,7 +72,7 @@ def test_memory_that_has_run_out_is_said_once(in_here, monkeypatch, error, remar
         del lost
         raise MemoryError
 
-    monkeypatch.setattr(cli, "_command", broken)
+    monkeypatch.setattr(cli, "_run_app", broken)
     code, _, said = in_here("check")
     assert (code, said) == (3, "hilctl: not enough memory\n")
     assert len(heard) == remarks
@@ -82,24 +80,24 @@ def test_memory_that_has_run_out_is_said_once(in_here, monkeypatch, error, remar
 
 
 @pytest.mark.parametrize("name", ["check", "report"])
-def test_data_that_end_unexpectedly_are_not_taken_for_ctrl_d(in_here, monkeypatch, name):
+def test_eof_error_is_not_reported_as_ctrl_d(in_here, monkeypatch, name):
 
     def ended() -> None:
         raise EOFError("Ran out of input")
 
-    monkeypatch.setattr("hilctl.cli.reading.report", ended)
-    monkeypatch.setattr("hilctl.cli.running.check", ended)
+    monkeypatch.setattr("hilctl.cli.reports.report", ended)
+    monkeypatch.setattr("hilctl.cli.run.check", ended)
     code, _, stderr = in_here(name)
     assert code == 3
     assert stderr.startswith("hilctl: ")
     assert "Ran out of input" in stderr
 
 
-def test_clock_beyond_what_can_be_told_is_refused(in_here, monkeypatch):
+def test_clock_after_2262_is_refused(in_here, monkeypatch):
     def beyond():
         raise OverflowError("timestamp too large to convert to C _PyTime_t")
 
-    monkeypatch.setattr(cli, "_command", beyond)
+    monkeypatch.setattr(cli, "_run_app", beyond)
     with pytest.raises(OverflowError):  # whatever else overflows is a fault of hilctl
         cli.main()
     monkeypatch.setattr("time.time_ns", beyond)
@@ -108,8 +106,7 @@ def test_clock_beyond_what_can_be_told_is_refused(in_here, monkeypatch):
     assert "2262" in stderr
 
 
-def test_a_group_of_commands_runs_its_own(in_here):
-    """``devices`` is one, with ``probe`` in it."""
+def test_group_runs_its_subcommands(in_here):
     code, _, stderr = in_here("devices", "probe", "absent.yaml")
     assert code == 2
     assert stderr == "hilctl: absent.yaml: no such file\n"
@@ -133,7 +130,7 @@ def hilctl(*arguments):
         ("hilctl check --", {"--set"}),
     ],
 )
-def test_a_shell_completes_the_options_of_every_command(words, some):
+def test_shell_completes_options(words, some):
     code = "import sys; sys.argv[0] = 'hilctl'; from hilctl.cli import main; main()"
     asked = {"_HILCTL_COMPLETE": "complete_bash", "COMP_WORDS": words, "COMP_CWORD": "2"}
     ended = subprocess.run(
@@ -161,28 +158,25 @@ finally:
 
 
 @pytest.mark.parametrize("words", [["report"], ["export", "run.mcap"], ["stop", "--absent"]])
-def test_wrong_words_are_a_usage_error(in_here, words):
+def test_wrong_arguments_are_a_usage_error(in_here, words):
     code, _, stderr = in_here(*words)
     assert code == 2
     assert f"{words[0]} [OPTIONS]" in stderr
 
 
 def test_help_names_every_command():
-    """Each command is in the help, with a line of what it does."""
     text = hilctl("--help").stdout
     for name in ("run", "check", "schema", "report", "replay", "identify", "export"):
         assert f" {name} " in text
 
 
 def test_version():
-    """The version is the package's."""
     from hilctl import __version__
 
     assert hilctl("--version").stdout == f"hilctl {__version__}\n"
 
 
 def test_json_errors_are_json(in_here):
-    """A program gets the problem as JSON, with the same exit code."""
     code, stdout, stderr = in_here("check", "absent.yaml", "--json")
     assert code == 2
     assert "no such file" in json.loads(stdout)["error"]
@@ -191,7 +185,6 @@ def test_json_errors_are_json(in_here):
 
 @pytest.mark.parametrize("command", ["report", "replay", "identify"])
 def test_absent_recordings_are_refused(in_here, command):
-    """A recording that is not there is one line and exit code 2."""
     code, _, stderr = in_here(command, "absent.mcap")
     assert code == 2
     assert stderr == "hilctl: absent.mcap: no such file\n"

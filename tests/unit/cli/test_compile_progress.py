@@ -6,7 +6,7 @@ import numba
 import pytest
 
 from hilctl.cli.compile_progress import compile_progress
-from hilctl.cli.volume import Volume
+from hilctl.cli.verbosity import Verbosity
 
 
 class Terminal(io.StringIO):
@@ -59,7 +59,7 @@ def test_no_program_reads_it(capsys):
 
 def test_nor_who_wants_quiet(at_terminal, monkeypatch):
     terminal = at_terminal()
-    monkeypatch.setattr(Volume, "quiet", True)
+    monkeypatch.setattr(Verbosity, "quiet", True)
     with compile_progress():
         compile_something()
     assert terminal.getvalue() == ""

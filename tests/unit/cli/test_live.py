@@ -12,18 +12,18 @@ from hilctl.run.run_folder import run_folder
 
 @pytest.fixture
 def served(monkeypatch):
-    """What the server is given; it says its address and is over."""
+    """Replace the server; return its arguments."""
     given = {}
 
     def serve_runs(chosen, over, on_url, port):
         given.update(chosen=chosen, over=over, port=port)
         on_url("http://127.0.0.1:5/#x")
 
-    monkeypatch.setattr("hilctl.desk.live.serve_runs", serve_runs)
+    monkeypatch.setattr("hilctl.cli.live.serve_runs", serve_runs)
     return given
 
 
-def test_the_address_is_printed_and_any_run_is_shown(served):
+def test_address_is_printed(served):
     said = CliRunner().invoke(app, ["live", "--port", "5"])
     assert said.output == "live page: http://127.0.0.1:5/#x\n"
     assert served["port"] == 5
@@ -33,27 +33,27 @@ def test_the_address_is_printed_and_any_run_is_shown(served):
     assert json.loads(CliRunner().invoke(app, ["live", "--json"]).output)["url"].endswith("/#x")
 
 
-def test_foxglove_is_served_at_its_own_port_unless_another_is_given(monkeypatch):
+def test_foxglove_has_a_default_port(monkeypatch):
     ports = []
 
     def serve_foxglove(chosen, over, on_url, port):
         ports.append(port)
         on_url("ws://127.0.0.1:5")
 
-    monkeypatch.setattr("hilctl.desk.live.serve_foxglove", serve_foxglove)
+    monkeypatch.setattr("hilctl.cli.live.serve_foxglove", serve_foxglove)
     said = CliRunner().invoke(app, ["live", "--foxglove"])
     assert said.output == "Foxglove server: ws://127.0.0.1:5\n"
     CliRunner().invoke(app, ["live", "--foxglove", "--port", "0"])
     assert ports == [None, 0]
 
 
-def test_a_run_is_found_by_the_beginning_of_its_name(served, tmp_path):
+def test_run_is_found_by_the_beginning_of_its_name(served, tmp_path):
     with run_folder("demo", tmp_path / "a.mcap", 1.0) as (folder, _):
         assert CliRunner().invoke(app, ["live", "de"]).exit_code == 0
         assert served["chosen"]([]) == folder
 
 
-def test_a_run_that_is_not_there_is_refused(served, tmp_path):
+def test_unknown_run_is_refused(served, tmp_path):
     said = CliRunner().invoke(app, ["live", "x"])
     assert str(said.exception) == "no run is going on"
     with run_folder("demo", tmp_path / "a.mcap", 1.0):
@@ -62,7 +62,7 @@ def test_a_run_that_is_not_there_is_refused(served, tmp_path):
     assert not served
 
 
-def test_it_is_over_where_its_run_ended_before_it_could_be_looked_at(served, tmp_path):
+def test_server_ends_if_its_run_ended_before_it_was_read(served, tmp_path):
     nothing = SimpleNamespace(feed=lambda name: None)
     with run_folder("demo", tmp_path / "a.mcap", 1.0) as (folder, _):
         CliRunner().invoke(app, ["live", folder.card.name])

@@ -3,8 +3,6 @@
 import os
 import pty
 import select
-import signal
-import subprocess
 import sys
 import termios
 from contextlib import nullcontext
@@ -105,14 +103,14 @@ def shown(view, capsys, width=80, height=24):
         (b"s", "in", "stop"),
     ],
 )
-def test_a_key_is_one_request(sent, key, inverse, wanted):
+def test_key_sends_one_request(sent, key, inverse, wanted):
     view = View(FakeFeed(inverse=inverse))
     view.press(key)
     assert sent == [wanted]
     assert view.message.endswith(": done")
 
 
-def test_a_refusal_is_shown(sent, monkeypatch, capsys):
+def test_refused_request_is_shown(sent, monkeypatch, capsys):
     feed = FakeFeed()
     feed.values["gain"] = 1.0
     view = View(feed)
@@ -127,7 +125,7 @@ def test_a_refusal_is_shown(sent, monkeypatch, capsys):
     assert "no right" in view.message
 
 
-def test_a_change_that_takes_time_does_not_delay_a_stop(monkeypatch):
+def test_slow_change_does_not_delay_a_stop(monkeypatch):
     started = []
     view = View(FakeFeed())
     thread = SimpleNamespace(
@@ -138,10 +136,10 @@ def test_a_change_that_takes_time_does_not_delay_a_stop(monkeypatch):
     view.press(b"is")
     assert len(started) == 2
     started[1]()
-    assert view.message == "stop: the run is over"
+    assert view.message == "stop: the run has ended"
 
 
-def test_a_mark_is_typed_and_its_letters_are_no_keys(sent, capsys):
+def test_letters_of_a_mark_are_not_keys(sent, capsys):
     view = View(FakeFeed())
     view.press(b"mtaqs\x7f\x07")
     assert "mark: taq_" in shown(view, capsys)
@@ -163,7 +161,7 @@ def test_arrows_and_unknown_keys_do_nothing(sent):
     assert (sent, view.left) == (["stop"], True)
 
 
-def test_windows_change_from_the_newest_cycles_to_the_longest_and_back(capsys):
+def test_windows_can_be_selected(capsys):
     view = View(FakeFeed())
     assert "newest cycles" in shown(view, capsys)
     view.press(b"]" * 20)
@@ -177,7 +175,7 @@ def test_windows_change_from_the_newest_cycles_to_the_longest_and_back(capsys):
 
 
 @pytest.mark.parametrize("size", [(80, 24), (160, 50), (40, 14), (39, 24), (80, 5)])
-def test_a_screen_fits_and_has_plots_if_there_is_room(size):
+def test_screen_fits_the_terminal(size):
     view = View(FakeFeed())
     view.message = "x" * 200
     parts = view.screen(*size).renderables
@@ -199,7 +197,7 @@ def test_the_screen_has_state_limits_figures_and_the_newest_events(capsys):
     assert "tap 1" not in text
 
 
-def test_no_signal_yet_is_no_curve(capsys):
+def test_empty_signal_has_no_curve(capsys):
     feed = FakeFeed()
     nothing = np.full((len(SIGNALS), 3), np.nan)
     empty = Window(np.arange(3.0), Buckets(nothing, nothing, nothing))
@@ -219,7 +217,7 @@ def test_a_missing_reference_does_not_change_the_scale(capsys):
     assert "newest cycles, axis in s" in text
 
 
-def test_control_characters_of_a_run_do_not_reach_the_terminal(monkeypatch, capsys):
+def test_control_characters_are_escaped(monkeypatch, capsys):
     monkeypatch.setattr(module.time, "sleep", lambda s: None)
     feed = FakeFeed(polls=3)
     feed.events = [Event(1500, "info", "mark", "tapped \x1b[2J")]
@@ -233,7 +231,7 @@ def test_control_characters_of_a_run_do_not_reach_the_terminal(monkeypatch, caps
     assert text.count("1.500 s  mark: tapped \\x1b[2J") == 2
 
 
-def test_lines_are_each_event_once_and_the_state_now_and_then(monkeypatch, capsys):
+def test_lines_show_each_event_once_and_the_state(monkeypatch, capsys):
     monkeypatch.setattr(module.time, "sleep", lambda s: None)
     print_lines(FakeFeed(polls=15))
     lines = capsys.readouterr().out.splitlines()
@@ -268,7 +266,7 @@ def terminal(monkeypatch):
 
 
 @pytest.mark.parametrize("way_out", ["q", "end", KeyboardInterrupt, SystemExit, ValueError])
-def test_the_terminal_is_restored_on_every_way_out(terminal, monkeypatch, way_out):
+def test_terminal_is_restored_on_every_exit(terminal, monkeypatch, way_out):
     user = terminal()
     assert module._has_keys()
     before = termios.tcgetattr(sys.stdin.fileno())
@@ -296,7 +294,7 @@ def test_the_terminal_is_restored_on_every_way_out(terminal, monkeypatch, way_ou
     assert termios.tcgetattr(sys.stdin.fileno()) == before
 
 
-def test_there_are_lines_in_the_background_and_without_a_terminal(terminal, monkeypatch):
+def test_lines_are_printed_in_the_background_and_without_a_terminal(terminal, monkeypatch):
     terminal()
     monkeypatch.setattr(os, "tcgetpgrp", lambda _: os.getpgrp() + 1)
     assert not module._has_keys()
@@ -324,7 +322,7 @@ def run(monkeypatch):
     return made
 
 
-def test_the_end_of_a_run_is_printed_or_that_it_goes_on(run, monkeypatch, capsys):
+def test_final_state_is_printed(run, monkeypatch, capsys):
     module.watch("demo")
     assert capsys.readouterr().out == "demo-7: stopped: by hand\n"
     run.feed.ended = False
@@ -337,7 +335,7 @@ def test_the_end_of_a_run_is_printed_or_that_it_goes_on(run, monkeypatch, capsys
     assert "hilctl stop" in capsys.readouterr().out
 
 
-def test_the_subprocess_shows_the_run_of_its_parent_only(run, monkeypatch, capsys):
+def test_subprocess_shows_the_run_of_its_parent(run, monkeypatch, capsys):
     """It waits until that run exists; without a parent it ends."""
     other = SimpleNamespace(card=SimpleNamespace(name="x", supervisor=8))
     found = iter([[], [other], [other, run]])
@@ -351,7 +349,7 @@ def test_the_subprocess_shows_the_run_of_its_parent_only(run, monkeypatch, capsy
     assert capsys.readouterr().out == "demo-7: stopped: by hand\n"
 
 
-def test_a_run_that_ended_before_the_subprocess_saw_it_is_one_message(run, monkeypatch, capsys):
+def test_run_that_ended_before_it_was_read_is_one_message(run, monkeypatch, capsys):
     def refuse(folder):
         raise RunError("demo-7: gone")
 
@@ -362,23 +360,3 @@ def test_a_run_that_ended_before_the_subprocess_saw_it_is_one_message(run, monke
     monkeypatch.setattr(sys, "argv", ["watch", "7"])
     module.main()
     assert capsys.readouterr().err == "hilctl: demo-7: gone\n"
-
-
-@pytest.mark.parametrize("ignores", ["", "signal.signal(15, signal.SIG_IGN);"])
-def test_the_subprocess_ends_with_the_run(monkeypatch, ignores):
-    monkeypatch.setattr(module, "_END_S", 0.2)
-    started = []
-
-    class Started(subprocess.Popen):
-        def __init__(self, command):
-            code = f"import signal, time; {ignores} print(flush=True); time.sleep(60)"
-            super().__init__([sys.executable, "-c", code], stdout=subprocess.PIPE)
-            self.stdout.readline()
-            started.append((command, self))
-
-    monkeypatch.setattr(subprocess, "Popen", Started)
-    with module.watched_beside():
-        assert started[0][1].poll() is None
-    ((command, process),) = started
-    assert command[-2:] == ["hilctl.cli.watch", str(os.getpid())]
-    assert process.returncode == -(signal.SIGKILL if ignores else signal.SIGTERM)

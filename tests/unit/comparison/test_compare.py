@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from hilctl.base.errors import InputError
-from hilctl.cli.compare_view import notes
+from hilctl.cli.models import notes
 from hilctl.comparison.compare import COMPARED, ComparisonRequest, compare, save_models
 from hilctl.comparison.page import comparison_page
 from hilctl.identify.catalogue import CATALOGUE, entry

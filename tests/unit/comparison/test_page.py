@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from hilctl.base.errors import InputError
-from hilctl.cli.comparing import compare as command
+from hilctl.cli.models import compare as command
 from hilctl.comparison.compare import ComparisonRequest, compare
 from hilctl.comparison.page import comparison_figure, comparison_page
 from tests.fakes import SteppingClock

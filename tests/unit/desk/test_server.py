@@ -162,7 +162,7 @@ def test_without_a_run_a_page_says_so_and_a_stop_is_refused():
 
     status, answer = asyncio.run(seen())
     assert "run" not in status
-    assert (answer["ok"], answer["error"]) == (False, "no such run is going on")
+    assert (answer["ok"], answer["error"]) == (False, "no such active run")
 
 
 def test_strangers_are_refused_in_the_upgrade():

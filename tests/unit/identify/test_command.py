@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from hilctl.base.errors import ConfigError, InputError
-from hilctl.cli.identify_view import print_identification
+from hilctl.cli.models import print_identification
 from hilctl.identify import command as subject
 from hilctl.identify.command import TURNS, identify_files, settings_from, with_modes
 from hilctl.identify.data.records import History, SteadyLoop
@@ -70,7 +70,7 @@ def test_order_and_lag_are_found_and_reported(
     assert len(mapping["orders"]) == len(found.orders)
     print_identification(found, output)
     shown = capsys.readouterr().out
-    assert "loops held out" in shown
+    assert "validation loops" in shown
     assert "2 samples later" in shown
     write_identification(found, page)
     text = page.read_text()

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
-from hilctl.cli.machine_view import render
+from hilctl.cli.devices import render_diagnosis
 from hilctl.machine.diagnosis import Diagnosis, examine, machine_facts
 from hilctl.machine.files import Finding
 from hilctl.machine.latency import Latency
@@ -23,7 +23,7 @@ def latency(late_ns, rate_hz=1000.0):
 
 def text_of(diagnosis):
     console = Console(file=io.StringIO(), width=100)
-    console.print(render(diagnosis))
+    console.print(render_diagnosis(diagnosis))
     return console.file.getvalue()
 
 

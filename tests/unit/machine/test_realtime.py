@@ -355,7 +355,6 @@ def test_command_line_requires_real_time(monkeypatch):
     from typer.testing import CliRunner
 
     from hilctl.cli.commands import app
-    from hilctl.run import start
 
     asked = []
 
@@ -363,8 +362,8 @@ def test_command_line_requires_real_time(monkeypatch):
         asked.append(settings)
         raise InputError("far enough")
 
-    monkeypatch.setattr(start, "start_run", refuse)
-    monkeypatch.setattr("hilctl.cli.running.finish_orphans", lambda: None)  # not this machine's own
+    monkeypatch.setattr("hilctl.api.running.start_run", refuse)
+    monkeypatch.setattr("hilctl.cli.run.finish_dead_runs", lambda: None)  # not this machine's own
     runner = CliRunner()
     for flags in ([], ["--require-rt"], ["--require-rt", "--set", "name=other"]):
         runner.invoke(app, ["run", "experiment.yaml", *flags])

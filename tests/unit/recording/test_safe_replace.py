@@ -255,6 +255,6 @@ def test_the_command(torn):
     assert "'hilctl recover' makes it a whole file again" in reported.stderr.splitlines()[0]
     first = hilctl("recover", torn)
     assert (first.returncode, first.stderr) == (0, "")
-    assert f"the file as it was: {torn}.torn" in first.stdout
+    assert f"original file: {torn}.torn" in first.stdout
     second = hilctl("recover", torn)
     assert second.stdout == f"{torn}: sound: nothing to recover\n"

@@ -58,7 +58,7 @@ OF_OTHERS = ("scipy.special", "mcap", "google.protobuf", "rich", "typer")
             f"hilctl.base.plain, {LOOP}, hilctl.models.refined, hilctl_drivers.simulated.rigs",
             (*BULKY, *OF_OTHERS, "pydantic", "pydantic_core", "hilctl.base.yaml"),
         ),
-        ("hilctl.cli.run_view", BULKY),
+        ("hilctl.cli.run", BULKY),
         ("hilctl.run.client", (*BULKY, *OF_OTHERS, "numpy", "pydantic")),
     ],
     ids=["loop", "plain loop", "supervisor", "client"],

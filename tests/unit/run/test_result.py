@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from hilctl.cli.run_view import run_mapping
+from hilctl.cli.run import run_mapping
 from hilctl.run.result import RunResult
 
 RESULT = RunResult(

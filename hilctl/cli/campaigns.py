@@ -1,0 +1,368 @@
+"""Commands that run an experiment repeatedly: campaign, sweep, learn."""
+
+import json
+import shlex
+import signal
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.table import Table
+from rich.text import Text
+
+from hilctl import api
+from hilctl.api.campaigns import run_steps
+from hilctl.api.given import runs_folder
+from hilctl.base.errors import ConfigError, InputError, Problem
+from hilctl.base.yaml import Document
+from hilctl.campaign.plan import SeriesPlan
+from hilctl.campaign.session import SeriesHost, SeriesResult
+from hilctl.campaign.steps import CampaignSteps, SeriesStep, campaign_of, cell, load_campaign
+from hilctl.campaign.table import SeriesRow
+from hilctl.cli.console import console, progress_bar
+from hilctl.cli.options import (
+    AsJson,
+    DryRun,
+    ExperimentFile,
+    Fast,
+    LabelTexts,
+    Overwrite,
+    Settings,
+)
+from hilctl.cli.safe_streams import print_json
+from hilctl.experiment.labels import label_settings
+from hilctl.learning.results import Learned, Row
+from hilctl.learning.session import correction_setting
+from hilctl.run.dead_runs import finish_dead_runs
+from hilctl.series.columns import COMPLETED
+
+_RESUMES = "the same command resumes from there"
+Folder = Annotated[
+    Path | None,
+    typer.Option(help="Folder for recordings and table; default: NAME in recording.folder."),
+]
+SchedulerOption = Annotated[
+    str,
+    typer.Option("--scheduler", help="With --fast: none, processes, or a Dask scheduler address."),
+]
+
+
+def campaign(
+    file: Annotated[Path, typer.Argument(help="Campaign file (YAML).", metavar="FILE")],
+    folder: Folder = None,
+    settings: Settings = None,
+    fast: Fast = False,
+    scheduler: SchedulerOption = "none",
+    dry_run: DryRun = False,
+    as_json: AsJson = False,
+) -> None:
+    """Run an experiment with each combination of varied keys (resumes where it stopped)."""
+    steps = load_campaign(file, settings or [])
+    _run_campaign(steps, folder, fast=fast, scheduler=scheduler, dry_run=dry_run, as_json=as_json)
+
+
+def sweep(
+    experiment: ExperimentFile,
+    vary: Annotated[
+        list[str],
+        typer.Option(
+            "--vary",
+            metavar="KEY=VALUES",
+            help="KEY=1,2,5 or KEY=first:last:count[log]; several are combined.",
+        ),
+    ],
+    folder: Folder = None,
+    settings: Settings = None,
+    repeat: Annotated[int, typer.Option(min=1, help="Number of runs per step.")] = 1,
+    fast: Fast = False,
+    scheduler: SchedulerOption = "none",
+    dry_run: DryRun = False,
+    as_json: AsJson = False,
+) -> None:
+    """Run an experiment with several values of one or more keys (a campaign in one line)."""
+    document = sweep_document(experiment, vary, repeat)
+    steps = campaign_of(document, Path(), settings or [])
+    _run_campaign(steps, folder, fast=fast, scheduler=scheduler, dry_run=dry_run, as_json=as_json)
+
+
+def sweep_document(experiment: Path, vary: Sequence[str], repeat: int) -> Document:
+    """Return the campaign file that is equivalent to ``--vary`` options.
+
+    Raises:
+        ConfigError: An option does not have the form ``KEY=VALUES``, or a key is repeated.
+    """
+    lines = [
+        f"name: {json.dumps(f'{experiment.stem[:70]}-sweep')}",
+        f"experiment: {json.dumps(str(experiment))}",
+        f"repeat: {repeat}",
+        "vary:",
+    ]
+    problems = []
+    for text in vary:
+        key, equals, values = (part.strip() for part in text.partition("="))
+        if not (key and equals and values):
+            rule = "must be KEY=1,2,5 or KEY=first:last:count"
+            problems.append(Problem(f"--vary {text}", "", rule))
+        listed = values if ":" in values and "{" not in values else f"[{values}]"
+        lines.append(f"  {json.dumps(key)}: {listed}")
+    if problems:
+        raise ConfigError(problems)
+    names = [""] * (len(lines) - len(vary)) + [f"--vary {text}" for text in vary]
+    return Document("--vary", "\n".join(lines) + "\n", names)
+
+
+def _run_campaign(
+    steps: CampaignSteps,
+    folder: Path | None,
+    *,
+    fast: bool,
+    scheduler: str,
+    dry_run: bool,
+    as_json: bool,
+) -> None:
+    if scheduler != "none" and not fast:
+        raise InputError("--scheduler needs --fast: runs in real time are sequential")
+
+    def on_plan(plan: SeriesPlan) -> None:
+        if not as_json:
+            print_plan(plan, fast=fast, every_step=dry_run)
+        elif dry_run:
+            print_json(plan_mapping(plan))
+
+    with progress_bar("campaign", quiet=as_json) as on_progress:
+        host = SeriesHost(on_progress=on_progress, on_note=_note)
+        host = host if as_json else replace(host, on_row=print_row)
+        try:
+            result = run_steps(
+                steps, folder, host,
+                fast=fast, scheduler=scheduler, dry_run=dry_run, on_plan=on_plan,
+            )  # fmt: skip
+        except KeyboardInterrupt:  # between two runs, or while the coil cools
+            print(f"hilctl: stopped by Ctrl-C between two steps; {_RESUMES}", file=sys.stderr)
+            raise typer.Exit(128 + signal.SIGINT) from None
+    if result is not None:
+        _finish(result, as_json=as_json)
+
+
+def _note(text: str) -> None:
+    print(f"hilctl: {text}", file=sys.stderr)
+
+
+def _finish(result: SeriesResult, *, as_json: bool) -> None:
+    if as_json:
+        print_json(result_mapping(result))
+    else:
+        print_result(result)
+    if result.stop_signal:
+        print(f"hilctl: stopped: {result.reason}; {_RESUMES}", file=sys.stderr)
+        raise typer.Exit(128 + result.stop_signal)
+    if result.reason:
+        print(f"hilctl: fault: {result.reason}", file=sys.stderr)
+    if result.reason or result.count("completed") < len(result.plan.steps):
+        raise typer.Exit(3)
+
+
+def plan_mapping(plan: SeriesPlan) -> dict[str, Any]:
+    """Return a plan as plain values."""
+    return {
+        "campaign": plan.campaign.config.name,
+        "folder": str(plan.folder),
+        "steps": [
+            {
+                "step": each.step.number,
+                "repeat": each.step.repeat,
+                "reference_run": each.step.is_reference,
+                "values": {key: cell(value) for key, value in each.step.point.items()},
+                "seconds": each.seconds,
+                "pause_s": each.pause_s,
+                "heat_before_a": each.heat_a2**0.5,
+                "kept": str(each.kept) if each.kept else None,
+            }
+            for each in plan.steps
+        ],
+        "left": len(plan.left),
+        "rig_time_s": plan.seconds,
+        "pauses_s": plan.pauses_s,
+        "recordings_mb": plan.megabytes,
+        "free_mb": plan.free_mb,
+    }
+
+
+def print_plan(plan: SeriesPlan, *, fast: bool, every_step: bool) -> None:
+    """Print the plan of a campaign.
+
+    Args:
+        plan: The plan.
+        fast: Whether the runs are simulated without waiting.
+        every_step: Whether to list each step.
+    """
+    terminal = console()
+    if every_step:
+        terminal.print(_steps(plan))
+    kept = len(plan.steps) - len(plan.left)
+    done = f", {kept} done earlier" if kept else ""
+    time = f"{_duration(plan.seconds)} of rig time"
+    pauses = f" and {_duration(plan.pauses_s)} for the coil to cool" if plan.pauses_s else ""
+    how = ", without waiting" if fast else ""
+    disk = f"{plan.megabytes:.0f} MB of {plan.free_mb:.0f} MB free in {plan.folder}"
+    count = f"{plan.campaign.config.name}: {len(plan.steps)} steps{done}"
+    terminal.print(f"{count}; {time}{pauses}{how}; {disk}", soft_wrap=True)
+
+
+def _steps(plan: SeriesPlan) -> Table:
+    table = Table(title=Text(f"{plan.campaign.config.name}: steps"), title_justify="left")
+    for name in ("step", *plan.campaign.keys, "s", "pause s", "coil A rms", ""):
+        table.add_column(name, justify="right")
+    for each in plan.steps:
+        values = [_shown(each.step.point.get(key)) for key in plan.campaign.keys]
+        kind = "reference run" if each.step.is_reference else ""
+        table.add_row(
+            str(each.step.number),
+            *map(Text, values),
+            f"{each.seconds:.1f}" if each.kept is None else "",
+            f"{each.pause_s:.0f}" if each.pause_s else "",
+            f"{each.heat_a2**0.5:.2f}" if each.kept is None else "",
+            "done earlier" if each.kept else kind,
+        )
+    return table
+
+
+def _shown(value: Any) -> str:
+    if value is None:
+        return ""
+    return f"{value:g}" if isinstance(value, float) else str(cell(value))
+
+
+def _duration(seconds: float) -> str:
+    whole = round(seconds)
+    if whole < 100:
+        return f"{seconds:.0f} s"
+    return f"{whole // 3600}:{whole // 60 % 60:02d}:{whole % 60:02d}"
+
+
+def print_row(step: SeriesStep, row: SeriesRow) -> None:
+    """Print a completed step."""
+    values = "  ".join(f"{key}={_shown(value)}" for key, value in step.point.items())
+    figures = row.figures
+    parts = [
+        (figures.peak_to_peak_um, "{:.4g} µm"),
+        (figures.peak_hysteresis_percent, "hysteresis {:.3g} %"),
+        (figures.peak_error_percent, "error {:.3g} %"),
+        (figures.natural_hz, "resonance {:.4g} Hz"),
+    ]
+    values_text = "  ".join(text.format(value) for value, text in parts if value is not None)
+    text = values_text if row.code == COMPLETED else row.result
+    kept = "done earlier  " if row.kept else ""
+    print(f"{step.number:4d}  {values or 'reference run'}  {kept}{text}", flush=True)
+
+
+def result_mapping(result: SeriesResult) -> dict[str, Any]:
+    """Return the result of a campaign as plain values."""
+    codes = [row.code for _, row in result.ordered]
+    return {
+        "campaign": result.plan.campaign.config.name,
+        "folder": str(result.plan.folder),
+        "tables": [str(path) for path in result.tables],
+        "page": str(result.page) if result.page else None,
+        "steps": len(codes),
+        "results": {code: codes.count(code) for code in sorted(set(codes))},
+        "drift": result.drift.to_mapping() if result.drift else None,
+        "reason": result.reason,
+    }
+
+
+def print_result(result: SeriesResult) -> None:
+    """Print the result of a campaign, its drift and its files."""
+    terminal = console()
+    counts = result_mapping(result)["results"]
+    done = ", ".join(f"{count} {code}" for code, count in counts.items())
+    terminal.print(f"{result.plan.campaign.config.name}: {done}", soft_wrap=True)
+    if result.drift is not None:
+        terminal.print(str(result.drift), soft_wrap=True)
+    for path in result.tables:
+        terminal.print(f"table: {path}", soft_wrap=True)
+    if result.page is not None:
+        terminal.print(f"page: {result.page}", soft_wrap=True)
+
+
+def learn(
+    experiment: ExperimentFile,
+    output: Annotated[Path, typer.Option(help="Correction file to write.")],
+    cycles: Annotated[
+        int, typer.Option(min=1, max=200, help="Largest number of runs after the first.")
+    ] = 20,
+    folder: Annotated[
+        Path | None, typer.Option(help="Folder for the recordings; default: OUTPUT-runs.")
+    ] = None,
+    settings: Settings = None,
+    labels: LabelTexts = None,
+    fast: Fast = False,
+    overwrite: Overwrite = False,
+    as_json: AsJson = False,
+) -> None:
+    """Learn a correction for a periodic reference: run, correct, and run again."""
+    finish_dead_runs()
+    chosen = runs_folder(output, folder)
+    learned = api.learn(
+        experiment,
+        output,
+        cycles=cycles,
+        folder=chosen,
+        settings=[*(settings or []), *label_settings(labels or [])],
+        fast=fast,
+        overwrite=overwrite,
+        on_rows=(lambda rows: None) if as_json else _print_iteration,
+    )
+    if as_json:
+        print_json({**learned.to_mapping(), "output": str(output), "folder": str(chosen)})
+    else:
+        _print_learned(learned, output, chosen)
+    if learned.stop_signal:
+        raise typer.Exit(128 + signal.Signals(learned.stop_signal))
+    if learned.fault:
+        raise typer.Exit(3)
+
+
+def _print_iteration(rows: Sequence[Row]) -> None:
+    for row in rows:
+        name = f"  {row.label}" if len(rows) > 1 else ""
+        reach = f"learning bandwidth {row.reach_hz:.0f} Hz" if row.run else "start"
+        error = f"peak error {row.error_percent:.4f} % (noise floor {row.floor_percent:.4f} %)"
+        print(f"run {row.run:2d}  {error}  {reach}{name}", flush=True)
+
+
+def _print_learned(learned: Learned, output: Path, folder: Path) -> None:
+    checks = {row.label: row for row in learned.check}
+    last = {row.label: row for row in learned.rows}
+    table = Table(title=Text(f"learned: {learned.reason}"), title_justify="left")
+    for name in (
+        "waveform",
+        "start %",
+        "best %",
+        "verified %",
+        "noise floor %",
+        "delay",
+        "resonance",
+    ):
+        table.add_column(name, justify="left" if name == "waveform" else "right")
+    for cycle in learned.correction.cycles:
+        row = last[cycle.label]
+        check = checks.get(cycle.label)
+        natural = f"{row.natural_hz:.0f} Hz" if row.natural_hz else "-"
+        table.add_row(
+            Text(cycle.label),
+            f"{cycle.start_percent:.4f}",
+            f"{cycle.error_percent:.4f}",
+            f"{check.error_percent:.4f}" if check else "-",
+            f"{row.floor_percent:.4f}",
+            f"{row.delay_samples:.2f} samples",
+            natural,
+        )
+    terminal = console()
+    terminal.print(table)
+    terminal.print(f"correction: {output}; runs: {folder}", soft_wrap=True)
+    setting = shlex.quote(correction_setting(output))
+    terminal.print(f"  --set {setting}", soft_wrap=True)

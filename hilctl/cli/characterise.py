@@ -1,0 +1,179 @@
+"""The command ``hilctl characterise``."""
+
+import signal
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.table import Table
+from rich.text import Text
+
+from hilctl import api
+from hilctl.api.given import runs_folder
+from hilctl.base.errors import RunError
+from hilctl.characterise.page import HELD_OUT_HEADINGS, figure_rows, held_out_rows
+from hilctl.characterise.results import Characterisation, StepRow
+from hilctl.characterise.session import CampaignPlan
+from hilctl.cli.console import console, progress_bar
+from hilctl.cli.options import (
+    AsJson,
+    DryRun,
+    ExperimentFile,
+    Fast,
+    LabelTexts,
+    Overwrite,
+    Settings,
+)
+from hilctl.cli.safe_streams import print_json
+from hilctl.experiment.labels import label_settings
+from hilctl.run.step import StepStoppedError
+
+_RESUMES = "the same command resumes from this step"
+
+
+def characterise(
+    experiment: ExperimentFile,
+    output: Annotated[Path, typer.Option(help="Model file to write; its HTML page is beside it.")],
+    folder: Annotated[
+        Path | None, typer.Option(help="Folder for the recordings; default: OUTPUT-runs.")
+    ] = None,
+    settings: Settings = None,
+    labels: LabelTexts = None,
+    highest_hz: Annotated[
+        float | None,
+        typer.Option(help="Highest frequency of loops, Hz; default: from the sample rate."),
+    ] = None,
+    fast: Fast = False,
+    dry_run: DryRun = False,
+    overwrite: Overwrite = False,
+    as_json: AsJson = False,
+) -> None:
+    """Measure a connected actuator within its limits, then identify and validate a model."""
+    chosen = runs_folder(output, folder)
+
+    def on_plan(plan: CampaignPlan) -> None:
+        if not as_json:
+            print_plan(plan, chosen)
+        elif dry_run:
+            print_json(plan_mapping(plan))
+
+    with progress_bar("characterise", quiet=as_json) as on_progress:
+        result = _characterise(
+            experiment,
+            output,
+            folder=chosen,
+            settings=[*(settings or []), *label_settings(labels or [])],
+            highest_hz=highest_hz,
+            fast=fast,
+            overwrite=overwrite,
+            dry_run=dry_run,
+            on_progress=on_progress,
+            on_plan=on_plan,
+            on_step=(lambda row: None) if as_json else print_step,
+        )
+    if result is not None:
+        _finish(result, output, output.with_suffix(".html"), chosen, as_json=as_json)
+
+
+def _characterise(experiment: Path, output: Path, **options: Any) -> Characterisation | None:
+    try:
+        return api.characterise(experiment, output, **options)
+    except (StepStoppedError, KeyboardInterrupt) as error:
+        number = getattr(error, "signal", signal.SIGINT)
+        print(f"hilctl: stopped: {error or 'Ctrl-C'}; {_RESUMES}", file=sys.stderr)
+        raise typer.Exit(128 + number) from None
+    except RunError as error:
+        raise RunError(f"{error}; {_RESUMES}") from None
+
+
+def _finish(
+    result: Characterisation, output: Path, page: Path, folder: Path, *, as_json: bool
+) -> None:
+    model = output if result.is_model else None
+    if as_json:
+        places = {"output": str(model) if model else None, "page": str(page)}
+        print_json({**result.to_mapping(), **places, "folder": str(folder)})
+    else:
+        print_characterisation(result, model, page)
+    if result.problem:
+        print(f"hilctl: {result.problem}", file=sys.stderr)
+        print(
+            "hilctl: fix this, then use --overwrite to measure again (see the page for results)",
+            file=sys.stderr,
+        )
+        raise typer.Exit(3)
+    if not result.is_model:
+        raise typer.Exit(1)
+
+
+def plan_mapping(plan: CampaignPlan) -> dict[str, Any]:
+    """Return a plan as plain values."""
+    limits = plan.limits
+    return {
+        "device": limits.loaded.device.info.name,
+        "unit": limits.unit,
+        "command_range": [limits.low, limits.high],
+        "stroke_um": list(limits.stroke_um),
+        "band_hz": [limits.lowest_hz, limits.highest_hz],
+        "rig_time_s": plan.seconds,
+        "pauses_s": plan.pauses_s,
+        "recordings_mb": plan.megabytes,
+        "free_mb": plan.free_mb,
+        "steps": [
+            {"name": step.name, "purpose": step.purpose, "seconds": step.seconds}
+            for step in plan.steps
+        ],
+    }
+
+
+def print_plan(plan: CampaignPlan, folder: Path) -> None:
+    """Print the steps of a characterisation and their largest extent."""
+    limits = plan.limits
+    table = Table(title=Text(f"{limits.loaded.device.info.name}: steps"), title_justify="left")
+    for name in ("step", "purpose", "s"):
+        table.add_column(name, justify="right" if name == "s" else "left")
+    for step in plan.steps:
+        table.add_row(step.name, step.purpose, f"{step.seconds:.1f}")
+    terminal = console()
+    terminal.print(table)
+    low_um, high_um = limits.stroke_um
+    within = f"{limits.low:g} to {limits.high:g} {limits.unit}, {low_um:g} to {high_um:g} µm"
+    terminal.print(f"within {within}; loops at {limits.lowest_hz:g} to {limits.highest_hz:g} Hz")
+    heat = "no thermal limit is set"
+    if limits.loaded.config.limits.rms_current_a is not None:
+        heat = f"{plan.pauses_s:.0f} s for the coil to cool"
+    disk = f"{plan.megabytes:.0f} MB of {plan.free_mb:.0f} MB free in {folder}"
+    terminal.print(f"at most {plan.seconds:.0f} s of rig time; {heat}; {disk}", soft_wrap=True)
+
+
+def print_step(row: StepRow) -> None:
+    """Print a completed step."""
+    how = "done" if row.kept else f"{row.seconds:.1f} s"
+    print(f"{row.name:16s} {how:>7s}  {row.text}", flush=True)
+
+
+def print_characterisation(result: Characterisation, model: Path | None, page: Path) -> None:
+    """Print the validation error, the measured values and the files."""
+    terminal = console()
+    if result.held_out:
+        title = Text("validation errors (references that were not fitted)")
+        terminal.print(_table(title, HELD_OUT_HEADINGS, held_out_rows(result)))
+        terminal.print(f"verdict: {result.verdict}", soft_wrap=True)
+        for note in result.verdict.notes if result.verdict else ():
+            terminal.print(note, soft_wrap=True)
+    figures = list(figure_rows(result))
+    if figures:
+        terminal.print(_table(Text("measured"), ("quantity", "value"), figures))
+    if model is not None:
+        terminal.print(f"model: {model}", soft_wrap=True)
+    terminal.print(f"page: {page}", soft_wrap=True)
+
+
+def _table(title: Text, headings: tuple[str, ...], rows: list[Any]) -> Table:
+    table = Table(title=title, title_justify="left")
+    for i, name in enumerate(headings):
+        table.add_column(name, justify="left" if i == 0 or len(headings) == 2 else "right")
+    for row in rows:
+        table.add_row(*map(Text, row))
+    return table

@@ -1,0 +1,326 @@
+"""Commands that identify models: identify, refine, compare."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich import box
+from rich.console import Group, RenderableType
+from rich.table import Table
+
+from hilctl import api
+from hilctl.base.errors import InputError
+from hilctl.base.files import check_writable
+from hilctl.cli.console import console, print_rich, progress_bar
+from hilctl.cli.options import AsJson, Overwrite, Settings
+from hilctl.cli.safe_streams import print_json
+from hilctl.comparison.compare import Comparison
+from hilctl.comparison.summary import headings, notes, table_rows, titles
+from hilctl.identify.catalogue import CATALOGUE
+from hilctl.identify.command import Identification
+from hilctl.identify.judge import LoopError
+from hilctl.identify.model_size import OrderError
+from hilctl.identify.page import write_identification
+from hilctl.identify.refine.command import Refinement
+from hilctl.identify.refine.page import HEADINGS as REFINEMENT_HEADINGS
+from hilctl.identify.refine.page import refinement_rows, write_refinement
+from hilctl.identify.settings import setting_rows
+from hilctl.identify.summary import HEADINGS, error_rows, parameter_texts, summary
+from hilctl.run.dead_runs import finish_dead_runs
+
+IdentifyInput = Annotated[
+    list[Path], typer.Argument(metavar="FILE", help="Recordings (MCAP) or text tables.")
+]
+TableUnit = Annotated[str | None, typer.Option(help="Unit of the command in a table, A or V.")]
+TableColumn = Annotated[str | None, typer.Option(help="Column of a table: name, or number from 1.")]
+RateHz = Annotated[float | None, typer.Option(help="Sample rate of a table without a time column.")]
+Whole = Annotated[bool, typer.Option(help="Evaluate complete histories instead of steady cycles.")]
+LeaveOut = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="LABEL", help="Loop to omit (its label, or the beginning of it); may be repeated."
+    ),
+]
+Validate = Annotated[
+    list[Path] | None,
+    typer.Option(metavar="FILE", help="File to validate the model with; may be repeated."),
+]
+Scheduler = Annotated[
+    str | None,
+    typer.Option(
+        help="none, threads, processes, or a Dask scheduler address; default for auto: threads."
+    ),
+]
+FitTexts = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set", metavar="KEY=VALUE", help="Setting of the fit (see --settings); may be repeated."
+    ),
+]
+ValidateRuns = Annotated[
+    list[Path] | None,
+    typer.Option(metavar="RUN", help="Recording to validate the model with; may be repeated."),
+]
+Models = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="KIND",
+        help="Kinds (separated by commas) or model files; default: all. May be repeated.",
+    ),
+]
+TryIn = Annotated[
+    Path | None,
+    typer.Option(help="Compensated experiment to test the inverses in; default: as recorded."),
+]
+Frequencies = Annotated[
+    str | None,
+    typer.Option(help="Frequencies of the tests, Hz, separated by commas; default: 10,100,200."),
+]
+
+
+def _list_settings(requested: bool) -> None:
+    if requested:
+        print_settings()
+        raise typer.Exit
+
+
+ListSettings = Annotated[
+    bool,
+    typer.Option(
+        "--settings", callback=_list_settings, is_eager=True,
+        help="List all kinds of model and all settings.",
+    ),
+]  # fmt: skip
+
+
+def identify(
+    files: IdentifyInput,
+    model: Annotated[str, typer.Option(help="Kind of model, or auto.")] = "integrated",
+    output: Annotated[Path | None, typer.Option(help="Model file to write.")] = None,
+    settings: FitTexts = None,
+    list_settings: ListSettings = False,
+    unit: TableUnit = None,
+    command_column: TableColumn = None,
+    displacement_column: TableColumn = None,
+    time_column: TableColumn = None,
+    rate_hz: RateHz = None,
+    whole: Whole = False,
+    leave_out: LeaveOut = None,
+    validate: Validate = None,
+    scheduler: Scheduler = None,
+    html: Annotated[
+        Path | None, typer.Option(help="HTML page that compares model and data, to write.")
+    ] = None,
+    overwrite: Overwrite = False,
+    as_json: AsJson = False,
+) -> None:
+    """Identify a model's parameters from recordings or measured tables."""
+    del list_settings
+    if html is not None:
+        check_writable(html, overwrite=overwrite, inputs=[*files, *(validate or [])])
+    table = {
+        "table.unit": unit,
+        "table.command_column": _column(command_column),
+        "table.displacement_column": _column(displacement_column),
+        "table.time_column": _column(time_column),
+        "table.rate_hz": rate_hz,
+        "whole": whole or None,
+        "leave_out": leave_out or None,
+    }
+    texts = [f"{key}={json.dumps(value)}" for key, value in table.items() if value is not None]
+    finish_dead_runs()
+    with progress_bar("identify", quiet=as_json) as progress:
+        result = api.identify(
+            files,
+            output,
+            model=model,
+            settings=[*texts, *(settings or [])],
+            validate=validate or [],
+            scheduler=scheduler,
+            overwrite=overwrite,
+            on_progress=progress,
+        )
+    if html is not None:
+        write_identification(result, html)
+    refused = result.verdict.grade == "not a model"
+    if as_json:
+        written = str(output) if output and not refused else None
+        print_json({"output": written, **result.to_mapping()})
+    else:
+        print_identification(result, output)
+    if refused:
+        raise typer.Exit(1)
+
+
+def _column(text: str | None) -> str | int | None:
+    return int(text) if text is not None and text.isdecimal() else text
+
+
+def refine(
+    model: Annotated[Path, typer.Argument(help="Model file.", metavar="MODEL")],
+    runs: Annotated[
+        list[Path],
+        typer.Argument(metavar="RUN", help="Recordings (MCAP): compensated, learned, or neither."),
+    ],
+    output: Annotated[Path | None, typer.Option(help="Model file to write.")] = None,
+    validate: ValidateRuns = None,
+    html: Annotated[
+        Path | None, typer.Option(help="HTML page that compares both models, to write.")
+    ] = None,
+    overwrite: Overwrite = False,
+    as_json: AsJson = False,
+) -> None:
+    """Improve a model from recordings of runs (written only if it is better)."""
+    if html is not None:
+        check_writable(html, overwrite=overwrite, inputs=[model, *runs, *(validate or [])])
+    finish_dead_runs()
+    with progress_bar("refine", quiet=as_json) as progress:
+        result = api.refine(
+            model, runs, output, validate=validate or [], overwrite=overwrite, on_progress=progress
+        )
+    if html is not None:
+        write_refinement(result, html)
+    if as_json:
+        print_json({"output": str(output) if output and result.better else None,
+                    **result.to_mapping()})  # fmt: skip
+    else:
+        print_refinement(result, output)
+    if not result.better:
+        raise typer.Exit(1)
+
+
+def print_refinement(result: Refinement, output: Path | None) -> None:
+    """Print the validation errors of the old and the new model."""
+    terminal = console()
+    terminal.print(str(result))
+    table = Table(title=f"validation: {result.choice.after.how}")
+    for name in REFINEMENT_HEADINGS:
+        table.add_column(name, justify="left" if name == REFINEMENT_HEADINGS[0] else "right")
+    for row in refinement_rows(result):
+        table.add_row(*row)
+    terminal.print(table)
+    if result.choice.own:
+        terminal.print("offset, creep and drift of single runs were not learned")
+    if output is not None:
+        written = f"model: {output}" if result.better else f"{output}: not written"
+        terminal.print(written, soft_wrap=True)
+
+
+def compare(
+    files: Annotated[
+        list[Path], typer.Argument(metavar="RUN", help="Recordings (MCAP) of steady loops.")
+    ],
+    models: Models = None,
+    experiment: TryIn = None,
+    frequencies: Frequencies = None,
+    points: Annotated[int, typer.Option(min=16, help="Points per loop.")] = 300,
+    html: Annotated[
+        Path | None, typer.Option(help="HTML page with table and plot to write.")
+    ] = None,
+    save: Annotated[Path | None, typer.Option(help="Folder for the model files.")] = None,
+    settings: Settings = None,
+    overwrite: Overwrite = False,
+    as_json: AsJson = False,
+) -> None:
+    """Identify models of the literature on the same loops and compare them."""
+    names = [name for text in models or [] for name in text.split(",") if name]
+    numbers = _numbers(frequencies)
+    with progress_bar("compare", quiet=as_json) as on_progress:
+        comparison = api.compare(
+            files,
+            names,
+            experiment=experiment,
+            settings=settings or [],
+            frequencies_hz=numbers,
+            points=points,
+            html=html,
+            save=save,
+            overwrite=overwrite,
+            on_progress=on_progress,
+        )
+    if as_json:
+        print_json(comparison.to_mapping())
+    else:
+        print_rich(render_comparison(comparison))
+
+
+def _numbers(text: str | None) -> list[float] | None:
+    if text is None:
+        return None
+    try:
+        return [float(part) for part in text.split(",")]
+    except ValueError:
+        raise InputError(
+            f"--frequencies must be numbers separated by commas (got {text!r})"
+        ) from None
+
+
+def print_identification(result: Identification, output: Path | None) -> None:
+    """Print the quality of a model, its errors per loop, its parameters and its file."""
+    terminal = console()
+    fit, held_out = result.fit, result.held_out
+    for line in summary(result):
+        terminal.print(line)
+    if result.orders:
+        terminal.print(_orders_table(result.orders))
+    if held_out is not None:
+        terminal.print(_errors_table(f"validation: {held_out.how}", held_out.judgement.errors))
+    terminal.print(_errors_table(f"fit: {fit.model.provenance.method}", fit.errors))
+    rows = ", ".join(f"{name} {text}" for name, text in parameter_texts(fit))
+    if rows:
+        terminal.print(f"parameters: {rows}")
+    if output is not None and result.verdict.grade != "not a model":
+        terminal.print(f"model: {output}", soft_wrap=True)
+    elif output is not None:
+        terminal.print(f"{output}: not written", soft_wrap=True)
+
+
+def _errors_table(title: str, errors: Sequence[LoopError]) -> Table:
+    table = Table(title=title)
+    for name in HEADINGS:
+        table.add_column(name, justify="left" if name == "loop" else "right")
+    for row in error_rows(errors):
+        table.add_row(*row)
+    return table
+
+
+def _orders_table(orders: Sequence[OrderError]) -> Table:
+    table = Table(title="errors on validation loops")
+    for name in ("plays", "deadbands per side", "rms %", "peak %"):
+        table.add_column(name, justify="right")
+    for order in orders:
+        figures = (f"{order.rms_percent:.3f}", f"{order.peak_percent:.2f}")
+        table.add_row(str(order.plays), str(order.deadbands_a_side), *figures)
+    return table
+
+
+def print_settings() -> None:
+    """Print all kinds of model and all settings of a fit."""
+    kinds = Table("--model", "description", "identified by", "from", box=None)
+    kinds.columns[0].no_wrap = True
+    for kind, known in CATALOGUE.items():
+        kinds.add_row(kind, known.title, known.found_by, known.data)
+    settings = Table("--set", "default", "limits", "of", "description", box=None)
+    settings.columns[0].no_wrap = True
+    for row in setting_rows():
+        settings.add_row(*row)
+    terminal = console()
+    terminal.print(kinds)
+    terminal.print()
+    terminal.print(settings)
+
+
+def render_comparison(comparison: Comparison) -> RenderableType:
+    """Return the tables of a comparison."""
+    title = f"models on {', '.join(comparison.sources)}"
+    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    for i, heading in enumerate(headings(comparison)):
+        table.add_column(heading, justify="right" if i else "left", no_wrap=True)
+    for row in table_rows(comparison):
+        table.add_row(*row)
+    names = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
+    for name, title in titles(comparison.rows):
+        names.add_row(name, title)
+    return Group(table, names, *notes(comparison))

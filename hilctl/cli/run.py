@@ -1,0 +1,360 @@
+"""Commands on one run: run, check, safe."""
+
+import logging
+import os
+import shlex
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Annotated, Any, Self
+
+import numpy as np
+import typer
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+from rich.table import Table
+from rich.text import Text
+
+from hilctl import api
+from hilctl.base.errors import HilctlError, InputError
+from hilctl.base.events import adapted_text
+from hilctl.base.formatting import unit_text
+from hilctl.cli.compile_progress import compile_progress
+from hilctl.cli.console import console
+from hilctl.cli.options import AsJson, ExperimentFile, LabelTexts, Overwrite, Settings
+from hilctl.cli.reports import render_report
+from hilctl.cli.safe_streams import print_json
+from hilctl.experiment.labels import label_settings
+from hilctl.loop.safe_output import describe
+from hilctl.machine.files import Machine
+from hilctl.machine.logind import log_out
+from hilctl.run.architecture import require_linux
+from hilctl.run.dead_runs import finish_dead_runs
+from hilctl.run.run_folder import facts_of
+from hilctl.run.waiting_loop import started_ahead
+
+if TYPE_CHECKING:
+    from hilctl.analysis.figures import RunReport
+    from hilctl.experiment.check import Checked
+    from hilctl.run.result import Progress as RunProgress
+    from hilctl.run.result import RunResult
+
+_log = logging.getLogger(__name__)
+
+_REFRESH_S = 0.1
+_LARGEST_REPORTED = 5_000_000
+_VIEW_END_S = 2.0
+
+
+def run(
+    experiment: ExperimentFile,
+    output: Annotated[Path | None, typer.Option(help="Recording to write.")] = None,
+    settings: Settings = None,
+    labels: LabelTexts = None,
+    overwrite: Overwrite = False,
+    detach: Annotated[
+        bool, typer.Option("--detach", help="Run in the background; see status, set and stop.")
+    ] = False,
+    watch: Annotated[
+        bool, typer.Option("--watch", help="Show the run in the terminal, with keys to change it.")
+    ] = False,
+    live: Annotated[bool, typer.Option("--live", help="Serve a live page of the run.")] = False,
+    require_rt: Annotated[
+        bool,
+        typer.Option("--require-rt", help="Refuse to run without SCHED_FIFO and locked memory."),
+    ] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Run an experiment and record it (Ctrl-C ramps to the safe value first)."""
+    settings = [*(settings or []), *label_settings(labels or [])]
+    if require_rt:
+        settings.append("realtime.require=true")
+    if watch and (detach or as_json):
+        raise InputError("--watch excludes --detach (use hilctl watch instead) and --json")
+    if detach and live:
+        raise InputError("--detach excludes --live: use hilctl live after the start")
+    if detach:
+        _detach(experiment, output, settings, overwrite=overwrite, as_json=as_json)
+        return
+    with _loop_started_early(experiment):
+        _run(experiment, output, settings, overwrite, watch=watch, live=live, as_json=as_json)
+
+
+@contextmanager
+def _loop_started_early(experiment: Path) -> Iterator[None]:
+    """Start the loop's process before the checks, so that both import at the same time."""
+    require_linux()
+    if not experiment.is_file():
+        yield  # the check rejects it
+        return
+    with started_ahead(), compile_progress():
+        yield
+
+
+def _run(
+    experiment: Path,
+    output: Path | None,
+    settings: list[str],
+    overwrite: bool,
+    *,
+    watch: bool,
+    live: bool,
+    as_json: bool,
+) -> None:
+    finish_dead_runs()
+    quiet = as_json or watch
+    with (
+        _served(requested=live) as addresses,
+        _watched(requested=watch),
+        LiveView(quiet=quiet, addresses=addresses) as view,
+    ):
+        result = api.run(
+            experiment, output, settings=settings, overwrite=overwrite, on_progress=view.update
+        )
+        if result.stop_signal:  # a second Ctrl-C must not suppress the result
+            signal.signal(result.stop_signal, signal.SIG_IGN)
+    report, unread = None, ""
+    try:
+        report = report_of(result, every=as_json)
+    except HilctlError as error:  # not exit code 2, because the actuator has moved
+        unread = f"hilctl: cannot report the recording: {error}"
+        print(unread, file=sys.stderr)
+    if as_json:
+        print_json(run_mapping(result, report))
+    else:
+        print_run(result, report)
+    if result.code == "fault" or unread or not result.safe:
+        raise typer.Exit(3)
+    if result.stop_signal:
+        raise typer.Exit(128 + result.stop_signal)
+
+
+@contextmanager
+def _watched(*, requested: bool) -> Iterator[None]:
+    """Show the run from a subprocess, so that a blocked terminal cannot delay the run."""
+    if not requested:
+        yield
+        return
+    with subprocess.Popen([sys.executable, "-Pm", "hilctl.cli.watch", str(os.getpid())]) as process:
+        try:
+            yield
+        finally:
+            process.terminate()  # restores the terminal first
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(_VIEW_END_S)
+            process.kill()
+
+
+@contextmanager
+def _served(*, requested: bool) -> Iterator[list[str]]:
+    """Serve the live page if requested; yield its addresses."""
+    if not requested:
+        yield []
+        return
+    from hilctl.desk.live import served_beside
+
+    with served_beside() as url:
+        yield [url]
+
+
+def _detach(
+    experiment: Path, output: Path | None, settings: list[str], *, overwrite: bool, as_json: bool
+) -> None:
+    from hilctl.run.detached import start_detached
+
+    finding = log_out(Machine())
+    if finding.level != "ok":
+        _log.warning("a log-out %s: %s", finding.text, finding.remedy)
+    flags = ["--overwrite"] if overwrite else []
+    started = start_detached(experiment, settings, output, flags)
+    facts = {"recording": str(started.recording), "log": str(started.log)}
+    if as_json:
+        print_json({**(facts_of(started.run) if started.run else {}), **facts})
+    elif started.run is None:
+        print(f"run already ended; recording: {started.recording}; log: {started.log}")
+    else:
+        print(f"{started.run.card.name} is running; recording: {started.run.card.recording}")
+        print("  hilctl status    hilctl set gain=0.5 --over 2    hilctl stop")
+
+
+def check(experiment: ExperimentFile, settings: Settings = None, as_json: AsJson = False) -> None:
+    """Check an experiment and show what it would do (nothing moves)."""
+    checked = api.check(experiment, settings or [])
+    if as_json:
+        forecast = {"warnings": list(checked.warnings), **checked.forecast.to_mapping()}
+        print_json({"experiment": str(experiment), **forecast})
+    else:
+        print_forecast(checked)
+
+
+def safe(experiment: ExperimentFile, settings: Settings = None, as_json: AsJson = False) -> None:
+    """Set a device to its safe value (refused while a run uses it)."""
+    require_linux()
+    from hilctl.run.by_hand import put_safe
+
+    put = put_safe(experiment, settings or [])
+    where = f"{put.device}: {describe(put.output, put.error)} ({put.value:g} {put.unit})"
+    if as_json:
+        print_json(put.to_mapping())
+    elif put.output == "confirmed":
+        print(where)
+    else:
+        print(where, file=sys.stderr)
+        if put.guardian_active:
+            print(
+                "The guardian of the last run is still retrying: see hilctl status.",
+                file=sys.stderr,
+            )
+    if put.output != "confirmed":
+        raise typer.Exit(3)
+
+
+class LiveView:
+    """A progress line on standard error: samples, error, command, late ticks.
+
+    Args:
+        quiet: Show nothing.
+        addresses: Addresses of live pages; printed with the first samples.
+    """
+
+    def __init__(self, *, quiet: bool, addresses: Sequence[str] = ()) -> None:
+        self._addresses = list(addresses)
+        terminal = console(stderr=True)
+        self._progress = Progress(
+            TextColumn("[bold]run"),
+            BarColumn(bar_width=24),
+            TextColumn("{task.percentage:>3.0f} %"),
+            TextColumn("{task.fields[live]}"),
+            TimeRemainingColumn(),
+            console=terminal,
+            disable=quiet or not terminal.is_terminal,
+            refresh_per_second=8,
+        )
+        self._task: TaskID | None = None
+        self._shown = 0.0
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self._progress.stop()
+
+    def update(self, progress: "RunProgress") -> None:
+        """Show the newest samples, a few times per second."""
+        while self._addresses:
+            print(f"live page: {self._addresses.pop()}", file=sys.stderr)
+        if self._progress.disable:
+            return
+        now = time.monotonic()
+        if now - self._shown < _REFRESH_S and progress.samples < progress.total:
+            return
+        self._shown = now
+        if self._task is None:
+            self._progress.start()
+            self._task = self._progress.add_task("run", total=progress.total, live="")
+        done = min(progress.samples, progress.total)
+        self._progress.update(self._task, completed=done, live=_live_text(progress))
+
+
+def _live_text(progress: "RunProgress") -> str:
+    newest = progress.batch.samples(slice(-1, None))
+    command, displacement_um = newest.command, newest.displacement_um
+    error_um = displacement_um - newest.reference_um
+    shown = progress.compensated and np.isfinite(error_um[-1])
+    error = f"error {error_um[-1]:+7.2f} µm  " if shown else ""
+    return (
+        f"{error}x {displacement_um[-1]:+8.2f} µm  command {command[-1]:+7.3f}  "
+        f"late {progress.late_ticks}"
+    )
+
+
+def report_of(result: "RunResult", *, every: bool) -> "RunReport | None":
+    """Return the report of a finished run.
+
+    Args:
+        result: Result of the run.
+        every: Report runs of any length; otherwise none of a very long run.
+    """
+    wanted = every or 0 < result.samples <= _LARGEST_REPORTED
+    return api.summarize(result.path) if wanted else None
+
+
+def run_mapping(result: "RunResult", report: "RunReport | None") -> dict[str, Any]:
+    """Return the result and report of a run as plain values."""
+    return {**(report.to_mapping() if report else {}), **result.to_mapping()}
+
+
+def print_run(result: "RunResult", report: "RunReport | None") -> None:
+    """Print the result of a run and its report, if there is one."""
+    terminal = console()
+    colour = {"completed": "green", "stopped": "yellow"}.get(result.code, "red")
+    terminal.print(Text(result.code, colour) + f": {result.reason}")
+    if not result.safe:
+        terminal.print(f"Not safe: {describe(result.output_state)}.", style="bold red")
+    if result.guardian_active:
+        terminal.print("The guardian is still retrying: see hilctl status; hilctl safe ends it.")
+    if result.deadline_misses:
+        terminal.print(result.deadline_misses, style="bold yellow")
+    if result.samples == 0:
+        terminal.print("no samples recorded")
+    elif report is not None:
+        terminal.print(render_report(report))
+    elif result.adapted:
+        terminal.print(f"adapted: {adapted_text(result.adapted)}")
+    terminal.print(f"recorded: {result.path}", soft_wrap=True)
+    path = shlex.quote(str(result.path))
+    terminal.print(f"  hilctl report {path} --html run.html", soft_wrap=True)
+
+
+def print_forecast(checked: "Checked") -> None:
+    """Print the forecast of a run and its warnings."""
+    forecast, config = checked.forecast, checked.loaded.config
+    unit, reference_unit = forecast.command_unit, checked.reference.unit
+    limits = config.limits
+    low, high = limits.command_range
+    table = Table(show_header=False, box=None, padding=(0, 2, 0, 0))
+    rows = {
+        "experiment": config.name,
+        "device": checked.loaded.device.info.description,
+        "samples": f"{forecast.samples} at {config.sample_rate_hz:g} Hz, {config.block} per tick",
+        "highest rate": f"{forecast.highest_rate_hz:.6g} Hz"
+        + (f" ({forecast.rate_note})" if forecast.rate_note else ""),
+        "duration": f"{forecast.duration_s:g} s"
+        + (
+            f", after {forecast.before_s:g} s of conditioning and rest" if forecast.before_s else ""
+        ),
+        "reference": f"{forecast.reference_min:.4g} to {forecast.reference_max:.4g} "
+        f"{unit_text(reference_unit)}",
+        "command": f"{forecast.command_min:.4g} to {forecast.command_max:.4g} {unit} "
+        f"(limits {low:g} to {high:g})",
+        "slew": f"{forecast.slew_per_s:.4g} {unit}/s (limit {limits.slew_per_s:g})",
+        "recording": _recording(forecast.recording_mb),
+    }
+    if forecast.begins:
+        rows["initial state"] = forecast.begins
+    if note := checked.loaded.device.info.safe_note:
+        rows["safe value"] = note
+    if forecast.heating_rms_a is not None:
+        initial = f"initially {forecast.begins_rms_a or 0.0:.3g} A rms"
+        maximum = f"{forecast.heating_rms_a:.4g} A rms (limit {limits.rms_current_a:g})"
+        rows["heating"] = f"{maximum}, {initial}"
+    for name, text in rows.items():
+        table.add_row(name, text)
+    terminal = console()
+    terminal.print(table)
+    for warning in checked.warnings:
+        terminal.print(f"warning: {warning}", style="yellow")
+    terminal.print("ready to run", style="green")
+
+
+def _recording(megabytes: float) -> str:
+    return f"about {megabytes:.3g} MB" if megabytes < 1000.0 else f"about {megabytes / 1e3:.3g} GB"

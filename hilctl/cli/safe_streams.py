@@ -1,0 +1,143 @@
+"""Escape control characters in all text for standard output and error; print JSON.
+
+File names, files and devices may contain escape sequences that retitle a window, hide a line or
+make a terminal type. They are printed as text. Tables are styled by
+:func:`hilctl.cli.console.console`, which escapes their texts first.
+"""
+
+import errno
+import io
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from typing import Any, TextIO
+
+from hilctl.base.formatting import finite_json, printable
+
+_READER_CLOSED = {errno.EPIPE, errno.EIO}
+"""Errors of a closed pipe or a terminal that hung up; they are not reported."""
+
+
+class StandardStream(io.TextIOWrapper):
+    """A standard stream that never fails, so that a closed pipe cannot stop a run.
+
+    Attributes:
+        failure: The first error; everything written after it is lost.
+    """
+
+    def __init__(self, stream: io.TextIOWrapper) -> None:
+        # Characters outside the locale's encoding are escaped. This layer does not buffer, so that
+        # texts written through several layers stay in order.
+        super().__init__(
+            stream.buffer,
+            encoding=stream.encoding,
+            errors="backslashreplace",
+            line_buffering=stream.line_buffering,
+            write_through=True,
+        )
+        self.failure: OSError | None = None
+
+    def write(self, text: str) -> int:
+        """Write a text unchanged."""
+        try:
+            return super().write(text)
+        except OSError as error:
+            self._fail(error)
+            return len(text)
+
+    def flush(self) -> None:
+        """Flush the stream."""
+        try:
+            super().flush()
+        except OSError as error:
+            self._fail(error)
+
+    def _fail(self, error: OSError) -> None:
+        self.failure = self.failure or error
+        # Buffered text would fail again at every write and at exit.
+        null = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(null, self.fileno())
+        os.close(null)
+
+
+class SafeStream(StandardStream):
+    """A standard stream that escapes control characters.
+
+    Attributes:
+        styled: The same stream without escaping, for styled tables.
+    """
+
+    def __init__(self, stream: io.TextIOWrapper) -> None:
+        super().__init__(stream)
+        self.styled = StandardStream(stream)
+
+    def write(self, text: str) -> int:
+        """Write a text with its control characters escaped."""
+        super().write(printable(text, lines=True))
+        return len(text)
+
+    def close_wrapper(self) -> OSError | None:
+        """Flush and detach from the underlying file; return the first error."""
+        self.flush()
+        self.styled.detach()
+        self.detach()
+        return self.failure or self.styled.failure
+
+
+@contextmanager
+def safe_streams(*, acts: bool = False) -> Iterator[None]:
+    """Escape control characters on standard output and error.
+
+    Args:
+        acts: Whether the command moves an actuator; a write error then does not change its exit
+            code.
+
+    Raises:
+        SystemExit: Standard output could not be written; the message is on standard error.
+    """
+    _open_missing()
+    before = sys.stdout, sys.stderr
+    streams = _safe(sys.stdout), _safe(sys.stderr)
+    sys.stdout, sys.stderr = streams
+    code: object = 0
+    try:
+        yield
+    except SystemExit as end:
+        code = end.code
+        raise
+    finally:
+        sys.stdout, sys.stderr = before
+        failures = [stream.close_wrapper() for stream in streams if isinstance(stream, SafeStream)]
+        lost = [each for each in failures if each and each.errno not in _READER_CLOSED]
+        if lost:
+            with suppress(OSError):
+                what = "the result could not be printed" if acts else "standard output"
+                print(f"hilctl: {what}: {lost[0].strerror}", file=sys.stderr, flush=True)
+            if not code and not acts:
+                raise SystemExit(3)
+
+
+def _open_missing() -> None:
+    """Open the null device for each closed descriptor from 0 to 2.
+
+    Otherwise the next file that is opened, such as a recording, gets one of these numbers and
+    receives what processes write to their standard error.
+    """
+    for number in range(3):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # takes the lowest free number, this one
+    for number, name in ((1, "stdout"), (2, "stderr")):
+        if getattr(sys, name) is None:
+            setattr(sys, name, os.fdopen(number, "w", encoding="utf-8", closefd=False))
+
+
+def _safe(stream: TextIO) -> TextIO:
+    return SafeStream(stream) if isinstance(stream, io.TextIOWrapper) else stream
+
+
+def print_json(value: dict[str, Any]) -> None:
+    """Print one JSON object, with ``null`` for numbers that are not finite."""
+    print(finite_json(value, indent=2))

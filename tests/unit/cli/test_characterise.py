@@ -1,0 +1,181 @@
+"""The characterise command: output, files, refusals and exit codes."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import typer
+
+from hilctl.base.errors import InputError, RunError
+from hilctl.characterise.results import Characterisation, StepRow
+from hilctl.characterise.session import CampaignPlan
+from hilctl.cli.characterise import (
+    characterise,
+    plan_mapping,
+    print_characterisation,
+    print_plan,
+    print_step,
+)
+from hilctl.run.step import StepStoppedError, paced, unpaced
+from tests.unit.characterise.conftest import experiment, limits, limits_with
+from tests.unit.characterise.test_results import FOUND, identification
+
+__all__ = ["experiment", "limits", "limits_with"]
+
+
+@pytest.fixture
+def ends(monkeypatch, limits):
+    """Replace the characterisation; return its arguments and result."""
+    monkeypatch.setattr("hilctl.api.campaigns.finish_dead_runs", lambda: None)
+    measured = FOUND.measured.also(growing=(), reversal=None)
+    asked = {"found": replace(FOUND, measured=measured, held_out=())}
+    monkeypatch.setattr(Characterisation, "is_model", property(lambda self: asked["is_model"]))
+    asked["is_model"] = True
+
+    class Done:
+        plan = CampaignPlan(limits, FOUND.steps, 3.0, 5000.0)
+
+        def __init__(self, experiment, settings, folder, highest_hz, host):
+            asked.update(folder=folder, highest_hz=highest_hz, run=host.run)
+
+        def discard(self):
+            asked["discarded"] = True
+
+        def characterise(self, output, *, overwrite):
+            asked["ran"] = True
+            if "error" in asked:
+                raise asked["error"]
+            return asked["found"]
+
+    monkeypatch.setattr("hilctl.api.campaigns.Campaign", Done)
+    return asked
+
+
+def command(tmp_path, **more):
+    """Call the command with its defaults."""
+    wanted = {"folder": None, "settings": None, "highest_hz": None, "fast": True}
+    wanted |= {"dry_run": False, "overwrite": False, "as_json": False, **more}
+    characterise(tmp_path / "rig.yaml", tmp_path / "model.yaml", **wanted)
+
+
+def test_plan_and_result_are_printed(ends, tmp_path, capsys):
+    command(tmp_path)
+    shown = capsys.readouterr().out
+    assert "within -4 to 4 A, -50 to 50 µm; loops at 0.5 to 80 Hz" in shown
+    assert "at most 2 s of rig time" in shown
+    assert "30.0 nm rms" in shown
+    assert (tmp_path / "model.html").is_file()
+    assert ends["folder"] == tmp_path / "model-runs"
+    assert ends["run"] is unpaced
+    assert "discarded" not in ends
+
+
+def test_one_json_object_is_printed(ends, tmp_path, capsys):
+    command(tmp_path, as_json=True, fast=False, highest_hz=20.0)
+    printed = json.loads(capsys.readouterr().out)
+    assert printed["page"] == str(tmp_path / "model.html")
+    assert printed["output"] == str(tmp_path / "model.yaml")
+    assert (ends["run"], ends["highest_hz"]) == (paced, 20.0)
+
+
+@pytest.mark.parametrize("as_json", [False, True])
+def test_dry_run_prints_the_plan_only(ends, tmp_path, capsys, as_json):
+    command(tmp_path, dry_run=True, as_json=as_json)
+    shown = capsys.readouterr().out
+    assert "ran" not in ends
+    assert list(tmp_path.glob("model*")) == []
+    if as_json:
+        assert json.loads(shown)["rig_time_s"] == 2.0
+    else:
+        assert "noise" in shown
+
+
+def test_problem_of_the_rig_has_exit_code_3(ends, tmp_path, capsys):
+    """The page has the measured values."""
+    ends["found"] = replace(ends["found"], problem="no reaction: look", problem_code="no_reaction")
+    with pytest.raises(typer.Exit) as ended:
+        command(tmp_path)
+    assert ended.value.exit_code == 3
+    assert "no reaction: look" in capsys.readouterr().err
+    assert (tmp_path / "model.html").is_file()
+
+
+def test_invalid_model_has_exit_code_1(ends, tmp_path, capsys):
+    ends["is_model"] = False
+    with pytest.raises(typer.Exit) as ended:
+        command(tmp_path, as_json=True)
+    assert ended.value.exit_code == 1
+    assert json.loads(capsys.readouterr().out)["output"] is None
+
+
+@pytest.mark.parametrize(
+    ("error", "code"),
+    [(StepStoppedError("rest: stopped", 15), 143), (KeyboardInterrupt(), 130)],
+)
+def test_message_of_a_stop_says_how_to_resume(ends, tmp_path, capsys, error, code):
+    ends["error"] = error
+    with pytest.raises(typer.Exit) as ended:
+        command(tmp_path)
+    assert ended.value.exit_code == code
+    assert "the same command resumes" in capsys.readouterr().err
+
+
+def test_message_of_a_fault_says_how_to_resume(ends, tmp_path):
+    ends["error"] = RunError("slow-loops: the cable was pulled")
+    with pytest.raises(RunError, match="the cable was pulled; the same command resumes"):
+        command(tmp_path)
+
+
+def test_existing_model_is_refused(ends, tmp_path):
+    (tmp_path / "model.yaml").write_text("mine")
+    with pytest.raises(InputError, match="overwrite"):
+        command(tmp_path)
+    assert "ran" not in ends
+    command(tmp_path, overwrite=True)
+    assert ends["discarded"]
+
+
+def test_existing_page_is_refused(ends, tmp_path):
+    """A page of this characterisation (with its recordings) is replaced."""
+    (tmp_path / "model.html").write_text("mine")
+    with pytest.raises(InputError, match="overwrite"):
+        command(tmp_path)
+    (tmp_path / "model-runs").mkdir()
+    (tmp_path / "model-runs" / "01-rest.mcap").touch()
+    command(tmp_path)
+
+
+def test_model_must_not_have_the_name_of_its_page(ends, tmp_path):
+    with pytest.raises(InputError, match="is the name of the page"):
+        characterise(tmp_path / "rig.yaml", tmp_path / "model.html")
+
+
+def test_plan_prints_cooling_with_a_thermal_limit(limits_with, capsys):
+    budget = limits_with("limits.rms_current_a=1.0", "limits.thermal_time_constant_s=9.0")
+    for kept_to, text in ((limits_with(), "no thermal limit"), (budget, "7 s for the coil")):
+        print_plan(CampaignPlan(kept_to, FOUND.steps, 7.0, 5000.0), Path("runs"))
+        assert text in capsys.readouterr().out
+
+
+def test_plan_mapping(limits):
+    mapping = plan_mapping(CampaignPlan(limits, FOUND.steps, 7.0, 5000.0))
+    assert mapping["band_hz"] == [0.5, 80.0]
+    assert mapping["steps"] == [{"name": "rest", "purpose": "noise", "seconds": 2.0}]
+
+
+def test_earlier_and_new_steps_differ(capsys):
+    for kept, text in ((True, "done"), (False, "2.0 s")):
+        print_step(StepRow("rest", "noise", 2.0, 0.1, "[b]0.03 um[/b]", "x.mcap", kept))
+        shown = capsys.readouterr().out
+        assert text in shown
+        assert "[b]0.03 um[/b]" in shown
+
+
+def test_validation_error_is_printed_first(capsys):
+    found = replace(FOUND, identification=identification())
+    print_characterisation(found, Path("model.yaml"), Path("model.html"))
+    shown = capsys.readouterr().out
+    assert shown.index("random reference") < shown.index("noise at rest")
+    assert "verdict: good" in shown
+    assert "model: model.yaml" in shown

@@ -1,0 +1,134 @@
+"""Commands on this computer and its devices: doctor, devices."""
+
+import io
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+from typer.testing import CliRunner
+
+from hilctl.cli.devices import (
+    devices_app,
+    measurement_progress,
+    print_described,
+    print_inventory,
+    print_probed,
+    render_diagnosis,
+)
+from hilctl.experiment.inventory import (
+    Described,
+    DeviceOption,
+    Inventory,
+    SerialPort,
+)
+from hilctl.machine.diagnosis import Diagnosis
+from hilctl.machine.latency import Latency
+from hilctl.run.probe import Probed
+
+DEMO = Path(__file__).parents[3] / "configs" / "demo.yaml"
+
+
+@pytest.fixture
+def devices():
+    """Return a function that runs `hilctl devices` and returns its output."""
+
+    def run(*words):
+        ended = CliRunner().invoke(devices_app, list(map(str, words)))
+        assert ended.exit_code == 0, ended.output
+        return ended.stdout
+
+    return run
+
+
+def test_devices_are_listed(devices):
+    listed = json.loads(devices("--json"))
+    assert "simulated_terfenol" in listed["devices"]
+    assert "labjack_t7" in listed["profiles"]
+    shown = devices()
+    assert "simulated_terfenol" in shown
+    assert "labjack_t7" in shown
+
+
+def test_probe_prints_the_answers_of_a_device(devices):
+    probed = json.loads(devices("probe", DEMO, "--json"))
+    assert probed["name"] == "simulated_terfenol"
+    assert probed["max_rate_hz"] > 0.0
+    shown = devices("probe", DEMO)
+    assert "simulated_terfenol answers" in shown
+    assert "profiles" not in shown
+
+
+def test_implausible_answer_has_exit_code_3(monkeypatch):
+    wrong = Probed("rig", "a device", 1.0, "", "", {}, 2.8e20, None, "A", ("too far",))
+    monkeypatch.setattr("hilctl.run.probe.probe", lambda path, settings: wrong)
+    for words in ([], ["--json"]):
+        ended = CliRunner().invoke(devices_app, ["probe", str(DEMO), *words])
+        assert ended.exit_code == 3
+        assert "too far" in ended.stdout
+
+
+@pytest.fixture(autouse=True)
+def wide(monkeypatch):
+    monkeypatch.setenv("COLUMNS", "150")
+
+
+def test_bars_are_logarithmic():
+    """One late tick among thousands has a visible bar."""
+    late_ns = np.array([1500] * 9_999 + [70_000], dtype=np.int64)
+    console = Console(file=io.StringIO(), width=120)
+    console.print(render_diagnosis(Diagnosis((), Latency(1000.0, late_ns, ()))))
+    bars = [line.count("#") for line in console.file.getvalue().splitlines() if "#" in line]
+    assert max(bars) == 40
+    assert min(bars) == round(40 * np.log(2.0) / np.log(10_000.0))
+
+
+def test_serial_ports_are_listed(capsys):
+    print_inventory(Inventory({"rig": "a:b"}, {"labjack_t7": "x"}, ()))
+    assert "no serial port found" in capsys.readouterr().out
+    print_inventory(Inventory({}, {}, (SerialPort("/dev/ttyUSB0", "an adapter"),)))
+    shown = capsys.readouterr().out
+    assert "/dev/ttyUSB0" in shown
+    assert "no serial port" not in shown
+
+
+def test_profile_is_printed_without_markup(capsys):
+    channel = {"min": 0.0, "max": 5.0, "unit": "V"}
+    profile = {"model": "[T7]", "outputs": {"DAC0": channel}, "notes": ("one\nnote", "another")}
+    print_described(Described("t7", "t7.yaml", (), profile))
+    shown = capsys.readouterr().out
+    for text in ("t7: t7.yaml", "model: [T7]", "0.0 to 5.0 V", "notes: one note", "notes: another"):
+        assert text in shown
+
+
+def test_required_options_are_marked(capsys):
+    options = (DeviceOption("host", None, "where it is"), DeviceOption("port", "502", "its port"))
+    print_described(Described("dac", "a:B", options, {}))
+    shown = capsys.readouterr().out
+    assert "host  required" in shown
+    assert "502" in shown
+
+
+def test_no_progress_with_json(capsys):
+    with measurement_progress(1.0, quiet=True) as report:
+        report(0.5)
+    assert capsys.readouterr().err == ""
+
+
+PROBED = Probed(
+    "rig", "a [bold] device", 1000.0, "", "a message takes up to 0.3 s", {"firmware": "[1.2]"},
+    2.8e20, None, "A", ("too far",),
+)  # fmt: skip
+
+
+def test_answers_of_a_device_are_printed_without_markup(capsys):
+    print_probed(PROBED)
+    shown = capsys.readouterr().out
+    assert "rig answers: a [bold] device\n" in shown
+    assert "firmware: [1.2]" in shown
+    assert "1000 samples per second\n" in shown
+    assert "displacement: 2.8e+20 µm" in shown
+    assert "output: unknown" in shown
+    assert "safe value: a message takes up to 0.3 s" in shown
+    assert "fault: too far" in shown

@@ -1,0 +1,128 @@
+"""Standard output: escaped control characters, and output that nobody reads; JSON."""
+
+import errno
+import io
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+
+from hilctl.cli import ACTING
+from hilctl.cli.commands import COMMANDS
+from hilctl.cli.safe_streams import SafeStream, StandardStream, print_json, safe_streams
+
+HOSTILE = "a\x1b]0;title\x07b\x9b2Jc\rd\x7fe\u202ef"
+
+
+SHOWN = r"a\x1b]0;title\x07b\x9b2Jc\rd\x7fe\u202ef"
+
+
+def wrapped(target, encoding="utf-8"):
+    return io.TextIOWrapper(target, encoding=encoding)
+
+
+def test_escaped_and_styled_text_stay_in_order():
+    target = io.BytesIO()
+    below = wrapped(target)
+    stream = SafeStream(below)
+    print("one\x1b", file=stream)
+    stream.styled.write("\x1b[1mtwo\x1b[0m\n")
+    print("three", file=stream)
+    assert stream.close_wrapper() is None
+    assert target.getvalue() == b"one\\x1b\n\x1b[1mtwo\x1b[0m\nthree\n"
+
+
+def test_characters_outside_the_encoding_are_escaped():
+    target = io.BytesIO()
+    below = wrapped(target, "ascii")
+    print("40 µm", file=(stream := SafeStream(below)))
+    stream.close_wrapper()
+    assert target.getvalue() == b"40 \\xb5m\n"
+
+
+def test_closed_pipe_is_no_error():
+    """The first error is kept, and later output is discarded."""
+    reading, writing = os.pipe()
+    os.close(reading)
+    with os.fdopen(writing, "w") as below:
+        stream = StandardStream(below)
+        for _ in range(3):
+            assert stream.write("x" * 100_000) == 100_000
+            stream.flush()
+        stream.detach()
+        assert stream.failure is not None
+        assert stream.failure.errno == errno.EPIPE
+
+
+def in_a_process(code, shell, **environment):
+    """Run code behind a shell's redirection."""
+    command = ["sh", "-c", f'exec "$0" -c "$1" {shell}', sys.executable, code]
+    return subprocess.run(
+        command, capture_output=True, text=True, timeout=60, env={**os.environ, **environment}
+    )
+
+
+PRINTING = (
+    "from hilctl.cli.safe_streams import safe_streams\nwith safe_streams():\n    print('µ' * 9)"
+)
+
+
+def test_lost_output_is_an_error():
+    """For example a full disk."""
+    ended = in_a_process(PRINTING, "> /dev/full")
+    assert ended.returncode == 3
+    assert ended.stderr == "hilctl: standard output: No space left on device\n"
+
+
+def test_exit_code_is_kept_if_output_is_lost():
+    ended = in_a_process(f"{PRINTING}\n    raise SystemExit(2)", "> /dev/full")
+    assert ended.returncode == 2
+
+
+@pytest.mark.parametrize("code", [0, 130])
+def test_lost_output_does_not_change_the_exit_code_of_acting_commands(code):
+    acting = PRINTING.replace("safe_streams():", "safe_streams(acts=True):")
+    ended = in_a_process(f"{acting}\n    raise SystemExit({code})", "> /dev/full")
+    assert ended.returncode == code
+    assert "No space left on device" in ended.stderr
+
+
+def test_acting_commands_are_commands():
+    assert set(ACTING) <= set(COMMANDS)
+
+
+def test_reader_that_closes_early_is_no_error():
+    code = f"import time\n{PRINTING}; time.sleep(0.0)\n    print('x' * 10**6)"
+    ended = in_a_process(code, "| head -c 2")
+    assert ended.stderr == ""
+
+
+@pytest.mark.parametrize("closed", ["0<&-", "1>&-", "2>&-", "0<&- 1>&- 2>&-"])
+def test_closed_descriptor_is_not_reused_by_a_file(closed):
+    """Otherwise a recording could become the standard output of other processes."""
+    code = """
+import os, sys
+from hilctl.cli.safe_streams import safe_streams
+with safe_streams():
+    print("out"), print("err", file=sys.stderr)
+    opened = os.open("/dev/null", os.O_RDONLY)
+raise SystemExit(0 if opened > 2 else 1)
+"""
+    assert in_a_process(code, closed).returncode == 0
+
+
+def test_streams_are_restored(capsys):
+    before = sys.stdout, sys.stderr
+    with safe_streams():
+        print(HOSTILE)
+    assert (sys.stdout, sys.stderr) == before
+    assert capsys.readouterr().out == SHOWN + "\n"
+
+
+def test_json_is_one_object_without_nan(capsys):
+    print_json({"gain": 0.5, "names": ["a"]})
+    assert json.loads(capsys.readouterr().out) == {"gain": 0.5, "names": ["a"]}
+    print_json({"gain": float("nan"), "largest": [float("inf")]})
+    assert json.loads(capsys.readouterr().out) == {"gain": None, "largest": [None]}
