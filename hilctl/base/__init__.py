@@ -3,7 +3,7 @@
 arrays.py    array types, and long arrays piece by piece
 device.py    the contract of a device and of a clock; units.py  of its commands
 errors.py    every exception that is raised on purpose
-strict.py    base of every pydantic model; plain.py  stands in for it where nothing is checked
+strict.py    base of every pydantic model
 files.py     texts, each read once; files written whole or not at all
 private.py   folders that belong to one user alone
 samples.py   a sample's columns and flags, and blocks of samples

@@ -49,22 +49,11 @@ def run(
     if detach:
         _detach(experiment, output, settings, overwrite=overwrite, as_json=as_json)
         return
-    with _loop_ahead(experiment):
-        _run(experiment, output, settings, overwrite, watch=watch, live=live, as_json=as_json)
-
-
-@contextmanager
-def _loop_ahead(experiment: Path) -> Iterator[None]:
-    """Have the loop's process import while this one does, where there may be a run."""
     from hilctl.run.architecture import require_linux
-    from hilctl.run.waiting_loop import started_ahead
 
     require_linux()
-    if not experiment.is_file():
-        yield  # and is refused in words
-        return
-    with started_ahead(), compiling_shown():
-        yield
+    with compiling_shown():
+        _run(experiment, output, settings, overwrite, watch=watch, live=live, as_json=as_json)
 
 
 def _run(

@@ -9,13 +9,11 @@ import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, Protocol, TypeAlias
+from typing import Literal, Protocol, TypeAlias
 
 from hilctl.base.errors import InputError
 from hilctl.machine.linux import DMA_LATENCY, LinuxProcess
-
-if TYPE_CHECKING:  # importing it early would decide whether a process checks what it gets
-    from hilctl.machine.settings import Realtime
+from hilctl.machine.settings import Realtime
 
 StepOutcome: TypeAlias = Literal["done", "refused", "not asked"]
 
@@ -137,7 +135,7 @@ def _lock_memory(system: System) -> SetUpStep:
     return _step("memory", detail, system.lock_memory, remedy)
 
 
-def _pin(settings: "Realtime", system: System) -> SetUpStep:
+def _pin(settings: Realtime, system: System) -> SetUpStep:
     cpu = settings.cpu
     if cpu is None:
         with suppress(OSError):
@@ -148,7 +146,7 @@ def _pin(settings: "Realtime", system: System) -> SetUpStep:
     return _step("cpu", f"CPU {cpu}", lambda: system.pin(cpu), remedy)
 
 
-def _set_fifo(settings: "Realtime", system: System) -> SetUpStep:
+def _set_fifo(settings: Realtime, system: System) -> SetUpStep:
     priority = settings.priority
     throttling = _throttling(system)
     try:
@@ -176,7 +174,7 @@ def _throttling(system: System) -> str:
 _THIS_PROCESS = LinuxProcess()
 
 
-def prepare(settings: "Realtime", system: System = _THIS_PROCESS) -> tuple[SetUpStep, ...]:
+def prepare(settings: Realtime, system: System = _THIS_PROCESS) -> tuple[SetUpStep, ...]:
     """Take every step that is allowed; call it last, when all memory is mapped and warm.
 
     Args:

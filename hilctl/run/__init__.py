@@ -3,16 +3,14 @@
 start.py           from an experiment file to a finished run
 step.py            one run of several, and by what its recording is known
 architecture.py    systems that a run may be on
-job.py             what was checked as it goes to the loop's process
+job.py             what loop and guardian get, as JSON text in the run's folder
 assemble.py        from a checked experiment to the plan of its loop
 supervisor.py      starts loop, guardian and recorder; started_run.py  sees to them to the end
-child.py           the supervisor's hold on the loop's process; hang_watch.py  whether it hangs
+child.py           the supervisor's hold on its processes; hang_watch.py  whether it hangs
 guardian.py        a process that makes the output safe where the loop can't, started by
                    guardian_process.py; safety.py  sees to it, and stands in for it;
                    safe_action.py  what both do then
-loop_process.py    the loop's process; carried_out.py  what it does with its job,
-                   host.py  its side of the shared memory,
-                   waiting_loop.py  started before its run is known
+loop_process.py    the loop process; host.py  its side of the shared memory
 starting.py        where the output is before a run
 ring.py            sample blocks in shared memory, behind shared_page.py
 recorder.py        into the recording; metadata.py what it says of the run, end_figures.py of

@@ -9,7 +9,7 @@ from hilctl.experiment.adaptation import make_adaptation
 from hilctl.experiment.feedback import make_feedback
 from hilctl.experiment.file import Experiment
 from hilctl.experiment.interlocks import interlock_context
-from hilctl.experiment.run_parts import RunParts
+from hilctl.experiment.load import LoadedExperiment
 from hilctl.loop.adaptation import DisplacementOperator
 from hilctl.loop.compensator import Compensator
 from hilctl.loop.conditioning import Conditioning
@@ -21,7 +21,7 @@ _MISSED_WINDOW_S = 10.0
 
 
 def assemble(
-    parts: RunParts,
+    loaded: LoadedExperiment,
     reference: F64,
     input_um: F64,
     state: F64 | None,
@@ -34,7 +34,7 @@ def assemble(
     """Return what a run does; its compensator is warmed up.
 
     Args:
-        parts: Of the experiment.
+        loaded: The experiment.
         reference: float64[n], in the waveform's unit.
         input_um: float64[n], the compensator's input.
         state: The compensator's memory before the first sample; at rest where None.
@@ -43,11 +43,11 @@ def assemble(
         paced: Whether the run keeps real time; else no tick is late.
         heat_a2: Heat of the coil before it, in A^2.
     """
-    config, info = parts.config, parts.device.info
+    config, info = loaded.config, loaded.device.info
     rate_hz = config.sample_rate_hz
     policy = _late_policy(config, info) if paced else "catch_up"
     host_paced = paced and not info.buffered and not info.latency_blocks
-    compensator = Compensator(parts.model, rate_hz)
+    compensator = Compensator(loaded.model, rate_hz)
     compensator.warm_up()
     if state is not None:
         compensator.restore(state)

@@ -1,8 +1,8 @@
 """The guardian: a small process that sets the output to its safe value if the loop cannot.
 
-Started by the supervisor as ``python -m hilctl.run.guardian JOB PIDFD``, with a pidfd of the loop's
-process. Once it watches, it reads no file, imports nothing and waits for no other process, so that
-neither a disk nor the supervisor can delay the safe value.
+Started by the supervisor as ``python -m hilctl.run.guardian JOB PIDFD PID``, with a pidfd and the
+number of the loop process. Once it watches, it reads no file, imports nothing and waits for no
+other process, so neither a disk nor the supervisor can delay the safe value.
 
 It acts if the loop dies without a confirmed safe output, or hangs. It keeps trying until the device
 confirms the safe value, also after the supervisor has ended; SIGTERM ends it then. The supervisor
@@ -11,30 +11,25 @@ drives the device only after the guardian has ended or was killed, so two proces
 As ``python -m hilctl.run.guardian JOB act`` it has no loop to watch, and acts at once.
 """
 
-import json
 import os
 import select
 import shutil
 import signal
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from types import FrameType
-from typing import Self
 
 from hilctl.base.device import Device
-from hilctl.base.errors import HilctlError, InputError
-from hilctl.base.files import TextFiles
-from hilctl.base.yaml import Document
-from hilctl.experiment.device import made_device
+from hilctl.base.errors import HilctlError
 from hilctl.loop.safe_output import SafeGoal
 from hilctl.machine.linux import LinuxProcess
 from hilctl.machine.realtime import be_quick
-from hilctl.run.hang_watch import HangWatch, SilenceLimits, is_stopped
+from hilctl.run.hang_watch import HangWatch, is_stopped
+from hilctl.run.job import Job
 from hilctl.run.ring import SampleRing
 from hilctl.run.run_folder import keep_removed
 from hilctl.run.safe_action import SafeAction
@@ -53,57 +48,6 @@ LAST_CALL_MS = 5
 back its memory takes much longer, and only a device that takes one connection waits for that."""
 
 
-@dataclass(frozen=True, slots=True)
-class GuardianJob:
-    """What the guardian is to guard, as text.
-
-    Attributes:
-        experiment: The experiment as YAML.
-        files: Texts of the files that its device refers to, by absolute path.
-        folder: Folder that file names in it are relative to.
-        ring: File of the ring.
-        safe_value: The safe value, in the device's command unit.
-        ramp_per_s: Fastest change on the way there.
-        limits: How long the loop may be silent.
-        loop: Process number of the loop.
-        supervisor: Process number of the supervisor.
-        priority: SCHED_FIFO priority that is asked for.
-    """
-
-    experiment: str
-    files: Mapping[str, str]
-    folder: str
-    ring: str
-    safe_value: float
-    ramp_per_s: float
-    limits: SilenceLimits
-    loop: int
-    supervisor: int
-    priority: int
-
-    def to_json(self) -> str:
-        """Return the fields as JSON."""
-        return json.dumps(asdict(self))
-
-    @classmethod
-    def from_json(cls, text: str) -> Self:
-        """Undo :meth:`to_json`."""
-        fields = json.loads(text)
-        return cls(**{**fields, "limits": SilenceLimits(**fields["limits"])})
-
-    def device(self) -> Device:
-        """Return the device, made but not opened; nothing is read from disk.
-
-        Raises:
-            InputError: It can't be made.
-        """
-        document = Document("experiment", self.experiment)
-        made = made_device(document, Path(self.folder), TextFiles(self.files))
-        if made is None:
-            raise InputError("the experiment has no device")
-        return made
-
-
 class Guardian:
     """Watches the loop, and sets the output to its safe value if the loop died or hangs.
 
@@ -111,7 +55,8 @@ class Guardian:
         ring: Shared with loop and supervisor.
         device: Not open.
         job: What to guard.
-        loop: A pidfd of the loop's process.
+        pidfd: A pidfd of the loop's process.
+        loop: Its process number.
         prepare: Called first in the thread that drives the device.
     """
 
@@ -119,16 +64,17 @@ class Guardian:
         self,
         ring: SampleRing,
         device: Device,
-        job: GuardianJob,
+        job: Job,
+        pidfd: int,
         loop: int,
         prepare: Callable[[], object] = lambda: None,
     ) -> None:
         self._ring, self._page = ring, ring.page
-        self._device, self._job, self._loop = device, job, loop
+        self._device, self._job, self._pidfd = device, job, pidfd
         self._prepare = prepare
-        self._watch = HangWatch(ring.page, job.limits, lambda: is_stopped(job.loop))
+        self._watch = HangWatch(ring.page, job.limits, lambda: is_stopped(loop))
         self._death = select.poll()
-        self._death.register(loop, select.POLLIN)
+        self._death.register(pidfd, select.POLLIN)
 
     def watch(self) -> bool:
         """Watch until the loop is gone, and the output safe if that can be had.
@@ -158,7 +104,7 @@ class Guardian:
     def _kill_loop(self) -> None:
         """End the loop for good: should it go on, it would send commands from before."""
         with suppress(ProcessLookupError):
-            signal.pidfd_send_signal(self._loop, signal.SIGKILL)
+            signal.pidfd_send_signal(self._pidfd, signal.SIGKILL)
         self._death.poll(LAST_CALL_MS)
 
 
@@ -226,7 +172,7 @@ def main(words: list[str]) -> int:
     """Guard one run; the exit code is 0 if the job could be read and the device driven."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)  # it ends with the loop, and not before
-    job = GuardianJob.from_json(Path(words[0]).read_text(encoding="utf-8"))
+    job = Job.read(Path(words[0]))
     ring = SampleRing(Path(job.ring))
     page = ring.page
     page.put(Field.GUARDIAN_PID, os.getpid())
@@ -238,13 +184,13 @@ def main(words: list[str]) -> int:
     "localhost".encode("idna")  # the codec, which is imported at the first connection otherwise
     process = LinuxProcess()
     _stay_in_memory(process)
-    be_quick(job.priority, process)
-    prepare = partial(be_quick, job.priority, process)
+    be_quick(job.safe_priority, process)
+    prepare = partial(be_quick, job.safe_priority, process)
     if words[1] == "act":
         goal = safe_goal(ring, device, job.safe_value, job.ramp_per_s)
         done = act(page, device, goal, hung=False, prepare=prepare)
     else:
-        done = Guardian(ring, device, job, int(words[1]), prepare).watch()
+        done = Guardian(ring, device, job, int(words[1]), int(words[2]), prepare).watch()
     if os.getppid() != job.supervisor:
         _leave_folder(Path(words[0]).parent, page)
     return 0 if done else 1

@@ -14,7 +14,6 @@ from hilctl.experiment.load import input_files, load_experiment
 from hilctl.run.architecture import require_linux
 from hilctl.run.own_process import has_threads, run_in_own_process
 from hilctl.run.result import Progress, RunResult
-from hilctl.run.waiting_loop import started_ahead
 
 _log = logging.getLogger(__name__)
 
@@ -80,8 +79,7 @@ def start_run(
     if has_threads():
         given = (path, settings, output, overwrite, heat_a2)
         return run_in_own_process(given, on_progress)
-    with started_ahead():
-        return _run(path, settings, output, overwrite, on_progress, heat_a2)
+    return _run(path, settings, output, overwrite, on_progress, heat_a2)
 
 
 def _run(

@@ -12,7 +12,7 @@ from hilctl.base.events import Event
 from hilctl.experiment.check import Checked
 from hilctl.loop.plan import Outcome
 from hilctl.loop.safe_output import describe
-from hilctl.run.child import LoopChild
+from hilctl.run.child import LoopProcess
 from hilctl.run.result import Progress
 from hilctl.run.ring import SampleRing
 from hilctl.run.ring_recorder import RingRecorder
@@ -43,7 +43,7 @@ class StartedRun:
         self,
         checked: Checked,
         ring: SampleRing,
-        child: LoopChild,
+        child: LoopProcess,
         safety: Safety,
         recording: RingRecorder,
     ) -> None:

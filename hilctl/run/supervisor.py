@@ -6,11 +6,13 @@ are seen to, whatever else goes wrong here.
 
 import json
 import logging
+import os
 import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 from types import FrameType
 
@@ -19,9 +21,11 @@ from hilctl.experiment.check import Checked
 from hilctl.loop.pacer import deadline_misses
 from hilctl.machine.memory import ProcessMemory
 from hilctl.machine.realtime import be_ordinary, favoured
-from hilctl.run.child import LoopChild
+from hilctl.run.child import LoopProcess
 from hilctl.run.control_socket import ControlServer
-from hilctl.run.guardian_process import GuardianRelief
+from hilctl.run.description import RunDescription
+from hilctl.run.guardian_process import GuardianProcess, GuardianRelief
+from hilctl.run.job import Job
 from hilctl.run.progress import ProgressThread
 from hilctl.run.recorder import Recorder
 from hilctl.run.requests import Requests
@@ -29,7 +33,7 @@ from hilctl.run.result import Progress, RunResult
 from hilctl.run.ring import SampleRing
 from hilctl.run.ring_recorder import RingRecorder
 from hilctl.run.run_folder import RunFolder, held_devices, run_folder
-from hilctl.run.safety import Safety, guardian_starter
+from hilctl.run.safety import Safety
 from hilctl.run.shared_page import Field, PageText, SharedPage
 from hilctl.run.started_run import STOPS, StartedRun
 from hilctl.run.stopping import JOB_CONTROL, STOP_SIGNAL
@@ -105,7 +109,8 @@ class Supervisor:
                 recording = RingRecorder(ring, recorder, config.recording.flush_s)
                 requests = Requests(self._checked, folder, ring.page, recording)
                 server = stack.enter_context(ControlServer(folder.socket, requests.answer))
-                child = LoopChild(self._checked, folder, ring, locks + own, self._silence_s)
+                self._write_job(folder)
+                child = LoopProcess(folder, ring.page, locks + own)
                 # Open to the end: watchers find it even if the folder is removed.
                 stack.enter_context(folder.description.open("rb"))
                 run = folder, ring, child, recording
@@ -131,7 +136,7 @@ class Supervisor:
         stack: ExitStack,
         folder: RunFolder,
         ring: SampleRing,
-        child: LoopChild,
+        child: LoopProcess,
         recording: RingRecorder,
         locks: list[int],
     ) -> tuple[Safety, int]:
@@ -143,7 +148,8 @@ class Supervisor:
         page, checked = ring.page, self._checked
         safety = None
         try:
-            guardian = guardian_starter(checked, folder, ring, child.pid, locks)
+            simulated = checked.loaded.device.info.simulated  # needs no guardian
+            guardian = None if simulated else partial(GuardianProcess, folder, page, locks)
             safety = Safety(checked, ring, child, guardian, recording.record_event)
             child.await_ready(lambda: self._stop_signal != 0)
             # It is started after the loop, to watch its process, and ready long before it.
@@ -253,6 +259,12 @@ class Supervisor:
             for number, handler in before.items():
                 if handler is not None:  # one that is not Python's can't be set again
                     signal.signal(number, handler)
+
+    def _write_job(self, folder: RunFolder) -> None:
+        """Write what the loop process, the guardian and watchers read."""
+        job = Job.of(self._checked, folder, supervisor=os.getpid(), silence_s=self._silence_s)
+        job.write(folder.job)
+        RunDescription.of(self._checked).write(folder.description)
 
     def _make_ring(self, folder: RunFolder) -> SampleRing:
         config, info = self._config, self._checked.loaded.device.info

@@ -7,6 +7,7 @@ ROOT = UNIT.parents[1]
 PACKAGES = {Path(): ROOT / "hilctl", Path("drivers"): ROOT / "drivers" / "hilctl_drivers"}
 
 WITHOUT = {
+    "run/guardian_process": "tests/faults/test_processes.py runs it; run/test_job.py the limits",
     "base/arrays": "names of array types; nothing runs",
     "base/device": "the contract of devices: tests/contract/test_devices.py holds each to it",
     "base/units": "a name of a type; nothing runs",
@@ -15,7 +16,6 @@ WITHOUT = {
     "drivers/contract": "the checks of tests/contract; test_bad_devices.py makes each of them fail",
     "drivers/emulator/wire": "a contract and a record; drivers/emulator/test_server.py uses both",
     "drivers/labjack/safe_write": "two messages; labjack/test_device.py sees what becomes of them",
-    "experiment/run_parts": "a contract; run/test_carried_out.py runs what keeps it",
     "loop/host": "a contract and a record; loop/test_loop.py runs the loop on a double of it",
     "loop/plan": "two records of plain values; loop/test_loop.py fills and reads all of them",
     "recording/facts": "names; analysis/test_catalogue.py reads all of them",

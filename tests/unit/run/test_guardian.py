@@ -16,8 +16,9 @@ import pytest
 from hilctl.base.errors import DeviceError
 from hilctl.loop.plan import Outcome
 from hilctl.run import guardian
-from hilctl.run.guardian import LAST_CALL_MS, Guardian, GuardianJob, main
+from hilctl.run.guardian import LAST_CALL_MS, Guardian, main
 from hilctl.run.hang_watch import SilenceLimits
+from hilctl.run.job import Job
 from hilctl.run.ring import SampleRing
 from hilctl.run.safe_action import SafeAction
 from hilctl.run.shared_page import Field, GuardianPhase, PageText, Phase, SharedPage
@@ -25,6 +26,18 @@ from hilctl.run.shared_page import Field, GuardianPhase, PageText, Phase, Shared
 SLEEP = [sys.executable, "-c", "import time; time.sleep(600)"]
 DESCRIPTORS = Path("/proc/self/fd")
 IGNORED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+LIMITS = SilenceLimits(1.0, 1.0, 1.0, 1.0)
+
+
+def job_of(experiment, *, ring="", limits=LIMITS):
+    """Return a job with what a guardian needs of it."""
+    return Job(
+        experiment=experiment, files={}, folder="", ring=ring, reference="", input_um="",
+        state=None, heat_a2=0.0, stands_um=None, adapted=None, safe_value=0.25, ramp_per_s=50.0,
+        limits=limits, supervisor=2, silence_s=1.0, safe_priority=7,
+    )  # fmt: skip
 
 
 class Device:
@@ -61,8 +74,7 @@ def guarded(tmp_path, monkeypatch):
 
     def guard(hang_s=60.0):
         limits = SilenceLimits(hang_s, hang_s, 60.0, hang_s)
-        job = GuardianJob("", {}, "", "", 0.25, 50.0, limits, loop.pid, 1, 1)
-        return Guardian(ring, made.device, job, pidfd).watch()
+        return Guardian(ring, made.device, job_of("", limits=limits), pidfd, loop.pid).watch()
 
     made.guard = guard
     yield made
@@ -261,11 +273,8 @@ def written(tmp_path):
     before = {number: signal.getsignal(number) for number in IGNORED}
 
     def call(experiment, loop=0):
-        limits = SilenceLimits(1.0, 1.0, 1.0, 1.0)
-        job = GuardianJob(experiment, {}, "", str(ring), 0.25, 50.0, limits, 1, 2, 7)
-        assert GuardianJob.from_json(job.to_json()) == job
-        (tmp_path / "job").write_text(job.to_json(), encoding="utf-8")
-        return main([str(tmp_path / "job"), str(loop)])
+        job_of(experiment, ring=str(ring)).write(tmp_path / "job")
+        return main([str(tmp_path / "job"), str(loop), "1"])
 
     yield SimpleNamespace(call=call, page=page)
     for number, handler in before.items():
@@ -289,16 +298,14 @@ def test_a_device_that_has_no_memory_is_said_before_the_start(written, monkeypat
     def device(_job):
         raise MemoryError
 
-    monkeypatch.setattr(GuardianJob, "device", device)
+    monkeypatch.setattr(Job, "device", device)
     assert written.call("device: {kind: simulated_terfenol}") == 1
     assert written.page.get(Field.GUARDIAN_PHASE) == GuardianPhase.FAILED
     assert written.page.read_text(PageText.GUARDIAN) == "not enough memory"
 
 
 def test_the_device_is_made_of_the_experiment_alone():
-    limits = SilenceLimits(1.0, 1.0, 1.0, 1.0)
-    job = GuardianJob("device: {kind: simulated_terfenol}", {}, "", "", 0.0, 1.0, limits, 1, 1, 1)
-    assert job.device().info.simulated
+    assert job_of("device: {kind: simulated_terfenol}").device().info.simulated
 
 
 @pytest.mark.parametrize("limit", [None, 65536])
@@ -312,7 +319,7 @@ def test_it_prepares_for_a_machine_that_does_nothing_else(written, guarded, monk
         set_fifo=lambda priority: done.append((priority, threading.current_thread().name)),
     )
     monkeypatch.setattr(guardian, "LinuxProcess", lambda: process)
-    monkeypatch.setattr(GuardianJob, "device", lambda job: guarded.device)
+    monkeypatch.setattr(Job, "device", lambda job: guarded.device)
     written.page.put(Field.GO, 1)
     written.page.put_float(Field.OUTPUT_AT_START, 0.25)
     written.page.put(Field.PHASE, Phase.RUNNING)

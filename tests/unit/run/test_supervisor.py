@@ -29,6 +29,8 @@ STARTED = [
     "claimed",
     "folder",
     "server",
+    "job.json",
+    "description.json",
     "child",
     "guardian",
 ]
@@ -83,7 +85,8 @@ class Neighbours:
         )
         self.folder = SimpleNamespace(
             path=folder, ring=folder / "ring", socket=folder / "socket",
-            description=folder / "description.json", keep=lambda: self.note("folder kept"),
+            description=folder / "description.json", job=folder / "job.json",
+            keep=lambda: self.note("folder kept"),
         )  # fmt: skip
         self.folder.description.touch()
         self.said, self.resumed, self.kept = [], [], False
@@ -98,9 +101,13 @@ class Neighbours:
                 answer=None, attend=lambda: self.note("requests")
             ),
             "ControlServer": self.server,
-            "LoopChild": self.child,
+            "LoopProcess": self.child,
+            "Job": SimpleNamespace(of=self.job),
+            "RunDescription": SimpleNamespace(
+                of=lambda checked: SimpleNamespace(write=self.written)
+            ),
             "RingRecorder": self.ring_recorder,
-            "guardian_starter": self.guardian_starter,
+            "GuardianProcess": lambda folder, page, inherits, loop: self.note("guardian", inherits),
             "GuardianRelief": lambda holds: SimpleNamespace(
                 resume=self.resumed.append, discard=lambda: self.resumed.append("discarded")
             ),
@@ -131,9 +138,6 @@ class Neighbours:
         finally:
             self.log.append(afterwards)
 
-    def guardian_starter(self, checked, folder, ring, loop, inherits):
-        return None if self.info.simulated else self.note("guardian", inherits)
-
     def run_folder(self, name, output, started, holds):
         assert (name, output, started, holds) == ("stage", self.output, 5.0, ("tcp:here",))
         return self.around("folder", "folder removed", (self.folder, ["lock"]))
@@ -148,12 +152,19 @@ class Neighbours:
         assert 0.0 < wait_s <= 0.02  # meanwhile nobody sees to the ring
         self.note("serve")
 
-    def child(self, checked, folder, ring, inherits, silence_s):
-        self.ring, self.silence_s = ring, silence_s
+    def job(self, checked, folder, *, supervisor, silence_s):
+        assert supervisor == os.getpid()
+        self.silence_s = silence_s
+        return SimpleNamespace(write=self.written)
+
+    def written(self, path):
+        self.note(path.name)
+
+    def child(self, folder, page, inherits):
         assert inherits == ["tcp:here", "lock"]
         set_up = json.dumps([{"rt.fifo": "done: 50"}, self.refused])
-        ring.page.write_text(PageText.SET_UP, set_up)
-        ring.page.put(Field.WAVEFORM_AT, 40)
+        page.write_text(PageText.SET_UP, set_up)
+        page.put(Field.WAVEFORM_AT, 40)
         self.note("child")
         return SimpleNamespace(
             pid=1, await_ready=self.await_ready, kill=lambda: self.note("child killed")
@@ -173,6 +184,7 @@ class Neighbours:
         self.note("begin")
 
     def ring_recorder(self, ring, recorder, flush_s):
+        self.ring = ring
         return SimpleNamespace(recorder=recorder, start=self.start, record_event=None)
 
     def start(self):
@@ -180,7 +192,7 @@ class Neighbours:
         self.note("recording")
 
     def safety(self, checked, ring, child, guardian, record_event):
-        self.guardian = guardian
+        self.guardian = guardian and guardian(child.pid)
         return SimpleNamespace(
             ready=self.ready, close=lambda stopped=None: self.note("safety closed", self.kept)
         )
