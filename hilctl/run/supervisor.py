@@ -19,7 +19,6 @@ from types import FrameType
 from hilctl.base.errors import RunError
 from hilctl.experiment.check import Checked
 from hilctl.loop.pacer import deadline_misses
-from hilctl.machine.memory import ProcessMemory
 from hilctl.machine.realtime import be_ordinary, favoured
 from hilctl.run.child import LoopProcess
 from hilctl.run.control_socket import ControlServer
@@ -154,7 +153,6 @@ class Supervisor:
             child.await_ready(lambda: self._stop_signal != 0)
             # It is started after the loop, to watch its process, and ready long before it.
             self._await_guardian(safety)
-            ProcessMemory().stay_small()  # all is compiled
             start_ns = self._begin(recording.recorder, page)
             # Before there are threads: all that share the interpreter with this one come along.
             stack.enter_context(favoured(child.pid))

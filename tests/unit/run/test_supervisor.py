@@ -34,7 +34,7 @@ STARTED = [
     "child",
     "guardian",
 ]
-READY = [*STARTED, "await ready", "small", "begin", "favoured", "recording"]
+READY = [*STARTED, "await ready", "begin", "favoured", "recording"]
 UNDONE = ["ordinary again", "server closed", "folder removed", "devices let go"]
 
 
@@ -112,7 +112,6 @@ class Neighbours:
                 resume=self.resumed.append, discard=lambda: self.resumed.append("discarded")
             ),
             "Safety": self.safety,
-            "ProcessMemory": lambda: SimpleNamespace(stay_small=lambda: self.note("small")),
             "StartedRun": self.started_run,
             "ProgressThread": lambda *a: SimpleNamespace(
                 start=lambda: self.said.append("shown"), end=lambda: self.note("progress ended")
