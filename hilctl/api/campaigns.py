@@ -66,7 +66,7 @@ def characterise(
     from hilctl.characterise.session import Campaign, CampaignHost
     from hilctl.experiment.load import inputs_of
     from hilctl.recording.ends import recordings_in
-    from hilctl.run.step import paced, unpaced
+    from hilctl.run.start import paced, unpaced
 
     file, chosen = Path(output), runs_folder(output, folder)
     page = file.with_suffix(".html")

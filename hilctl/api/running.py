@@ -115,7 +115,7 @@ def learn(
     from hilctl.experiment.correction import write_correction
     from hilctl.experiment.load import inputs_of
     from hilctl.learning.session import Session
-    from hilctl.run.step import paced, unpaced
+    from hilctl.run.start import paced, unpaced
 
     file, chosen = Path(output), runs_folder(output, folder)
     inputs = inputs_of(Path(experiment), texts_of(settings))

@@ -30,8 +30,7 @@ from hilctl.models.files import dump_model
 from hilctl.recording.data import Recording
 from hilctl.recording.reader import read
 from hilctl.run.result import RunResult
-from hilctl.run.start import checked_experiment
-from hilctl.run.step import OnPart, RunKey, StepStoppedError, paced, unpaced
+from hilctl.run.start import OnPart, RunKey, StepStoppedError, checked_experiment, paced, unpaced
 
 StepRunner: TypeAlias = Callable[[Path, Sequence[str], Path, OnPart], RunResult]
 """Runs an experiment file with settings into a recording, over one that stands there."""

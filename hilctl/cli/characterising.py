@@ -71,7 +71,7 @@ def characterise(
 
 def _characterised(experiment: Path, output: Path, **asked: Any) -> "Characterisation | None":
     from hilctl import api
-    from hilctl.run.step import StepStoppedError
+    from hilctl.run.start import StepStoppedError
 
     try:
         return api.characterise(experiment, output, **asked)

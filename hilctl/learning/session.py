@@ -25,8 +25,7 @@ from hilctl.learning.results import Learned, Row, row_of
 from hilctl.learning.update import learn, refused
 from hilctl.recording.reader import read
 from hilctl.run.result import RunResult
-from hilctl.run.start import checked_experiment
-from hilctl.run.step import StepStoppedError, paced
+from hilctl.run.start import StepStoppedError, checked_experiment, paced
 
 Runner: TypeAlias = Callable[[Path, Sequence[str], Path], RunResult]
 """Runs an experiment file with settings into a recording."""

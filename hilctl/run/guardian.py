@@ -16,6 +16,7 @@ import select
 import shutil
 import signal
 import sys
+import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -25,14 +26,12 @@ from types import FrameType
 
 from hilctl.base.device import Device
 from hilctl.base.errors import HilctlError
-from hilctl.loop.safe_output import SafeGoal
+from hilctl.loop.safe_output import LocalError, SafeGoal, SafeOutput
 from hilctl.machine.linux import LinuxProcess
 from hilctl.machine.realtime import be_quick
-from hilctl.run.hang_watch import HangWatch, is_stopped
-from hilctl.run.job import Job
+from hilctl.run.job import Job, SilenceLimits
 from hilctl.run.ring import SampleRing
 from hilctl.run.run_folder import keep_removed
-from hilctl.run.safe_action import SafeAction
 from hilctl.run.shared_page import (
     Field,
     GuardianPhase,
@@ -42,10 +41,138 @@ from hilctl.run.shared_page import (
     SharedPage,
 )
 
+_POLLS = 3
+_CLOSING_S = 30.0
 _POLL_MS = 5
 LAST_CALL_MS = 5
 """How long a process that was killed may be in a call that it is to end. Then it is dying: giving
 back its memory takes much longer, and only a device that takes one connection waits for that."""
+
+
+class HangWatch:
+    """Looks at the loop's heartbeat.
+
+    Where the whole machine stands still, this process does too: silence counts only where this side
+    has looked several times meanwhile.
+
+    Args:
+        page: Shared with the loop.
+        limits: Longest that it may be silent.
+        is_stopped: Whether the loop's process is stopped.
+    """
+
+    def __init__(
+        self, page: SharedPage, limits: SilenceLimits, is_stopped: Callable[[], bool]
+    ) -> None:
+        self._page = page
+        self._limits = limits
+        self._is_stopped = is_stopped
+        self._heartbeat_ns = -1
+        self._seen_ns = 0
+        self._polls = 0
+
+    def hangs(self, now_ns: int) -> bool:
+        """Look once; return whether the loop has been silent for too long.
+
+        Args:
+            now_ns: Monotonic time.
+        """
+        page = self._page
+        heartbeat_ns, phase = page.get(Field.LOOP_HEARTBEAT_NS), page.get(Field.PHASE)
+        watched = phase in {Phase.RUNNING, Phase.CLOSING}
+        if heartbeat_ns != self._heartbeat_ns or not watched:
+            self._heartbeat_ns, self._seen_ns, self._polls = heartbeat_ns, now_ns, 0
+            return False
+        self._polls += 1
+        silent_s = (now_ns - self._seen_ns) * 1e-9
+        if self._polls <= _POLLS:
+            return False
+        limits = self._limits
+        loop_s = limits.real_time_s if page.get(Field.REAL_TIME) else limits.ordinary_s
+        if silent_s > loop_s + self._wait_s(phase):
+            return True
+        # Last, since it asks the kernel.
+        return silent_s > limits.stopped_s and self._is_stopped()
+
+    def _wait_s(self, phase: int) -> float:
+        """Return how long the loop may be waiting for its device."""
+        # A device that is lost may use up its time-outs; and before the first tick nothing moves.
+        if phase == Phase.CLOSING or not self._page.get(Field.LOOP_HEARTBEAT_NS):
+            return _CLOSING_S
+        return self._limits.exchange_s if self._page.get(Field.EXCHANGING) else 0.0
+
+
+def is_stopped(process: int) -> bool:
+    """Return whether a process is stopped or traced; of one that is gone, False."""
+    try:
+        stat = Path(f"/proc/{process}/stat").read_bytes()
+    except OSError:
+        return False
+    # Behind the program's name, which may have spaces and brackets of its own.
+    return stat.rpartition(b")")[2].split()[0] in {b"T", b"t"}
+
+
+class SafeAction:
+    """Drives a device to its safe value in a thread, until no write can tell more.
+
+    Args:
+        page: Shared with the other processes of the run.
+        device: Not open; each write opens a connection of its own.
+        goal: Where the output goes.
+        hung: Whether the loop had to be killed.
+        prepare: Called in that thread first.
+
+    Attributes:
+        failed: What broke in this process, so that another one has to try; empty if nothing did.
+
+    Raises:
+        RuntimeError: No thread can be started.
+    """
+
+    def __init__(
+        self,
+        page: SharedPage,
+        device: Device,
+        goal: SafeGoal,
+        *,
+        hung: bool,
+        prepare: Callable[[], object] = lambda: None,
+    ) -> None:
+        self._output = SafeOutput(device, goal, on_write=page.note_safe_write)
+        self._hung, self._prepare = hung, prepare
+        self._result = SafeActionResult(hung, "unknown", self._output.error, final=False)
+        self._ending = threading.Event()
+        self.failed = ""
+        # A daemon: a device that blocks it for ever must not keep the process from ending.
+        self._thread = threading.Thread(target=self._run, name="safe action", daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        output = self._output
+        try:
+            self._prepare()
+            while not output.final and not self._ending.is_set():
+                output.attempt()
+                self._result = SafeActionResult(
+                    self._hung, output.state, output.error, output.final
+                )
+                if not output.final:
+                    self._ending.wait(output.pause_s)
+        except LocalError as error:
+            self.failed = str(error)
+        except Exception as error:  # noqa: BLE001  no error may pass for a confirmed output
+            self.failed = f"{type(error).__name__}: {error}"
+
+    def result(self, wait_s: float = 0.0) -> SafeActionResult:
+        """Return what is reached so far, after ``wait_s`` or when nothing more follows."""
+        self._thread.join(wait_s)
+        return self._result
+
+    def end(self, wait_s: float) -> bool:
+        """Write no more; return whether the last write is over within ``wait_s``."""
+        self._ending.set()
+        self._thread.join(wait_s)
+        return not self._thread.is_alive()
 
 
 class Guardian:

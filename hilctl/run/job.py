@@ -23,7 +23,6 @@ from hilctl.base.errors import InputError, RunError
 from hilctl.base.files import TextFiles
 from hilctl.base.yaml import Document
 from hilctl.experiment.device import made_device
-from hilctl.run.hang_watch import SilenceLimits
 
 if TYPE_CHECKING:
     from hilctl.experiment.check import Checked
@@ -32,6 +31,24 @@ if TYPE_CHECKING:
 _SIMULATED_MARGIN_S = 0.5
 _HANG_S = 0.08
 _STOPPED_S = 0.02
+
+
+@dataclass(frozen=True, slots=True)
+class SilenceLimits:
+    """How long the loop may be silent.
+
+    Attributes:
+        real_time_s: While it runs with real-time priority.
+        ordinary_s: While it runs without: a busy machine may keep it waiting for so long.
+        exchange_s: What is added while it waits for the device.
+        stopped_s: While its process is stopped, as by SIGSTOP: it waits for nothing that could
+            come, and it is no busy machine that keeps it.
+    """
+
+    real_time_s: float
+    ordinary_s: float
+    exchange_s: float
+    stopped_s: float
 
 
 @dataclass(frozen=True, slots=True)

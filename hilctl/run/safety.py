@@ -17,12 +17,10 @@ from hilctl.experiment.check import Checked
 from hilctl.loop.safe_output import PATIENCE_S
 from hilctl.machine.realtime import be_ordinary, be_quick
 from hilctl.run.child import LoopProcess
-from hilctl.run.guardian import LAST_CALL_MS, safe_goal
+from hilctl.run.guardian import LAST_CALL_MS, HangWatch, SafeAction, is_stopped, safe_goal
 from hilctl.run.guardian_process import GuardianProcess
-from hilctl.run.hang_watch import HangWatch, is_stopped
 from hilctl.run.job import safe_priority, silence_limits
 from hilctl.run.ring import SampleRing
-from hilctl.run.safe_action import SafeAction
 from hilctl.run.shared_page import Field, GuardianPhase, SafeActionResult
 
 _AWAKE_NS = 50_000_000

@@ -8,24 +8,28 @@ import json
 import logging
 import os
 import signal
+import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import FrameType
 
 from hilctl.base.errors import RunError
+from hilctl.base.events import Event
 from hilctl.experiment.check import Checked
 from hilctl.loop.pacer import deadline_misses
+from hilctl.loop.plan import Outcome
+from hilctl.loop.safe_output import describe
 from hilctl.machine.realtime import be_ordinary, favoured
 from hilctl.run.child import LoopProcess
 from hilctl.run.control_socket import ControlServer
 from hilctl.run.description import RunDescription
 from hilctl.run.guardian_process import GuardianProcess, GuardianRelief
 from hilctl.run.job import Job
-from hilctl.run.progress import ProgressThread
 from hilctl.run.recorder import Recorder
 from hilctl.run.requests import Requests
 from hilctl.run.result import Progress, RunResult
@@ -33,17 +37,202 @@ from hilctl.run.ring import SampleRing
 from hilctl.run.ring_recorder import RingRecorder
 from hilctl.run.run_folder import RunFolder, held_devices, run_folder
 from hilctl.run.safety import Safety
-from hilctl.run.shared_page import Field, PageText, SharedPage
-from hilctl.run.started_run import STOPS, StartedRun
-from hilctl.run.stopping import JOB_CONTROL, STOP_SIGNAL
-from hilctl.run.systemd import Notifier
+from hilctl.run.shared_page import Field, PageText, SharedPage, Stop
+from hilctl.run.stopping import HANG_UP, JOB_CONTROL, STOP_SIGNAL
 
 _log = logging.getLogger(__name__)
 
 _POLL_S = 0.01
+_SHOWN_EVERY_S = 0.05
+_LAST_SHOWN_S = 0.5
 _START_DELAY_NS = 50_000_000
 _START_TRIES = 3
 _GUARDIAN_READY_S = 60.0
+STOPS = {
+    signal.SIGINT: Stop.CTRL_C,
+    signal.SIGTERM: Stop.SIGTERM,
+    HANG_UP: Stop.SIGHUP,
+    STOP_SIGNAL: Stop.REQUEST,
+}
+
+
+class SystemdNotifier:
+    """Notify systemd of readiness, watchdog and stop, by sd_notify(3).
+
+    Args:
+        environment: ``NOTIFY_SOCKET`` and ``WATCHDOG_USEC`` are looked up here.
+        clock: Monotonic time in s.
+    """
+
+    def __init__(
+        self,
+        environment: Mapping[str, str] = os.environ,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        address = environment.get("NOTIFY_SOCKET", "")
+        self._address = "\0" + address[1:] if address.startswith("@") else address
+        self._clock = clock
+        self._next_s = clock()
+        try:
+            self._every_s = int(environment.get("WATCHDOG_USEC", "0")) * 1e-6 / 3.0
+        except ValueError:
+            self._every_s = 0.0
+
+    def say(self, *lines: str) -> None:
+        """Send lines such as ``READY=1``; one that can't be sent is not worth a run."""
+        if not self._address:
+            return
+        with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as out:
+            out.setblocking(False)
+            out.sendto("\n".join(lines).encode(), self._address)
+
+    def alive(self) -> None:
+        """Feed the watchdog, three times in its interval; to be called more often than that."""
+        if self._every_s and self._clock() >= self._next_s:
+            self._next_s = self._clock() + self._every_s
+            self.say("WATCHDOG=1")
+
+
+class ProgressThread:
+    """Report progress from a thread of its own, so that a blocked terminal does not delay a run.
+
+    Args:
+        current: Returns where it stands; None where there is nothing new to say.
+        on_progress: Called with that; may take as long as it likes.
+        on_error: Called once, with what went wrong in it; nothing is shown from then on.
+    """
+
+    def __init__(
+        self,
+        current: Callable[[], Progress | None],
+        on_progress: Callable[[Progress], None],
+        on_error: Callable[[str], None],
+    ) -> None:
+        self._current, self._on_progress, self._on_error = current, on_progress, on_error
+        self._ending = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="progress", daemon=True)
+
+    def start(self) -> None:
+        """Begin to show."""
+        self._thread.start()
+
+    def end(self) -> None:
+        """Show the last of it; a terminal that stands still is not waited for."""
+        self._ending.set()
+        self._thread.join(_LAST_SHOWN_S)
+
+    def _run(self) -> None:
+        try:
+            while not self._ending.wait(_SHOWN_EVERY_S):
+                self._show()
+            self._show()
+        except Exception as error:  # noqa: BLE001  whoever shows a run must not end it
+            self._on_error(f"progress is not shown any more: {type(error).__name__}: {error}")
+
+    def _show(self) -> None:
+        if (progress := self._current()) is not None:
+            self._on_progress(progress)
+
+
+class RunMonitor:
+    """Watch a run from the supervisor's main thread: heartbeat, stop requests, outcome.
+
+    It covers the time from the start signal to the closed recording. It does no file input or
+    output, and never waits for a thread that does.
+
+    Args:
+        checked: The experiment.
+        ring: Its ring.
+        child: Its loop.
+        safety: Who sees to a safe output.
+        recording: Takes what the loop exchanges.
+    """
+
+    def __init__(
+        self,
+        checked: Checked,
+        ring: SampleRing,
+        child: LoopProcess,
+        safety: Safety,
+        recording: RingRecorder,
+    ) -> None:
+        self._config, self._forecast = checked.loaded.config, checked.forecast
+        self._page, self._child = ring.page, child
+        self._safety, self._recording = safety, recording
+        self.outcome: Outcome | None = None
+        """How it ended, with the output safe as far as that can be had; None before."""
+        self.broke = ""
+        """What went wrong in the supervisor itself; empty where nothing did."""
+
+    def attend(self, stop_signal: int) -> bool:
+        """Write the heartbeat, pass stops on, see to a safe output; return whether it goes on.
+
+        Args:
+            stop_signal: Number of the signal that is to stop the run, or 0.
+        """
+        # Asked first: of a loop that has ended, nothing can come after that.
+        ended = self._child.ended
+        now_ns = time.monotonic_ns()
+        self._page.put(Field.SUPERVISOR_HEARTBEAT_NS, now_ns)
+        self._pass_stop_on(stop_signal)
+        if self.outcome is None:
+            self._safety.update(now_ns, ended=ended)
+            # The coil comes before the samples: those wait in memory, and lose nothing by it.
+            self._conclude(ended=ended)
+        return not self._recording.finished
+
+    def break_off(self, error: Exception) -> None:
+        """Have the loop stop by its safe ramp, as something is wrong with the supervisor."""
+        self.broke = self.broke or f"{type(error).__name__}: {error}"
+        text = f"the supervisor broke: {self.broke}"
+        sample = self._page.get(Field.NEXT_SAMPLE)
+        self._recording.record_event(Event(sample, "error", "supervisor_broke", text))
+
+    def progress(self) -> Progress | None:
+        """Return where it stands; None before the first sample."""
+        if (newest := self._recording.newest) is None:
+            return None
+        return Progress(
+            samples=self._recording.recorder.samples,
+            total=self._forecast.samples,
+            late_ticks=self._page.get(Field.LATE_TICKS),
+            compensated=self._config.compensator is not None,
+            batch=newest,
+        )
+
+    def progress_failed(self, text: str) -> None:
+        """Record that nobody sees the progress any more."""
+        sample = self._page.get(Field.NEXT_SAMPLE)
+        self._recording.record_event(Event(sample, "warning", "progress_failed", text))
+
+    def _conclude(self, *, ended: bool) -> None:
+        result, said = self._safety.result, self._page.outcome() if ended else None
+        if result is None:
+            # Without a safe end, somebody is still to act.
+            self.outcome = said if self._page.ended_safely() else None
+        else:
+            hung = "the loop process hung, and was killed"
+            reason = hung if result.hung else said.reason if said else self._child.death()
+            if self._safety.by == "guardian" and result.confirmed:
+                reason += "; the guardian set the output to its safe value"
+            if not result.confirmed:
+                reason += f"; {describe(result.output, result.error)}"
+            last = said or Outcome("fault", "", 0, "unknown", 0)
+            self.outcome = replace(last, code="fault", reason=reason, output=result.output)
+        if self.outcome is not None:
+            self._recording.end(self.outcome, lost_loop=result is not None and said is None)
+
+    def _pass_stop_on(self, stop_signal: int) -> None:
+        page = self._page
+        must_record = self._config.recording.on_failure == "stop"
+        if stop_signal:
+            page.put(Field.STOP, STOPS[signal.Signals(stop_signal)])
+        elif self.broke:
+            page.put(Field.STOP, Stop.SUPERVISOR_BROKE)
+        elif must_record and self._recording.stalled_s() > self._config.recording.ring_s / 2.0:
+            # Not at the first error: until the ring is half full, nothing is lost by a retry.
+            failed = bool(self._recording.recorder.error)
+            page.put(Field.STOP, Stop.RECORDER_FAILED if failed else Stop.RECORDER_STALLED)
 
 
 def _stay(number: int, frame: FrameType | None) -> None:
@@ -75,7 +264,7 @@ class Supervisor:
         self._output = output
         self._overwrite = overwrite
         self._on_progress = on_progress
-        self._notifier = Notifier()
+        self._notifier = SystemdNotifier()
         self._stop_signal = self._stops = 0
 
     def run(self) -> RunResult:
@@ -114,7 +303,7 @@ class Supervisor:
                 stack.enter_context(folder.description.open("rb"))
                 run = folder, ring, child, recording
                 safety, start_ns = self._start(stack, *run, locks + own)
-                started = StartedRun(self._checked, ring, child, safety, recording)
+                started = RunMonitor(self._checked, ring, child, safety, recording)
             except BaseException:
                 if recorder is not None:
                     recorder.give_back()
@@ -199,7 +388,7 @@ class Supervisor:
             "nothing has moved"
         )
 
-    def _attend(self, started: StartedRun, server: ControlServer, requests: Requests) -> None:
+    def _attend(self, started: RunMonitor, server: ControlServer, requests: Requests) -> None:
         """See to a run until its recording is closed, whatever goes wrong meanwhile."""
         shown: ProgressThread | None = None
         try:
@@ -217,7 +406,7 @@ class Supervisor:
         if shown is not None:
             shown.end()
 
-    def _attend_only(self, started: StartedRun) -> None:
+    def _attend_only(self, started: RunMonitor) -> None:
         """See to a run without what may have broken: no requests, display or service manager."""
         while True:
             try:
@@ -280,7 +469,7 @@ class Supervisor:
 
     def _result(
         self,
-        started: StartedRun,
+        started: RunMonitor,
         recorder: Recorder,
         ring: SampleRing,
         folder: RunFolder,

@@ -10,7 +10,7 @@ from hilctl.base.errors import InputError, RunError
 from hilctl.characterise import session
 from hilctl.characterise.session import Campaign, CampaignHost
 from hilctl.characterise.steps import STEPS
-from hilctl.run.step import StepStoppedError, unpaced
+from hilctl.run.start import StepStoppedError, unpaced
 
 FEW = ("rest", "polarity", "growing-1", "growing-2")
 SHORT = tuple(step for step in STEPS if step.name.startswith(FEW))

@@ -11,7 +11,7 @@ from hilctl.characterise import session
 from hilctl.characterise.results import Characterisation
 from hilctl.characterise.session import CampaignPlan
 from hilctl.cli.characterising import characterise
-from hilctl.run.step import StepStoppedError, paced, unpaced
+from hilctl.run.start import StepStoppedError, paced, unpaced
 from tests.unit.characterise.conftest import experiment, limits, limits_with
 from tests.unit.characterise.test_results import FOUND
 
