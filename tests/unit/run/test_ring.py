@@ -83,22 +83,6 @@ def test_a_loop_has_all_of_it_mapped_before_its_first_tick(tmp_path):
     assert mapped(whole) >= size
 
 
-def test_the_consumer_keeps_no_page_that_it_has_given_back(tmp_path):
-    """Not mapped any more in the process that was through all of it; what stands there stays."""
-    ring = make(tmp_path, slots=1000)
-    for number in range(1000):
-        push(ring, number)
-    other = SampleRing(ring.path)
-    for _ in other.batches():
-        pass
-    before = mapped(ring)
-    other.release(keep=10)
-    after = mapped(ring)
-    assert before - after > 1000 * BLOCK * 8
-    batch, _ = other.look(990)
-    assert batch.columns[:, 1, 0].tolist() == list(range(990, 1000))
-
-
 def test_many_come_out_some_at_a_time(tmp_path, monkeypatch):
     """In order, round the end of the ring, and no more than there were when it was asked."""
     monkeypatch.setattr(module, "_BATCH_SAMPLES", 2 * BLOCK)
