@@ -1,4 +1,4 @@
-"""From a checked experiment to the plan of its loop: one way for every host."""
+"""From a checked experiment and an open device to the plan of the loop, for every host."""
 
 import math
 from dataclasses import replace
@@ -17,18 +17,20 @@ from hilctl.loop.conditioning import Conditioning
 from hilctl.loop.pacer import LatePolicy, LateRules
 from hilctl.loop.plan import Plan
 
-_ROUNDING = 1e-6  # of the device's range: what reading an end of it back may be off by
+_ALWAYS_LATE_S = 2.0
+_MISSED_WINDOW_S = 10.0
+_ROUNDING = 1e-6  # of the device's range: error of reading back an end of it
 
 
 def starting_output(device: Device, at_start: float | None) -> float:
-    """Return the command at which the output of an open device stands; nothing moves.
+    """Return the command that an open device puts out before the run; nothing moves.
 
     Args:
-        device: Open; what it says goes before ``at_start``.
-        at_start: ``safe.at_start`` of the experiment, for devices that can't know.
+        device: Open; its answer is used before ``at_start``.
+        at_start: ``safe.at_start`` of the experiment, for devices that cannot read it.
 
     Raises:
-        InputError: Neither says it, or the output is where no command can have put it.
+        InputError: Both are missing, or the output is outside of the device's range.
         DeviceError: The device did not answer.
     """
     info = device.info
@@ -51,10 +53,6 @@ def starting_output(device: Device, at_start: float | None) -> float:
             "no ramp can begin there: bring it to its safe value by hand; nothing has moved"
         )
     return min(info.command_max, max(info.command_min, output))
-
-
-_ALWAYS_LATE_S = 2.0
-_MISSED_WINDOW_S = 10.0
 
 
 def assemble(

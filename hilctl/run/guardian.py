@@ -50,10 +50,10 @@ back its memory takes much longer, and only a device that takes one connection w
 
 
 class HangWatch:
-    """Looks at the loop's heartbeat.
+    """Detect a loop that lives but writes no heartbeat.
 
-    Where the whole machine stands still, this process does too: silence counts only where this side
-    has looked several times meanwhile.
+    A stall of the whole machine stalls this process too, so silence counts only after several
+    polls.
 
     Args:
         page: Shared with the loop.
@@ -72,7 +72,7 @@ class HangWatch:
         self._polls = 0
 
     def hangs(self, now_ns: int) -> bool:
-        """Look once; return whether the loop has been silent for too long.
+        """Poll once; return whether the loop has been silent for too long.
 
         Args:
             now_ns: Monotonic time.
@@ -96,24 +96,24 @@ class HangWatch:
 
     def _wait_s(self, phase: int) -> float:
         """Return how long the loop may be waiting for its device."""
-        # A device that is lost may use up its time-outs; and before the first tick nothing moves.
+        # A lost device may use up its timeouts; before the first tick nothing moves.
         if phase == Phase.CLOSING or not self._page.get(Field.LOOP_HEARTBEAT_NS):
             return _CLOSING_S
         return self._limits.exchange_s if self._page.get(Field.EXCHANGING) else 0.0
 
 
 def is_stopped(process: int) -> bool:
-    """Return whether a process is stopped or traced; of one that is gone, False."""
+    """Return whether a process is stopped or traced; False if it does not exist."""
     try:
         stat = Path(f"/proc/{process}/stat").read_bytes()
     except OSError:
         return False
-    # Behind the program's name, which may have spaces and brackets of its own.
+    # After the program's name, which may contain spaces and brackets.
     return stat.rpartition(b")")[2].split()[0] in {b"T", b"t"}
 
 
 class SafeAction:
-    """Drives a device to its safe value in a thread, until no write can tell more.
+    """Drive a device to its safe value in a thread, until the outcome is final.
 
     Args:
         page: Shared with the other processes of the run.
@@ -123,7 +123,7 @@ class SafeAction:
         prepare: Called in that thread first.
 
     Attributes:
-        failed: What broke in this process, so that another one has to try; empty if nothing did.
+        failed: Error of this process, after which another one has to try; empty without one.
 
     Raises:
         RuntimeError: No thread can be started.
@@ -143,7 +143,7 @@ class SafeAction:
         self._result = SafeActionResult(hung, "unknown", self._output.error, final=False)
         self._ending = threading.Event()
         self.failed = ""
-        # A daemon: a device that blocks it for ever must not keep the process from ending.
+        # A daemon: a device that blocks for ever must not keep the process alive.
         self._thread = threading.Thread(target=self._run, name="safe action", daemon=True)
         self._thread.start()
 
@@ -164,19 +164,19 @@ class SafeAction:
             self.failed = f"{type(error).__name__}: {error}"
 
     def result(self, wait_s: float = 0.0) -> SafeActionResult:
-        """Return what is reached so far, after ``wait_s`` or when nothing more follows."""
+        """Return the result so far, after ``wait_s`` or as soon as it is final."""
         self._thread.join(wait_s)
         return self._result
 
     def end(self, wait_s: float) -> bool:
-        """Write no more; return whether the last write is over within ``wait_s``."""
+        """Stop writing; return whether the last write ends within ``wait_s``."""
         self._ending.set()
         self._thread.join(wait_s)
         return not self._thread.is_alive()
 
 
 class Guardian:
-    """Watches the loop, and sets the output to its safe value if the loop died or hangs.
+    """Watch the loop, and set the output to its safe value if the loop died or hangs.
 
     Args:
         ring: Shared with loop and supervisor.

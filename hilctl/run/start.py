@@ -32,7 +32,7 @@ OnPart: TypeAlias = Callable[[float], None]
 
 
 def checked_experiment(path: Path, settings: Sequence[str], heat_a2: float = 0.0) -> Checked:
-    """Load an experiment and hold it against device, model and limits.
+    """Load an experiment and check it against device, model and limits.
 
     Args:
         path: Experiment file.
@@ -40,7 +40,7 @@ def checked_experiment(path: Path, settings: Sequence[str], heat_a2: float = 0.0
         heat_a2: Heat that its coil has at least, in A^2.
 
     Raises:
-        InputError: It can't be used, all problems are listed.
+        InputError: It cannot be used; all problems are listed.
     """
     return check(load_experiment(path, settings), heat_a2)
 
@@ -74,12 +74,12 @@ def start_run(
 ) -> RunResult:
     """Run an experiment file to its end.
 
-    A program with threads, such as a notebook or a window, runs it in a process of its own.
+    A program with threads, such as a notebook, runs it in a process of its own.
 
     Args:
         path: Experiment file.
         settings: ``key=value`` texts over it.
-        output: Recording to write; a name in the experiment's folder where None.
+        output: Recording to write; a name in the experiment's folder if None.
         overwrite: Whether an existing recording may be replaced.
         on_progress: Called with each batch of samples.
         heat_a2: Heat that the coil has at least, in A^2, whatever the last run of it says.
@@ -90,24 +90,12 @@ def start_run(
     """
     require_linux()
     if has_threads():
-        given = (path, settings, output, overwrite, heat_a2)
-        return run_in_own_process(given, on_progress)
-    return _run(path, settings, output, overwrite, on_progress, heat_a2)
-
-
-def _run(
-    path: Path,
-    settings: Sequence[str],
-    output: Path | None,
-    overwrite: bool,
-    on_progress: Callable[[Progress], None],
-    heat_a2: float,
-) -> RunResult:
-    # Not before: what only checks or computes works where a supervisor can't be imported.
+        return run_in_own_process((path, settings, output, overwrite, heat_a2), on_progress)
+    # Here: check and unpaced runs work on systems that have no supervisor.
     from hilctl.run.supervisor import Supervisor
 
     checked = checked_experiment(path, settings, heat_a2)
-    # Of a device with a past: nobody should have to look into the recording for what was taken.
+    # A real device remembers earlier runs: tell the user which memory is assumed.
     if checked.begun.begins and checked.loaded.device.info.holds:
         _log.warning("the compensator begins %s", checked.begun.begins)
     output = output_of(checked, output)
@@ -162,7 +150,7 @@ def unpaced(
 
 
 class StepStoppedError(RunError):
-    """Somebody stopped a run of several; the runs before it stand.
+    """A run of several was stopped by a signal; the recordings before it are kept.
 
     Attributes:
         signal: Number of the signal.
@@ -175,12 +163,12 @@ class StepStoppedError(RunError):
 
 @dataclass(frozen=True, slots=True)
 class RunKey:
-    """What a run is of: two of one key differ in nothing that is chosen.
+    """Identity of a run: two runs with one key have the same experiment, model and correction.
 
     Attributes:
         experiment: SHA-256 of the experiment as it runs.
         model: SHA-256 of the compensator's model; empty without one.
-        correction: SHA-256 of what has been learned; empty without.
+        correction: SHA-256 of the learned correction; empty without one.
     """
 
     experiment: str
@@ -196,13 +184,13 @@ class RunKey:
 
     @classmethod
     def of_facts(cls, run: Mapping[str, str]) -> Self:
-        """Return the key of a recorded run, by the facts of its beginning."""
+        """Return the key of a recorded run from its metadata."""
         names = ("experiment_sha256", "model_sha256", "correction_sha256")
         return cls(*(run.get(name, "") for name in names))
 
 
 def completed_key(path: Path) -> RunKey | None:
-    """Return what a recording is of; None where it is not of a whole run that was completed."""
+    """Return the key of a recording; None unless its run was completed."""
     try:
         ends = read_ends(path)
     except DataError:

@@ -1,7 +1,7 @@
-"""The supervisor: starts loop, guardian and recorder, and ends the run whatever becomes of them.
+"""The supervisor: start loop, guardian and recorder, and end the run whatever happens to them.
 
-All that can fail comes before the start signal: from then on the recording, the ring and the coil
-are seen to, whatever else goes wrong here.
+Everything that can fail happens before the start signal. From then on the supervisor serves the
+recording, the ring and the safe value, whatever else fails in it.
 """
 
 import json
@@ -79,7 +79,7 @@ class SystemdNotifier:
             self._every_s = 0.0
 
     def say(self, *lines: str) -> None:
-        """Send lines such as ``READY=1``; one that can't be sent is not worth a run."""
+        """Send lines such as ``READY=1``; ignore lines that cannot be sent."""
         if not self._address:
             return
         with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as out:
@@ -87,7 +87,7 @@ class SystemdNotifier:
             out.sendto("\n".join(lines).encode(), self._address)
 
     def alive(self) -> None:
-        """Feed the watchdog, three times in its interval; to be called more often than that."""
+        """Feed the watchdog three times per interval; call it more often than that."""
         if self._every_s and self._clock() >= self._next_s:
             self._next_s = self._clock() + self._every_s
             self.say("WATCHDOG=1")
@@ -97,9 +97,9 @@ class ProgressThread:
     """Report progress from a thread of its own, so that a blocked terminal does not delay a run.
 
     Args:
-        current: Returns where it stands; None where there is nothing new to say.
-        on_progress: Called with that; may take as long as it likes.
-        on_error: Called once, with what went wrong in it; nothing is shown from then on.
+        current: Returns the progress; None before the first sample.
+        on_progress: Called with it; may block.
+        on_error: Called once with the error of ``on_progress``, which is not called any more.
     """
 
     def __init__(
@@ -113,11 +113,11 @@ class ProgressThread:
         self._thread = threading.Thread(target=self._run, name="progress", daemon=True)
 
     def start(self) -> None:
-        """Begin to show."""
+        """Start the thread."""
         self._thread.start()
 
     def end(self) -> None:
-        """Show the last of it; a terminal that stands still is not waited for."""
+        """Report once more; wait only briefly for a blocked terminal."""
         self._ending.set()
         self._thread.join(_LAST_SHOWN_S)
 
@@ -144,8 +144,8 @@ class RunMonitor:
         checked: The experiment.
         ring: Its ring.
         child: Its loop.
-        safety: Who sees to a safe output.
-        recording: Takes what the loop exchanges.
+        safety: Watches guardian and loop.
+        recording: Records from the ring.
     """
 
     def __init__(
@@ -160,15 +160,15 @@ class RunMonitor:
         self._page, self._child = ring.page, child
         self._safety, self._recording = safety, recording
         self.outcome: Outcome | None = None
-        """How it ended, with the output safe as far as that can be had; None before."""
+        """How the run ended; None until the output is safe or nothing more can be done."""
         self.broke = ""
-        """What went wrong in the supervisor itself; empty where nothing did."""
+        """Error of the supervisor itself; empty if there was none."""
 
     def attend(self, stop_signal: int) -> bool:
-        """Write the heartbeat, pass stops on, see to a safe output; return whether it goes on.
+        """Write the heartbeat, pass stops on, update safety; return whether the run is active.
 
         Args:
-            stop_signal: Number of the signal that is to stop the run, or 0.
+            stop_signal: Number of the signal that stops the run, or 0.
         """
         # Asked first: of a loop that has ended, nothing can come after that.
         ended = self._child.ended
@@ -177,19 +177,19 @@ class RunMonitor:
         self._pass_stop_on(stop_signal)
         if self.outcome is None:
             self._safety.update(now_ns, ended=ended)
-            # The coil comes before the samples: those wait in memory, and lose nothing by it.
+            # The safe value comes before the samples, which wait in memory.
             self._conclude(ended=ended)
         return not self._recording.finished
 
     def break_off(self, error: Exception) -> None:
-        """Have the loop stop by its safe ramp, as something is wrong with the supervisor."""
+        """Stop the loop by its safe ramp because the supervisor failed."""
         self.broke = self.broke or f"{type(error).__name__}: {error}"
         text = f"the supervisor broke: {self.broke}"
         sample = self._page.get(Field.NEXT_SAMPLE)
         self._recording.record_event(Event(sample, "error", "supervisor_broke", text))
 
     def progress(self) -> Progress | None:
-        """Return where it stands; None before the first sample."""
+        """Return the progress; None before the first sample."""
         if (newest := self._recording.newest) is None:
             return None
         return Progress(
@@ -201,14 +201,14 @@ class RunMonitor:
         )
 
     def progress_failed(self, text: str) -> None:
-        """Record that nobody sees the progress any more."""
+        """Record that progress is not reported any more."""
         sample = self._page.get(Field.NEXT_SAMPLE)
         self._recording.record_event(Event(sample, "warning", "progress_failed", text))
 
     def _conclude(self, *, ended: bool) -> None:
         result, said = self._safety.result, self._page.outcome() if ended else None
         if result is None:
-            # Without a safe end, somebody is still to act.
+            # Without a safe end, guardian or supervisor still has to act.
             self.outcome = said if self._page.ended_safely() else None
         else:
             hung = "the loop process hung, and was killed"
@@ -230,7 +230,7 @@ class RunMonitor:
         elif self.broke:
             page.put(Field.STOP, Stop.SUPERVISOR_BROKE)
         elif must_record and self._recording.stalled_s() > self._config.recording.ring_s / 2.0:
-            # Not at the first error: until the ring is half full, nothing is lost by a retry.
+            # Not at the first error: while the ring is less than half full, a retry loses nothing.
             failed = bool(self._recording.recorder.error)
             page.put(Field.STOP, Stop.RECORDER_FAILED if failed else Stop.RECORDER_STALLED)
 
@@ -242,7 +242,7 @@ def _stay(number: int, frame: FrameType | None) -> None:
 
 
 class Supervisor:
-    """Runs one checked experiment into one recording.
+    """Run one checked experiment into one recording.
 
     Args:
         checked: The experiment.
@@ -298,9 +298,9 @@ class Supervisor:
                 requests = Requests(self._checked, folder, ring.page, recording)
                 server = stack.enter_context(ControlServer(folder.socket, requests.answer))
                 self._write_job(folder)
-                child = LoopProcess(folder, ring.page, locks + own)
                 # Open to the end: watchers find it even if the folder is removed.
                 stack.enter_context(folder.description.open("rb"))
+                child = LoopProcess(folder, ring.page, locks + own)
                 run = folder, ring, child, recording
                 safety, start_ns = self._start(stack, *run, locks + own)
                 started = RunMonitor(self._checked, ring, child, safety, recording)
