@@ -279,10 +279,11 @@ OF_OTHERS = ("scipy.linalg", "scipy.special", "mcap", "google.protobuf", "rich",
     ("modules", "left_out"),
     [
         ("hilctl.run.loop_process, hilctl_drivers.modbus.device", BULKY + OF_OTHERS),
+        ("hilctl.run.loop_process, hilctl_drivers.simulated.rigs", BULKY + OF_OTHERS[2:]),
         ("hilctl.cli.run_view", BULKY),
         ("hilctl.run.client", (*BULKY, *OF_OTHERS, "numpy", "pydantic")),
     ],
-    ids=["loop", "supervisor", "client"],
+    ids=["loop", "simulated loop", "supervisor", "client"],
 )
 def test_it_has_nothing_that_only_others_need(modules, left_out):
     """The loop's is locked in memory; a stop is not to wait for what it does not use."""
