@@ -18,7 +18,7 @@ from hilctl.desk.lateness import EDGES_US, LatenessCounts
 from hilctl.desk.scope import Scope
 from hilctl.desk.signals import Traces, traces_of
 from hilctl.desk.spectrum import ErrorSpectrum
-from hilctl.run.description import RunDescription
+from hilctl.run.metadata import RunDescription
 from hilctl.run.ring import SampleRing
 from hilctl.run.run_folder import RunFolder
 from hilctl.run.shared_page import Field, Phase

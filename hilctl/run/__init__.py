@@ -10,10 +10,9 @@ assemble.py        from a checked experiment and an open device to the plan of t
 guardian.py        a process that sets the safe value if the loop dies or hangs;
                    guardian_process.py  starts it, safety.py  watches and replaces it
 ring.py            sample blocks in shared memory, behind shared_page.py
-recorder.py        into the recording; metadata.py  facts of the run, end_figures.py  of its end
-ring_recorder.py   from the ring into the recording, in a thread
+recorder.py        from the ring into the recording, in a thread
+metadata.py        facts and figures of a run, for its recording and for watchers
 run_folder.py      active runs, and who holds a device
-description.py     what a run tells watchers
 requests.py        requests to a run, over control_socket.py; stopping.py  a signal to stop;
                    client.py  sends them, protocol.py  has their words; detached.py  starts runs in
                    the background

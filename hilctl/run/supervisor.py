@@ -27,14 +27,13 @@ from hilctl.loop.safe_output import describe
 from hilctl.machine.realtime import be_ordinary, favoured
 from hilctl.run.child import LoopProcess
 from hilctl.run.control_socket import ControlServer
-from hilctl.run.description import RunDescription
 from hilctl.run.guardian_process import GuardianProcess, GuardianRelief
 from hilctl.run.job import Job
-from hilctl.run.recorder import Recorder
+from hilctl.run.metadata import RunDescription
+from hilctl.run.recorder import Recorder, RingRecorder
 from hilctl.run.requests import Requests
 from hilctl.run.result import Progress, RunResult
 from hilctl.run.ring import SampleRing
-from hilctl.run.ring_recorder import RingRecorder
 from hilctl.run.run_folder import RunFolder, held_devices, run_folder
 from hilctl.run.safety import Safety
 from hilctl.run.shared_page import Field, PageText, SharedPage, Stop

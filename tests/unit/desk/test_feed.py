@@ -12,7 +12,7 @@ from hilctl.base.samples import Head
 from hilctl.desk.feed import RunFeed
 from hilctl.desk.signals import ROW
 from hilctl.loop.plan import Outcome
-from hilctl.run.description import RunDescription
+from hilctl.run.metadata import RunDescription
 from hilctl.run.ring import SampleRing
 from hilctl.run.run_folder import run_folder
 from hilctl.run.shared_page import Field, Phase, Stop
