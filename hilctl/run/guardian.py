@@ -336,7 +336,7 @@ def _stay_in_memory(process: LinuxProcess) -> None:
     process.freeze_gc()
     with suppress(OSError):
         if process.lockable_bytes() is None:
-            process.lock_memory()
+            process.lock_memory(untouched=True)
 
 
 if __name__ == "__main__":

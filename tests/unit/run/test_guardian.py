@@ -321,7 +321,7 @@ def test_it_prepares_for_a_machine_that_does_nothing_else(written, guarded, monk
     process = SimpleNamespace(
         freeze_gc=lambda: done.append("frozen"),
         lockable_bytes=lambda: limit,
-        lock_memory=lambda: done.append("locked"),
+        lock_memory=lambda *, untouched: done.append(f"locked {untouched}"),
         set_fifo=lambda priority: done.append((priority, threading.current_thread().name)),
     )
     monkeypatch.setattr(guardian, "LinuxProcess", lambda: process)
@@ -332,7 +332,7 @@ def test_it_prepares_for_a_machine_that_does_nothing_else(written, guarded, monk
     guarded.loop.kill()
     assert written.call("", guarded.pidfd) == 0
     assert guarded.device.asked == [(0.25, False)]
-    locked = ["locked"] if limit is None else []
+    locked = ["locked True"] if limit is None else []
     assert done == ["frozen", *locked, (7, "MainThread"), (7, "safe action")]
     for number in (signal.SIGINT, signal.SIGHUP):  # SIGTERM ends an action that goes on
         assert signal.getsignal(number) == signal.SIG_IGN
@@ -340,7 +340,7 @@ def test_it_prepares_for_a_machine_that_does_nothing_else(written, guarded, monk
 
 
 def test_refused_real_time_is_no_reason_to_leave_the_coil(written, guarded, monkeypatch):
-    def refuse(*_):
+    def refuse(*_, **_named):
         raise OSError(1, "Operation not permitted")
 
     process = SimpleNamespace(
