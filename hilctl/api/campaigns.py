@@ -29,7 +29,7 @@ from hilctl.learning.results import Learned, Row
 from hilctl.learning.session import Session
 from hilctl.recording.ends import recordings_in
 from hilctl.run.dead_runs import finish_dead_runs
-from hilctl.run.step import paced, unpaced
+from hilctl.run.start import paced, unpaced
 
 
 def _nothing(*_ignored: object) -> None:

@@ -3,7 +3,7 @@
 types.py     array types, the unit of commands, and long arrays in chunks
 device.py    the contract of a device and of a clock
 errors.py    every exception that is raised on purpose
-strict.py    base of every pydantic model; plain.py  stands in for it where nothing is checked
+strict.py    base of every pydantic model
 files.py     texts, each read once; files written whole or not at all
 private.py   folders that belong to one user alone, and locks on files
 samples.py   a sample's columns and flags, and blocks of samples

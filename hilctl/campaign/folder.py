@@ -16,7 +16,7 @@ from hilctl.recording.ends import read_ends, recordings_in
 from hilctl.recording.locks import is_being_recorded
 from hilctl.recording.recover import recover_recording
 from hilctl.run.run_folder import RunFolder, runs
-from hilctl.run.step import RunKey, completed_key
+from hilctl.run.start import RunKey, completed_key
 
 _LONGEST_WAIT_S = 60.0
 _POLL_S = 0.1

@@ -12,7 +12,7 @@ from hilctl.campaign.steps import CampaignSteps, SeriesStep, base_problem, key_o
 from hilctl.experiment.check import check
 from hilctl.experiment.heat import CoolingCoil, RunHeat
 from hilctl.experiment.load import LoadedExperiment
-from hilctl.run.step import RunKey
+from hilctl.run.start import RunKey
 
 _SPARE = 1.2
 _MOST_PROBLEMS = 20

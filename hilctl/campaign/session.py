@@ -25,7 +25,7 @@ from hilctl.recording.data import Recording
 from hilctl.recording.reader import read
 from hilctl.run.orphans import recover_orphans
 from hilctl.run.result import RunResult
-from hilctl.run.step import OnPart, RunKey, StepStoppedError, paced
+from hilctl.run.start import OnPart, RunKey, StepStoppedError, paced
 from hilctl.series.collect import series_of
 from hilctl.series.columns import COMPLETED
 from hilctl.series.digest import digest_of
@@ -52,7 +52,7 @@ class SeriesRunner(Protocol):
         overwrite: bool,
         heat_a2: float,
     ) -> RunResult:
-        """See :func:`hilctl.run.step.paced`."""
+        """See :func:`hilctl.run.start.paced`."""
         ...
 
 

@@ -31,8 +31,7 @@ from hilctl.models.files import dump_model
 from hilctl.recording.data import Recording
 from hilctl.recording.reader import read
 from hilctl.run.result import RunResult
-from hilctl.run.start import checked_experiment
-from hilctl.run.step import OnPart, RunKey, StepStoppedError, paced, unpaced
+from hilctl.run.start import OnPart, RunKey, StepStoppedError, checked_experiment, paced, unpaced
 
 
 def waveform_setting(keys: Keys) -> str:

@@ -27,7 +27,7 @@ from hilctl.cli.options import (
 )
 from hilctl.cli.safe_streams import print_json
 from hilctl.experiment.labels import label_settings
-from hilctl.run.step import StepStoppedError
+from hilctl.run.start import StepStoppedError
 
 _RESUMES = "the same command resumes from this step"
 

@@ -35,7 +35,6 @@ from hilctl.machine.logind import log_out
 from hilctl.run.architecture import require_linux
 from hilctl.run.dead_runs import finish_dead_runs
 from hilctl.run.run_folder import facts_of
-from hilctl.run.waiting_loop import started_ahead
 
 if TYPE_CHECKING:
     from hilctl.analysis.figures import RunReport
@@ -80,19 +79,9 @@ def run(
     if detach:
         _detach(experiment, output, settings, overwrite=overwrite, as_json=as_json)
         return
-    with _loop_started_early(experiment):
-        _run(experiment, output, settings, overwrite, watch=watch, live=live, as_json=as_json)
-
-
-@contextmanager
-def _loop_started_early(experiment: Path) -> Iterator[None]:
-    """Start the loop's process before the checks, so that both import at the same time."""
     require_linux()
-    if not experiment.is_file():
-        yield  # the check rejects it
-        return
-    with started_ahead(), compile_progress():
-        yield
+    with compile_progress():
+        _run(experiment, output, settings, overwrite, watch=watch, live=live, as_json=as_json)
 
 
 def _run(

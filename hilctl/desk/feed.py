@@ -20,7 +20,7 @@ from hilctl.desk.figures import FigureValues, RunningFigures
 from hilctl.desk.headroom import Gauge, Headroom
 from hilctl.desk.scope import Scope
 from hilctl.desk.signals import ROW, Traces, traces_of
-from hilctl.run.description import RunDescription
+from hilctl.run.metadata import RunDescription
 from hilctl.run.ring import SampleRing
 from hilctl.run.run_folder import RunFolder
 from hilctl.run.shared_page import Field, Phase

@@ -8,7 +8,7 @@ import numpy as np
 
 from hilctl.base.types import F64, I64
 from hilctl.desk.signals import ROW, Traces
-from hilctl.run.description import LimitBounds, RunDescription
+from hilctl.run.metadata import LimitBounds, RunDescription
 
 WARNING_USED, ERROR_USED = 0.8, 0.95
 """Parts of a limit from which on a gauge is a warning and an error."""

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -11,12 +10,10 @@ from hilctl.base.segments import Segment
 from hilctl.base.types import F64
 from hilctl.experiment.feedback import LOOP_DELAY, delays
 from hilctl.experiment.file import Experiment
+from hilctl.experiment.load import LoadedExperiment
 from hilctl.loop.adaptation import Adaptation, AdaptationBounds, DisplacementOperator
 from hilctl.loop.compensator import Compensator
-
-if TYPE_CHECKING:  # the loop's process has no use for what it imports
-    from hilctl.experiment.load import LoadedExperiment
-    from hilctl.waveforms.build import Reference
+from hilctl.waveforms.build import Reference
 
 _OFFSET_SHARE = 0.1  # of the stroke's limits, where no bound is given
 _SLOWER = 5.0
@@ -43,7 +40,7 @@ def adaptation_bounds(config: Experiment) -> AdaptationBounds:
     return AdaptationBounds(offset_um, shape * wanted.gain, shape * wanted.weight)
 
 
-def adapted_operator(config: Experiment, reference: "Reference") -> DisplacementOperator | None:
+def adapted_operator(config: Experiment, reference: Reference) -> DisplacementOperator | None:
     """Return what a run adapts, for its reference; None where nothing is adapted."""
     bounds = adaptation_bounds(config)
     if not bounds.array.any():
@@ -73,7 +70,7 @@ def make_adaptation(
     )
 
 
-def adaptation_problems(loaded: "LoadedExperiment", preview: int) -> list[Problem]:
+def adaptation_problems(loaded: LoadedExperiment, preview: int) -> list[Problem]:
     """Return why an experiment can't have the adaptation that it asks for.
 
     Args:
@@ -129,7 +126,7 @@ def adaptation_warnings(config: Experiment, segments: tuple[Segment, ...]) -> tu
     return (f"adaptation.time_constant_s: {periods}: parameters will follow each of them",)
 
 
-def _shortest_s(loaded: "LoadedExperiment", preview: int) -> float:
+def _shortest_s(loaded: LoadedExperiment, preview: int) -> float:
     config, wanted = loaded.config, loaded.config.adaptation
     assert wanted is not None
     _, shown_after = delays(wanted.sensor_delay_s, config.sample_rate_hz, preview)

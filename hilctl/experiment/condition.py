@@ -6,19 +6,15 @@ and the compensator begins with what the cycle leaves.
 """
 
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from hilctl.base.errors import Problem
 from hilctl.base.types import F64
 from hilctl.experiment.file import Experiment
+from hilctl.experiment.load import LoadedExperiment
 from hilctl.experiment.parts import REST_S
-from hilctl.experiment.run_parts import RunParts
 from hilctl.loop.conditioning import Conditioning
-
-if TYPE_CHECKING:  # the loop's process has no use for what it imports
-    from hilctl.experiment.load import LoadedExperiment
 
 OFFSET_SHARE = 0.25
 """Largest offset that is taken out, as a share of the limits of the stroke."""
@@ -32,21 +28,23 @@ def measures_offset(config: Experiment) -> bool:
     return config.compensator is not None and config.compensator.offset == "measured"
 
 
-def conditioning_of(parts: RunParts, stands_um: float | None = None) -> Conditioning | None:
+def conditioning_of(
+    loaded: LoadedExperiment, stands_um: float | None = None
+) -> Conditioning | None:
     """Return what comes before the waveform; None where nothing does.
 
     Args:
-        parts: Of the experiment.
+        loaded: The experiment.
         stands_um: Displacement at its end by the model; None where no offset is measured.
     """
-    config, condition = parts.config, parts.config.condition
+    config, condition = loaded.config, loaded.config.condition
     if condition is None and not measures_offset(config):
         return None
     rate_hz, block, safe = config.sample_rate_hz, config.block, config.safe.value
     cycle = np.empty(0) if condition is None else _cycle(config)
     rest_s = REST_S if condition is None else condition.rest_s
     stop = cycle.size + max(block, round(rest_s * rate_hz))
-    blocks = math.ceil(stop / block) + parts.device.info.latency_blocks
+    blocks = math.ceil(stop / block) + loaded.device.info.latency_blocks
     command = np.full(blocks * block, safe)
     command[: cycle.size] = cycle
     low_um, high_um = config.limits.stroke_um
@@ -60,7 +58,7 @@ def conditioning_of(parts: RunParts, stands_um: float | None = None) -> Conditio
     )
 
 
-def condition_problems(loaded: "LoadedExperiment") -> list[Problem]:
+def condition_problems(loaded: LoadedExperiment) -> list[Problem]:
     """Return why an experiment can't have the condition that it asks for."""
     config, condition = loaded.config, loaded.config.condition
     if condition is None:

@@ -6,18 +6,15 @@ bandwidth is the delay, and with it the rate.
 
 import cmath
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from hilctl.base.errors import Problem
 from hilctl.experiment.file import Experiment
+from hilctl.experiment.load import LoadedExperiment
 from hilctl.experiment.parts import IntegralFeedbackConfig, PiFeedbackConfig
 from hilctl.loop.compensator import Compensator
 from hilctl.loop.feedback import Controller, Feedback, Gains, IntegralFeedback
-
-if TYPE_CHECKING:  # the loop's process has no use for what it imports
-    from hilctl.experiment.load import LoadedExperiment
 
 LOOP_DELAY = 2
 """Samples from a correction to the first tick that sees its effect: one until the sensor can show
@@ -71,7 +68,7 @@ def delays(sensor_delay_s: float, rate_hz: float, preview: int) -> tuple[int, in
     return due_after, due_after + preview
 
 
-def feedback_problems(loaded: "LoadedExperiment", preview: int) -> list[Problem]:
+def feedback_problems(loaded: LoadedExperiment, preview: int) -> list[Problem]:
     """Return why an experiment can't have the feedback that it asks for.
 
     Args:
@@ -95,7 +92,7 @@ def feedback_problems(loaded: "LoadedExperiment", preview: int) -> list[Problem]
 
 
 def _fast_problems(
-    loaded: "LoadedExperiment", wanted: PiFeedbackConfig, preview: int
+    loaded: LoadedExperiment, wanted: PiFeedbackConfig, preview: int
 ) -> list[tuple[str, str, str, str]]:
     config, info = loaded.config, loaded.device.info
     found = []
@@ -114,7 +111,7 @@ def _fast_problems(
 
 
 def _slow_problems(
-    loaded: "LoadedExperiment", wanted: IntegralFeedbackConfig, preview: int
+    loaded: LoadedExperiment, wanted: IntegralFeedbackConfig, preview: int
 ) -> list[tuple[str, str, str, str]]:
     """Hold the bandwidth of an integrator against the loop's delay and the resonance."""
     config, info = loaded.config, loaded.device.info
@@ -191,7 +188,7 @@ def _needs(rate_hz: float) -> str:
 
 
 def _resonance_problems(
-    loaded: "LoadedExperiment", wanted: PiFeedbackConfig
+    loaded: LoadedExperiment, wanted: PiFeedbackConfig
 ) -> list[tuple[str, str, str, str]]:
     """Hold the gain at the resonance, where a light one multiplies it by 1/(2 damping), to half."""
     natural_hz, damping = _resonance(loaded, wanted)
@@ -211,7 +208,7 @@ def _resonance_problems(
 
 
 def _resonance(
-    loaded: "LoadedExperiment", wanted: PiFeedbackConfig | IntegralFeedbackConfig
+    loaded: LoadedExperiment, wanted: PiFeedbackConfig | IntegralFeedbackConfig
 ) -> tuple[float | None, float | None]:
     """Return natural frequency in Hz and damping: the experiment's, else those of the model."""
     structure = getattr(loaded.model, "structure", None)

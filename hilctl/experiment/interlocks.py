@@ -1,14 +1,10 @@
 """Interlocks from an experiment: what they are set to, and what is known of them before a run."""
 
-from typing import TYPE_CHECKING
-
 from hilctl.base.device import DeviceInfo
 from hilctl.base.errors import Problem
 from hilctl.experiment.file import Experiment
+from hilctl.experiment.load import LoadedExperiment
 from hilctl.loop.interlocks import InterlockContext, InterlockSettings, Needs
-
-if TYPE_CHECKING:  # the loop's process has no use for what it imports
-    from hilctl.experiment.load import LoadedExperiment
 
 _TRAVEL = 0.02  # of the command's range: far beyond noise, and far less than any run worth watching
 
@@ -30,7 +26,7 @@ def interlock_context(config: Experiment, info: DeviceInfo) -> InterlockContext:
     )
 
 
-def interlock_problems(loaded: "LoadedExperiment") -> list[Problem]:
+def interlock_problems(loaded: LoadedExperiment) -> list[Problem]:
     """Return interlocks that could not do what they say, each by its key."""
     limits = loaded.config.limits
     found = []
@@ -44,7 +40,7 @@ def interlock_problems(loaded: "LoadedExperiment") -> list[Problem]:
     ]
 
 
-def _unmet(needs: Needs, loaded: "LoadedExperiment") -> list[str]:
+def _unmet(needs: Needs, loaded: LoadedExperiment) -> list[str]:
     """Return what a key needs and does not have, in words."""
     limits, info = loaded.config.limits, loaded.device.info
     rules = []

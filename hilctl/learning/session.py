@@ -28,8 +28,7 @@ from hilctl.learning.results import Learned, Row, row_of
 from hilctl.learning.update import Learning, begin, learn, refused
 from hilctl.recording.reader import read
 from hilctl.run.result import RunResult
-from hilctl.run.start import checked_experiment
-from hilctl.run.step import StepStoppedError, paced
+from hilctl.run.start import StepStoppedError, checked_experiment, paced
 
 HIGHEST_PART = 0.125
 """Highest frequency that a correction reaches, as a part of the sample rate."""

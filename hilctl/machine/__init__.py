@@ -2,7 +2,6 @@
 
 settings.py   how the loop's process asks for real time
 realtime.py   asks for it, step by step; linux.py  the system calls,
-              memory.py  what is mapped, and which of it no tick needs
 files.py      what is read of a machine: its /proc and /sys, or those of a test
 usage.py      what a process has taken of it
 findings.py   one function a check: good, worth knowing, or bad, with the remedy

@@ -9,13 +9,11 @@ import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, Protocol, TypeAlias
+from typing import Literal, Protocol, TypeAlias
 
 from hilctl.base.errors import InputError
 from hilctl.machine.linux import DMA_LATENCY, LinuxProcess
-
-if TYPE_CHECKING:  # importing it early would decide whether a process checks what it gets
-    from hilctl.machine.settings import Realtime
+from hilctl.machine.settings import Realtime
 
 StepOutcome: TypeAlias = Literal["done", "refused", "not asked"]
 
@@ -77,7 +75,7 @@ class System(Protocol):
         ...
 
     def lock_memory(self) -> None:
-        """Keep in RAM what a tick may need, and what is touched from now on."""
+        """Keep in RAM every page that is there now, and every page that is touched later."""
         ...
 
     def set_timer_slack(self, slack_ns: int) -> None:
@@ -133,11 +131,12 @@ def _lock_memory(system: System) -> SetUpStep:
     if limit is not None and limit < needed:
         detail = f"only {limit >> 20} MB may be locked, {needed >> 20} MB are needed"
         return SetUpStep("memory", "refused", detail, remedy)
-    detail = "locked: what a tick may need, and what is touched later"
-    return _step("memory", detail, system.lock_memory, remedy)
+    return _step(
+        "memory", "locked: pages in RAM now, and those touched later", system.lock_memory, remedy
+    )
 
 
-def _pin(settings: "Realtime", system: System) -> SetUpStep:
+def _pin(settings: Realtime, system: System) -> SetUpStep:
     cpu = settings.cpu
     if cpu is None:
         with suppress(OSError):
@@ -148,7 +147,7 @@ def _pin(settings: "Realtime", system: System) -> SetUpStep:
     return _step("cpu", f"CPU {cpu}", lambda: system.pin(cpu), remedy)
 
 
-def _set_fifo(settings: "Realtime", system: System) -> SetUpStep:
+def _set_fifo(settings: Realtime, system: System) -> SetUpStep:
     priority = settings.priority
     throttling = _throttling(system)
     try:
@@ -176,7 +175,7 @@ def _throttling(system: System) -> str:
 _THIS_PROCESS = LinuxProcess()
 
 
-def prepare(settings: "Realtime", system: System = _THIS_PROCESS) -> tuple[SetUpStep, ...]:
+def prepare(settings: Realtime, system: System = _THIS_PROCESS) -> tuple[SetUpStep, ...]:
     """Take every step that is allowed; call it last, when all memory is mapped and warm.
 
     Args:
@@ -186,9 +185,8 @@ def prepare(settings: "Realtime", system: System = _THIS_PROCESS) -> tuple[SetUp
     Returns:
         The steps in the order in which they were tried.
     """
-    # The heap after the lock, which gives back what is free of it first; from then on pages stay in
-    # RAM once they are touched. The CPU before the policy, so that none is
-    # taken from everybody else; SCHED_FIFO last, as the steps before it take milliseconds.
+    # The heap after the lock: its pages then stay in RAM. The CPU before the policy, so that none
+    # is taken from other processes; SCHED_FIFO last, as the steps before it take milliseconds.
     return (
         _step("gc", "collected once, then off", system.freeze_gc),
         _lock_memory(system),

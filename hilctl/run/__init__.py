@@ -1,33 +1,26 @@
 """Three processes round one loop: shared memory, recording, requests, recovery.
 
-start.py           from an experiment file to a finished run
-step.py            one run of several, and by what its recording is known
+start.py           from an experiment file to a finished run; runs that are steps of several
 architecture.py    systems that a run may be on
-job.py             what was checked as it goes to the loop's process
-assemble.py        from a checked experiment to the plan of its loop
-supervisor.py      starts loop, guardian and recorder; started_run.py  sees to them to the end
-child.py           the supervisor's hold on the loop's process; hang_watch.py  whether it hangs
-guardian.py        a process that makes the output safe where the loop can't, started by
-                   guardian_process.py; safety.py  sees to it, and stands in for it;
-                   safe_action.py  what both do then
-loop_process.py    the loop's process; carried_out.py  what it does with its job,
-                   host.py  its side of the shared memory,
-                   waiting_loop.py  started before its run is known
-starting.py        where the output is before a run
+job.py             what loop and guardian get, as JSON text in the run's folder
+supervisor.py      starts loop, guardian and recorder, and watches the run to its end
+child.py           the supervisor's hold on its processes
+loop_process.py    the loop process, and its side of the shared memory
+assemble.py        from a checked experiment and an open device to the plan of the loop
+guardian.py        a process that sets the safe value if the loop dies or hangs;
+                   guardian_process.py  starts it, safety.py  watches and replaces it
 ring.py            sample blocks in shared memory, behind shared_page.py
-recorder.py        into the recording; metadata.py what it says of the run, end_figures.py of
-                   what came out
-ring_recorder.py   from the ring into it, in a thread of its own; progress.py  for who looks on
-run_folder.py      runs that are going on, and who holds a device
-description.py     what a run says of itself to those who look on
-requests.py        answers requests to a run, over control_socket.py, one thread per client;
-                   client.py sends them and stops runs, protocol.py defines them;
-                   detached.py starts runs in the background
+recorder.py        from the ring into the recording, in a thread
+metadata.py        facts and figures of a run, for its recording and for watchers
+run_folder.py      active runs, and who holds a device
+requests.py        requests to a run, over control_socket.py; stopping.py  a signal to stop;
+                   client.py  sends them, protocol.py  has their words; detached.py  starts runs in
+                   the background
 changes.py         gain, offset and inverse on their way to the loop
-systemd.py         readiness and watchdog of a service
+own_process.py     a run of a program with threads, in a process of its own
 probe.py           whether a device answers, and whether that can be true
 orphans.py         what dead runs left behind; dead_runs.py  finished before anything is read
-by_hand.py         a device put at its safe value with no run
-unpaced.py         a run of a simulated device that needs no real time
-result.py          where a run stands, and how it ended
+by_hand.py         a device set to its safe value without a run
+unpaced.py         a run of a simulated device without real time
+result.py          progress and result of a run
 """

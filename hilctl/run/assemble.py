@@ -1,15 +1,16 @@
-"""From a checked experiment to the plan of its loop: one way for every host."""
+"""From a checked experiment and an open device to the plan of the loop, for every host."""
 
 import math
 from dataclasses import replace
 
-from hilctl.base.device import DeviceInfo
+from hilctl.base.device import Device, DeviceInfo
+from hilctl.base.errors import InputError
 from hilctl.base.types import F64
 from hilctl.experiment.adaptation import make_adaptation
 from hilctl.experiment.feedback import make_feedback
 from hilctl.experiment.file import Experiment
 from hilctl.experiment.interlocks import interlock_context
-from hilctl.experiment.run_parts import RunParts
+from hilctl.experiment.load import LoadedExperiment
 from hilctl.loop.adaptation import DisplacementOperator
 from hilctl.loop.compensator import Compensator
 from hilctl.loop.conditioning import Conditioning
@@ -18,10 +19,44 @@ from hilctl.loop.plan import Plan
 
 _ALWAYS_LATE_S = 2.0
 _MISSED_WINDOW_S = 10.0
+_ROUNDING = 1e-6  # of the device's range: error of reading back an end of it
+
+
+def starting_output(device: Device, at_start: float | None) -> float:
+    """Return the command that an open device puts out before the run; nothing moves.
+
+    Args:
+        device: Open; its answer is used before ``at_start``.
+        at_start: ``safe.at_start`` of the experiment, for devices that cannot read it.
+
+    Raises:
+        InputError: Both are missing, or the output is outside of the device's range.
+        DeviceError: The device did not answer.
+    """
+    info = device.info
+    output = device.output()
+    if output is None:
+        output = at_start
+    if output is None:
+        raise InputError(
+            f"safe.at_start: is required: {info.name} can't tell what it puts out, and a run ramps "
+            f"from there to safe.value: measure it, and give it in {info.command_unit}; "
+            "nothing has moved"
+        )
+    slack = _ROUNDING * (info.command_max - info.command_min)
+    low, high = info.command_min - slack, info.command_max + slack
+    if not (math.isfinite(output) and low <= output <= high):
+        unit = info.command_unit
+        span = f"{info.command_min:g} to {info.command_max:g} {unit}"
+        raise InputError(
+            f"{info.name}: puts out {output:g} {unit}, which is not within what it takes, {span}: "
+            "no ramp can begin there: bring it to its safe value by hand; nothing has moved"
+        )
+    return min(info.command_max, max(info.command_min, output))
 
 
 def assemble(
-    parts: RunParts,
+    loaded: LoadedExperiment,
     reference: F64,
     input_um: F64,
     state: F64 | None,
@@ -34,7 +69,7 @@ def assemble(
     """Return what a run does; its compensator is warmed up.
 
     Args:
-        parts: Of the experiment.
+        loaded: The experiment.
         reference: float64[n], in the waveform's unit.
         input_um: float64[n], the compensator's input.
         state: The compensator's memory before the first sample; at rest where None.
@@ -43,11 +78,11 @@ def assemble(
         paced: Whether the run keeps real time; else no tick is late.
         heat_a2: Heat of the coil before it, in A^2.
     """
-    config, info = parts.config, parts.device.info
+    config, info = loaded.config, loaded.device.info
     rate_hz = config.sample_rate_hz
     policy = _late_policy(config, info) if paced else "catch_up"
     host_paced = paced and not info.buffered and not info.latency_blocks
-    compensator = Compensator(parts.model, rate_hz)
+    compensator = Compensator(loaded.model, rate_hz)
     compensator.warm_up()
     if state is not None:
         compensator.restore(state)

@@ -1,6 +1,5 @@
-"""The supervisor's hold on the loop's process: start it, wait for it, learn how it ended."""
+"""The processes that the supervisor starts: their end, and the loop process as one of them."""
 
-import os
 import signal
 import subprocess
 import time
@@ -8,40 +7,64 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 
 from hilctl.base.errors import InputError, RunError
-from hilctl.experiment.check import Checked
-from hilctl.run.job import Job
-from hilctl.run.ring import SampleRing
+from hilctl.run.job import start_process
 from hilctl.run.run_folder import RunFolder
-from hilctl.run.shared_page import Field, PageText, Phase
-from hilctl.run.waiting_loop import taken
+from hilctl.run.shared_page import Field, PageText, Phase, SharedPage
 
 _READY_TIMEOUT_S = 120.0
 _DEATH_S = 0.1
 
 
-class LoopChild:
-    """The loop process of one run.
+class ChildProcess:
+    """A process of a run.
 
     Args:
-        checked: The experiment.
-        folder: The run's folder, with its ring.
-        ring: That ring.
-        inherits: Descriptors of locks that it is to hold.
-        silence_s: Longest that the supervisor may be silent.
+        process: The process, started.
     """
 
-    def __init__(
-        self,
-        checked: Checked,
-        folder: RunFolder,
-        ring: SampleRing,
-        inherits: Sequence[int],
-        silence_s: float,
-    ) -> None:
-        self._page = ring.page
-        job = Job.of(checked, folder, supervisor=os.getpid(), silence_s=silence_s)
-        # One that died at once is reported by await_ready.
-        self._process = taken().give(job.to_bytes(), inherits)
+    def __init__(self, process: "subprocess.Popen[bytes]") -> None:
+        self._process = process
+
+    @property
+    def pid(self) -> int:
+        """Its process number."""
+        return self._process.pid
+
+    @property
+    def ended(self) -> bool:
+        """Whether the process is gone."""
+        return self._process.poll() is not None
+
+    def kill(self, wait_s: float = _DEATH_S) -> None:
+        """Kill it; do not wait longer for a process that is blocked in the kernel.
+
+        Args:
+            wait_s: Longest wait until it is gone.
+        """
+        self._process.kill()
+        with suppress(subprocess.TimeoutExpired):
+            self._process.wait(wait_s)
+
+
+class LoopProcess(ChildProcess):
+    """The loop process of one run; see :mod:`hilctl.run.loop_process`.
+
+    Args:
+        folder: The run's folder, with its job.
+        page: Shared with it.
+        inherits: Descriptors of locks that it is to hold.
+
+    Raises:
+        RunError: It cannot be started.
+    """
+
+    def __init__(self, folder: RunFolder, page: SharedPage, inherits: Sequence[int]) -> None:
+        self._page = page
+        try:
+            process = start_process("hilctl.run.loop_process", str(folder.job), inherits=inherits)
+        except OSError as error:
+            raise RunError(f"cannot start the loop process: {error.strerror}") from None
+        super().__init__(process)
 
     def await_ready(self, stopped: Callable[[], bool]) -> None:
         """Wait until it needs only the start signal.
@@ -67,26 +90,6 @@ class LoopChild:
             raise RunError(page.read_text(PageText.ERROR))
         if page.observe(Field.PHASE) != Phase.READY:
             raise RunError(f"the loop process died before the start: {self._death()}")
-
-    @property
-    def pid(self) -> int:
-        """Its process number."""
-        return self._process.pid
-
-    @property
-    def ended(self) -> bool:
-        """Whether the process is gone."""
-        return self._process.poll() is not None
-
-    def kill(self, wait_s: float = _DEATH_S) -> None:
-        """End it at once; one that the kernel keeps from dying is not waited for.
-
-        Args:
-            wait_s: Longest wait until it is gone.
-        """
-        self._process.kill()
-        with suppress(subprocess.TimeoutExpired):
-            self._process.wait(wait_s)
 
     def death(self) -> str:
         """Return why it could not say how it ended."""

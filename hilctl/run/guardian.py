@@ -1,8 +1,8 @@
 """The guardian: a small process that sets the output to its safe value if the loop cannot.
 
-Started by the supervisor as ``python -m hilctl.run.guardian JOB PIDFD``, with a pidfd of the loop's
-process. Once it watches, it reads no file, imports nothing and waits for no other process, so that
-neither a disk nor the supervisor can delay the safe value.
+Started by the supervisor as ``python -m hilctl.run.guardian JOB PIDFD PID``, with a pidfd and the
+number of the loop process. Once it watches, it reads no file, imports nothing and waits for no
+other process, so neither a disk nor the supervisor can delay the safe value.
 
 It acts if the loop dies without a confirmed safe output, or hangs. It keeps trying until the device
 confirms the safe value, also after the supervisor has ended; SIGTERM ends it then. The supervisor
@@ -11,33 +11,27 @@ drives the device only after the guardian has ended or was killed, so two proces
 As ``python -m hilctl.run.guardian JOB act`` it has no loop to watch, and acts at once.
 """
 
-import json
 import os
 import select
 import shutil
 import signal
 import sys
+import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from types import FrameType
-from typing import Self
 
 from hilctl.base.device import Device
-from hilctl.base.errors import HilctlError, InputError
-from hilctl.base.files import TextFiles
-from hilctl.base.yaml import Document
-from hilctl.experiment.device import made_device
-from hilctl.loop.safe_output import SafeGoal
+from hilctl.base.errors import HilctlError
+from hilctl.loop.safe_output import LocalError, SafeGoal, SafeOutput
 from hilctl.machine.linux import LinuxProcess
 from hilctl.machine.realtime import be_quick
-from hilctl.run.hang_watch import HangWatch, SilenceLimits, is_stopped
+from hilctl.run.job import Job, SilenceLimits
 from hilctl.run.ring import SampleRing
 from hilctl.run.run_folder import keep_removed
-from hilctl.run.safe_action import SafeAction
 from hilctl.run.shared_page import (
     Field,
     GuardianPhase,
@@ -47,71 +41,149 @@ from hilctl.run.shared_page import (
     SharedPage,
 )
 
+_POLLS = 3
+_CLOSING_S = 30.0
 _POLL_MS = 5
 LAST_CALL_MS = 5
 """How long a process that was killed may be in a call that it is to end. Then it is dying: giving
 back its memory takes much longer, and only a device that takes one connection waits for that."""
 
 
-@dataclass(frozen=True, slots=True)
-class GuardianJob:
-    """What the guardian is to guard, as text.
+class HangWatch:
+    """Detect a loop that lives but writes no heartbeat.
 
-    Attributes:
-        experiment: The experiment as YAML.
-        files: Texts of the files that its device refers to, by absolute path.
-        folder: Folder that file names in it are relative to.
-        ring: File of the ring.
-        safe_value: The safe value, in the device's command unit.
-        ramp_per_s: Fastest change on the way there.
-        limits: How long the loop may be silent.
-        loop: Process number of the loop.
-        supervisor: Process number of the supervisor.
-        priority: SCHED_FIFO priority that is asked for.
+    A stall of the whole machine stalls this process too, so silence counts only after several
+    polls.
+
+    Args:
+        page: Shared with the loop.
+        limits: Longest that it may be silent.
+        is_stopped: Whether the loop's process is stopped.
     """
 
-    experiment: str
-    files: Mapping[str, str]
-    folder: str
-    ring: str
-    safe_value: float
-    ramp_per_s: float
-    limits: SilenceLimits
-    loop: int
-    supervisor: int
-    priority: int
+    def __init__(
+        self, page: SharedPage, limits: SilenceLimits, is_stopped: Callable[[], bool]
+    ) -> None:
+        self._page = page
+        self._limits = limits
+        self._is_stopped = is_stopped
+        self._heartbeat_ns = -1
+        self._seen_ns = 0
+        self._polls = 0
 
-    def to_json(self) -> str:
-        """Return the fields as JSON."""
-        return json.dumps(asdict(self))
+    def hangs(self, now_ns: int) -> bool:
+        """Poll once; return whether the loop has been silent for too long.
 
-    @classmethod
-    def from_json(cls, text: str) -> Self:
-        """Undo :meth:`to_json`."""
-        fields = json.loads(text)
-        return cls(**{**fields, "limits": SilenceLimits(**fields["limits"])})
-
-    def device(self) -> Device:
-        """Return the device, made but not opened; nothing is read from disk.
-
-        Raises:
-            InputError: It can't be made.
+        Args:
+            now_ns: Monotonic time.
         """
-        document = Document("experiment", self.experiment)
-        made = made_device(document, Path(self.folder), TextFiles(self.files))
-        if made is None:
-            raise InputError("the experiment has no device")
-        return made
+        page = self._page
+        heartbeat_ns, phase = page.get(Field.LOOP_HEARTBEAT_NS), page.get(Field.PHASE)
+        watched = phase in {Phase.RUNNING, Phase.CLOSING}
+        if heartbeat_ns != self._heartbeat_ns or not watched:
+            self._heartbeat_ns, self._seen_ns, self._polls = heartbeat_ns, now_ns, 0
+            return False
+        self._polls += 1
+        silent_s = (now_ns - self._seen_ns) * 1e-9
+        if self._polls <= _POLLS:
+            return False
+        limits = self._limits
+        loop_s = limits.real_time_s if page.get(Field.REAL_TIME) else limits.ordinary_s
+        if silent_s > loop_s + self._wait_s(phase):
+            return True
+        # Last, since it asks the kernel.
+        return silent_s > limits.stopped_s and self._is_stopped()
+
+    def _wait_s(self, phase: int) -> float:
+        """Return how long the loop may be waiting for its device."""
+        # A lost device may use up its timeouts; before the first tick nothing moves.
+        if phase == Phase.CLOSING or not self._page.get(Field.LOOP_HEARTBEAT_NS):
+            return _CLOSING_S
+        return self._limits.exchange_s if self._page.get(Field.EXCHANGING) else 0.0
+
+
+def is_stopped(process: int) -> bool:
+    """Return whether a process is stopped or traced; False if it does not exist."""
+    try:
+        stat = Path(f"/proc/{process}/stat").read_bytes()
+    except OSError:
+        return False
+    # After the program's name, which may contain spaces and brackets.
+    return stat.rpartition(b")")[2].split()[0] in {b"T", b"t"}
+
+
+class SafeAction:
+    """Drive a device to its safe value in a thread, until the outcome is final.
+
+    Args:
+        page: Shared with the other processes of the run.
+        device: Not open; each write opens a connection of its own.
+        goal: Where the output goes.
+        hung: Whether the loop had to be killed.
+        prepare: Called in that thread first.
+
+    Attributes:
+        failed: Error of this process, after which another one has to try; empty without one.
+
+    Raises:
+        RuntimeError: No thread can be started.
+    """
+
+    def __init__(
+        self,
+        page: SharedPage,
+        device: Device,
+        goal: SafeGoal,
+        *,
+        hung: bool,
+        prepare: Callable[[], object] = lambda: None,
+    ) -> None:
+        self._output = SafeOutput(device, goal, on_write=page.note_safe_write)
+        self._hung, self._prepare = hung, prepare
+        self._result = SafeActionResult(hung, "unknown", self._output.error, final=False)
+        self._ending = threading.Event()
+        self.failed = ""
+        # A daemon: a device that blocks for ever must not keep the process alive.
+        self._thread = threading.Thread(target=self._run, name="safe action", daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        output = self._output
+        try:
+            self._prepare()
+            while not output.final and not self._ending.is_set():
+                output.attempt()
+                self._result = SafeActionResult(
+                    self._hung, output.state, output.error, output.final
+                )
+                if not output.final:
+                    self._ending.wait(output.pause_s)
+        except LocalError as error:
+            self.failed = str(error)
+        except Exception as error:  # noqa: BLE001  no error may pass for a confirmed output
+            self.failed = f"{type(error).__name__}: {error}"
+
+    def result(self, wait_s: float = 0.0) -> SafeActionResult:
+        """Return the result so far, after ``wait_s`` or as soon as it is final."""
+        self._thread.join(wait_s)
+        return self._result
+
+    def end(self, wait_s: float) -> bool:
+        """Stop writing; return whether the last write ends within ``wait_s``."""
+        self._ending.set()
+        self._thread.join(wait_s)
+        return not self._thread.is_alive()
 
 
 class Guardian:
-    """Watches the loop, and sets the output to its safe value if the loop died or hangs.
+    """Watch the loop, and set the output to its safe value if the loop died or hangs.
 
     Args:
         ring: Shared with loop and supervisor.
         device: Not open.
         job: What to guard.
-        loop: A pidfd of the loop's process.
+        pidfd: A pidfd of the loop's process.
+        loop: Its process number.
         prepare: Called first in the thread that drives the device.
     """
 
@@ -119,16 +191,17 @@ class Guardian:
         self,
         ring: SampleRing,
         device: Device,
-        job: GuardianJob,
+        job: Job,
+        pidfd: int,
         loop: int,
         prepare: Callable[[], object] = lambda: None,
     ) -> None:
         self._ring, self._page = ring, ring.page
-        self._device, self._job, self._loop = device, job, loop
+        self._device, self._job, self._pidfd = device, job, pidfd
         self._prepare = prepare
-        self._watch = HangWatch(ring.page, job.limits, lambda: is_stopped(job.loop))
+        self._watch = HangWatch(ring.page, job.limits, lambda: is_stopped(loop))
         self._death = select.poll()
-        self._death.register(loop, select.POLLIN)
+        self._death.register(pidfd, select.POLLIN)
 
     def watch(self) -> bool:
         """Watch until the loop is gone, and the output safe if that can be had.
@@ -158,7 +231,7 @@ class Guardian:
     def _kill_loop(self) -> None:
         """End the loop for good: should it go on, it would send commands from before."""
         with suppress(ProcessLookupError):
-            signal.pidfd_send_signal(self._loop, signal.SIGKILL)
+            signal.pidfd_send_signal(self._pidfd, signal.SIGKILL)
         self._death.poll(LAST_CALL_MS)
 
 
@@ -226,7 +299,7 @@ def main(words: list[str]) -> int:
     """Guard one run; the exit code is 0 if the job could be read and the device driven."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)  # it ends with the loop, and not before
-    job = GuardianJob.from_json(Path(words[0]).read_text(encoding="utf-8"))
+    job = Job.read(Path(words[0]))
     ring = SampleRing(Path(job.ring))
     page = ring.page
     page.put(Field.GUARDIAN_PID, os.getpid())
@@ -238,13 +311,13 @@ def main(words: list[str]) -> int:
     "localhost".encode("idna")  # the codec, which is imported at the first connection otherwise
     process = LinuxProcess()
     _stay_in_memory(process)
-    be_quick(job.priority, process)
-    prepare = partial(be_quick, job.priority, process)
+    be_quick(job.safe_priority, process)
+    prepare = partial(be_quick, job.safe_priority, process)
     if words[1] == "act":
         goal = safe_goal(ring, device, job.safe_value, job.ramp_per_s)
         done = act(page, device, goal, hung=False, prepare=prepare)
     else:
-        done = Guardian(ring, device, job, int(words[1]), prepare).watch()
+        done = Guardian(ring, device, job, int(words[1]), int(words[2]), prepare).watch()
     if os.getppid() != job.supervisor:
         _leave_folder(Path(words[0]).parent, page)
     return 0 if done else 1
@@ -263,7 +336,7 @@ def _stay_in_memory(process: LinuxProcess) -> None:
     process.freeze_gc()
     with suppress(OSError):
         if process.lockable_bytes() is None:
-            process.lock_memory()
+            process.lock_memory(untouched=True)
 
 
 if __name__ == "__main__":

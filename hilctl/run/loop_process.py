@@ -1,34 +1,221 @@
-"""The loop's own process: what it is before it has a job.
+"""The loop process: prepare everything, run the loop, and leave the outcome in the ring's page.
 
-Started by the supervisor in :mod:`hilctl.run.waiting_loop`, before that has its experiment; the job
-comes over the socket that is its standard input, and the locks with it. Until then it imports only
-what every run needs: whether it is to check anything is known with the job.
+Started by the supervisor as ``python -m hilctl.run.loop_process JOB``. It prints nothing and writes
+no file.
 """
 
+import json
+import os
 import signal
 import sys
+import time
+from pathlib import Path
 
-from hilctl.kernels import atomics
-from hilctl.kernels.interlock import interlock_block
-from hilctl.kernels.jit import ensure_compiled
-from hilctl.kernels.limit import limit_block
-from hilctl.machine.realtime import be_ordinary
-from hilctl.run.waiting_loop import PLAIN, received_job
+import numpy as np
 
-_EVERY_RUN = (atomics.publish, atomics.observe, limit_block, interlock_block)
+from hilctl.base.device import Clock
+from hilctl.base.errors import HilctlError, InputError, RunError
+from hilctl.base.files import TextFiles
+from hilctl.experiment.condition import conditioning_of
+from hilctl.experiment.load import LoadedExperiment, resolve
+from hilctl.loop.adaptation import DisplacementOperator
+from hilctl.loop.host import StraightLine, Tuning
+from hilctl.loop.loop import Loop
+from hilctl.loop.pacer import SystemClock
+from hilctl.loop.plan import Outcome, Plan
+from hilctl.loop.safe_output import SafeGoal, describe, drive_to_safe
+from hilctl.machine.realtime import be_ordinary, prepare, refusals, require, step_facts
+from hilctl.machine.usage import ProcessUsage
+from hilctl.run.assemble import assemble, starting_output
+from hilctl.run.job import Job
+from hilctl.run.ring import SampleRing
+from hilctl.run.run_folder import keep_removed
+from hilctl.run.shared_page import Field, PageText, Phase, SharedPage, Stop
+
+# Plain numbers: looking up an enumeration's member takes longer than writing it.
+_HEARTBEAT_NS, _NEXT_SAMPLE = int(Field.LOOP_HEARTBEAT_NS), int(Field.NEXT_SAMPLE)
+_LATE_TICKS, _STOP = int(Field.LATE_TICKS), int(Field.STOP)
+_SUPERVISOR_HEARTBEAT_NS = int(Field.SUPERVISOR_HEARTBEAT_NS)
+_TUNE_WANTED, _TUNE_TAKEN = int(Field.TUNE_WANTED), int(Field.TUNE_TAKEN)
+_TUNE_BEGINS_AT = int(Field.TUNE_BEGINS_AT)
 
 
-def main() -> int:
-    """Run one job; the exit code is 0 where the loop ended by its safe ramp."""
+class RingHost:
+    """See :class:`hilctl.loop.host.Host`.
+
+    Args:
+        ring: Shared with the supervisor.
+        clock: Time.
+        supervisor: The supervisor's process number.
+        silence_s: Longest that it may be silent.
+    """
+
+    def __init__(self, ring: SampleRing, clock: Clock, supervisor: int, silence_s: float) -> None:
+        ring.prepare_blocks()
+        self.clock = clock
+        self.claim, self.sending, self.answered = ring.claim, ring.sending, ring.answered
+        self.record_event = ring.page.push_event
+        self.writing_safe = ring.page.note_safe_write
+        self._page = ring.page
+        self._numbers = ring.page.numbers
+        self._supervisor = supervisor
+        self._silence_ns = silence_s * 1e9
+
+    def heartbeat(self, next_sample: int, late_ticks: int) -> str:
+        """Write the loop's heartbeat; return why the run should end, or an empty text."""
+        numbers = self._numbers
+        now_ns = self.clock.now_ns()
+        numbers[_HEARTBEAT_NS] = now_ns
+        numbers[_NEXT_SAMPLE] = next_sample
+        numbers[_LATE_TICKS] = late_ticks
+        if numbers[_STOP]:
+            return Stop(numbers[_STOP]).reason
+        if not self.supervised():
+            return "stopped because the supervisor died"
+        if now_ns - numbers[_SUPERVISOR_HEARTBEAT_NS] > self._silence_ns:
+            return f"stopped because the supervisor was silent for {self._silence_ns * 1e-9:g} s"
+        return ""
+
+    def closing(self) -> None:
+        """Say that the loop is over, and that the device may take its time."""
+        self._numbers[_HEARTBEAT_NS] = self.clock.now_ns()
+        self._page.publish(Field.PHASE, Phase.CLOSING)
+
+    def tuning(self) -> Tuning | None:
+        """Return a change of the reference that is wanted, new, and due to begin."""
+        numbers, page = self._numbers, self._page
+        if numbers[_TUNE_WANTED] == numbers[_TUNE_TAKEN]:
+            return None
+        wanted = page.observe(Field.TUNE_WANTED)
+        if numbers[_NEXT_SAMPLE] < numbers[_TUNE_BEGINS_AT]:
+            return None
+        tuning = Tuning(
+            page.get_float(Field.TUNE_GAIN),
+            page.get_float(Field.TUNE_OFFSET),
+            page.get(Field.TUNE_SAMPLES),
+            page.get(Field.TUNE_BEGINS_AT),
+            page.get_float(Field.TUNE_INVERSE_SHARE),
+            StraightLine(*map(page.get_float, (Field.TUNE_LINE_SLOPE, Field.TUNE_LINE_AT_ZERO))),
+        )
+        # Taken only once it has been read: the supervisor may write the next one from here on.
+        page.publish(Field.TUNE_TAKEN, wanted)
+        return tuning
+
+    def supervised(self) -> bool:
+        """Return whether the supervisor is still there."""
+        return os.getppid() == self._supervisor
+
+
+def loaded_of(job: Job) -> LoadedExperiment:
+    """Return the experiment of a job; nothing is read from disk."""
+    return resolve(job.document(), Path(job.folder), files=TextFiles(job.files))
+
+
+def plan_of(job: Job, loaded: LoadedExperiment) -> Plan:
+    """Return what the loop of a job does."""
+    reference, input_um = job.arrays()
+    return assemble(
+        loaded,
+        reference,
+        input_um,
+        None if job.state is None else np.array(job.state),
+        conditioning_of(loaded, job.stands_um),
+        operator=None if job.adapted is None else DisplacementOperator.from_lists(job.adapted),
+        heat_a2=job.heat_a2,
+    )
+
+
+def run_job(job: Job, ring: SampleRing) -> Outcome:
+    """Run a job, from set-up to the closed device.
+
+    Raises:
+        HilctlError: It could not start, or broke; the output was put at its safe value.
+    """
+    loaded = loaded_of(job)
+    config, device, page = loaded.config, loaded.device, ring.page
+    host = RingHost(ring, SystemClock(), job.supervisor, job.silence_s)
+    loop = Loop(plan_of(job, loaded), device, host)
+    # After the warm-up, so that all it has mapped gets locked; before the device is opened, so that
+    # a refusal moves nothing.
+    steps = prepare(config.realtime)
+    if config.realtime.require:
+        require(steps)
+    device.open(config.sample_rate_hz, config.block)
+    try:
+        output = starting_output(device, config.safe.at_start)
+        waveform_at = loop.begin_at(output)
+        page.put_float(Field.OUTPUT_AT_START, output)
+        page.put(Field.REAL_TIME, int(any(s.name == "fifo" and s.outcome == "done" for s in steps)))
+        page.put(Field.WAVEFORM_AT, waveform_at)
+        page.write_text(PageText.SET_UP, json.dumps([step_facts(steps), refusals(steps)]))
+        # After the text, which the supervisor reads then.
+        page.publish(Field.PHASE, Phase.READY)
+        start_ns = _await_go(page, host)
+    except BaseException:
+        device.close()  # and no safe value: nothing has moved, and the output is not to step there
+        raise
+    try:
+        page.publish(Field.PHASE, Phase.RUNNING)
+        before = ProcessUsage.now()
+        outcome = loop.run(start_ns)
+        page.leave_usage(ProcessUsage.now().since(before))
+        # Before the device is closed: that may take its time-outs, and is no hang.
+        host.closing()
+    except BaseException as error:
+        pending = bool(page.get(Field.EXCHANGING)) and not device.info.simulated
+        goal = SafeGoal(job.safe_value, job.ramp_per_s, ring.last_command(), pending)
+        found = drive_to_safe(device, goal, on_write=page.note_safe_write)
+        if found.state != "confirmed":
+            # The cause first: a device that can't be reached is often only what follows from it.
+            cause = str(error) if isinstance(error, HilctlError) else f"the loop broke: {error!r}"
+            raise RunError(f"{cause}; {describe(found.state, found.error)}") from error
+        raise
+    finally:
+        device.close()
+        page.leave_lateness(loop.lateness)
+    return outcome
+
+
+def _await_go(page: SharedPage, host: RingHost) -> int:
+    """Return when the first tick is due.
+
+    Raises:
+        RunError: The supervisor has died; nothing has moved.
+    """
+    while not page.observe(Field.GO):
+        if not host.supervised():
+            raise RunError("the supervisor died before the start; nothing has moved")
+        time.sleep(0.001)
+    return page.get(Field.START_NS)
+
+
+def main(words: list[str]) -> int:
+    """Run one job; the exit code is 0 if the loop ended by its safe ramp."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)  # the supervisor decides, and the loop ramps down
-    be_ordinary()  # as its maker is by the time that it has a job
-    ensure_compiled(*_EVERY_RUN)  # while the supervisor checks
-    job = received_job(sys.stdin.fileno())
-    if not job:
-        return 0  # there is no run for this one
-    if job.startswith(PLAIN):
-        import hilctl.base.plain  # noqa: F401  before what would import pydantic
-    from hilctl.run.carried_out import carry_out
+    be_ordinary()
+    job = Job.read(Path(words[0]))
+    ring = SampleRing(Path(job.ring), at_once=True)
+    try:
+        ring.page.leave_outcome(run_job(job, ring))
+    except InputError as error:  # before anything has moved
+        return _failed(ring.page, str(error), Phase.REFUSED)
+    except HilctlError as error:
+        return _failed(ring.page, str(error))
+    except Exception as error:  # noqa: BLE001  the supervisor sets the rig to its safe value
+        return _failed(ring.page, f"the loop broke: {type(error).__name__}: {error}")
+    finally:
+        if os.getppid() != job.supervisor:
+            keep_removed()
+    return 0
 
-    return carry_out(job)
+
+def _failed(page: SharedPage, text: str, phase: Phase = Phase.FAILED) -> int:
+    # The text first: the phase says that it is there.
+    page.write_text(PageText.ERROR, text)
+    page.publish(Field.PHASE, phase)
+    return 1
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

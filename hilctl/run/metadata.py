@@ -1,30 +1,44 @@
-"""What a recording says of its run: before the first sample, and at its end.
+"""The descriptions of a run: facts for its recording, figures of its end, and what watchers read.
 
-Commands that only finish what a dead run left import this too: they have no time for numba, which
-takes seconds.
+Commands that only recover a dead run, and watchers, import this module: it must not import numba.
 """
 
 import hashlib
 import json
+import math
 import platform
 import sys
 import uuid
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
 from hilctl import __version__
-from hilctl.base.samples import COLUMNS
+from hilctl.base.errors import RunError
+from hilctl.base.events import CHANGES, Event
+from hilctl.base.metrics import (
+    Folding,
+    loop_area,
+    peak,
+    peak_hysteresis_percent,
+    peak_to_peak,
+    percent,
+    rms,
+)
+from hilctl.base.samples import COLUMNS, NO_WAVEFORM, Flag, Samples
+from hilctl.base.segments import Segment
+from hilctl.base.strict import Strict
 from hilctl.base.yaml import dump
 from hilctl.loop.pacer import Lateness
 from hilctl.loop.plan import Outcome
 from hilctl.machine.diagnosis import machine_facts
 from hilctl.machine.usage import ProcessUsage
 from hilctl.recording.facts import (
+    END_FIGURES,
     HEAT_FACT,
     HOLDS_FACT,
     LABELS_FACT,
@@ -36,6 +50,8 @@ if TYPE_CHECKING:
     from hilctl.experiment.check import Checked
     from hilctl.experiment.load import LoadedExperiment
     from hilctl.waveforms.spec import AnyWaveform
+
+_LEFT_OUT = NO_WAVEFORM | Flag.SENSOR_INVALID
 
 
 def run_facts(
@@ -143,3 +159,264 @@ def usage_facts(loop: ProcessUsage | None, supervisor: ProcessUsage) -> dict[str
     """
     known = {"loop": loop, "supervisor": supervisor}
     return {USAGE_FACT: json.dumps({name: asdict(each) for name, each in known.items() if each})}
+
+
+class SettingRow(Strict):
+    """One key of the experiment as it runs.
+
+    Attributes:
+        key: Dotted.
+        value: As text.
+        settable: Whether ``--set`` can give another one; else it is changed in the file.
+    """
+
+    key: str
+    value: str
+    settable: bool
+
+
+class LimitBounds(Strict):
+    """What limiter and interlocks hold the run to; None where there is none.
+
+    Attributes:
+        command: Lowest and highest command, in its unit.
+        slew_per_s: Fastest change of the command.
+        stroke_um: Lowest and highest displacement.
+        rms_current_a: Largest running rms of the coil current.
+        thermal_time_constant_s: Its time constant.
+        heat_a2: Heat of the coil before the run, in A^2.
+        tracking_error_um: Largest distance of displacement and reference.
+        measured_deviation: Largest distance of command and measured command.
+        late_s: A tick later than this ends the run.
+    """
+
+    command: list[float]
+    slew_per_s: float
+    stroke_um: list[float]
+    rms_current_a: float | None
+    thermal_time_constant_s: float | None
+    heat_a2: float
+    tracking_error_um: float | None
+    measured_deviation: float | None
+    late_s: float
+
+
+class RunDescription(Strict):
+    """One run.
+
+    Attributes:
+        name: Of the experiment.
+        text: The experiment's description.
+        device: What its device is.
+        simulated: Whether that is a simulation.
+        sample_rate_hz: Samples a second.
+        block: Samples in a tick.
+        command_unit: ``A`` or ``V``.
+        measures_command: Whether the device measures its command.
+        waveform_unit: Unit of the reference.
+        compensator: Kind of its model; empty without one.
+        samples: Samples of the waveform.
+        segments: Its stretches as :meth:`hilctl.base.segments.Segment.to_mapping`, counted from
+            the waveform's first sample.
+        limits: What it is held to.
+        settings: Every key of its experiment.
+    """
+
+    name: str
+    text: str
+    device: str
+    simulated: bool
+    sample_rate_hz: float
+    block: int
+    command_unit: str
+    measures_command: bool
+    waveform_unit: str
+    compensator: str
+    samples: int
+    segments: list[dict[str, Any]]
+    limits: LimitBounds
+    settings: list[SettingRow]
+
+    @classmethod
+    def of(cls, checked: "Checked") -> Self:
+        """Return what a checked experiment says of itself."""
+        loaded, reference = checked.loaded, checked.reference
+        config, info = loaded.config, loaded.device.info
+        return cls(
+            name=config.name,
+            text=config.description,
+            device=info.description,
+            simulated=info.simulated,
+            sample_rate_hz=config.sample_rate_hz,
+            block=config.block,
+            command_unit=info.command_unit,
+            measures_command=info.measures_command,
+            waveform_unit=reference.unit,
+            compensator=str(getattr(loaded.model, "kind", "")),
+            samples=int(reference.values.size),
+            segments=[each.to_mapping() for each in reference.segments],
+            limits=_limits(checked),
+            settings=setting_rows(loaded.document.data),
+        )
+
+    def segments_at(self, waveform_at: int) -> list[Segment]:
+        """Return the stretches, counted from the run's first sample.
+
+        Args:
+            waveform_at: Index of the waveform's first sample.
+        """
+        return [Segment.from_mapping(each).shifted(waveform_at) for each in self.segments]
+
+    def write(self, path: Path) -> None:
+        """Leave it for those who look on.
+
+        Raises:
+            RunError: There is no room for it.
+        """
+        try:
+            path.write_text(self.model_dump_json(), encoding="utf-8")
+        except OSError as error:
+            raise RunError(f"{path}: no memory: {error.strerror}") from None
+
+    @classmethod
+    def read(cls, path: Path) -> Self:
+        """Return what a run has left.
+
+        Raises:
+            OSError: There is none.
+            ValueError: It is damaged, or another version's.
+        """
+        return cls.model_validate_json(path.read_bytes())
+
+
+def _limits(checked: "Checked") -> LimitBounds:
+    config = checked.loaded.config
+    limits = config.limits
+    return LimitBounds(
+        command=list(limits.command_range),
+        slew_per_s=limits.slew_per_s,
+        stroke_um=list(limits.stroke_um),
+        rms_current_a=limits.rms_current_a,
+        thermal_time_constant_s=limits.thermal_time_constant_s,
+        heat_a2=checked.heat_a2,
+        tracking_error_um=limits.tracking_error_um,
+        measured_deviation=limits.measured_deviation,
+        late_s=config.timing.max_late_s,
+    )
+
+
+def setting_rows(value: Any, key: str = "") -> list[SettingRow]:
+    """Return the keys of an experiment's data, in order; a sequence is one value of its own."""
+    if isinstance(value, dict):
+        inner = (setting_rows(each, f"{key}.{name}".strip(".")) for name, each in value.items())
+        return [row for rows in inner for row in rows]
+    parts = any(isinstance(each, dict | tuple) for each in value) if _is_sequence(value) else False
+    text = f"{len(value)} entries" if parts else str(list(value) if _is_sequence(value) else value)
+    return [SettingRow(key=key, value=text, settable=not parts)]
+
+
+def _is_sequence(value: Any) -> bool:
+    return isinstance(value, tuple | list)
+
+
+class EndFigures:
+    """Gathers the figures of a run.
+
+    Args:
+        segments: Its stretches, in order.
+        compensated: Whether a compensator stands between reference and command.
+    """
+
+    def __init__(self, segments: Sequence[Segment], *, compensated: bool) -> None:
+        self._segments = list(segments)
+        self._compensated = compensated
+        self._done: list[tuple[Segment, dict[str, float]]] = []
+        self._changes: list[Event] = []
+        self._current: _SegmentFigures | None = None
+
+    def add(self, samples: Samples) -> None:
+        """Take the next samples of the run."""
+        index = samples.index[(samples.flags & NO_WAVEFORM) == 0]
+        while self._segments and index.size and self._segments[0].steady_start <= index[-1]:
+            segment = self._segments[0]
+            if self._current is None:
+                self._current = _SegmentFigures(segment, compensated=self._compensated)
+            self._current.add(samples)
+            if index[-1] + 1 < segment.steady_stop:
+                return
+            self._done.append((segment, self._current.figures()))
+            self._current = None
+            del self._segments[0]
+
+    def event(self, event: Event) -> None:
+        """Take an event of the run."""
+        if event.code in CHANGES:
+            self._changes.append(event)
+
+    def facts(self) -> dict[str, str]:
+        """Return the largest of each figure that any segment has, as text."""
+        judged = [figures for segment, figures in self._done if not self._tuned(segment)]
+        known = {name: [each[name] for each in judged if name in each] for name in END_FIGURES}
+        return {name: repr(max(values)) for name, values in known.items() if values}
+
+    def _tuned(self, segment: Segment) -> bool:
+        """Return whether a change of the reference reaches the steady part of a segment."""
+        changes = [each for each in self._changes if each.sample < segment.steady_stop]
+        return bool(changes) and (
+            changes[-1].sample + changes[-1].values["samples"] > segment.steady_start
+        )
+
+
+class _SegmentFigures:
+    """Figures of one segment, as its samples come."""
+
+    def __init__(self, segment: Segment, *, compensated: bool) -> None:
+        self._segment, self._compensated = segment, compensated
+        self._start, self._stop, cycles = segment.steady_cycles()
+        self._folding = Folding(segment.period, 2) if cycles else None
+        self._lowest_um, self._highest_um = math.inf, -math.inf
+        self._peak_um = self._squares_um2 = 0.0
+        self._samples = 0
+
+    @np.errstate(over="ignore", invalid="ignore")  # of readings near the end of all numbers
+    def add(self, samples: Samples) -> None:
+        """Take those of some samples that are of its steady part."""
+        part = samples.part(self._start, self._stop)
+        part = part.rows((part.flags & _LEFT_OUT) == 0)
+        loop_input = part.reference_um if self._compensated else part.command
+        loop = np.array((loop_input, part.displacement_um))
+        if self._folding:
+            self._folding.add(part.index - self._segment.start, loop)
+            return
+        loop_input, output = loop[:, np.isfinite(loop).all(axis=0)]
+        if output.size:
+            error_um = output - loop_input
+            self._lowest_um = min(self._lowest_um, float(output.min()))
+            self._highest_um = max(self._highest_um, float(output.max()))
+            self._peak_um = max(self._peak_um, float(np.abs(error_um).max()))
+            self._squares_um2 += float(np.square(error_um).sum())
+            self._samples += output.size
+
+    @np.errstate(over="ignore", invalid="ignore")
+    def figures(self) -> dict[str, float]:
+        """Return those that it has, by name."""
+        found: dict[str, float | None] = {}
+        if self._folding:
+            cycle = self._folding.fold()
+            if cycle.whole:
+                loop_input, output = cycle.signals
+                error_um = output - loop_input
+                found = self._quality(peak_to_peak(output), peak(error_um), rms(error_um))
+                found["peak_hysteresis_percent"] = peak_hysteresis_percent(loop_input, output)
+                found["loop_area"] = loop_area(loop_input, output)
+        elif self._samples:
+            rms_um = math.sqrt(self._squares_um2 / self._samples)
+            found = self._quality(self._highest_um - self._lowest_um, self._peak_um, rms_um)
+        return {name: value for name, value in found.items() if value is not None}
+
+    def _quality(self, stroke_um: float, peak_um: float, rms_um: float) -> dict[str, float | None]:
+        found: dict[str, float | None] = {"peak_to_peak_um": stroke_um}
+        if self._compensated:
+            found["peak_error_percent"] = percent(peak_um, stroke_um)
+            found["rms_error_percent"] = percent(rms_um, stroke_um)
+        return found

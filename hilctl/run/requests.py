@@ -12,7 +12,7 @@ from hilctl.base.strict import Strict
 from hilctl.experiment.check import Checked
 from hilctl.run.changes import Changes
 from hilctl.run.protocol import MAX_MARK
-from hilctl.run.ring_recorder import RingRecorder
+from hilctl.run.recorder import RingRecorder
 from hilctl.run.run_folder import RunFolder, facts_of
 from hilctl.run.shared_page import Field as Number
 from hilctl.run.shared_page import Phase, SharedPage

@@ -271,10 +271,10 @@ class SampleRing:
         return batch if whole.all() else batch.rows(np.flatnonzero(whole)), max(head, since)
 
     def release(self, keep: int = 0) -> None:
-        """Give the room of what was taken back to the producer: all of it is safe elsewhere.
+        """Release consumed blocks to the producer; they are on disk.
 
         Args:
-            keep: Newest blocks that stay for those who look on, until the next time.
+            keep: Newest blocks that stay for watchers, until the next call.
         """
         self.page.release_events()
         until = max(self._released, self._tail - keep)
@@ -286,9 +286,6 @@ class SampleRing:
         self._clean(slice(0, max(0, first + count - self.slots)))
         self._released = until
         self.page.publish(Field.TAIL, until)
-        # They stay in the ring; this process maps again what it looks at, some at a time, and does
-        # not have all of it in its memory as soon as it has been round once.
-        self._map.madvise(mmap.MADV_DONTNEED)
 
     def _clean(self, slots: slice) -> None:
         """Let slots hold no flag and no answer."""

@@ -119,9 +119,9 @@ class RunFolder:
         return self._file("description.json")
 
     @property
-    def guardian_job(self) -> Path:
-        """File of what the guardian is to guard."""
-        return self.path / "guardian.json"
+    def job(self) -> Path:
+        """File of the job of the loop process and the guardian."""
+        return self.path / "job.json"
 
     @property
     def guardian_log(self) -> Path:

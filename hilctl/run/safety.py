@@ -7,7 +7,7 @@ one process holds the device. What is not confirmed when the run ends is left to
 """
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
 
@@ -16,18 +16,11 @@ from hilctl.base.events import Event
 from hilctl.experiment.check import Checked
 from hilctl.loop.safe_output import PATIENCE_S
 from hilctl.machine.realtime import be_ordinary, be_quick
-from hilctl.run.child import LoopChild
-from hilctl.run.guardian import LAST_CALL_MS, safe_goal
-from hilctl.run.guardian_process import (
-    GuardianProcess,
-    safe_priority,
-    silence_limits,
-    write_guardian_job,
-)
-from hilctl.run.hang_watch import HangWatch, is_stopped
+from hilctl.run.child import LoopProcess
+from hilctl.run.guardian import LAST_CALL_MS, HangWatch, SafeAction, is_stopped, safe_goal
+from hilctl.run.guardian_process import GuardianProcess
+from hilctl.run.job import safe_priority, silence_limits
 from hilctl.run.ring import SampleRing
-from hilctl.run.run_folder import RunFolder
-from hilctl.run.safe_action import SafeAction
 from hilctl.run.shared_page import Field, GuardianPhase, SafeActionResult
 
 _AWAKE_NS = 50_000_000
@@ -38,27 +31,6 @@ _AGAIN_NS = 5_000_000_000
 _HAND_OVER_S = 10.0
 _POLL_S = 0.01
 _ACTING = {GuardianPhase.ACTING, GuardianPhase.DONE}
-
-
-def guardian_starter(
-    checked: Checked, folder: RunFolder, ring: SampleRing, loop: int, inherits: Sequence[int]
-) -> Callable[[int | None], GuardianProcess] | None:
-    """Return what starts the guardian of a run; None for a simulated device, which needs none.
-
-    Args:
-        checked: The experiment.
-        folder: The run's folder.
-        ring: The run's ring.
-        loop: Process number of the loop.
-        inherits: Descriptors of locks that the guardian is to hold.
-
-    Raises:
-        OSError: The guardian's job cannot be written.
-    """
-    if checked.loaded.device.info.simulated:
-        return None
-    write_guardian_job(checked, folder, loop)
-    return lambda watched: GuardianProcess(folder, ring.page, inherits, watched)
 
 
 class Safety:
@@ -77,7 +49,7 @@ class Safety:
         self,
         checked: Checked,
         ring: SampleRing,
-        child: LoopChild,
+        child: LoopProcess,
         start_guardian: Callable[[int | None], GuardianProcess] | None,
         record_event: Callable[[Event], None],
     ) -> None:

@@ -1,26 +1,38 @@
-"""From an experiment file to a finished run: load, check, run."""
+"""From an experiment file to a finished run: load, check, run.
+
+Campaigns and learning run the same steps, in real time or not.
+"""
 
 import logging
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Self, TypeAlias
 
-from hilctl.base.errors import InputError
+from hilctl.base.errors import DataError, InputError, RunError
 from hilctl.base.files import check_no_input
 from hilctl.base.remedy import reason
 from hilctl.experiment.check import Checked, check
-from hilctl.experiment.load import input_files, load_experiment
+from hilctl.experiment.correction import dump_correction
+from hilctl.experiment.load import LoadedExperiment, input_files, load_experiment
+from hilctl.models.files import dump_model
+from hilctl.recording.ends import read_ends
 from hilctl.run.architecture import require_linux
+from hilctl.run.metadata import experiment_sha256, sha256_of
 from hilctl.run.own_process import has_threads, run_in_own_process
 from hilctl.run.result import Progress, RunResult
-from hilctl.run.waiting_loop import started_ahead
+from hilctl.run.unpaced import run_unpaced
 
 _log = logging.getLogger(__name__)
 
+OnPart: TypeAlias = Callable[[float], None]
+"""Called with how much of a run is done, from 0 to 1."""
+
 
 def checked_experiment(path: Path, settings: Sequence[str], heat_a2: float = 0.0) -> Checked:
-    """Load an experiment and hold it against device, model and limits.
+    """Load an experiment and check it against device, model and limits.
 
     Args:
         path: Experiment file.
@@ -28,7 +40,7 @@ def checked_experiment(path: Path, settings: Sequence[str], heat_a2: float = 0.0
         heat_a2: Heat that its coil has at least, in A^2.
 
     Raises:
-        InputError: It can't be used, all problems are listed.
+        InputError: It cannot be used; all problems are listed.
     """
     return check(load_experiment(path, settings), heat_a2)
 
@@ -62,12 +74,12 @@ def start_run(
 ) -> RunResult:
     """Run an experiment file to its end.
 
-    A program with threads, such as a notebook or a window, runs it in a process of its own.
+    A program with threads, such as a notebook, runs it in a process of its own.
 
     Args:
         path: Experiment file.
         settings: ``key=value`` texts over it.
-        output: Recording to write; a name in the experiment's folder where None.
+        output: Recording to write; a name in the experiment's folder if None.
         overwrite: Whether an existing recording may be replaced.
         on_progress: Called with each batch of samples.
         heat_a2: Heat that the coil has at least, in A^2, whatever the last run of it says.
@@ -78,25 +90,12 @@ def start_run(
     """
     require_linux()
     if has_threads():
-        given = (path, settings, output, overwrite, heat_a2)
-        return run_in_own_process(given, on_progress)
-    with started_ahead():
-        return _run(path, settings, output, overwrite, on_progress, heat_a2)
-
-
-def _run(
-    path: Path,
-    settings: Sequence[str],
-    output: Path | None,
-    overwrite: bool,
-    on_progress: Callable[[Progress], None],
-    heat_a2: float,
-) -> RunResult:
-    # Not before: what only checks or computes works where a supervisor can't be imported.
+        return run_in_own_process((path, settings, output, overwrite, heat_a2), on_progress)
+    # Here: check and unpaced runs work on systems that have no supervisor.
     from hilctl.run.supervisor import Supervisor
 
     checked = checked_experiment(path, settings, heat_a2)
-    # Of a device with a past: nobody should have to look into the recording for what was taken.
+    # A real device remembers earlier runs: tell the user which memory is assumed.
     if checked.begun.begins and checked.loaded.device.info.holds:
         _log.warning("the compensator begins %s", checked.begun.begins)
     output = output_of(checked, output)
@@ -112,3 +111,88 @@ def default_output(name: str, folder: Path, now: time.struct_time) -> Path:
         candidate = folder / f"{name}-{stamp}-{number}.mcap"
         number += 1
     return candidate
+
+
+def _unseen(part: float) -> None:
+    del part
+
+
+def paced(
+    path: Path,
+    settings: Sequence[str],
+    output: Path,
+    on_part: OnPart = _unseen,
+    *,
+    overwrite: bool = True,
+    heat_a2: float = 0.0,
+) -> RunResult:
+    """Run as ``hilctl run`` does, into a file of this name; see :func:`start_run`."""
+
+    def show(progress: Progress) -> None:
+        on_part(progress.samples / max(progress.total, 1))
+
+    return start_run(path, settings, output, overwrite, show, heat_a2)
+
+
+def unpaced(
+    path: Path,
+    settings: Sequence[str],
+    output: Path,
+    on_part: OnPart = _unseen,
+    *,
+    overwrite: bool = True,
+    heat_a2: float = 0.0,
+) -> RunResult:
+    """Run a simulated device as fast as it goes."""
+    del on_part
+    checked = checked_experiment(path, settings, heat_a2=heat_a2)
+    return run_unpaced(checked, output, overwrite=overwrite)
+
+
+class StepStoppedError(RunError):
+    """A run of several was stopped by a signal; the recordings before it are kept.
+
+    Attributes:
+        signal: Number of the signal.
+    """
+
+    def __init__(self, text: str, number: int) -> None:
+        super().__init__(text)
+        self.signal = number
+
+
+@dataclass(frozen=True, slots=True)
+class RunKey:
+    """Identity of a run: two runs with one key have the same experiment, model and correction.
+
+    Attributes:
+        experiment: SHA-256 of the experiment as it runs.
+        model: SHA-256 of the compensator's model; empty without one.
+        correction: SHA-256 of the learned correction; empty without one.
+    """
+
+    experiment: str
+    model: str = ""
+    correction: str = ""
+
+    @classmethod
+    def of(cls, loaded: LoadedExperiment) -> Self:
+        """Return the key of an experiment."""
+        model = dump_model(loaded.model) if loaded.model else ""
+        correction = dump_correction(loaded.correction) if loaded.correction else ""
+        return cls(experiment_sha256(loaded), sha256_of(model), sha256_of(correction))
+
+    @classmethod
+    def of_facts(cls, run: Mapping[str, str]) -> Self:
+        """Return the key of a recorded run from its metadata."""
+        names = ("experiment_sha256", "model_sha256", "correction_sha256")
+        return cls(*(run.get(name, "") for name in names))
+
+
+def completed_key(path: Path) -> RunKey | None:
+    """Return the key of a recording; None unless its run was completed."""
+    try:
+        ends = read_ends(path)
+    except DataError:
+        return None
+    return RunKey.of_facts(ends.run) if ends.end.get("code") == "completed" else None

@@ -1,46 +1,237 @@
-"""The supervisor: starts loop, guardian and recorder, and ends the run whatever becomes of them.
+"""The supervisor: start loop, guardian and recorder, and end the run whatever happens to them.
 
-All that can fail comes before the start signal: from then on the recording, the ring and the coil
-are seen to, whatever else goes wrong here.
+Everything that can fail happens before the start signal. From then on the supervisor serves the
+recording, the ring and the safe value, whatever else fails in it.
 """
 
 import json
 import logging
+import os
 import signal
+import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import FrameType
 
 from hilctl.base.errors import RunError
+from hilctl.base.events import Event
 from hilctl.experiment.check import Checked
 from hilctl.loop.pacer import deadline_misses
-from hilctl.machine.memory import ProcessMemory
+from hilctl.loop.plan import Outcome
+from hilctl.loop.safe_output import describe
 from hilctl.machine.realtime import be_ordinary, favoured
-from hilctl.run.child import LoopChild
+from hilctl.run.child import LoopProcess
 from hilctl.run.control_socket import ControlServer
-from hilctl.run.guardian_process import GuardianRelief
-from hilctl.run.progress import ProgressThread
-from hilctl.run.protocol import JOB_CONTROL, STOP_SIGNAL
-from hilctl.run.recorder import Recorder
+from hilctl.run.guardian_process import GuardianProcess, GuardianRelief
+from hilctl.run.job import Job
+from hilctl.run.metadata import RunDescription
+from hilctl.run.protocol import HANG_UP, JOB_CONTROL, STOP_SIGNAL
+from hilctl.run.recorder import Recorder, RingRecorder
 from hilctl.run.requests import Requests
 from hilctl.run.result import Progress, RunResult
 from hilctl.run.ring import SampleRing
-from hilctl.run.ring_recorder import RingRecorder
 from hilctl.run.run_folder import RunFolder, held_devices, run_folder
-from hilctl.run.safety import Safety, guardian_starter
-from hilctl.run.shared_page import Field, PageText, SharedPage
-from hilctl.run.started_run import STOPS, StartedRun
-from hilctl.run.systemd import Notifier
+from hilctl.run.safety import Safety
+from hilctl.run.shared_page import Field, PageText, SharedPage, Stop
 
 _log = logging.getLogger(__name__)
 
 _POLL_S = 0.01
+_SHOWN_EVERY_S = 0.05
+_LAST_SHOWN_S = 0.5
 _START_DELAY_NS = 50_000_000
 _START_TRIES = 3
 _GUARDIAN_READY_S = 60.0
+STOPS = {
+    signal.SIGINT: Stop.CTRL_C,
+    signal.SIGTERM: Stop.SIGTERM,
+    HANG_UP: Stop.SIGHUP,
+    STOP_SIGNAL: Stop.REQUEST,
+}
+
+
+class SystemdNotifier:
+    """Notify systemd of readiness, watchdog and stop, by sd_notify(3).
+
+    Args:
+        environment: ``NOTIFY_SOCKET`` and ``WATCHDOG_USEC`` are looked up here.
+        clock: Monotonic time in s.
+    """
+
+    def __init__(
+        self,
+        environment: Mapping[str, str] = os.environ,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        address = environment.get("NOTIFY_SOCKET", "")
+        self._address = "\0" + address[1:] if address.startswith("@") else address
+        self._clock = clock
+        self._next_s = clock()
+        try:
+            self._every_s = int(environment.get("WATCHDOG_USEC", "0")) * 1e-6 / 3.0
+        except ValueError:
+            self._every_s = 0.0
+
+    def say(self, *lines: str) -> None:
+        """Send lines such as ``READY=1``; ignore lines that cannot be sent."""
+        if not self._address:
+            return
+        with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as out:
+            out.setblocking(False)
+            out.sendto("\n".join(lines).encode(), self._address)
+
+    def alive(self) -> None:
+        """Feed the watchdog three times per interval; call it more often than that."""
+        if self._every_s and self._clock() >= self._next_s:
+            self._next_s = self._clock() + self._every_s
+            self.say("WATCHDOG=1")
+
+
+class ProgressThread:
+    """Report progress from a thread of its own, so that a blocked terminal does not delay a run.
+
+    Args:
+        current: Returns the progress; None before the first sample.
+        on_progress: Called with it; may block.
+        on_error: Called once with the error of ``on_progress``, which is not called any more.
+    """
+
+    def __init__(
+        self,
+        current: Callable[[], Progress | None],
+        on_progress: Callable[[Progress], None],
+        on_error: Callable[[str], None],
+    ) -> None:
+        self._current, self._on_progress, self._on_error = current, on_progress, on_error
+        self._ending = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="progress", daemon=True)
+
+    def start(self) -> None:
+        """Start the thread."""
+        self._thread.start()
+
+    def end(self) -> None:
+        """Report once more; wait only briefly for a blocked terminal."""
+        self._ending.set()
+        self._thread.join(_LAST_SHOWN_S)
+
+    def _run(self) -> None:
+        try:
+            while not self._ending.wait(_SHOWN_EVERY_S):
+                self._show()
+            self._show()
+        except Exception as error:  # noqa: BLE001  whoever shows a run must not end it
+            self._on_error(f"progress is not shown any more: {type(error).__name__}: {error}")
+
+    def _show(self) -> None:
+        if (progress := self._current()) is not None:
+            self._on_progress(progress)
+
+
+class RunMonitor:
+    """Watch a run from the supervisor's main thread: heartbeat, stop requests, outcome.
+
+    It covers the time from the start signal to the closed recording. It does no file input or
+    output, and never waits for a thread that does.
+
+    Args:
+        checked: The experiment.
+        ring: Its ring.
+        child: Its loop.
+        safety: Watches guardian and loop.
+        recording: Records from the ring.
+    """
+
+    def __init__(
+        self,
+        checked: Checked,
+        ring: SampleRing,
+        child: LoopProcess,
+        safety: Safety,
+        recording: RingRecorder,
+    ) -> None:
+        self._config, self._forecast = checked.loaded.config, checked.forecast
+        self._page, self._child = ring.page, child
+        self._safety, self._recording = safety, recording
+        self.outcome: Outcome | None = None
+        """How the run ended; None until the output is safe or nothing more can be done."""
+        self.broke = ""
+        """Error of the supervisor itself; empty if there was none."""
+
+    def attend(self, stop_signal: int) -> bool:
+        """Write the heartbeat, pass stops on, update safety; return whether the run is active.
+
+        Args:
+            stop_signal: Number of the signal that stops the run, or 0.
+        """
+        # Asked first: of a loop that has ended, nothing can come after that.
+        ended = self._child.ended
+        now_ns = time.monotonic_ns()
+        self._page.put(Field.SUPERVISOR_HEARTBEAT_NS, now_ns)
+        self._pass_stop_on(stop_signal)
+        if self.outcome is None:
+            self._safety.update(now_ns, ended=ended)
+            # The safe value comes before the samples, which wait in memory.
+            self._conclude(ended=ended)
+        return not self._recording.finished
+
+    def break_off(self, error: Exception) -> None:
+        """Stop the loop by its safe ramp because the supervisor failed."""
+        self.broke = self.broke or f"{type(error).__name__}: {error}"
+        text = f"the supervisor broke: {self.broke}"
+        sample = self._page.get(Field.NEXT_SAMPLE)
+        self._recording.record_event(Event(sample, "error", "supervisor_broke", text))
+
+    def progress(self) -> Progress | None:
+        """Return the progress; None before the first sample."""
+        if (newest := self._recording.newest) is None:
+            return None
+        return Progress(
+            samples=self._recording.recorder.samples,
+            total=self._forecast.samples,
+            late_ticks=self._page.get(Field.LATE_TICKS),
+            compensated=self._config.compensator is not None,
+            batch=newest,
+        )
+
+    def progress_failed(self, text: str) -> None:
+        """Record that progress is not reported any more."""
+        sample = self._page.get(Field.NEXT_SAMPLE)
+        self._recording.record_event(Event(sample, "warning", "progress_failed", text))
+
+    def _conclude(self, *, ended: bool) -> None:
+        result, said = self._safety.result, self._page.outcome() if ended else None
+        if result is None:
+            # Without a safe end, guardian or supervisor still has to act.
+            self.outcome = said if self._page.ended_safely() else None
+        else:
+            hung = "the loop process hung, and was killed"
+            reason = hung if result.hung else said.reason if said else self._child.death()
+            if self._safety.by == "guardian" and result.confirmed:
+                reason += "; the guardian set the output to its safe value"
+            if not result.confirmed:
+                reason += f"; {describe(result.output, result.error)}"
+            last = said or Outcome("fault", "", 0, "unknown", 0)
+            self.outcome = replace(last, code="fault", reason=reason, output=result.output)
+        if self.outcome is not None:
+            self._recording.end(self.outcome, lost_loop=result is not None and said is None)
+
+    def _pass_stop_on(self, stop_signal: int) -> None:
+        page = self._page
+        must_record = self._config.recording.on_failure == "stop"
+        if stop_signal:
+            page.put(Field.STOP, STOPS[signal.Signals(stop_signal)])
+        elif self.broke:
+            page.put(Field.STOP, Stop.SUPERVISOR_BROKE)
+        elif must_record and self._recording.stalled_s() > self._config.recording.ring_s / 2.0:
+            # Not at the first error: while the ring is less than half full, a retry loses nothing.
+            failed = bool(self._recording.recorder.error)
+            page.put(Field.STOP, Stop.RECORDER_FAILED if failed else Stop.RECORDER_STALLED)
 
 
 def _stay(number: int, frame: FrameType | None) -> None:
@@ -50,7 +241,7 @@ def _stay(number: int, frame: FrameType | None) -> None:
 
 
 class Supervisor:
-    """Runs one checked experiment into one recording.
+    """Run one checked experiment into one recording.
 
     Args:
         checked: The experiment.
@@ -72,7 +263,7 @@ class Supervisor:
         self._output = output
         self._overwrite = overwrite
         self._on_progress = on_progress
-        self._notifier = Notifier()
+        self._notifier = SystemdNotifier()
         self._stop_signal = self._stops = 0
 
     def run(self) -> RunResult:
@@ -105,12 +296,13 @@ class Supervisor:
                 recording = RingRecorder(ring, recorder, config.recording.flush_s)
                 requests = Requests(self._checked, folder, ring.page, recording)
                 server = stack.enter_context(ControlServer(folder.socket, requests.answer))
-                child = LoopChild(self._checked, folder, ring, locks + own, self._silence_s)
+                self._write_job(folder)
                 # Open to the end: watchers find it even if the folder is removed.
                 stack.enter_context(folder.description.open("rb"))
+                child = LoopProcess(folder, ring.page, locks + own)
                 run = folder, ring, child, recording
                 safety, start_ns = self._start(stack, *run, locks + own)
-                started = StartedRun(self._checked, ring, child, safety, recording)
+                started = RunMonitor(self._checked, ring, child, safety, recording)
             except BaseException:
                 if recorder is not None:
                     recorder.give_back()
@@ -131,7 +323,7 @@ class Supervisor:
         stack: ExitStack,
         folder: RunFolder,
         ring: SampleRing,
-        child: LoopChild,
+        child: LoopProcess,
         recording: RingRecorder,
         locks: list[int],
     ) -> tuple[Safety, int]:
@@ -143,12 +335,12 @@ class Supervisor:
         page, checked = ring.page, self._checked
         safety = None
         try:
-            guardian = guardian_starter(checked, folder, ring, child.pid, locks)
+            simulated = checked.loaded.device.info.simulated  # needs no guardian
+            guardian = None if simulated else partial(GuardianProcess, folder, page, locks)
             safety = Safety(checked, ring, child, guardian, recording.record_event)
             child.await_ready(lambda: self._stop_signal != 0)
             # It is started after the loop, to watch its process, and ready long before it.
             self._await_guardian(safety)
-            ProcessMemory().stay_small()  # all is compiled
             start_ns = self._begin(recording.recorder, page)
             # Before there are threads: all that share the interpreter with this one come along.
             stack.enter_context(favoured(child.pid))
@@ -195,7 +387,7 @@ class Supervisor:
             "nothing has moved"
         )
 
-    def _attend(self, started: StartedRun, server: ControlServer) -> None:
+    def _attend(self, started: RunMonitor, server: ControlServer) -> None:
         """See to a run until its recording is closed, whatever goes wrong meanwhile."""
         shown: ProgressThread | None = None
         try:
@@ -213,7 +405,7 @@ class Supervisor:
         if shown is not None:
             shown.end()
 
-    def _attend_only(self, started: StartedRun) -> None:
+    def _attend_only(self, started: RunMonitor) -> None:
         """See to a run without what may have broken: no requests, display or service manager."""
         while True:
             try:
@@ -254,6 +446,12 @@ class Supervisor:
                 if handler is not None:  # one that is not Python's can't be set again
                     signal.signal(number, handler)
 
+    def _write_job(self, folder: RunFolder) -> None:
+        """Write what the loop process, the guardian and watchers read."""
+        job = Job.of(self._checked, folder, supervisor=os.getpid(), silence_s=self._silence_s)
+        job.write(folder.job)
+        RunDescription.of(self._checked).write(folder.description)
+
     def _make_ring(self, folder: RunFolder) -> SampleRing:
         config, info = self._config, self._checked.loaded.device.info
         try:
@@ -270,7 +468,7 @@ class Supervisor:
 
     def _result(
         self,
-        started: StartedRun,
+        started: RunMonitor,
         recorder: Recorder,
         ring: SampleRing,
         folder: RunFolder,

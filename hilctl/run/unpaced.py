@@ -20,11 +20,10 @@ from hilctl.loop.host import Tuning
 from hilctl.loop.loop import Loop
 from hilctl.loop.pacer import Lateness
 from hilctl.loop.plan import Outcome, Plan
-from hilctl.run.assemble import assemble
+from hilctl.run.assemble import assemble, starting_output
 from hilctl.run.metadata import end_facts
 from hilctl.run.recorder import Recorder
 from hilctl.run.result import RunResult
-from hilctl.run.starting import starting_output
 
 _BLOCKS_A_BATCH = 256
 

@@ -22,7 +22,7 @@ from hilctl.experiment.load import LoadedExperiment, load_experiment
 from hilctl.loop.pacer import SystemClock
 from hilctl.machine.realtime import prepare
 from hilctl.machine.settings import Realtime
-from hilctl.run import carried_out
+from hilctl.run import loop_process
 from hilctl.run.job import Job
 from hilctl.run.ring import SampleRing
 from hilctl.run.run_folder import RunCard, RunFolder
@@ -78,13 +78,13 @@ def ticks_us(options: argparse.Namespace, model: Path) -> tuple[np.ndarray, np.n
     TimedClock.woke.clear()
     config = checked.loaded.config
     slots = options.ticks + 10 * round(config.safe.ramp_s * options.rate)
-    carried_out.SystemClock = TimedClock  # type: ignore[misc]
+    loop_process.SystemClock = TimedClock  # type: ignore[misc]
     with tempfile.TemporaryDirectory(prefix="hilctl-", dir=memory_folder()) as name:
         folder = RunFolder(Path(name), RunCard("tick", "tick", "", os.getpid(), 0.0))
         ring = SampleRing.create(folder.ring, slots=slots, block=1, state_size=checked.state_size)
         work = job(folder, checked)
         threading.Thread(target=start, args=(ring.page,), daemon=True).start()
-        outcome = carried_out.run_job(work, ring, work.parts())
+        outcome = loop_process.run_job(work, ring)
         heads = [batch.heads for batch in ring.batches()]
     if outcome.code != "completed" or not heads:
         sys.exit(f"the run ended as {outcome.code}: {outcome.reason}")

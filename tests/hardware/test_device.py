@@ -28,8 +28,8 @@ from hilctl.base.errors import DeviceError
 from hilctl.experiment.load import LoadedExperiment, load_experiment
 from hilctl.loop.limiter import CommandLimits, Limiter
 from hilctl.loop.pacer import SystemClock
+from hilctl.run.assemble import starting_output
 from hilctl.run.probe import probe
-from hilctl.run.starting import starting_output
 
 SHARE = 0.1
 HOLD_S = 0.3

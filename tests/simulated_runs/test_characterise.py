@@ -13,8 +13,7 @@ import pytest
 from hilctl.analysis.report import summarize
 from hilctl.characterise.session import Campaign, CampaignHost
 from hilctl.recording.reader import read
-from hilctl.run.start import checked_experiment
-from hilctl.run.step import unpaced
+from hilctl.run.start import checked_experiment, unpaced
 from hilctl.run.unpaced import run_unpaced
 
 CONFIGS = Path(__file__).parents[2] / "configs"

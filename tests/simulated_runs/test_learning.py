@@ -18,8 +18,7 @@ from hilctl.models.files import dump_model, load_model
 from hilctl.models.staged import FieldLag, StagedModel
 from hilctl.models.structure import Structure
 from hilctl.recording.reader import read
-from hilctl.run.start import checked_experiment, start_run
-from hilctl.run.step import paced, unpaced
+from hilctl.run.start import checked_experiment, paced, start_run, unpaced
 from hilctl.run.unpaced import run_unpaced
 
 CONFIGS = Path(__file__).parents[2] / "configs"

@@ -13,7 +13,6 @@ WITHOUT = {
     "cli/options": "types of options; cli/test_commands.py loads every command that has them",
     "drivers/contract": "the checks of tests/contract; test_bad_devices.py makes each of them fail",
     "drivers/emulator/wire": "a contract and a record; drivers/emulator/test_server.py uses both",
-    "experiment/run_parts": "a contract; run/test_carried_out.py runs what keeps it",
     "loop/host": "a contract and a record; loop/test_loop.py runs the loop on a double of it",
     "loop/plan": "two records of plain values; loop/test_loop.py fills and reads all of them",
     "recording/facts": "names; analysis/test_catalogue.py reads all of them",

@@ -16,7 +16,7 @@ from hilctl.campaign.folder import (
     standing_runs,
 )
 from hilctl.experiment.check import check
-from hilctl.run.step import RunKey
+from hilctl.run.start import RunKey
 from hilctl.run.unpaced import run_unpaced
 from tests.unit.campaign.conftest import CAMPAIGN
 

@@ -16,7 +16,7 @@ from hilctl.campaign.session import (
     run_series,
 )
 from hilctl.recording.reader import read
-from hilctl.run.step import unpaced
+from hilctl.run.start import unpaced
 from tests.unit.campaign.conftest import CAMPAIGN
 
 BUDGET = "set: {limits.rms_current_a: 0.9, limits.thermal_time_constant_s: 3.0}\n"
@@ -116,7 +116,7 @@ def test_a_failed_step_is_marked_and_the_rest_goes_on(run, monkeypatch):
 
 
 def _but(name):
-    from hilctl.run.step import completed_key
+    from hilctl.run.start import completed_key
 
     return lambda path: None if path.name == name else completed_key(path)
 

@@ -19,7 +19,7 @@ from hilctl.characterise.session import (
 from hilctl.characterise.steps import STEPS
 from hilctl.characterise.waveforms import biased_loops
 from hilctl.experiment.load import load_experiment
-from hilctl.run.step import StepStoppedError, unpaced
+from hilctl.run.start import StepStoppedError, unpaced
 
 FEW = ("rest", "polarity", "growing-1", "growing-2")
 SHORT = tuple(step for step in STEPS if step.name.startswith(FEW))

@@ -17,7 +17,7 @@ from hilctl.cli.characterise import (
     print_plan,
     print_step,
 )
-from hilctl.run.step import StepStoppedError, paced, unpaced
+from hilctl.run.start import StepStoppedError, paced, unpaced
 from tests.unit.characterise.conftest import experiment, limits, limits_with
 from tests.unit.characterise.test_results import FOUND, identification
 

@@ -12,7 +12,7 @@ from hilctl.base.samples import Batch, Head
 from hilctl.desk.feed import EDGES_US, ErrorSpectrum, LatenessCounts, RunFeed
 from hilctl.desk.signals import ROW, SIGNALS, Traces
 from hilctl.loop.plan import Outcome
-from hilctl.run.description import RunDescription
+from hilctl.run.metadata import RunDescription
 from hilctl.run.ring import SampleRing
 from hilctl.run.run_folder import run_folder
 from hilctl.run.shared_page import Field, Phase, Stop

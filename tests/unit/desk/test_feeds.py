@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from hilctl.desk.feeds import RunFeeds
-from hilctl.run.description import RunDescription
+from hilctl.run.metadata import RunDescription
 from hilctl.run.ring import SampleRing
 from hilctl.run.run_folder import run_folder
 from hilctl.run.start import checked_experiment

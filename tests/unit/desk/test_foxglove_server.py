@@ -20,7 +20,7 @@ from websockets.asyncio.client import connect
 from hilctl.base.errors import InputError, RunError
 from hilctl.base.samples import Head
 from hilctl.desk.foxglove_server import FoxgloveServer
-from hilctl.run.description import RunDescription
+from hilctl.run.metadata import RunDescription
 from hilctl.run.ring import SampleRing
 from hilctl.run.run_folder import run_folder
 from hilctl.run.shared_page import Field, Phase

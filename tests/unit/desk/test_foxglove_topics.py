@@ -18,7 +18,7 @@ from hilctl.desk.foxglove_topics import (
     LiveTopics,
 )
 from hilctl.recording.schema import TOPICS, message_class
-from hilctl.run.description import RunDescription
+from hilctl.run.metadata import RunDescription
 from hilctl.run.ring import SampleRing
 from hilctl.run.run_folder import run_folder
 from hilctl.run.shared_page import Field, Phase

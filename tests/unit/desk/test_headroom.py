@@ -8,7 +8,7 @@ import pytest
 
 from hilctl.desk.headroom import Gauge, Headroom
 from hilctl.desk.signals import ROW, SIGNALS, Traces
-from hilctl.run.description import RunDescription
+from hilctl.run.metadata import RunDescription
 from hilctl.run.start import checked_experiment
 
 DEMO = Path(__file__).parents[3] / "configs" / "demo.yaml"

@@ -15,7 +15,7 @@ from hilctl.base.errors import RunError
 from hilctl.desk import server as module
 from hilctl.desk.admission import MOST_PENDING
 from hilctl.desk.server import FILES, LiveServer, file_response
-from hilctl.run.description import RunDescription
+from hilctl.run.metadata import RunDescription
 from hilctl.run.ring import SampleRing
 from hilctl.run.run_folder import run_folder
 from hilctl.run.shared_page import Field, Phase

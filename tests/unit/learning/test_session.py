@@ -9,8 +9,7 @@ from hilctl.base.errors import ConfigError, InputError, RunError
 from hilctl.experiment.correction import load_correction
 from hilctl.learning.session import HIGHEST_PART, Session, beginning, repeating
 from hilctl.run.result import RunResult
-from hilctl.run.start import checked_experiment
-from hilctl.run.step import unpaced
+from hilctl.run.start import checked_experiment, unpaced
 
 SINE = Path(__file__).parents[3] / "configs" / "terfenol_sine_6a.yaml"
 SETTINGS = ["waveform.frequency_hz=250", "waveform.duration_s=0.4681", "device.seed=40"]

@@ -7,7 +7,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from hilctl.run.assemble import assemble
+from hilctl.base.device import DeviceInfo
+from hilctl.base.errors import DeviceError, InputError
+from hilctl.run.assemble import assemble, starting_output
 from hilctl.run.start import checked_experiment
 
 CONFIGS = Path(__file__).parents[3] / "configs"
@@ -71,3 +73,48 @@ def test_the_compensator_starts_from_the_memory_that_was_given():
     state[0] += 0.25
     np.testing.assert_array_equal(planned(loaded, state).compensator.state(), state)
     np.testing.assert_array_equal(planned(loaded).compensator.state(), rest.state())
+
+
+INFO = DeviceInfo("rig", "a rig", "A", -10.0, 10.0, -75.0, 75.0, 1e3)
+
+
+def device(output):
+    return SimpleNamespace(info=INFO, output=lambda: output)
+
+
+@pytest.mark.parametrize("output", [-10.0, -7.0, 0.0, 10.0])
+@pytest.mark.parametrize("at_start", [None, 3.0])
+def test_what_the_device_says_goes_first(output, at_start):
+    assert starting_output(device(output), at_start) == output
+
+
+def test_what_is_vouched_for_stands_in_for_what_is_not_known():
+    assert starting_output(device(None), 3.0) == 3.0
+
+
+def test_an_unknown_output_is_refused_by_the_key_that_would_say_it():
+    with pytest.raises(InputError) as caught:
+        starting_output(device(None), None)
+    assert str(caught.value).startswith("safe.at_start: is required: rig can't tell what it puts")
+    assert str(caught.value).endswith("give it in A; nothing has moved")
+
+
+@pytest.mark.parametrize("output", [10.1, -10.1, float("nan"), float("inf")])
+def test_an_output_that_no_command_gives_is_refused(output):
+    with pytest.raises(InputError, match=r"rig: puts out .* A, which is not within .* -10 to 10 A"):
+        starting_output(device(output), None)
+
+
+@pytest.mark.parametrize("output", [10.00001, -10.00001])
+def test_a_rounded_end_of_the_range_is_the_end(output):
+    """A command beyond it would be refused by the device."""
+    assert starting_output(device(output), None) == pytest.approx(output)
+    assert abs(starting_output(device(output), None)) == 10.0
+
+
+def test_a_device_that_does_not_answer_is_no_refusal():
+    def silent():
+        raise DeviceError("no answer")
+
+    with pytest.raises(DeviceError, match="no answer"):
+        starting_output(SimpleNamespace(info=INFO, output=silent), 0.0)

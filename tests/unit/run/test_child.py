@@ -2,13 +2,14 @@
 
 import signal
 import subprocess
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
 from hilctl.base.errors import InputError, RunError
 from hilctl.run import child as module
-from hilctl.run.child import LoopChild
+from hilctl.run.child import LoopProcess
 from hilctl.run.ring import SampleRing
 from hilctl.run.shared_page import Field, PageText, Phase
 
@@ -29,16 +30,13 @@ def started(tmp_path, monkeypatch):
     """A child that was started, and its page."""
     process = FakeProcess()
 
-    def give(job, inherits):
-        process.job, process.inherits = job, inherits
+    def start_process(*words, inherits):
+        process.words, process.inherits = words, inherits
         return process
 
-    monkeypatch.setattr(module, "taken", lambda: SimpleNamespace(give=give))
-    monkeypatch.setattr(
-        module.Job, "of", lambda *a, **k: SimpleNamespace(to_bytes=lambda: b"a job")
-    )
+    monkeypatch.setattr(module, "start_process", start_process)
     ring = SampleRing.create(tmp_path / "ring", slots=4, block=1, state_size=1)
-    return LoopChild(None, None, ring, (5, 6), 1.0), ring.page
+    return LoopProcess(SimpleNamespace(job=Path("job")), ring.page, (5, 6)), ring.page
 
 
 def never():
@@ -47,8 +45,17 @@ def never():
 
 def test_the_job_is_given_with_the_locks(started):
     process = started[0]._process
-    assert process.job == b"a job"
+    assert process.words == ("hilctl.run.loop_process", "job")
     assert process.inherits == (5, 6)
+
+
+def test_a_loop_process_that_cannot_be_started_is_an_error_of_the_run(tmp_path, monkeypatch):
+    def start_process(*words, inherits):
+        raise OSError(24, "Too many open files")
+
+    monkeypatch.setattr(module, "start_process", start_process)
+    with pytest.raises(RunError, match="Too many open files"):
+        LoopProcess(SimpleNamespace(job=Path("job")), None, ())
 
 
 @pytest.mark.parametrize(

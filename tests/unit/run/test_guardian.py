@@ -15,16 +15,35 @@ import pytest
 
 from hilctl.base.errors import DeviceError
 from hilctl.loop.plan import Outcome
+from hilctl.loop.safe_output import SafeGoal
 from hilctl.run import guardian
-from hilctl.run.guardian import LAST_CALL_MS, Guardian, GuardianJob, main
-from hilctl.run.hang_watch import SilenceLimits
+from hilctl.run.guardian import LAST_CALL_MS, Guardian, HangWatch, SafeAction, is_stopped, main
+from hilctl.run.job import Job, SilenceLimits
 from hilctl.run.ring import SampleRing
-from hilctl.run.safe_action import SafeAction
-from hilctl.run.shared_page import Field, GuardianPhase, PageText, Phase, SharedPage
+from hilctl.run.shared_page import (
+    Field,
+    GuardianPhase,
+    PageText,
+    Phase,
+    SafeActionResult,
+    SharedPage,
+)
 
 SLEEP = [sys.executable, "-c", "import time; time.sleep(600)"]
 DESCRIPTORS = Path("/proc/self/fd")
 IGNORED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+JOB_LIMITS = SilenceLimits(1.0, 1.0, 1.0, 1.0)
+
+
+def job_of(experiment, *, ring="", limits=JOB_LIMITS):
+    """Return a job with what a guardian needs of it."""
+    return Job(
+        experiment=experiment, files={}, folder="", ring=ring, reference="", input_um="",
+        state=None, heat_a2=0.0, stands_um=None, adapted=None, safe_value=0.25, ramp_per_s=50.0,
+        limits=limits, supervisor=2, silence_s=1.0, safe_priority=7,
+    )  # fmt: skip
 
 
 class Device:
@@ -61,8 +80,7 @@ def guarded(tmp_path, monkeypatch):
 
     def guard(hang_s=60.0):
         limits = SilenceLimits(hang_s, hang_s, 60.0, hang_s)
-        job = GuardianJob("", {}, "", "", 0.25, 50.0, limits, loop.pid, 1, 1)
-        return Guardian(ring, made.device, job, pidfd).watch()
+        return Guardian(ring, made.device, job_of("", limits=limits), pidfd, loop.pid).watch()
 
     made.guard = guard
     yield made
@@ -261,11 +279,8 @@ def written(tmp_path):
     before = {number: signal.getsignal(number) for number in IGNORED}
 
     def call(experiment, loop=0):
-        limits = SilenceLimits(1.0, 1.0, 1.0, 1.0)
-        job = GuardianJob(experiment, {}, "", str(ring), 0.25, 50.0, limits, 1, 2, 7)
-        assert GuardianJob.from_json(job.to_json()) == job
-        (tmp_path / "job").write_text(job.to_json(), encoding="utf-8")
-        return main([str(tmp_path / "job"), str(loop)])
+        job_of(experiment, ring=str(ring)).write(tmp_path / "job")
+        return main([str(tmp_path / "job"), str(loop), "1"])
 
     yield SimpleNamespace(call=call, page=page)
     for number, handler in before.items():
@@ -289,16 +304,14 @@ def test_a_device_that_has_no_memory_is_said_before_the_start(written, monkeypat
     def device(_job):
         raise MemoryError
 
-    monkeypatch.setattr(GuardianJob, "device", device)
+    monkeypatch.setattr(Job, "device", device)
     assert written.call("device: {kind: simulated_terfenol}") == 1
     assert written.page.get(Field.GUARDIAN_PHASE) == GuardianPhase.FAILED
     assert written.page.read_text(PageText.GUARDIAN) == "not enough memory"
 
 
 def test_the_device_is_made_of_the_experiment_alone():
-    limits = SilenceLimits(1.0, 1.0, 1.0, 1.0)
-    job = GuardianJob("device: {kind: simulated_terfenol}", {}, "", "", 0.0, 1.0, limits, 1, 1, 1)
-    assert job.device().info.simulated
+    assert job_of("device: {kind: simulated_terfenol}").device().info.simulated
 
 
 @pytest.mark.parametrize("limit", [None, 65536])
@@ -308,18 +321,18 @@ def test_it_prepares_for_a_machine_that_does_nothing_else(written, guarded, monk
     process = SimpleNamespace(
         freeze_gc=lambda: done.append("frozen"),
         lockable_bytes=lambda: limit,
-        lock_memory=lambda: done.append("locked"),
+        lock_memory=lambda *, untouched: done.append(f"locked {untouched}"),
         set_fifo=lambda priority: done.append((priority, threading.current_thread().name)),
     )
     monkeypatch.setattr(guardian, "LinuxProcess", lambda: process)
-    monkeypatch.setattr(GuardianJob, "device", lambda job: guarded.device)
+    monkeypatch.setattr(Job, "device", lambda job: guarded.device)
     written.page.put(Field.GO, 1)
     written.page.put_float(Field.OUTPUT_AT_START, 0.25)
     written.page.put(Field.PHASE, Phase.RUNNING)
     guarded.loop.kill()
     assert written.call("", guarded.pidfd) == 0
     assert guarded.device.asked == [(0.25, False)]
-    locked = ["locked"] if limit is None else []
+    locked = ["locked True"] if limit is None else []
     assert done == ["frozen", *locked, (7, "MainThread"), (7, "safe action")]
     for number in (signal.SIGINT, signal.SIGHUP):  # SIGTERM ends an action that goes on
         assert signal.getsignal(number) == signal.SIG_IGN
@@ -327,7 +340,7 @@ def test_it_prepares_for_a_machine_that_does_nothing_else(written, guarded, monk
 
 
 def test_refused_real_time_is_no_reason_to_leave_the_coil(written, guarded, monkeypatch):
-    def refuse(*_):
+    def refuse(*_, **_named):
         raise OSError(1, "Operation not permitted")
 
     process = SimpleNamespace(
@@ -346,3 +359,167 @@ def test_it_brings_no_numba_along():
         "sys.exit(any(name in sys.modules for name in ('numba', 'scipy', 'mcap')))"
     )
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0
+
+
+LIMITS = SilenceLimits(real_time_s=1.0, ordinary_s=1.6, exchange_s=2.0, stopped_s=0.4)
+
+
+class Watched:
+    """A page with a heartbeat, and who watches it."""
+
+    def __init__(self, folder):
+        self.page = SampleRing.create(folder / "ring", slots=4, block=1, state_size=1).page
+        self.page.put(Field.PHASE, Phase.RUNNING)
+        self.page.put(Field.LOOP_HEARTBEAT_NS, 1)
+        self.page.put(Field.REAL_TIME, 1)
+        self.stopped = False
+        self.watch = HangWatch(self.page, LIMITS, lambda: self.stopped)
+
+    def looks(self, *times_s):
+        return [self.watch.hangs(round(time_s * 1e9)) for time_s in times_s]
+
+    def hangs_after_s(self):
+        """Look every 0.1 s; return the time of the first look that finds a hang."""
+        return next(k / 10 for k in range(1000) if self.watch.hangs(round(k * 1e8)))
+
+
+@pytest.fixture
+def watched(tmp_path):
+    return Watched(tmp_path)
+
+
+def test_silence_beyond_the_limit_is_a_hang(watched):
+    """A heartbeat that stands still for longer than the limit is found, and not before."""
+    assert watched.looks(*[0.1 * k for k in range(13)]) == [False] * 11 + [True] * 2
+
+
+def test_without_real_time_priority_a_busy_machine_may_keep_the_loop_waiting(watched):
+    watched.page.put(Field.REAL_TIME, 0)
+    assert watched.hangs_after_s() == 1.7
+
+
+def test_heartbeat_starts_the_time_again(watched):
+    """Any new sign of life will do."""
+    assert not any(watched.looks(*[0.1 * k for k in range(10)]))
+    watched.page.put(Field.LOOP_HEARTBEAT_NS, 2)
+    assert not any(watched.looks(*[0.9 + 0.1 * k for k in range(10)]))
+
+
+def test_machine_that_stood_still_is_no_hang(watched):
+    """A long pause of both processes is not held against the loop."""
+    assert not any(watched.looks(0.0, 0.1, 30.0, 30.02))
+
+
+def test_loop_that_does_not_run_yet_or_any_more_does_not_hang(watched):
+    """Opening and closing a device may take its time."""
+    for phase in (Phase.STARTING, Phase.READY, Phase.ENDED, Phase.FAILED):
+        watched.page.put(Field.PHASE, phase)
+        assert not any(watched.looks(*[0.5 * k for k in range(20)]))
+
+
+def test_a_device_that_keeps_the_loop_waiting_is_no_hang_at_once(watched):
+    """An exchange may use up the device's time-out; for that long the loop is silent."""
+    watched.page.put(Field.EXCHANGING, 1)
+    assert watched.hangs_after_s() == 3.1
+
+
+@pytest.mark.parametrize("phase", [Phase.RUNNING, Phase.CLOSING])
+@pytest.mark.parametrize("exchanging", [0, 1])
+def test_a_loop_that_is_stopped_waits_for_no_device(watched, phase, exchanging):
+    """SIGSTOP hits most loops in an exchange: its time-out is no excuse then, nor is the load."""
+    watched.page.put(Field.EXCHANGING, exchanging)
+    watched.page.put(Field.PHASE, phase)
+    watched.stopped = True
+    assert watched.hangs_after_s() == 0.5
+
+
+def test_a_stop_is_looked_at_several_times(watched):
+    """Where all processes were stopped and go on, this one may be the first of them."""
+    watched.stopped = True
+    assert watched.looks(0.0, 5.0, 5.1, 5.2, 5.3) == [False, False, False, False, True]
+
+
+def test_closing_a_device_has_more_time(watched):
+    """A device that is lost may use up its time-outs, but not for ever."""
+    watched.page.put(Field.PHASE, Phase.CLOSING)
+    assert watched.hangs_after_s() == pytest.approx(31.0, abs=0.11)
+
+
+def test_a_loop_that_never_comes_to_its_first_tick_is_found(watched):
+    """Nothing has moved until then, so that it gets more time: from the first look on."""
+    watched.page.put(Field.LOOP_HEARTBEAT_NS, 0)
+    assert not any(watched.looks(*[9e5 + 0.1 * k for k in range(310)]))
+    assert watched.looks(9e5 + 31.2) == [True]
+
+
+def test_the_kernel_says_whether_a_process_is_stopped():
+    """Whatever its program is called; one that is gone is not stopped."""
+    code = (
+        "import ctypes, os, signal; ctypes.CDLL(None).prctl(15, b') T ('); "
+        "os.kill(os.getpid(), signal.SIGSTOP)"
+    )
+    process = subprocess.Popen([sys.executable, "-c", code])
+    os.waitid(os.P_PID, process.pid, os.WSTOPPED)
+    assert is_stopped(process.pid)
+    assert not is_stopped(os.getpid())
+    process.kill()
+    process.wait()
+    assert is_stopped(process.pid) is False
+
+
+GOAL = SafeGoal(0.5, 1.0, None, pending=False)
+
+
+@pytest.fixture
+def act(tmp_path):
+    """Return a function that starts a safe action."""
+    page = SampleRing.create(tmp_path / "ring", slots=4, block=1, state_size=1).page
+
+    def start(make_safe, **changes):
+        device = SimpleNamespace(make_safe=make_safe)
+        action = SafeAction(page, device, GOAL, **{"hung": False, **changes})
+        action.page = page
+        return action
+
+    return start
+
+
+def test_the_caller_is_not_blocked(act):
+    go_on, asked = threading.Event(), []
+
+    def make_safe(value):
+        go_on.wait(30.0)
+        asked.append(value)
+
+    action = act(make_safe, hung=True, prepare=lambda: asked.append("prepared"))
+    assert not action.result().final
+    assert action._thread.daemon  # nor does it keep the process from ending
+    go_on.set()
+    assert action.result(30.0) == SafeActionResult(hung=True, output="confirmed")
+    assert asked == ["prepared", 0.5]
+    assert action.page.last_safe_write() == 0.5
+
+
+def test_an_action_goes_on_until_it_is_ended(act):
+    asked = threading.Event()
+
+    def make_safe(value):
+        asked.set()
+        raise DeviceError("no answer")
+
+    action = act(make_safe)
+    assert asked.wait(30.0)
+    assert action.end(30.0)
+    assert (action.result().output, action.result().error) == ("unknown", "no answer")
+    assert not action.result().final
+
+
+@pytest.mark.parametrize("error", [KeyError("x"), MemoryError()])
+def test_a_failure_of_this_process_is_no_answer_of_the_device(act, error):
+    def make_safe(value):
+        raise error
+
+    action = act(make_safe)
+    action.result(30.0)
+    assert type(error).__name__ in action.failed
+    assert not action.result().final

@@ -1,16 +1,22 @@
-"""What the supervisor hands to the loop's process: the same experiment, and nothing from disk."""
+"""The job: the loop process gets the experiment that was checked, to the last bit."""
 
+import math
 import shutil
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from hilctl.base.errors import RunError
-from hilctl.run.job import DeviceText, Job
+from hilctl.base.files import TextFiles
+from hilctl.base.yaml import Document
+from hilctl.experiment.load import load_experiment, resolve
+from hilctl.run.job import Job, safe_priority, silence_limits
+from hilctl.run.loop_process import loaded_of
 from hilctl.run.run_folder import run_folder
 from hilctl.run.start import checked_experiment
-from hilctl.run.waiting_loop import CHECKING, PLAIN
 
 CONFIGS = Path(__file__).parents[3] / "configs"
 
@@ -29,18 +35,37 @@ def test_the_job_is_what_was_checked_even_where_its_files_have_gone(folder, tmp_
     job = Job.of(checked, folder, supervisor=7, silence_s=5.0)
     shutil.rmtree(tmp_path / "models")
     (tmp_path / "demo.yaml").unlink()
-    assert folder.description.exists()  # who looks on finds it before the first sample
-    sent = job.to_bytes()
-    assert sent.startswith(PLAIN)
-    again = Job.from_bytes(sent)
-    parts = again.parts()
-    assert parts.config == checked.loaded.config
-    assert parts.model == checked.loaded.model
-    assert parts.device.info == checked.loaded.device.info
+    job.write(folder.job)
+    again = Job.read(folder.job)
+    assert again == job
+    loaded = loaded_of(again)
+    assert loaded.config == checked.loaded.config
+    assert loaded.model == checked.loaded.model
+    assert loaded.device.info == checked.loaded.device.info
     reference, input_um = again.arrays()
     np.testing.assert_array_equal(reference, checked.reference.values)
     np.testing.assert_array_equal(input_um, checked.begun.input_um)
-    assert (again.supervisor, again.silence_s, again.ring) == (7, 5.0, folder.ring)
+    assert (again.supervisor, again.silence_s, again.ring) == (7, 5.0, str(folder.ring))
+
+
+@pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.yaml")), ids=lambda path: path.stem)
+def test_an_experiment_goes_through_its_text_unchanged(path):
+    """Each shipped experiment and its model are the same values in the loop process."""
+    loaded = load_experiment(path)
+    again = resolve(
+        Document("experiment", loaded.yaml_text), loaded.folder, files=TextFiles(loaded.files.texts)
+    )
+    assert (again.config, again.model) == (loaded.config, loaded.model)
+    assert again.device.info == loaded.device.info
+
+
+def test_infinite_numbers_and_states_are_read_back(folder):
+    """A run that goes on without its recorder waits for its supervisor for ever."""
+    checked = checked_experiment(CONFIGS / "demo.yaml", ["waveform.duration_s=1.0"])
+    job = Job.of(checked, folder, supervisor=1, silence_s=math.inf)
+    job = replace(job, state=[0.1, -0.0, 1 / 3], adapted=[[math.inf, 0.1]])
+    job.write(folder.job)
+    assert Job.read(folder.job) == job
 
 
 def test_an_input_that_is_the_reference_is_kept_once(folder):
@@ -63,22 +88,32 @@ def test_samples_that_find_no_room_are_told(folder, monkeypatch):
         Job.of(plain, folder, supervisor=1, silence_s=1.0)
 
 
-@pytest.mark.parametrize("of_others", [False, True])
-def test_a_device_that_is_not_sent_is_made_from_what_was_checked(
-    folder, tmp_path, monkeypatch, of_others
-):
-    """A port that is polled stays in its process; other people's devices may count on checks."""
-    file = "demo.yaml" if of_others else "serial_cobs_fifo.yaml"
-    shutil.copytree(CONFIGS, tmp_path / "configs")
-    checked = checked_experiment(tmp_path / "configs" / file, ["waveform.duration_s=1.0"])
-    device = checked.loaded.device
-    if of_others:
-        monkeypatch.setattr(type(device), "__module__", "a_lab.rig")
-    job = Job.of(checked, folder, supervisor=1, silence_s=1.0)
-    shutil.rmtree(tmp_path / "configs")
-    assert isinstance(job.device, DeviceText)
-    sent = job.to_bytes()
-    assert sent.startswith(CHECKING)
-    made = Job.from_bytes(sent).parts().device
-    assert type(made) is type(device)
-    assert made.info == device.info
+def limits_of(*, hang_s=None, simulated=False):
+    info = SimpleNamespace(simulated=simulated)
+    config = SimpleNamespace(
+        timing=SimpleNamespace(hang_s=hang_s, max_late_s=1.0),
+        tick_s=0.01,
+        realtime=SimpleNamespace(priority=80),
+    )
+    loaded = SimpleNamespace(config=config, device=SimpleNamespace(info=info))
+    return SimpleNamespace(loaded=loaded)
+
+
+@pytest.mark.parametrize(
+    ("given", "simulated", "real_time_s", "ordinary_s", "stopped_s"),
+    [
+        (None, False, 0.1, 1.02, 0.04),
+        (0.5, False, 0.52, 0.52, 0.04),
+        (None, True, 1.52, 1.52, 1.52),
+    ],
+)
+def test_how_long_a_loop_may_be_silent(given, simulated, real_time_s, ordinary_s, stopped_s):
+    """Two periods, and what the experiment says; simulated coils can wait."""
+    limits = silence_limits(limits_of(hang_s=given, simulated=simulated))
+    assert (limits.real_time_s, limits.exchange_s) == (pytest.approx(real_time_s), 1.0)
+    assert limits.ordinary_s == pytest.approx(ordinary_s)
+    assert limits.stopped_s == pytest.approx(stopped_s)
+
+
+def test_who_makes_it_safe_comes_before_the_loop():
+    assert safe_priority(limits_of()) == 81

@@ -1,67 +1,289 @@
-"""The loop's process before it has a job, run in this one; and what it imports."""
+"""The loop process, run in this one: what it does with a job, and what it imports."""
 
+import json
+import math
+import os
 import signal
-import socket
 import subprocess
 import sys
+import time
+from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
-from hilctl.run import carried_out, loop_process
-from hilctl.run.waiting_loop import CHECKING
+from hilctl.base.errors import DeviceError, InputError, RunError
+from hilctl.base.samples import Flag, Head
+from hilctl.loop.compensator import Compensator
+from hilctl.loop.host import StraightLine, Tuning
+from hilctl.loop.interlocks import InterlockContext
+from hilctl.loop.limiter import CommandLimits
+from hilctl.loop.loop import Loop
+from hilctl.loop.pacer import Lateness, LateRules
+from hilctl.loop.plan import Outcome, Plan
+from hilctl.machine.realtime import SetUpStep
+from hilctl.machine.usage import ProcessUsage
+from hilctl.run import loop_process
+from hilctl.run import ring as ring_module
+from hilctl.run.job import Job
+from hilctl.run.loop_process import RingHost
+from hilctl.run.ring import SampleRing
+from hilctl.run.run_folder import RunCard, RunFolder
+from hilctl.run.shared_page import Field, PageText, Phase, Stop
+from hilctl.run.start import checked_experiment
+from tests.fakes import FakeClock, FakeDevice
+from tests.published import terfenol_rdpi
+
+EXPERIMENT = Path(__file__).parents[3] / "configs" / "demo.yaml"
 
 
-def test_a_job_is_carried_out_with_all_signals_ignored(monkeypatch):
-    """Once the kernels of every run are compiled."""
-    ignored, done = {}, []
+class Closing:
+    """A device that may refuse to be made safe."""
 
-    def carry_out(job):
-        assert job == CHECKING + b"what to do"
-        assert done == ["ordinary", "loaded"]
-        return 7
+    def __init__(self, info, *, reachable=True, output=0.0):
+        self.info, self._reachable, self._output, self.events = info, reachable, output, []
 
-    ours, theirs = socket.socketpair()
-    with ours:
-        ours.sendall(b"-" + CHECKING + b"what to do")  # without standard error, see waiting_loop
-    standard_input = SimpleNamespace(fileno=theirs.detach)
-    monkeypatch.setattr(loop_process.sys, "stdin", standard_input)
+    def open(self, sample_rate_hz, block):
+        self.events.append("open")
+
+    def output(self):
+        return self._output
+
+    def make_safe(self, command):
+        self.events.append("make_safe")
+        if not self._reachable:
+            raise DeviceError("no answer")
+
+    def close(self):
+        self.events.append("close")
+
+
+class Prepared:
+    """A job with everything it needs, a device that notes what is asked of it, and the page."""
+
+    def __init__(self, folder, monkeypatch, **device_is):
+        checked = checked_experiment(EXPERIMENT, ["waveform.duration_s=1.0"])
+        self.folder = folder = RunFolder(folder, RunCard("demo", "demo", "", 1, 0.0))
+        self.ring = SampleRing.create(
+            folder.ring, slots=16, block=50, state_size=checked.state_size
+        )
+        self.page = self.ring.page
+        self.page.put(Field.GO, 1)
+        self.job = Job.of(checked, folder, supervisor=os.getppid(), silence_s=1.0)
+        self.device = Closing(checked.loaded.device.info, **device_is)
+        self.loaded = replace(checked.loaded, device=self.device)
+        self._patch = monkeypatch
+        self.steps = ()
+        monkeypatch.setattr(loop_process, "loaded_of", lambda job: self.loaded)
+        monkeypatch.setattr(loop_process, "prepare", self._prepare)
+
+    def _prepare(self, settings):
+        assert settings is self.loaded.config.realtime
+        self.device.events.append("prepare")
+        return self.steps
+
+    def loop_does(self, run):
+        self._patch.setattr("hilctl.loop.loop.Loop.run", run)
+
+    def run(self):
+        return loop_process.run_job(self.job, self.ring)
+
+
+@pytest.fixture
+def prepared(tmp_path, monkeypatch):
+    """Return a function that makes a job; arguments are the device's."""
+    return lambda **device_is: Prepared(tmp_path, monkeypatch, **device_is)
+
+
+@pytest.fixture
+def broken(prepared):
+    """Run a job that breaks; return its device, what was raised and the page."""
+
+    def run(**device_is):
+        made = prepared(**device_is)
+        made.loop_does(lambda self, start_ns: 1 / 0)
+        with pytest.raises((ZeroDivisionError, RunError, InputError)) as caught:
+            made.run()
+        return made.device, caught.value, made.page
+
+    return run
+
+
+def test_a_loop_that_breaks_makes_the_output_safe_and_closes(broken):
+    """The error is the loop's own."""
+    device, error, page = broken(reachable=True)
+    assert device.events == ["prepare", "open", "make_safe", "close"]
+    assert isinstance(error, ZeroDivisionError)
+    assert page.get(Field.PHASE) == Phase.RUNNING
+
+
+def test_the_cause_is_not_lost_behind_a_device_that_can_not_be_reached(broken):
+    """Both are told, the cause first."""
+    device, error, _ = broken(reachable=False)
+    assert device.events[-1] == "close"
+    assert str(error).startswith("the loop broke: ZeroDivisionError")
+    assert str(error).endswith("; the safe value could not be confirmed: no answer")
+
+
+@pytest.mark.parametrize("output", [None, 99.0])
+def test_a_start_that_is_refused_moves_nothing(broken, output):
+    """Not to the safe value either, which would be the jump that the refusal is to spare."""
+    device, error, page = broken(output=output)
+    assert device.events == ["prepare", "open", "close"]
+    assert isinstance(error, InputError)
+    assert str(error).endswith("nothing has moved")
+    assert page.get(Field.PHASE) == Phase.STARTING
+
+
+@pytest.mark.parametrize(("output", "ramps"), [(0.0, False), (5.0, True)])
+def test_the_waveform_begins_after_the_ramp(broken, output, ramps):
+    """The recorder needs to know before the first sample: the page says it."""
+    _, _, page = broken(output=output)
+    assert (page.get(Field.WAVEFORM_AT) > 0) == ramps
+
+
+OUTCOME = Outcome("completed", "waveform completed", 7, "confirmed", 0)
+REFUSED = (SetUpStep("fifo", "failed", "not permitted", "raise rtprio"),)
+
+
+def test_the_loop_is_started_at_the_time_that_the_supervisor_says(prepared):
+    """It is ready with all that it set up, says so, and leaves how late it was."""
+    made = prepared()
+    made.page.put(Field.START_NS, 12345)
+    made.steps = REFUSED
+    seen = []
+
+    def run(loop, start_ns):
+        seen.append((start_ns, made.page.get(Field.PHASE)))
+        loop.lateness.late_ticks, loop.lateness.worst_ns = 3, 70
+        return OUTCOME
+
+    made.loop_does(run)
+    assert made.run() == OUTCOME
+    assert seen == [(12345, Phase.RUNNING)]
+    assert made.page.get(Field.PHASE) == Phase.CLOSING
+    assert made.device.events == ["prepare", "open", "close"]
+    assert made.page.lateness() == Lateness(late_ticks=3, worst_ns=70)
+    facts, refused = json.loads(made.page.read_text(PageText.SET_UP))
+    assert facts == {"rt.fifo": "failed: not permitted"}
+    assert refused == ["fifo: not permitted: raise rtprio"]
+
+
+@pytest.mark.parametrize("required", [False, True])
+def test_real_time_that_is_required_is_refused_before_the_device_is_opened(prepared, required):
+    made = prepared()
+    made.steps = REFUSED
+    made.loop_does(lambda loop, start_ns: OUTCOME)
+    realtime = made.loaded.config.realtime.model_copy(update={"require": required})
+    config = made.loaded.config.model_copy(update={"realtime": realtime})
+    made.loaded = replace(made.loaded, config=config)
+    if not required:
+        assert made.run() == OUTCOME
+        return
+    with pytest.raises(InputError, match="real time is required and can't be had"):
+        made.run()
+    assert made.device.events == ["prepare"]
+
+
+class Waiting:
+    """Time that the loop lets pass while it waits for the start signal."""
+
+    def __init__(self, made, supervised=True):
+        self.made, self.supervised, self.slept_s = made, supervised, []
+
+    def sleep(self, seconds):
+        assert self.made.page.get(Field.PHASE) == Phase.READY
+        self.slept_s.append(seconds)
+        if len(self.slept_s) == 3:
+            self.made.page.put(Field.GO, 1)
+
+    def __getattr__(self, name):
+        return getattr(time, name)
+
+
+def test_it_waits_for_the_start_signal(prepared, monkeypatch):
+    """Ready, and looking often: what it sleeps is missing between the signal and sample 0."""
+    made = prepared()
+    made.page.put(Field.GO, 0)
+    made.loop_does(lambda loop, start_ns: OUTCOME)
+    waiting = Waiting(made)
+    monkeypatch.setattr(loop_process, "time", waiting)
+    assert made.run() == OUTCOME
+    assert len(waiting.slept_s) == 3
+    assert max(waiting.slept_s) < 0.005
+
+
+def test_if_the_supervisor_dies_before_the_start_nothing_moves(prepared, monkeypatch):
+    """There is no recording that could say so; the output stays where it was found."""
+    made = prepared()
+    made.page.put(Field.GO, 0)
+    monkeypatch.setattr("hilctl.run.loop_process.RingHost.supervised", lambda host: False)
+    with pytest.raises(RunError, match="nothing has moved"):
+        made.run()
+    assert made.device.events == ["prepare", "open", "close"]
+
+
+def test_it_leaves_what_the_run_took_of_the_machine(prepared, monkeypatch):
+    """Of the run alone, and not of what came before it."""
+    made, counts = prepared(), iter(((50, 7, 1, 1, 1), (60, 9, 3, 1, 4)))
+    usage = SimpleNamespace(now=lambda: ProcessUsage(*next(counts)))
+    monkeypatch.setattr(loop_process, "ProcessUsage", usage)
+    made.loop_does(lambda loop, start_ns: OUTCOME)
+    assert made.run() == OUTCOME
+    assert made.page.usage() == ProcessUsage(60, 9, 3, 1, 4).since(ProcessUsage(50, 7, 1, 1, 1))
+
+
+@pytest.mark.parametrize(
+    ("raised", "code", "phase", "text"),
+    [
+        (None, 0, Phase.ENDED, ""),
+        (InputError("no such output"), 1, Phase.REFUSED, "no such output"),
+        (DeviceError("no answer"), 1, Phase.FAILED, "no answer"),
+        (RunError("then that"), 1, Phase.FAILED, "then that"),
+        (KeyError("a bug"), 1, Phase.FAILED, "the loop broke: KeyError: 'a bug'"),
+    ],
+)
+def test_all_that_it_has_to_say_is_in_the_page(prepared, monkeypatch, raised, code, phase, text):
+    """The supervisor tells by the phase what is there: an outcome, a refusal, or a fault.
+
+    A stop comes from the supervisor alone, so that the loop ends by the ramp.
+    """
+    made, signals, done = prepared(), {}, []
+
+    def run_job(job, ring):
+        assert job == made.job
+        assert done == ["ordinary"]
+        if raised is not None:
+            raise raised
+        return OUTCOME
+
+    monkeypatch.setattr(loop_process, "run_job", run_job)
     monkeypatch.setattr(loop_process, "be_ordinary", lambda: done.append("ordinary"))
-    monkeypatch.setattr(loop_process, "ensure_compiled", lambda *kernels: done.append("loaded"))
-    monkeypatch.setattr(loop_process.signal, "signal", ignored.__setitem__)
-    monkeypatch.setattr(carried_out, "carry_out", carry_out)
-    assert loop_process.main() == 7
-    # A stop comes from the supervisor alone, so that it ends by the ramp.
-    assert ignored == dict.fromkeys((signal.SIGINT, signal.SIGTERM, signal.SIGHUP), signal.SIG_IGN)
-
-
-def test_a_process_that_gets_no_job_ends_as_if_it_had_none(monkeypatch):
-    ours, theirs = socket.socketpair()
-    ours.close()
-    monkeypatch.setattr(loop_process.sys, "stdin", SimpleNamespace(fileno=theirs.detach))
-    monkeypatch.setattr(loop_process, "be_ordinary", lambda: None)
-    monkeypatch.setattr(loop_process.signal, "signal", lambda number, handler: None)
-    assert loop_process.main() == 0
+    monkeypatch.setattr(loop_process.signal, "signal", signals.__setitem__)
+    made.job.write(made.folder.job)
+    assert loop_process.main([str(made.folder.job)]) == code
+    assert signals == dict.fromkeys((signal.SIGINT, signal.SIGTERM, signal.SIGHUP), signal.SIG_IGN)
+    assert made.page.get(Field.PHASE) == phase
+    assert made.page.read_text(PageText.ERROR) == text
+    assert made.page.outcome() == (OUTCOME if code == 0 else None)
 
 
 BULKY = ("scipy.optimize", "scipy.signal", "scipy.sparse", "matplotlib", "pandas")
-LOOP = "hilctl.run.loop_process, hilctl.run.carried_out"
-OF_OTHERS = ("scipy.special", "mcap", "google.protobuf", "rich", "typer")
+OF_OTHERS = ("scipy.linalg", "scipy.special", "mcap", "google.protobuf", "rich", "typer")
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("modules", "left_out"),
     [
-        (f"{LOOP}, hilctl_drivers.modbus.device", BULKY + OF_OTHERS),
-        (
-            f"hilctl.base.plain, {LOOP}, hilctl.models.refined, hilctl_drivers.simulated.rigs",
-            (*BULKY, *OF_OTHERS, "pydantic", "pydantic_core", "hilctl.base.yaml"),
-        ),
-        ("hilctl.cli.run", BULKY),
+        ("hilctl.run.loop_process, hilctl_drivers.modbus.device", BULKY + OF_OTHERS),
+        ("hilctl.run.loop_process, hilctl_drivers.simulated.rigs", BULKY + OF_OTHERS[2:]),
+        ("hilctl.cli.run_view", BULKY),
         ("hilctl.run.client", (*BULKY, *OF_OTHERS, "numpy", "pydantic")),
     ],
-    ids=["loop", "plain loop", "supervisor", "client"],
+    ids=["loop", "simulated loop", "supervisor", "client"],
 )
 def test_it_has_nothing_that_only_others_need(modules, left_out):
     """The loop's is locked in memory; a stop is not to wait for what it does not use."""
@@ -71,3 +293,216 @@ def test_it_has_nothing_that_only_others_need(modules, left_out):
     program += f"print([name for name in {left_out} if name in sys.modules])"
     words = [sys.executable, "-P", "-c", program]
     assert subprocess.run(words, capture_output=True, text=True, check=True).stdout == "[]\n"
+
+
+SILENCE_S = 2.0
+
+
+@pytest.fixture
+def ring(tmp_path):
+    return SampleRing.create(tmp_path / "ring", slots=4, block=1, state_size=1)
+
+
+@pytest.fixture
+def clock():
+    return FakeClock(now=10_000_000_000)
+
+
+@pytest.fixture
+def host(ring, clock, monkeypatch):
+    """A host whose supervisor is process 77 and shows life at once."""
+    monkeypatch.setattr("os.getppid", lambda: 77)
+    ring.page.put(Field.SUPERVISOR_HEARTBEAT_NS, clock.now)
+    return RingHost(ring, clock, 77, SILENCE_S)
+
+
+def test_a_heartbeat_shows_time_sample_and_late_ticks(host, ring, clock):
+    assert host.heartbeat(50, 3) == ""
+    page = ring.page
+    assert page.get(Field.LOOP_HEARTBEAT_NS) == clock.now
+    assert (page.get(Field.NEXT_SAMPLE), page.get(Field.LATE_TICKS)) == (50, 3)
+
+
+def test_each_reason_to_end_is_said(host, ring, clock, monkeypatch):
+    """A silent supervisor, one that died, and first of all a stop that was asked for."""
+    clock.now += int(SILENCE_S * 1e9)
+    assert host.heartbeat(0, 0) == ""
+    clock.now += 1
+    assert host.heartbeat(0, 0) == "stopped because the supervisor was silent for 2 s"
+    monkeypatch.setattr("os.getppid", lambda: 1)
+    assert host.heartbeat(0, 0) == "stopped because the supervisor died"
+    ring.page.put(Field.STOP, Stop.CTRL_C)
+    assert host.heartbeat(0, 0) == Stop.CTRL_C.reason
+
+
+def test_a_tuning_is_taken_once(host, ring):
+    """The same wish is not taken again; the next one is."""
+    page = ring.page
+    assert host.tuning() is None
+    for number, gain in enumerate((0.5, 0.75), start=1):
+        page.put_float(Field.TUNE_GAIN, gain)
+        page.put_float(Field.TUNE_OFFSET, -1.0)
+        page.put(Field.TUNE_SAMPLES, 40)
+        page.put_float(Field.TUNE_INVERSE_SHARE, 0.25)
+        page.put_float(Field.TUNE_LINE_SLOPE, 0.1)
+        page.put_float(Field.TUNE_LINE_AT_ZERO, -2.0)
+        page.put(Field.TUNE_WANTED, number)
+        assert host.tuning() == Tuning(gain, -1.0, 40, 0, 0.25, StraightLine(0.1, -2.0))
+        assert host.tuning() is None
+        assert page.get(Field.TUNE_TAKEN) == number
+
+
+def test_a_tuning_waits_for_its_sample(host, ring):
+    """It was worked out from there on; where a tick was skipped it begins at the next one."""
+    page = ring.page
+    page.put_float(Field.TUNE_GAIN, 0.5)
+    page.put_float(Field.TUNE_INVERSE_SHARE, 1.0)
+    page.put(Field.TUNE_SAMPLES, 40)
+    page.put(Field.TUNE_BEGINS_AT, 60)
+    page.put(Field.TUNE_WANTED, 1)
+    host.heartbeat(59, 0)
+    assert host.tuning() is None
+    assert page.get(Field.TUNE_TAKEN) == 0
+    host.heartbeat(61, 0)
+    assert host.tuning() == Tuning(0.5, 0.0, 40, 60)
+    assert page.get(Field.TUNE_TAKEN) == 1
+
+
+def test_closing_is_shown_before_the_device_takes_its_time(host, ring, clock):
+    host.closing()
+    assert ring.page.get(Field.PHASE) == Phase.CLOSING
+    assert ring.page.get(Field.LOOP_HEARTBEAT_NS) == clock.now
+
+
+def test_a_supervisor_may_be_silent_for_ever(ring, clock, monkeypatch):
+    """Where the experiment says that the run goes on without it."""
+    monkeypatch.setattr("os.getppid", lambda: 77)
+    assert RingHost(ring, clock, 77, math.inf).heartbeat(0, 0) == ""
+
+
+class AskingDevice(FakeDevice):
+    """Calls a function in the exchange of one sample, as a supervisor would act meanwhile."""
+
+    def __init__(self, at, act):
+        super().__init__()
+        self.at, self.act = at, act
+
+    def exchange(self, first_sample, command, displacement_um, measured):
+        if first_sample == self.at:
+            self.act(float(command[0]))
+        super().exchange(first_sample, command, displacement_um, measured)
+
+
+class Rig:
+    """A loop on a ring, whose supervisor is this process' parent; it goes round several times."""
+
+    SLOTS = 16
+    SAMPLES = 84
+
+    def __init__(self, folder, *, at=-1, act=lambda command: None, block=1, stalls=None):
+        compensator = Compensator(terfenol_rdpi(), 1000.0)
+        compensator.warm_up()
+        reference = 14.0 * np.sin(2 * np.pi * 25.0 * np.arange(self.SAMPLES) / 1000.0)
+        plan = Plan(
+            reference=reference,
+            input_um=reference,
+            block=block,
+            latency_blocks=0,
+            sample_rate_hz=1000.0,
+            compensator=compensator,
+            limits=CommandLimits(-5.0, 5.0, 2000.0, 0.0, 100.0),
+            interlocks=InterlockContext(stroke_um=(-60.0, 60.0)),
+            late_rules=LateRules(late_after_ns=5e5),
+        )
+        size = compensator.state_size + 1
+        self.ring = SampleRing.create(folder, slots=self.SLOTS, block=block, state_size=size)
+        self.ring.page.put(Field.SUPERVISOR_HEARTBEAT_NS, 1)
+        self.host = RingHost(self.ring, FakeClock(stall_ns=stalls or {}), os.getppid(), 5.0)
+        self.batches, self.answered = [], self.host.answered
+        self.host.answered = self.take
+        self.loop = Loop(plan, AskingDevice(at, act), self.host)
+
+    def take(self, block):
+        """Record each block as it comes, and give its slot back."""
+        done = self.answered(block)
+        self.batches += [copied(batch) for batch in self.ring.batches()]
+        self.ring.release()
+        return done
+
+    def run(self):
+        self.loop.begin_at(0.0)
+        return self.loop.run(1_000_000)
+
+    def flags(self, number):
+        return self.batches[number].flags[0, 0]
+
+
+def copied(batch):
+    return batch.rows(np.arange(batch.heads.shape[0]))
+
+
+@pytest.mark.parametrize("block", [1, 7])
+def test_a_slot_that_is_used_again_has_nothing_of_its_last_block(tmp_path, monkeypatch, block):
+    """The same bytes as with a block made anew for each tick."""
+
+    def recorded(folder):
+        rig = Rig(folder, block=block, stalls={9: 2_500_000})
+        outcome = rig.run()
+        arrays = [[b.heads, b.states, b.columns, b.flags] for b in rig.batches]
+        return outcome, [[each.tobytes() for each in batch] for batch in arrays]
+
+    reused = recorded(tmp_path / "reused")
+    monkeypatch.setattr(ring_module, "_MOST_BLOCKS", 0)
+    assert reused == recorded(tmp_path / "anew")
+    assert reused[0].code == "completed"
+
+
+@pytest.mark.parametrize(
+    ("field", "number", "reason"),
+    [
+        (Field.STOP, Stop.REQUEST, Stop.REQUEST.reason),
+        (
+            Field.SUPERVISOR_HEARTBEAT_NS,
+            -(10**10),
+            "stopped because the supervisor was silent for 5 s",
+        ),
+    ],
+)
+def test_what_is_asked_holds_from_the_next_tick_on(tmp_path, field, number, reason):
+    """Asked during the exchange of sample 42, the ramp begins at 43."""
+    rig = Rig(tmp_path / "ring", at=42, act=lambda _: rig.ring.page.put(field, number))
+    outcome = rig.run()
+    assert (outcome.code, outcome.reason) == ("stopped", reason)
+    assert rig.flags(43) & Flag.RAMP
+    assert not rig.flags(42) & Flag.RAMP
+
+
+def test_a_block_on_its_way_can_be_seen_as_such(tmp_path):
+    """Before the exchange the ring holds its commands, and says that they are under way."""
+    seen = []
+
+    def look(command):
+        batch, page = rig.ring.unanswered(20), rig.ring.page
+        sent = batch.heads[0, Head.FIRST_SAMPLE], batch.columns[0, 2, 0]
+        fields = (Field.SENT, Field.HEAD, Field.ENDED_AT, Field.EXCHANGING, Field.NEXT_SAMPLE)
+        seen.append((*sent, [page.get(field) for field in fields]))
+        assert sent[1] == command
+
+    rig = Rig(tmp_path / "ring", at=20, act=look)
+    rig.run()
+    assert seen[0][0] == 20
+    assert seen[0][2] == [21, 20, 21, 1, 20]
+
+
+def test_a_tick_shows_how_many_were_late(tmp_path):
+    page = []
+    fields = (Field.LATE_TICKS, Field.NEXT_SAMPLE, Field.LOOP_HEARTBEAT_NS)
+    rig = Rig(
+        tmp_path / "ring",
+        at=20,
+        act=lambda _: page.extend(rig.ring.page.get(field) for field in fields),
+        stalls={5: 600_000},
+    )
+    rig.run()
+    assert page[:2] == [1, 20]
+    assert page[2] >= 21_000_000

@@ -6,7 +6,16 @@ from pathlib import Path
 import pytest
 
 from hilctl.base.errors import InputError
-from hilctl.run.start import checked_experiment, default_output, output_of
+from hilctl.experiment.load import load_experiment
+from hilctl.recording.reader import read
+from hilctl.run.start import (
+    RunKey,
+    checked_experiment,
+    completed_key,
+    default_output,
+    output_of,
+    unpaced,
+)
 
 DEMO = Path(__file__).parents[3] / "configs" / "demo.yaml"
 NOON = time.struct_time((2026, 1, 2, 12, 0, 5, 4, 2, 0))
@@ -34,3 +43,57 @@ def test_a_folder_that_can_not_be_made_is_said(tmp_path):
     checked = checked_experiment(DEMO, [f"recording.folder={tmp_path / 'file' / 'runs'}"])
     with pytest.raises(InputError, match="can't be made: Not a directory"):
         output_of(checked, None)
+
+
+EXPERIMENT = """\
+name: rig
+device: {kind: simulated_terfenol, seed: 3}
+sample_rate_hz: 2000
+block: 20
+waveform: {kind: sine, unit: A, amplitude: 2.0, frequency_hz: 20.0, duration_s: 0.4}
+compensator: none
+limits: {peak_current_a: 4.0, slew_a_per_s: 5000.0, stroke_um: [-50.0, 50.0]}
+"""
+BUDGET = ["limits.rms_current_a=2.0", "limits.thermal_time_constant_s=1.0"]
+
+
+@pytest.fixture
+def experiment(tmp_path) -> Path:
+    path = tmp_path / "rig.yaml"
+    path.write_text(EXPERIMENT, encoding="utf-8")
+    return path
+
+
+def test_a_recording_is_known_by_what_it_is_of(experiment, tmp_path):
+    """Another value of any key is another run."""
+    result = unpaced(experiment, [], tmp_path / "a.mcap")
+    assert completed_key(result.path) == RunKey.of(load_experiment(experiment))
+    assert completed_key(result.path) != RunKey.of(load_experiment(experiment, ["block=10"]))
+
+
+def test_what_was_not_completed_has_no_key(experiment, tmp_path):
+    fault = ["device.fault={kind: sensor_nan, at_sample: 100}"]
+    assert completed_key(unpaced(experiment, fault, tmp_path / "a.mcap").path) is None
+    (tmp_path / "text.mcap").write_text("no recording")
+    assert completed_key(tmp_path / "text.mcap") is None
+    assert completed_key(tmp_path / "absent.mcap") is None
+
+
+def test_a_model_counts(experiment):
+    """By what it is, not by the name of its file."""
+    loaded = load_experiment(experiment)
+    key = RunKey.of(loaded)
+    assert (key.model, key.correction) == ("", "")
+    facts = {"experiment_sha256": key.experiment, "model_sha256": "x"}
+    assert RunKey.of_facts(facts) == RunKey(key.experiment, "x", "")
+
+
+def test_a_recording_says_the_coil_s_heat_before_and_after(experiment, tmp_path):
+    """As the interlock has it: the run that follows at once begins with it."""
+    first = read(unpaced(experiment, BUDGET, tmp_path / "a.mcap").path)
+    left = float(first.end["coil_heat_a2"])
+    assert float(first.run["coil_heat_a2"]) == 0.0
+    assert 0.3 < left < 1.0
+    again = read(unpaced(experiment, BUDGET, tmp_path / "b.mcap", heat_a2=left).path)
+    assert float(again.run["coil_heat_a2"]) == left
+    assert float(again.end["coil_heat_a2"]) > left

@@ -6,6 +6,7 @@ All neighbours are doubles that note what is asked of them; whole runs are in ``
 import json
 import os
 import signal
+import socket
 import threading
 from contextlib import contextmanager
 from types import SimpleNamespace
@@ -19,8 +20,9 @@ from hilctl.loop.plan import Outcome
 from hilctl.run import supervisor as module
 from hilctl.run.protocol import STOP_SIGNAL
 from hilctl.run.ring import SampleRing
-from hilctl.run.shared_page import Field, PageText
-from hilctl.run.supervisor import Supervisor
+from hilctl.run.shared_page import Field, PageText, SafeActionResult, Stop
+from hilctl.run.supervisor import ProgressThread, RunMonitor, Supervisor, SystemdNotifier
+from tests.fakes import SteppingClock
 
 MS = 1_000_000
 STARTED = [
@@ -29,10 +31,12 @@ STARTED = [
     "claimed",
     "folder",
     "server",
+    "job.json",
+    "description.json",
     "child",
     "guardian",
 ]
-READY = [*STARTED, "await ready", "small", "begin", "favoured", "recording"]
+READY = [*STARTED, "await ready", "begin", "favoured", "recording"]
 UNDONE = ["ordinary again", "server closed", "folder removed", "devices let go"]
 
 
@@ -83,7 +87,8 @@ class Neighbours:
         )
         self.folder = SimpleNamespace(
             path=folder, ring=folder / "ring", socket=folder / "socket",
-            description=folder / "description.json", keep=lambda: self.note("folder kept"),
+            description=folder / "description.json", job=folder / "job.json",
+            keep=lambda: self.note("folder kept"),
         )  # fmt: skip
         self.folder.description.touch()
         self.said, self.resumed, self.kept = [], [], False
@@ -96,19 +101,22 @@ class Neighbours:
             "run_folder": self.run_folder,
             "Requests": lambda *a: SimpleNamespace(answer=None),
             "ControlServer": self.server,
-            "LoopChild": self.child,
+            "LoopProcess": self.child,
+            "Job": SimpleNamespace(of=self.job),
+            "RunDescription": SimpleNamespace(
+                of=lambda checked: SimpleNamespace(write=self.written)
+            ),
             "RingRecorder": self.ring_recorder,
-            "guardian_starter": self.guardian_starter,
+            "GuardianProcess": lambda folder, page, inherits, loop: self.note("guardian", inherits),
             "GuardianRelief": lambda holds: SimpleNamespace(
                 resume=self.resumed.append, discard=lambda: self.resumed.append("discarded")
             ),
             "Safety": self.safety,
-            "ProcessMemory": lambda: SimpleNamespace(stay_small=lambda: self.note("small")),
-            "StartedRun": self.started_run,
+            "RunMonitor": self.started_run,
             "ProgressThread": lambda *a: SimpleNamespace(
                 start=lambda: self.said.append("shown"), end=lambda: self.note("progress ended")
             ),
-            "Notifier": lambda: SimpleNamespace(
+            "SystemdNotifier": lambda: SimpleNamespace(
                 say=lambda *lines: self.said.extend(lines),
                 alive=lambda: self.said.append("alive"),
             ),
@@ -129,9 +137,6 @@ class Neighbours:
         finally:
             self.log.append(afterwards)
 
-    def guardian_starter(self, checked, folder, ring, loop, inherits):
-        return None if self.info.simulated else self.note("guardian", inherits)
-
     def run_folder(self, name, output, started, holds):
         assert (name, output, started, holds) == ("stage", self.output, 5.0, ("tcp:here",))
         return self.around("folder", "folder removed", (self.folder, ["lock"]))
@@ -142,12 +147,19 @@ class Neighbours:
         with self.around("server", "server closed", None):
             yield SimpleNamespace(start=lambda: self.note("serving"))
 
-    def child(self, checked, folder, ring, inherits, silence_s):
-        self.ring, self.silence_s = ring, silence_s
+    def job(self, checked, folder, *, supervisor, silence_s):
+        assert supervisor == os.getpid()
+        self.silence_s = silence_s
+        return SimpleNamespace(write=self.written)
+
+    def written(self, path):
+        self.note(path.name)
+
+    def child(self, folder, page, inherits):
         assert inherits == ["tcp:here", "lock"]
         set_up = json.dumps([{"rt.fifo": "done: 50"}, self.refused])
-        ring.page.write_text(PageText.SET_UP, set_up)
-        ring.page.put(Field.WAVEFORM_AT, 40)
+        page.write_text(PageText.SET_UP, set_up)
+        page.put(Field.WAVEFORM_AT, 40)
         self.note("child")
         return SimpleNamespace(
             pid=1, await_ready=self.await_ready, kill=lambda: self.note("child killed")
@@ -167,6 +179,7 @@ class Neighbours:
         self.note("begin")
 
     def ring_recorder(self, ring, recorder, flush_s):
+        self.ring = ring
         return SimpleNamespace(recorder=recorder, start=self.start, record_event=None)
 
     def start(self):
@@ -174,7 +187,7 @@ class Neighbours:
         self.note("recording")
 
     def safety(self, checked, ring, child, guardian, record_event):
-        self.guardian = guardian
+        self.guardian = guardian and guardian(child.pid)
         return SimpleNamespace(
             ready=self.ready, close=lambda stopped=None: self.note("safety closed", self.kept)
         )
@@ -494,3 +507,248 @@ def test_memory_that_is_not_to_be_had_is_told(stage, monkeypatch):
     with pytest.raises(RunError, match="ring: no memory: No space left on device; less recording"):
         stage.run()
     assert stage.log[-3:] == ["given back", *UNDONE[2:]]
+
+
+class Run:
+    """A started run whose neighbours the test has in its hand."""
+
+    def __init__(self, folder):
+        ring = SampleRing.create(folder / "ring", slots=4, block=1, state_size=1)
+        self.page, self.ended, self.looks = ring.page, [], []
+        recorder = SimpleNamespace(samples=5, error="")
+        self.stalled = 0.0
+        self.recording = SimpleNamespace(
+            recorder=recorder,
+            newest=None,
+            finished=False,
+            stalled_s=lambda: self.stalled,
+            record_event=self.ended.append,
+            end=lambda outcome, *, lost_loop: self.ended.append((outcome, lost_loop)),
+        )
+        self.child = SimpleNamespace(ended=False, death=lambda: "the loop process died: of this")
+        self.safety = SimpleNamespace(
+            result=None, by="", update=lambda now_ns, *, ended: self.looks.append(ended)
+        )
+        self.config = SimpleNamespace(
+            recording=SimpleNamespace(on_failure="stop", ring_s=10.0), compensator=None
+        )
+        checked = SimpleNamespace(
+            loaded=SimpleNamespace(config=self.config), forecast=SimpleNamespace(samples=100)
+        )
+        self.started = RunMonitor(checked, ring, self.child, self.safety, self.recording)
+
+
+@pytest.fixture
+def run(tmp_path):
+    return Run(tmp_path)
+
+
+def test_the_heartbeat_is_written_and_the_loop_looked_at(run, monkeypatch):
+    monkeypatch.setattr(module.time, "monotonic_ns", lambda: 77)
+    assert run.started.attend(0)
+    assert run.page.get(Field.SUPERVISOR_HEARTBEAT_NS) == 77
+    assert run.looks == [False]
+    assert run.page.get(Field.STOP) == 0
+    assert run.started.outcome is None
+
+
+def refuse(run):
+    run.recording.recorder.error, run.stalled = "full", 5.1
+
+
+def break_off(run):
+    run.started.break_off(ZeroDivisionError("a bug"))
+
+
+@pytest.mark.parametrize(
+    ("cause", "stop"),
+    [
+        (refuse, Stop.RECORDER_FAILED),
+        (lambda run: setattr(run, "stalled", 5.1), Stop.RECORDER_STALLED),
+        (break_off, Stop.SUPERVISOR_BROKE),
+    ],
+)
+def test_a_stop_is_passed_on(run, cause, stop):
+    run.started.attend(0)
+    assert run.page.get(Field.STOP) == 0
+    cause(run)
+    run.started.attend(0)
+    assert run.page.get(Field.STOP) == stop
+
+
+def test_a_write_that_is_refused_stops_nothing_while_the_ring_has_room(run):
+    run.recording.recorder.error, run.stalled = "full", 4.9
+    run.started.attend(0)
+    assert run.page.get(Field.STOP) == 0
+
+
+@pytest.mark.parametrize(
+    ("number", "stop"),
+    [
+        (signal.SIGINT, Stop.CTRL_C),
+        (signal.SIGTERM, Stop.SIGTERM),
+        (signal.SIGHUP, Stop.SIGHUP),
+        (STOP_SIGNAL, Stop.REQUEST),
+    ],
+)
+def test_a_signal_goes_before_all_else(run, number, stop):
+    break_off(run)
+    run.started.attend(number)
+    assert run.page.get(Field.STOP) == stop
+
+
+def test_a_run_that_is_to_go_on_goes_on_without_its_recording(run):
+    run.config.recording.on_failure = "go_on"
+    run.recording.recorder.error, run.stalled = "full", 60.0
+    run.started.attend(0)
+    assert run.page.get(Field.STOP) == 0
+
+
+def test_half_a_ring_is_no_reason_to_stop(run):
+    run.stalled = 4.9
+    run.started.attend(0)
+    assert run.page.get(Field.STOP) == 0
+
+
+def test_a_loop_that_ended_by_itself_is_believed_once_it_is_gone(run):
+    """Until then it may still be closing its device."""
+    outcome = Outcome("completed", "waveform completed", 7, "confirmed", 0)
+    run.page.leave_outcome(outcome)
+    run.started.attend(0)
+    assert run.ended == []
+    run.child.ended = True
+    assert run.started.attend(0)
+    assert run.ended == [(outcome, False)]
+    run.recording.finished = True
+    assert not run.started.attend(0)
+    assert run.ended == [(outcome, False)]
+    assert run.looks == [False, True]
+
+
+def test_the_recording_is_not_closed_before_the_output_is_safe(run):
+    """A loop that left nothing: somebody is still at it."""
+    run.child.ended = True
+    run.started.attend(0)
+    assert run.ended == []
+
+
+@pytest.mark.parametrize(
+    ("result", "by", "words"),
+    [
+        (SafeActionResult(False, "confirmed"), "supervisor", ["of this"]),
+        (SafeActionResult(True, "confirmed"), "supervisor", ["hung"]),
+        (SafeActionResult(True, "confirmed"), "guardian", ["hung", "the guardian set"]),
+        (SafeActionResult(False, "unknown", "no answer"), "guardian", ["of this", "no answer"]),
+        (SafeActionResult(False, "set", final=False), "guardian", ["not yet confirmed"]),
+    ],
+)
+def test_who_acted_is_said_and_only_what_was_confirmed(run, result, by, words):
+    run.safety.result, run.safety.by = result, by
+    run.child.ended = True
+    run.started.attend(0)
+    ((outcome, lost_loop),) = run.ended
+    assert (outcome.code, outcome.output) == ("fault", result.output)
+    assert all(word in outcome.reason for word in words)
+    assert lost_loop
+
+
+def test_a_loop_that_lost_its_device_keeps_its_account_of_the_end(run):
+    """The guardian went on where it gave up; what the loop recorded is whole."""
+    run.page.leave_outcome(Outcome("fault", "no answer", 7, "unknown", 3))
+    run.child.ended = True
+    run.started.attend(0)
+    assert run.ended == []
+    run.safety.result, run.safety.by = SafeActionResult(False, "confirmed"), "guardian"
+    run.started.attend(0)
+    ((outcome, lost_loop),) = run.ended
+    assert (outcome.output, outcome.ended_at, outcome.dropped) == ("confirmed", 7, 3)
+    assert outcome.reason.startswith("no answer; the guardian set")
+    assert not lost_loop
+
+
+def test_what_broke_the_supervisor_first_is_what_is_said(run):
+    run.started.break_off(ZeroDivisionError("a bug"))
+    run.started.break_off(KeyError("another"))
+    assert run.started.broke == "ZeroDivisionError: a bug"
+    assert run.ended[0].code == "supervisor_broke"
+
+
+def test_progress_is_that_of_the_newest_samples(run):
+    assert run.started.progress() is None
+    run.recording.newest = "newest"
+    found = run.started.progress()
+    assert (found.samples, found.total, found.batch, found.compensated) == (5, 100, "newest", False)
+    run.started.progress_failed("a pipe")
+    assert (run.ended[0].code, run.ended[0].text) == ("progress_failed", "a pipe")
+
+
+def test_the_last_is_shown_and_nothing_where_there_is_nothing_new(monkeypatch):
+    monkeypatch.setattr(module, "_SHOWN_EVERY_S", 60.0)
+    for current, shown in ((7, [7]), (None, [])):
+        seen = []
+        thread = ProgressThread(lambda current=current: current, seen.append, seen.append)
+        thread.start()
+        thread.end()
+        assert seen == shown
+
+
+def test_an_error_is_said_once(monkeypatch):
+    monkeypatch.setattr(module, "_SHOWN_EVERY_S", 0.0)
+    errors = []
+    thread = ProgressThread(lambda: 1, lambda progress: [][progress], errors.append)
+    thread.start()
+    thread._thread.join(30.0)
+    thread.end()
+    assert errors == ["progress is not shown any more: IndexError: list index out of range"]
+
+
+def test_a_terminal_that_stands_still_is_not_waited_for(monkeypatch):
+    monkeypatch.setattr(module, "_SHOWN_EVERY_S", 0.0)
+    monkeypatch.setattr(module, "_LAST_SHOWN_S", 0.0)
+    entered, released = threading.Event(), threading.Event()
+
+    def show(progress):
+        entered.set()
+        released.wait(30.0)
+
+    thread = ProgressThread(lambda: 1, show, lambda text: None)
+    thread.start()
+    assert entered.wait(30.0)
+    thread.end()
+    assert thread._thread.is_alive()
+    released.set()
+    thread._thread.join(30.0)
+
+
+def test_lines_reach_the_service_manager(tmp_path):
+    """What is said comes as one datagram."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.bind(str(tmp_path / "notify"))
+        SystemdNotifier({"NOTIFY_SOCKET": str(tmp_path / "notify")}).say("READY=1", "STATUS=fine")
+        assert manager.recv(100) == b"READY=1\nSTATUS=fine"
+
+
+def test_watchdog_is_fed_three_times_in_its_interval(tmp_path):
+    """However often it is called, it says so at a third of the interval."""
+    clock = SteppingClock()
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.bind(str(tmp_path / "notify"))
+        manager.setblocking(False)
+        notifier = SystemdNotifier(
+            {"NOTIFY_SOCKET": str(tmp_path / "notify"), "WATCHDOG_USEC": "3000000"}, clock
+        )
+        fed = []
+        for step in range(31):
+            clock.now = 0.1 * step
+            notifier.alive()
+            try:
+                fed.append((step, manager.recv(100)))
+            except BlockingIOError:
+                continue
+    assert fed == [(step, b"WATCHDOG=1") for step in (0, 10, 20, 30)]
+
+
+def test_nobody_listening_is_no_matter(tmp_path):
+    """A run outside a service, or one whose manager is gone, goes on."""
+    SystemdNotifier({}).say("READY=1")
+    SystemdNotifier({"NOTIFY_SOCKET": str(tmp_path / "gone"), "WATCHDOG_USEC": "x"}).say("READY=1")
