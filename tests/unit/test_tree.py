@@ -7,6 +7,7 @@ ROOT = UNIT.parents[1]
 PACKAGES = {Path(): ROOT / "hilctl", Path("drivers"): ROOT / "drivers" / "hilctl_drivers"}
 
 WITHOUT = {
+    "run/guardian_process": "tests/faults/test_processes.py runs it; run/test_job.py the limits",
     "base/types": "names of types; waveforms/test_build.py reads arrays in chunks",
     "base/device": "the contract of devices: tests/contract/test_devices.py holds each to it",
     "base/events": "one record of plain values; seen in run/test_shared_page.py",

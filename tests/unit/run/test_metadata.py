@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hilctl.recording.checks import labels_of
+from hilctl.recording.validation import labels_of
 
 from hilctl.analysis.report import summarize
 from hilctl.base.events import TUNED, Event
